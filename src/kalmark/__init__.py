@@ -1,0 +1,1 @@
+"""EKF-SLAM with a covariance that stays honest."""

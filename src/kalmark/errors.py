@@ -1,0 +1,35 @@
+"""The errors kalmark raises on bad input: one line each, saying what, where and what was expected."""
+
+from __future__ import annotations
+
+
+class KalmarkError(Exception):
+    """Any input kalmark refuses.  The command line prints it as one line and exits with status 2."""
+
+
+class EventError(KalmarkError):
+    """A control, scan or fix that cannot be used; the map is exactly what it was before."""
+
+
+class ModelError(KalmarkError):
+    """A motion, sensor or landmark model that is wrong in itself or does not fit the others."""
+
+
+class MapError(KalmarkError):
+    """A block that is not in the map, or a map that cannot be read."""
+
+
+class LogError(KalmarkError):
+    """A log that cannot be read.  The message starts with ``file:line:`` where there is one."""
+
+
+class ConfigError(KalmarkError):
+    """A configuration that cannot be read.  The message starts with ``file:line:column:``."""
+
+
+class DataError(KalmarkError):
+    """A dataset that is unknown, cannot be fetched or fails its checksum."""
+
+
+class RunError(KalmarkError):
+    """A run folder that is missing something or cannot be read."""

@@ -1,0 +1,33 @@
+"""Fixtures that find the real logs and recordings, or skip with a reason."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+
+def _finder(variable: str) -> Callable[[str], Path]:
+    def find(relative: str = ".") -> Path:
+        folder = os.environ.get(variable)
+        if not folder:
+            pytest.skip(f"{variable} is not set: the real data is not here")
+        path = Path(folder) / relative
+        assert path.exists(), f"{variable} is set, but {path} is missing"
+        return path
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def data() -> Callable[[str], Path]:
+    """Return the path of a file or folder of the real logs."""
+    return _finder("KALMARK_DATA")
+
+
+@pytest.fixture(scope="session")
+def oracle() -> Callable[[str], Path]:
+    """Return the path of a recording made with another program."""
+    return _finder("KALMARK_ORACLE")
