@@ -1,0 +1,190 @@
+"""Configuration of motion, sensors and landmarks: the fields of `kalmark.models`, by the same names."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Discriminator, Tag
+
+from kalmark.config.sections import Gate, Limit, NotNegative, Number, Positive, Reserved, Section, type_or
+
+
+class _Diffusion(Section):
+    sigma_along_m_per_sqrt_s: NotNegative = 0.0
+    """Random walk along the heading, while it moves."""
+    sigma_across_m_per_sqrt_s: NotNegative = 0.0
+    """Random walk across the heading, while it moves."""
+    sigma_theta_rad_per_sqrt_s: NotNegative = 0.0
+    """Random walk of the heading, while it moves."""
+
+
+class UnicycleMotion(_Diffusion):
+    """Speed and turn rate, each held until the next control."""
+
+    type: Literal["unicycle"] = "unicycle"
+    sigma_v_mps: NotNegative = 0.1
+    """Error of the speed held over its interval."""
+    sigma_w_radps: NotNegative = 0.05
+    """Error of the turn rate held over its interval."""
+
+
+class Odometry2DMotion(_Diffusion):
+    """Increments dx, dy, dtheta in the robot's frame."""
+
+    type: Literal["odometry_2d"] = "odometry_2d"
+    sigma_x_m: NotNegative = 0.01
+    """Error of one increment, forward."""
+    sigma_y_m: NotNegative = 0.0
+    """Error of one increment, to the left."""
+    sigma_theta_rad: NotNegative = 0.02
+    """Error of one increment, heading."""
+
+
+class AckermannMotion(_Diffusion):
+    """A car: wheel speed and steering angle, each held until the next control."""
+
+    type: Literal["ackermann"] = "ackermann"
+    wheelbase_m: Positive = 2.83
+    """Distance between the axles."""
+    encoder_offset_m: NotNegative = 0.76
+    """Wheel encoder, left of the middle of the rear axle."""
+    sigma_v_mps: NotNegative = 0.1
+    """Error of the wheel speed held over its interval."""
+    sigma_steering_rad: NotNegative = 0.02
+    """Error of the steering angle held over its interval."""
+
+
+Motion = Annotated[
+    Annotated[UnicycleMotion, Tag("unicycle")]
+    | Annotated[Odometry2DMotion, Tag("odometry_2d")]
+    | Annotated[AckermannMotion, Tag("ackermann")],
+    Discriminator(type_or()),
+]
+
+
+class IdentityAssociation(Section):
+    """Trust the ids of the log."""
+
+    type: Literal["identity"] = "identity"
+    gate: Gate = "default"
+    """Refuse observations outside this probability; or off, or default."""
+
+
+class NearestAssociation(Section):
+    """The nearest landmark by Mahalanobis distance, inside its gate."""
+
+    type: Literal["nearest"] = "nearest"
+    gate: Gate = 0.99
+    """Refuse pairs outside this probability; or off, or default."""
+
+
+Association = Annotated[
+    Annotated[IdentityAssociation, Tag("identity")] | Annotated[NearestAssociation, Tag("nearest")],
+    Discriminator(type_or("identity")),
+]
+
+
+class PointLandmark(Section):
+    """A Euclidean point."""
+
+    type: Literal["point"] = "point"
+
+
+class PointSignatureLandmark(Section):
+    """A Euclidean point with a signature (x, y, s)."""
+
+    type: Literal["point_signature"] = "point_signature"
+
+
+Landmark = Annotated[
+    Annotated[PointLandmark, Tag("point")] | Annotated[PointSignatureLandmark, Tag("point_signature")],
+    Discriminator(type_or("point")),
+]
+
+
+class MountConfig(Section):
+    """Where a sensor sits, in the robot's frame."""
+
+    x_m: Number = 0.0
+    """Forward of the robot's origin."""
+    y_m: Number = 0.0
+    """To the left of the robot's origin."""
+    theta_rad: Number = 0.0
+    """Turned to the left."""
+
+
+class _Sensor(Section):
+    mount: MountConfig = MountConfig()
+    """Where the sensor sits on the robot."""
+    landmark: Landmark | None = None
+    """Landmark type of this sensor; `landmarks` if absent."""
+    association: Association | None = None
+    """Association of this sensor; `association` if absent."""
+    detector: Reserved = None
+    """Reserved: how landmarks are found in raw data."""
+    range_min_m: NotNegative = 0.0
+    """Nearest landmark the sensor sees."""
+    range_max_m: Limit = math.inf
+    """Farthest landmark the sensor sees."""
+    fov_rad: Positive = 2 * math.pi
+    """Field of view, centred forward."""
+
+
+class _Range(_Sensor):
+    sigma_range_m: NotNegative = 0.1
+    """Constant part a of the range noise sqrt(a^2 + (b r)^2)."""
+    sigma_range_rel: NotNegative = 0.0
+    """Part b of the range noise, growing with range."""
+
+
+class RangeSensor(_Range):
+    """Distance to a landmark."""
+
+    type: Literal["range"] = "range"
+
+
+class RangeBearingSensor(_Range):
+    """Distance and direction of a landmark."""
+
+    type: Literal["range_bearing"] = "range_bearing"
+    sigma_bearing_rad: NotNegative = 0.02
+    """Noise of the bearing."""
+
+
+class RangeBearingSignatureSensor(_Range):
+    """Distance, direction and signature of a landmark."""
+
+    type: Literal["range_bearing_signature"] = "range_bearing_signature"
+    sigma_bearing_rad: NotNegative = 0.02
+    """Noise of the bearing."""
+    sigma_signature: NotNegative = 0.1
+    """Noise of the signature."""
+
+
+class BearingSensor(_Sensor):
+    """Direction of a landmark."""
+
+    type: Literal["bearing"] = "bearing"
+    sigma_bearing_rad: NotNegative = 0.02
+    """Noise of the bearing."""
+
+
+class PositionSensor(_Sensor):
+    """Position of a landmark in the sensor's frame."""
+
+    type: Literal["position"] = "position"
+    sigma_x_m: NotNegative = 0.1
+    """Noise, forward."""
+    sigma_y_m: NotNegative = 0.1
+    """Noise, to the left."""
+
+
+Sensor = Annotated[
+    Annotated[RangeBearingSensor, Tag("range_bearing")]
+    | Annotated[BearingSensor, Tag("bearing")]
+    | Annotated[RangeSensor, Tag("range")]
+    | Annotated[PositionSensor, Tag("position")]
+    | Annotated[RangeBearingSignatureSensor, Tag("range_bearing_signature")],
+    Discriminator(type_or()),
+]

@@ -1,0 +1,172 @@
+"""Read a configuration: YAML in, a checked `Config` out, or one line that says what is wrong and where."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from kalmark.config.models import Association, Landmark, Motion, Sensor
+from kalmark.config.schema import Config, Estimator
+from kalmark.config.sections import LATER, types
+from kalmark.config.tree import Tree, read_tree, show
+from kalmark.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_CHOICES = {
+    "motion": Motion,
+    "sensor": Sensor,
+    "landmark": Landmark,
+    "association": Association,
+    "estimator": Estimator,
+}
+_ENDINGS = (".yaml", ".yml")
+_EXPECTED = {
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a mapping of keys",
+    "model_type": "a mapping of keys",
+    "model_attributes_type": "a mapping of keys",
+}
+
+
+def load_config(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """Return the configuration at a path or of a shipped name, with overrides like ``log.path=my_log`` applied.
+
+    Raises ConfigError: ``file:line:column: key.path: got value, expected what``.
+    """
+    path = resolve_config(path_or_name)
+    tree = read_tree(path, overrides)
+    config = validate(tree, Config)
+    config._file = path
+    config._where.update(tree.places)
+    return config
+
+
+def shipped_configs() -> dict[str, Path]:
+    """Return the configurations that come with kalmark, by name."""
+    return {path.stem: path for path in _shipped_folder()}
+
+
+def _shipped_folder() -> list[Path]:
+    folder = Path(str(resources.files("kalmark"))) / "configs"
+    return sorted(path for path in folder.glob("*.yaml"))
+
+
+def resolve_config(path_or_name: str | Path) -> Path:
+    """Return the file of a path or shipped name; a missing ``anywhere/mrclam.yaml`` is the shipped `mrclam`."""
+    return resolve_name(path_or_name, shipped_configs(), "configuration")
+
+
+def resolve_name(path_or_name: str | Path, shipped: dict[str, Path], what: str) -> Path:
+    """Return the file that a path or one of the shipped names means.  Raises ConfigError naming the nearest name."""
+    path = Path(path_or_name)
+    if path.is_file():
+        return path
+    if str(path_or_name) in shipped:
+        return shipped[str(path_or_name)]
+    if path.is_dir():
+        raise ConfigError(f"{path}: got a folder, expected a {what}: a YAML file or one of {', '.join(shipped)}")
+    if path.suffix in _ENDINGS and path.stem in shipped:
+        return shipped[path.stem]
+    nearest = did_you_mean(path.stem, [*shipped])
+    raise ConfigError(f"{path}: no such file, expected a {what}: a YAML file or one of {', '.join(shipped)}{nearest}")
+
+
+def validate(tree: Tree, model: type[Model]) -> Model:
+    """Return the tree as a `model`, or raise the first error in it, in file order, as one ConfigError."""
+    try:
+        return model.model_validate(tree.values)
+    except ValidationError as error:
+        order = {path: n for n, path in enumerate(tree.keys)}
+        errors = [(_path(e["loc"], tree.values), e) for e in error.errors(include_url=False)]
+        raise _one_error(*min(errors, key=lambda e: order.get(e[0], 0)), tree) from None
+
+
+def did_you_mean(word: str, words: Sequence[str]) -> str:
+    """Return "; did you mean NEAREST?", or nothing if no word is near."""
+    near = difflib.get_close_matches(word, words, n=1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> ConfigError:
+    context: dict[str, Any] = error.get("ctx", {})
+    kind = error["type"]
+    if kind == "unknown_key":
+        key, keys = str(context["key"]), context["keys"]
+        path = (*path, key)
+        value = _at(tree.values, path)
+        message = f"got an unknown key (value {show(value)}), expected {_one_of(keys)}{did_you_mean(key, keys)}"
+        return ConfigError(f"{tree.place(path, of_key=True)}: {'.'.join(path)}: {message}")
+    value = _at(tree.values, path)
+    if kind == "union_tag_invalid":
+        path = (*path, "type")
+        message = _not_one_of(value.get("type"), _quoted(context["expected_tags"]), path)
+    elif kind == "literal_error":
+        message = _not_one_of(value, _quoted(context["expected"]), path)
+    elif kind == "union_tag_not_found":
+        message = f"got {show(value)}, expected a mapping with a type: {_one_of(types(_CHOICES[_kind(path)]))}"
+    else:
+        message = f"got {show(value)}, expected {_expected(kind, context, error['msg'])}"
+    return ConfigError(f"{tree.place(path)}: {'.'.join(path)}: {message}")
+
+
+def _path(loc: tuple[int | str, ...], values: Any) -> tuple[str, ...]:
+    """Return the path of keys that an error's location means, without the types of the choices taken on the way."""
+    path: tuple[str, ...] = ()
+    node = values
+    for part in loc:
+        here = part in node and part != node.get("type") if isinstance(node, dict) else isinstance(node, list)
+        if here:
+            node = node[part]
+            path = (*path, str(part))
+    return path
+
+
+def _at(values: Any, path: tuple[str, ...]) -> Any:
+    for part in path:
+        values = values.get(part) if isinstance(values, dict) else values[int(part)]
+    return values
+
+
+def _expected(kind: str, context: dict[str, Any], message: str) -> str:
+    if kind == "expected":
+        return str(context["what"])
+    for name, sign in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<")):
+        if name in context:
+            return f"a number {sign} {context[name]:g}"
+    return _EXPECTED.get(kind, message[0].lower() + message[1:])
+
+
+def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
+    if path[-1] == "type" and got in LATER.get(_kind(path[:-1]), ()):
+        return f"got {show(got)}, which is not available yet, expected {_one_of(words)}"
+    return f"got {show(got)}, expected {_one_of(words)}{did_you_mean(str(got), words)}"
+
+
+def _kind(path: tuple[str, ...]) -> str:
+    """Return what is chosen at `path`: motion, sensor, landmark, association, estimator or map."""
+    if len(path) > 1 and path[-2] == "sensors":
+        return "sensor"
+    return "landmark" if path[-1] == "landmarks" else path[-1]
+
+
+def _quoted(words: str) -> list[str]:
+    return re.findall(r"'([^']+)'", words)
+
+
+def _one_of(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else "one of " + ", ".join(words)

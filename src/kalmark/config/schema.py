@@ -1,0 +1,154 @@
+"""`Config`: everything that decides a run, each key with its default, in one frozen model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Discriminator, Field, PrivateAttr, Tag
+
+from kalmark.config.models import (
+    Association,
+    IdentityAssociation,
+    Landmark,
+    Motion,
+    PointLandmark,
+    Sensor,
+    UnicycleMotion,
+)
+from kalmark.config.sections import NotNegative, Number, Positive, RobotName, Section, type_or
+from kalmark.errors import ConfigError
+
+
+class LogConfig(Section):
+    """Which log, and how much of it."""
+
+    path: str | None = None
+    """Folder or file; beside this file, in KALMARK_DATA or downloaded."""
+    format: str | None = None
+    """Format of the log; recognised if absent."""
+    robots: Annotated[tuple[RobotName, ...], Field(strict=False)] | None = None
+    """Use only these robots, by name or number."""
+    from_s: Number | None = None
+    """Start here, counted from the first event of the log."""
+    to_s: Number | None = None
+    """End here, counted from the first event of the log."""
+    on_error: Literal["raise", "skip"] = "raise"
+    """What to do with bad input: refuse, or leave out."""
+    r_max: Positive | None = None
+    """lost_in_the_woods: drop observations beyond this range (m)."""
+    bearing_shift_s: Number | None = None
+    """mrclam: added to the time of every observation."""
+    detections: Literal["laser", "slsjf", "rfs"] | None = None
+    """victoria_park: which detections."""
+    steering: Literal["ascii", "mat"] | None = None
+    """victoria_park: which steering calibration."""
+
+    def options(self) -> dict[str, float | str]:
+        """Return the keys that only some formats have, as given."""
+        common = {"path", "format", "robots", "from_s", "to_s", "on_error"}
+        return self.model_dump(exclude=common, exclude_none=True)
+
+
+class StartConfig(Section):
+    """Where a robot starts, and how surely."""
+
+    x_m: Number = 0.0
+    """Position."""
+    y_m: Number = 0.0
+    """Position."""
+    theta_rad: Number = 0.0
+    """Heading."""
+    sigma_xy_m: NotNegative = 0.0
+    """Standard deviation of each coordinate."""
+    sigma_theta_rad: NotNegative = 0.0
+    """Standard deviation of the heading."""
+
+
+class RobotConfig(Section):
+    """One robot: how it moves, where it starts, what it carries."""
+
+    motion: Motion = UnicycleMotion()
+    """Motion model."""
+    start: StartConfig | None = None
+    """Start; if absent, the log's truth, or else the origin."""
+    sensors: dict[str, Sensor] = Field(default_factory=dict)
+    """Sensors by the log's name of each."""
+
+
+class EkfEstimator(Section):
+    """The textbook filter, landmark by landmark."""
+
+    type: Literal["ekf"] = "ekf"
+
+
+class InvariantEstimator(Section):
+    """The iterated invariant filter."""
+
+    type: Literal["invariant"] = "invariant"
+    iterations: Annotated[int, Field(ge=1)] = 6
+    """At most this many linearisations of a scan."""
+
+
+class FejEstimator(Section):
+    """First-estimates Jacobians."""
+
+    type: Literal["fej"] = "fej"
+
+
+Estimator = Annotated[
+    Annotated[InvariantEstimator, Tag("invariant")]
+    | Annotated[EkfEstimator, Tag("ekf")]
+    | Annotated[FejEstimator, Tag("fej")],
+    Discriminator(type_or("invariant")),
+]
+
+
+class MapConfig(Section):
+    """How the covariance is kept."""
+
+    type: Literal["auto", "dense"] = "auto"
+    """Auto: whatever serves best."""
+
+
+def _each() -> dict[str, RobotConfig]:
+    return {"each": RobotConfig()}
+
+
+class Config(Section):
+    """Everything that decides a run.  A saved run's config.yaml is one of these and can be run again."""
+
+    version: str | None = None
+    """kalmark version that saved this file."""
+    seed: int | None = None
+    """Seed of the simulation the log came from."""
+    log: LogConfig = LogConfig()
+    """The log."""
+    robots: dict[str, RobotConfig] = Field(default_factory=_each)
+    """Robots by name; `each` stands for every robot not named."""
+    landmarks: Landmark = PointLandmark()
+    """Landmark type."""
+    association: Association = IdentityAssociation()
+    """Which landmark was that."""
+    estimator: Estimator = InvariantEstimator()
+    """Filter."""
+    map: MapConfig = MapConfig()
+    """Covariance storage."""
+
+    _file: Path | None = PrivateAttr(None)
+    _where: dict[tuple[str, ...], str] = PrivateAttr(default_factory=dict)
+
+    @property
+    def file(self) -> Path | None:
+        """The file this was read from, or None."""
+        return self._file
+
+    @property
+    def name(self) -> str:
+        """The file's name without its ending, or "config"."""
+        return self._file.stem if self._file else "config"
+
+    def error(self, path: tuple[str, ...], message: str) -> ConfigError:
+        """Return the error of the value at `path`, naming the place it was read from."""
+        where = next((self._where[path[:n]] for n in range(len(path), -1, -1) if path[:n] in self._where), "")
+        return ConfigError(f"{where + ': ' if where else ''}{'.'.join(path)}: {message}")

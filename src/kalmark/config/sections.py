@@ -1,0 +1,90 @@
+"""The pieces that configuration sections are made of: strictness, numbers, choices by `type`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, model_validator
+from pydantic_core import PydanticCustomError
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Limit = Annotated[float, Field(gt=0, allow_inf_nan=True)]
+
+# What the contract names and later versions bring: refused by name, not as a spelling mistake.
+LATER: dict[str, tuple[str, ...]] = {
+    "motion": ("odometry_3d", "constant_velocity_3d", "inertial"),
+    "sensor": ("range_bearing_3d", "pinhole", "omnidirectional", "stereo", "tag_pose", "position_fix"),
+    "landmark": ("inverse_depth", "homogeneous", "anchored_homogeneous", "polar", "tag", "pluecker"),
+    "association": ("global", "jcbb", "clique", "sample", "jpda", "auto"),
+    "estimator": (),
+    "map": ("postponed",),
+}
+
+
+class Section(BaseModel):
+    """A frozen mapping of keys, each with its default; unknown keys and loosely typed values are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, value: Any) -> Any:
+        if isinstance(value, dict):
+            for key in value:
+                if key not in cls.model_fields:
+                    raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "keys": [*cls.model_fields]})
+        return value
+
+
+def expected(what: str) -> PydanticCustomError:
+    """Return the error of a value that should have been `what`."""
+    return PydanticCustomError("expected", "{what}", {"what": what})
+
+
+def type_or(default: str | None = None) -> Callable[[Any], str | None]:
+    """Return the discriminator of a choice by `type`; `default` is the type of a section that names none."""
+
+    def discriminate(value: Any) -> str | None:
+        if not isinstance(value, dict):
+            return getattr(value, "type", None)
+        kind = value.get("type", default)
+        return kind if kind is None or isinstance(kind, str) else repr(kind)
+
+    return discriminate
+
+
+def types(choice: Any) -> list[str]:
+    """Return the type names of a choice: an annotated union of tagged sections."""
+    union = get_args(choice)[0]
+    return [get_args(member)[1].tag for member in get_args(union)]
+
+
+def _gate(value: Any) -> float | str:
+    if value in ("off", "default"):
+        return str(value)
+    if isinstance(value, int | float) and 0 < value < 1:
+        return float(value)
+    raise expected("a probability between 0 and 1, off or default")
+
+
+Gate = Annotated[float | str, PlainValidator(_gate)]
+
+
+def _robot(value: Any) -> int | str:
+    if isinstance(value, str) or (isinstance(value, int) and not isinstance(value, bool)):
+        return value
+    raise expected("a robot's name or number")
+
+
+RobotName = Annotated[int | str, PlainValidator(_robot)]
+
+
+def _none_yet(value: Any) -> None:
+    if value is not None:
+        raise expected("nothing: this key is reserved and not available yet")
+
+
+Reserved = Annotated[None, PlainValidator(_none_yet)]

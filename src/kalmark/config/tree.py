@@ -1,0 +1,140 @@
+"""A YAML file as plain values, each remembering where it stood; and `--set` overrides laid over it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.reader import ReaderError
+
+from kalmark.errors import ConfigError
+
+_DEEPEST = 12  # a configuration is 5 levels deep; an alias to its own parent has no end
+
+
+@dataclass
+class Tree:
+    """Plain values, with the place of every key and every value by path."""
+
+    values: dict[str, Any] = field(default_factory=dict)
+    keys: dict[tuple[str, ...], str] = field(default_factory=dict)
+    places: dict[tuple[str, ...], str] = field(default_factory=dict)
+
+    def place(self, path: tuple[str, ...], *, of_key: bool = False) -> str:
+        """Return where the value (or its key) at `path` was written, or the nearest thing around it."""
+        if of_key and path in self.keys:
+            return self.keys[path]
+        return next((self.places[path[:n]] for n in range(len(path), -1, -1) if path[:n] in self.places), "")
+
+
+def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
+    """Return the YAML 1.2 file at `path` with the overrides applied.
+
+    Raises ConfigError, naming file, line and column, on anything that is not one mapping with distinct text keys.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: byte {error.start} is not UTF-8, expected a YAML text file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    content = _parse(text, str(path))
+    if not isinstance(content, CommentedMap) or not content:
+        got = "an empty file" if not content and not isinstance(content, int | float) else show(content)
+        raise ConfigError(f"{path}:1:1: got {got}, expected a mapping of keys")
+    tree = Tree()
+    tree.values = _plain(content, (), tree, str(path))
+    tree.places[()] = f"{path}:1:1"
+    for override in overrides:
+        _override(tree, override)
+    return tree
+
+
+def show(value: Any) -> str:
+    """Return a value as an error message quotes it: short, on one line."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _parse(text: str, name: str) -> Any:
+    try:
+        return YAML(typ="rt", pure=True).load(io.StringIO(text))
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
+        raise ConfigError(f"{where}: {_one_line(error)}") from None
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        column = error.position - text.rfind("\n", 0, error.position)
+        raise ConfigError(f"{name}:{line}:{column}: got {text[error.position]!r}, expected printable text") from None
+    except (YAMLError, ValueError) as error:
+        raise ConfigError(f"{name}: {_one_line(error)}") from None
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, DuplicateKeyError):
+        key = str(error.problem).split('"')[1]
+        return f"{key}: got this key a second time, expected each key once"
+    problem = str(getattr(error, "problem", None) or error).strip().splitlines()[0]
+    context = getattr(error, "context", None)
+    return f"{problem} ({context}), expected YAML" if context else f"{problem}, expected YAML"
+
+
+def _plain(node: Any, path: tuple[str, ...], tree: Tree, name: str) -> Any:
+    """Return `node` as plain dict, list and scalars, noting where each stood."""
+    if len(path) > _DEEPEST:
+        raise ConfigError(f"{tree.place(path)}: {'.'.join(path[:4])}...: nested deeper than {_DEEPEST} levels")
+    if isinstance(node, CommentedMap):
+        return {str(key): _item(node, key, path, tree, name) for key in node}
+    if isinstance(node, CommentedSeq):
+        return [_item(node, i, path, tree, name) for i in range(len(node))]
+    for kind in (bool, int, float, str):
+        if isinstance(node, kind):
+            return kind(node)
+    return None if node is None else str(node)
+
+
+def _item(node: CommentedMap | CommentedSeq, key: Any, path: tuple[str, ...], tree: Tree, name: str) -> Any:
+    place = (*path, str(key))
+    if key in (node.lc.data or ()):
+        line, column, *rest = node.lc.data[key]
+        tree.keys[place] = f"{name}:{line + 1}:{column + 1}"
+        if rest:
+            line, column = rest
+        tree.places[place] = f"{name}:{line + 1}:{column + 1}"
+    if isinstance(node, CommentedMap) and (isinstance(key, bool) or not isinstance(key, str | int)):
+        raise ConfigError(f"{tree.place(place)}: got key {show(key)}, expected a text key")
+    return _plain(node[key], place, tree, name)
+
+
+def _override(tree: Tree, override: str) -> None:
+    """Lay one `a.b=value` over the tree; the value is YAML."""
+    where = f"--set {override}"
+    dotted, equals, text = override.partition("=")
+    path = tuple(part.strip() for part in dotted.split("."))
+    if not equals or not all(path):
+        raise ConfigError(f"{where}: got no key and value, expected key.path=value")
+    node = tree.values
+    for depth, part in enumerate(path[:-1], 1):
+        if node.get(part) is None:
+            node[part] = {}
+        node = node[part]
+        if not isinstance(node, dict):
+            raise ConfigError(f"{where}: {'.'.join(path[:depth])}: got {show(node)}, expected a mapping of keys")
+    overlay = Tree()
+    node[path[-1]] = _plain(_parse(text, where), (), overlay, where)
+    for table in (tree.places, tree.keys):
+        for below in [p for p in table if p[: len(path)] == path]:
+            del table[below]
+        table[path] = where

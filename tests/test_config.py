@@ -1,0 +1,214 @@
+"""Configuration: what is read, what is refused, and that every refusal names its place."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from kalmark.config import load_config, resolve_config, shipped_configs
+from kalmark.errors import ConfigError
+
+GOOD = """\
+log: {path: my_log, robots: [3]}
+robots:
+  each:
+    motion: {type: unicycle, sigma_v_mps: 0.05, sigma_w_radps: 1e-1}
+    start: {x_m: 1, theta_rad: -2.5}
+    sensors:
+      camera:
+        type: range_bearing
+        sigma_range_m: 0.15
+        mount: {x_m: 0.2}
+association: {gate: off}
+"""
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    path = tmp_path / "good.yaml"
+    path.write_text(GOOD)
+    return path
+
+
+def refusal(path: Path, *overrides: str) -> str:
+    with pytest.raises(ConfigError) as error:
+        load_config(path, overrides)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def refusal_of(text: str, tmp_path: Path) -> str:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    message = refusal(path)
+    assert message.startswith(f"{path}:")
+    return message.removeprefix(f"{path}:")
+
+
+def test_what_the_file_says_is_in_force_and_the_rest_has_its_default(good: Path) -> None:
+    config = load_config(good)
+    robot = config.robots["each"]
+    camera = robot.sensors["camera"]
+    assert config.log.robots == (3,)
+    assert robot.motion.sigma_w_radps == 0.1
+    assert robot.start is not None
+    assert (robot.start.x_m, robot.start.sigma_xy_m) == (1.0, 0.0)
+    assert (camera.mount.x_m, camera.mount.theta_rad, camera.range_max_m) == (0.2, 0.0, math.inf)
+    assert config.association.gate == "off"
+    assert (config.association.type, config.estimator.type, config.map.type) == ("identity", "invariant", "auto")
+
+
+def test_a_configuration_cannot_be_changed(good: Path) -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        load_config(good).seed = 3  # type: ignore[misc]
+
+
+def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) -> None:
+    config = load_config(
+        good, ["robots.each.motion.sigma_v_mps=2e-1", "estimator.type=ekf", "robots.each.sensors.camera.mount={y_m: 3}"]
+    )
+    assert config.robots["each"].motion.sigma_v_mps == 0.2
+    assert config.robots["each"].motion.sigma_w_radps == 0.1
+    assert config.robots["each"].sensors["camera"].mount.x_m == 0.0
+    assert config.robots["each"].sensors["camera"].mount.y_m == 3.0
+    assert config.estimator.type == "ekf"
+
+
+@pytest.mark.parametrize(
+    ("override", "what"),
+    [
+        ("log.robot=3", "log.robot: got an unknown key (value 3), expected one of path, format, robots, "),
+        ("robots.each.motion.sigma_v_mps=-1", "robots.each.motion.sigma_v_mps: got -1, expected a number >= 0"),
+        ("robots.each.motion.sigma_v_mps=.nan", "robots.each.motion.sigma_v_mps: got nan, expected a finite number"),
+        ("robots.each.motion.sigma_v_mps=true", "robots.each.motion.sigma_v_mps: got true, expected a number"),
+        ("robots.each.motion.sigma_v_mps='1'", "robots.each.motion.sigma_v_mps: got '1', expected a number"),
+        (
+            "robots.each.motion.type=unicicle",
+            "got 'unicicle', expected one of unicycle, odometry_2d, ackermann; did you",
+        ),
+        ("robots.each.motion.type=odometry_3d", "got 'odometry_3d', which is not available yet, expected one of unic"),
+        ("robots.each.motion=3", "robots.each.motion: got 3, expected a mapping with a type: one of unicycle, od"),
+        ("robots.each.start.x_m=.inf", "robots.each.start.x_m: got inf, expected a finite number"),
+        (
+            "robots.each.sensors.camera.detector=x",
+            "sensors.camera.detector: got 'x', expected nothing: this key is res",
+        ),
+        ("robots.each.sensors.camera.type=sonar", "robots.each.sensors.camera.type: got 'sonar', expected one of "),
+        ("robots.each.sensors=[1]", "robots.each.sensors: got [1], expected a mapping of keys"),
+        ("association.type=jcbb", "association.type: got 'jcbb', which is not available yet, expected one of identity"),
+        ("association.gate=2", "association.gate: got 2, expected a probability between 0 and 1, off or default"),
+        ("map.type=postponed", "map.type: got 'postponed', which is not available yet, expected one of auto, dense"),
+        ("estimator.iterations=2.5", "estimator.iterations: got 2.5, expected a whole number"),
+        ("estimator.iterations=0", "estimator.iterations: got 0, expected a number >= 1"),
+        ("log.on_error=skp", "log.on_error: got 'skp', expected one of raise, skip; did you mean skip?"),
+        ("log.robots=3", "log.robots: got 3, expected a list"),
+        ("log.robots=[1.5]", "log.robots.0: got 1.5, expected a robot's name or number"),
+        ("log.path.x=3", "log.path: got 'my_log', expected a mapping of keys"),
+        ("robots.each.sensors.range={type: range, range: 5}", "robots.each.sensors.range.range: got an unknown key"),
+        ("log={path: [", "expected the node content"),
+        ("estimator", "got no key and value, expected key.path=value"),
+    ],
+)
+def test_a_bad_override_is_refused_by_its_own_text(good: Path, override: str, what: str) -> None:
+    message = refusal(good, override)
+    assert message.startswith(f"--set {override}:")
+    assert what in message
+
+
+@pytest.mark.parametrize(
+    ("line", "replacement", "where", "what"),
+    [
+        (4, "    motion: {type: unicycle, sigma_v: 0.05}", "4:30", "motion.sigma_v: got an unknown key (value 0.05)"),
+        (
+            4,
+            "    motion: {type: unicycle, sigma_v_mps: -2}",
+            "4:43",
+            "motion.sigma_v_mps: got -2, expected a number >= 0",
+        ),
+        (4, "    motion: {type: car}", "4:20", "motion.type: got 'car', expected one of unicycle"),
+        (4, "    motoin: {type: unicycle}", "4:5", "robots.each.motoin: got an unknown key"),
+        (9, "        sigma_range_m: .nan", "9:24", "camera.sigma_range_m: got nan, expected a finite number"),
+        (9, "        sigma_range_m: 0,15", "9:24", "camera.sigma_range_m: got '0,15', expected a number"),
+        (11, "association: {gate: of}", "11:21", "association.gate: got 'of', expected a probability"),
+        (11, "log: {path: again}", "11:1", "log: got this key a second time, expected each key once"),
+        (11, "association: {gate: off", "12:1", "expected ',' or '}'"),
+        (11, "\tassociation: off", "11:1", "cannot start any token"),
+    ],
+)
+def test_a_bad_line_is_refused_by_file_line_and_column(
+    tmp_path: Path, line: int, replacement: str, where: str, what: str
+) -> None:
+    lines = GOOD.splitlines()
+    lines[line - 1] = replacement
+    message = refusal_of("\n".join(lines) + "\n", tmp_path)
+    assert message.startswith(f"{where}: ")
+    assert what in message
+
+
+def test_an_unknown_key_is_told_the_nearest_one(tmp_path: Path) -> None:
+    message = refusal_of("robots:\n  each: {motion: {type: unicycle, sigma_w_rads: 1}}\n", tmp_path)
+    assert message.endswith("; did you mean sigma_w_radps?")
+
+
+def test_the_first_of_several_mistakes_is_named(tmp_path: Path) -> None:
+    message = refusal_of("map: {type: auto}\nassociation: {gate: 5}\nlog: {form: 3}\n", tmp_path)
+    assert message.startswith("2:21: association.gate: ")
+
+
+@pytest.mark.parametrize("text", ["", "3", "[1, 2]", "# nothing\n", "{}", "''"])
+def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
+    assert refusal_of(text, tmp_path).startswith("1:1: got ")
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(b"log: \xff\xfe")
+    assert refusal(path) == f"{path}: byte 5 is not UTF-8, expected a YAML text file"
+    assert refusal_of("log: \x01", tmp_path) == "1:6: got '\\x01', expected printable text"
+
+
+def test_an_alias_to_itself_is_refused(tmp_path: Path) -> None:
+    assert "robots.a.motion" in refusal_of("robots:\n  a: &a {motion: {type: unicycle, sigma_v_mps: *a}}\n", tmp_path)
+    assert "log.robots" in refusal_of("log:\n  robots: &a [1, [*a]]\n", tmp_path)
+
+
+def test_anchors_and_merge_keys_work(tmp_path: Path) -> None:
+    path = tmp_path / "merge.yaml"
+    path.write_text(
+        "robots:\n  a: &a {motion: &m {type: unicycle, sigma_v_mps: 3}}\n  b: *a\n"
+        "  c: {motion: {<<: *m, sigma_w_radps: 2}}\n"
+    )
+    config = load_config(path)
+    assert config.robots["b"].motion.sigma_v_mps == 3
+    assert (config.robots["c"].motion.sigma_v_mps, config.robots["c"].motion.sigma_w_radps) == (3, 2)
+
+
+def test_numbers_as_robot_names_are_names(tmp_path: Path) -> None:
+    path = tmp_path / "numbers.yaml"
+    path.write_text("robots: {3: {motion: {type: unicycle}}}\n")
+    assert list(load_config(path).robots) == ["3"]
+
+
+@pytest.mark.parametrize("name", sorted(shipped_configs()))
+def test_every_shipped_configuration_loads(name: str) -> None:
+    assert load_config(name).name == name
+
+
+def test_a_missing_path_with_a_shipped_name_means_the_shipped_one(tmp_path: Path) -> None:
+    shipped = shipped_configs()["mrclam"]
+    assert resolve_config("mrclam") == shipped
+    assert resolve_config("configs/mrclam.yaml") == shipped
+    own = tmp_path / "mrclam.yaml"
+    own.write_text(GOOD)
+    assert resolve_config(own) == own
+
+
+def test_a_name_that_means_nothing_is_told_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"mrclm: no such file.*; did you mean mrclam\?$"):
+        resolve_config("mrclm")
+    with pytest.raises(ConfigError, match="got a folder, expected a configuration"):
+        resolve_config(tmp_path)
