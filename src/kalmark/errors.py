@@ -33,3 +33,7 @@ class DataError(KalmarkError):
 
 class RunError(KalmarkError):
     """A run folder that is missing something or cannot be read."""
+
+
+class DivergedError(KalmarkError):
+    """The filter refuses to go on: an innovation covariance is no longer positive definite."""

@@ -1,0 +1,1 @@
+"""The stochastic map and the estimators that correct it."""

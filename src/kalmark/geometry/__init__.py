@@ -1,0 +1,30 @@
+"""Geometry of the plane with Jacobians, spaces of the map's blocks, and Gaussians."""
+
+from kalmark.geometry.angles import V, V_inverse, rotation, wrap
+from kalmark.geometry.frames import (
+    compose,
+    from_frame,
+    inv_observe,
+    inv_scan,
+    inverse,
+    move,
+    observe,
+    scan,
+    to_frame,
+)
+from kalmark.geometry.gaussian import (
+    compound,
+    ellipse,
+    gate,
+    mahalanobis,
+    merge,
+    sigma_probability,
+    sigma_table,
+)
+from kalmark.geometry.spaces import POINT2, SE2, Rn, Space
+
+__all__ = [
+    "POINT2", "SE2", "Rn", "Space", "V", "V_inverse", "compose", "compound", "ellipse", "from_frame", "gate",
+    "inv_observe", "inv_scan", "inverse", "mahalanobis", "merge", "move", "observe", "rotation", "scan",
+    "sigma_probability", "sigma_table", "to_frame", "wrap",
+]  # fmt: skip

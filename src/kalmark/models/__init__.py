@@ -1,0 +1,1 @@
+"""Motion, sensor and landmark models, and the seam where they meet."""

@@ -1,0 +1,1 @@
+"""The system: events in, reports out."""

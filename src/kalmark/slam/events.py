@@ -31,9 +31,9 @@ def nanoseconds(t_s: float | None, t_ns: int | None, what: str) -> int:
 
 
 def finite(value: Any, what: str) -> Array:
-    """Return `value` as a float array, or refuse it if anything in it is not a finite number."""
+    """Return a copy of `value` as a float array, or refuse it if anything in it is not a finite number."""
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64, order="C")
     except (TypeError, ValueError):
         raise EventError(f"{what} is {value!r}, expected numbers") from None
     flat = array.ravel()

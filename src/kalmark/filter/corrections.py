@@ -1,0 +1,269 @@
+"""The corrections: textbook, invariant and first-estimates, each one function from innovation to corrected map.
+
+The same source runs twice: compiled for the built-in models, as plain Python for a user's (`linearize` is the only
+place that differs).  `blocks` and `atoms` are the map's tables, `robot` and `slots` rows of `blocks`; a scan's
+observations of K landmarks are y (K, m) with noise R (K, m, m).  Nothing is changed unless all of it succeeds.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba.extending import register_jitable
+
+from kalmark.compiled import compiled
+from kalmark.filter.kernels import Index, cholesky_inverse, columns, downdate, submatrix, transport
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.spaces import Table, generator, retract
+from kalmark.models.observe import linearize
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+POSE = 3  # numbers and degrees of freedom of a planar pose; its heading is the last
+HEADING = 2
+
+
+@compiled
+def observed_block(
+    x: Array, blocks: Table, atoms: Table, robot: int, slots: Index, d: int
+) -> tuple[Index, Table, Array]:
+    """Return the rows in P, the atoms and the mean of the robot's pose and the first d numbers of K landmarks."""
+    size = POSE + d * len(slots)
+    index, mean = np.empty(size, np.int64), np.empty(size)
+    table = np.empty((size, 3), np.int64)
+    count = at = 0
+    for i in range(len(slots) + 1):
+        slot, width = (robot, POSE) if i == 0 else (slots[i - 1], d)
+        x_at, p_at, first = blocks[slot, 0], blocks[slot, 2], blocks[slot, 4]
+        for j in range(width):
+            index[at + j], mean[at + j] = p_at + j, x[x_at + j]
+        for a in range(first, first + blocks[slot, 5]):
+            if atoms[a, 1] - x_at < width:
+                table[count, 0] = atoms[a, 0]
+                table[count, 1], table[count, 2] = at + atoms[a, 1] - x_at, at + atoms[a, 2] - p_at
+                count += 1
+        at += width
+    return index, table[:count], mean
+
+
+@compiled
+def residual(y: Array, e: Array, angular: Flags) -> Array:
+    """Return z = y - e (K, m), the angles among them wrapped.  [S] (26)."""
+    z = y - e
+    for j in range(len(angular)):
+        if angular[j]:
+            for i in range(len(z)):
+                z[i, j] = wrap(z[i, j])
+    return z
+
+
+@compiled
+def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array]:
+    """Return each observation's innovation covariance Z (K, m, m) and d2 = z' Z^-1 z (K,).  [S] (27), (83)."""
+    k, m, d = E_l.shape
+    Z, d2 = np.empty((k, m, m)), np.empty(k)
+    rows, H = np.empty(POSE + d, np.int64), np.empty((m, POSE + d))
+    rows[:POSE] = index[:POSE]
+    for i in range(k):
+        rows[POSE:] = index[POSE + i * d : POSE + (i + 1) * d]
+        H[:, :POSE], H[:, POSE:] = E_r[i], E_l[i]
+        S = submatrix(P, rows)
+        for a in range(m):
+            for b in range(a + 1):
+                s = R[i, a, b]
+                for c in range(POSE + d):
+                    t = 0.0
+                    for f in range(POSE + d):
+                        t += S[c, f] * H[b, f]
+                    s += H[a, c] * t
+                Z[i, a, b] = Z[i, b, a] = s
+        M, positive = cholesky_inverse(Z[i])
+        d2[i] = np.nan
+        if positive:
+            w = 0.0
+            for a in range(m):
+                s = 0.0
+                for b in range(a + 1):
+                    s += M[a, b] * z[i, b]
+                w += s * s
+            d2[i] = w
+    return Z, d2
+
+
+@compiled
+def stacked(E_r: Array, E_l: Array) -> Array:
+    """Return the Jacobian H (K m, 3 + K d) of all observations of a scan with respect to the observed block."""
+    k, m, d = E_l.shape
+    H = np.zeros((k * m, POSE + k * d))
+    for i in range(k):
+        H[i * m : (i + 1) * m, :POSE] = E_r[i]
+        H[i * m : (i + 1) * m, POSE + i * d : POSE + (i + 1) * d] = E_l[i]
+    return H
+
+
+@compiled
+def add_blocks(S: Array, R: Array) -> None:
+    """S += blockdiag(R), R (K, m, m)."""
+    k, m, _ = R.shape
+    for i in range(k):
+        S[i * m : (i + 1) * m, i * m : (i + 1) * m] += R[i]
+
+
+@register_jitable  # type: ignore[untyped-decorator]
+def iterate(
+    view: Any, table: Table, mean: Array, P_ss: Array, y: Array, R: Array, angular: Flags, most: int, tolerance: float
+) -> tuple[Array, Array, Array, bool]:
+    """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
+
+    The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
+    those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta').
+    """
+    k, d = len(y), (len(mean) - POSE) // len(y)
+    correction = np.zeros(len(mean))
+    turned = generator(table, mean, len(mean))
+    x_j = mean
+    for _ in range(most):
+        e, E_r, E_l = linearize(view, x_j[:POSE], x_j[POSE:].reshape(k, d))
+        H = stacked(E_r, E_l)
+        H[:, HEADING] += H @ (generator(table, x_j, len(mean)) - turned)
+        v = residual(y, e, angular).ravel() + H @ correction
+        PH = P_ss @ H.T
+        Z = H @ PH
+        add_blocks(Z, R)
+        M, positive = cholesky_inverse(Z)
+        if not positive:
+            break
+        step = PH @ (M.T @ (M @ v))
+        change = np.abs(step - correction).max()
+        correction = step
+        x_j = mean.copy()
+        retract(table, x_j, correction, correction[HEADING])
+        if change < tolerance:
+            break
+    return H, M, v, positive
+
+
+@compiled
+def fuse(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> Array:
+    """P <- P - W W' with W = P H' L^-T, M = L^-1; return the correction K v (n,) of the mean.  [S] (28)-(30)."""
+    W = (columns(P, index, n) @ H.T) @ M.T
+    d = W @ (M @ v)
+    downdate(P, W)
+    return d
+
+
+def invariant(
+    view: Any,
+    x: Array,
+    P: Array,
+    n: int,
+    blocks: Table,
+    atoms: Table,
+    robot: int,
+    slots: Index,
+    d: int,
+    y: Array,
+    R: Array,
+    angular: Flags,
+    gate: float,
+    most: int,
+) -> tuple[Array, Array, Array, Array, bool]:
+    """Correct with one scan: gate, iterate, fuse, retract, transport.  MATH: the invariant filter, 1 to 3.
+
+    Returns e, z, Z, d2 at the prediction and whether the filter could go on; d2 <= gate were fused.
+    """
+    index, table, mean = observed_block(x, blocks, atoms, robot, slots, d)
+    e, E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(len(slots), d))
+    z = residual(y, e, angular)
+    Z, d2 = innovation(P, index, E_r, E_l, R, z)
+    near = d2 <= gate
+    if not near.any():
+        return e, z, Z, d2, True
+    if not near.all():
+        y, R = y[near], R[near]
+        index, table, mean = observed_block(x, blocks, atoms, robot, slots[near], d)
+    H, M, v, positive = iterate(view, table, mean, submatrix(P, index), y, R, angular, most, 1e-7)
+    if not positive:
+        return e, z, Z, d2, False
+    before = generator(atoms, x, n)
+    correction = fuse(P, n, index, H, M, v)
+    theta = index[HEADING]
+    retract(atoms, x, correction, correction[theta])
+    transport(P, generator(atoms, x, n) - before, theta)
+    return e, z, Z, d2, True
+
+
+def textbook(
+    view: Any,
+    x: Array,
+    P: Array,
+    n: int,
+    blocks: Table,
+    atoms: Table,
+    robot: int,
+    slots: Index,
+    d: int,
+    y: Array,
+    R: Array,
+    angular: Flags,
+    gate: float,
+    _: None,
+) -> tuple[Array, Array, Array, Array, bool]:
+    """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3."""
+    k, m = y.shape
+    e, z, Z, d2 = np.empty((k, m)), np.empty((k, m)), np.empty((k, m, m)), np.empty(k)
+    for i in range(k):
+        one = slice(i, i + 1)
+        index, _, mean = observed_block(x, blocks, atoms, robot, slots[one], d)
+        e[one], E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(1, d))
+        z[one] = residual(y[one], e[one], angular)
+        Z[one], d2[one] = innovation(P, index, E_r, E_l, R[one], z[one])
+        if d2[i] < gate:
+            M, _ = cholesky_inverse(Z[i])
+            retract(atoms, x, fuse(P, n, index, stacked(E_r, E_l), M, z[i].copy()), 0.0)
+    return e, z, Z, d2, True
+
+
+def first_estimates(
+    view: Any,
+    x: Array,
+    P: Array,
+    n: int,
+    blocks: Table,
+    atoms: Table,
+    robot: int,
+    slots: Index,
+    d: int,
+    y: Array,
+    R: Array,
+    angular: Flags,
+    gate: float,
+    x_first: Array,
+) -> tuple[Array, Array, Array, Array, bool]:
+    """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
+    k = len(slots)
+    index, _, mean = observed_block(x, blocks, atoms, robot, slots, d)
+    _, _, first = observed_block(x_first, blocks, atoms, robot, slots, d)
+    e, _, _ = linearize(view, mean[:POSE], mean[POSE:].reshape(k, d))
+    _, E_r, E_l = linearize(view, first[:POSE], first[POSE:].reshape(k, d))
+    z = residual(y, e, angular)
+    Z, d2 = innovation(P, index, E_r, E_l, R, z)
+    near = d2 <= gate
+    if not near.any():
+        return e, z, Z, d2, True
+    index, _, _ = observed_block(x, blocks, atoms, robot, slots[near], d)
+    H = stacked(E_r[near], E_l[near])
+    Z_all = H @ (submatrix(P, index) @ H.T)
+    add_blocks(Z_all, R[near])
+    M, positive = cholesky_inverse(Z_all)
+    if positive:
+        retract(atoms, x, fuse(P, n, index, H, M, z[near].ravel()), 0.0)
+    return e, z, Z, d2, positive
+
+
+compiled_invariant = compiled(invariant)
+compiled_textbook = compiled(textbook)
+compiled_first_estimates = compiled(first_estimates)

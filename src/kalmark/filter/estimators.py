@@ -1,0 +1,120 @@
+"""The estimators to choose from.  They differ in the correction alone; prediction and augmentation are the textbook's.
+
+`Invariant` is the default: its unobservable directions do not depend on the estimate, which keeps it consistent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import ModelError
+from kalmark.filter import corrections
+from kalmark.filter.map import X_AT, StochasticMap
+from kalmark.geometry.spaces import SE2
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+
+class Correction(NamedTuple):
+    """What a scan of K known landmarks said: expectation, innovation, its covariance, squared distance, and health."""
+
+    e: Array
+    z: Array
+    Z: Array
+    d2: Array
+    healthy: bool
+
+
+class Estimator(Protocol):
+    """How a scan corrects the map."""
+
+    coordinates: ClassVar[str]
+    default_gate: ClassVar[float]
+
+    def correct(
+        self, map_: StochasticMap, view: Any, robot: int, slots: Index, d: int, y: Array, R: Array, angular: Any,
+        gate: float,
+    ) -> Correction:  # fmt: skip
+        """Fuse the observations y (K, m), noise R (K, m, m), of the first d numbers of `slots`, those with d2 <= gate."""
+
+    def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
+        """Return the Jacobian J (., 3) with respect to the robot's pose, taken where this estimator linearises."""
+
+
+class _Estimator:
+    """Runs the compiled correction for built-in models and the same source in Python for a user's."""
+
+    source: ClassVar[Callable[..., Any]]
+    compiled: ClassVar[Callable[..., Any]]
+
+    def correct(
+        self, map_: StochasticMap, view: Any, robot: int, slots: Index, d: int, y: Array, R: Array, angular: Any,
+        gate: float,
+    ) -> Correction:  # fmt: skip
+        """Fuse the observations y (K, m), noise R (K, m, m), of the first d numbers of `slots`, those with d2 <= gate."""
+        m, run = map_, type(self).compiled if isinstance(view, tuple) else type(self).source
+        scan = (robot, slots, d, y, R, angular, gate)
+        return Correction(*run(view, m.x, m.P, m.n, m.blocks, m.atoms, *scan, self._option(m)))
+
+    def _option(self, map_: StochasticMap) -> Any:
+        return None
+
+    def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
+        """Return J as it is: everything is linearised at the estimate."""
+        return J
+
+
+@dataclass(frozen=True)
+class Ekf(_Estimator):
+    """The textbook filter, landmark by landmark, gate 3 sigma.  [S] (26)-(30), C.3.  Overconfident: for comparison."""
+
+    coordinates: ClassVar[str] = "world"
+    default_gate: ClassVar[float] = 9.0
+    source = corrections.textbook
+    compiled = corrections.compiled_textbook
+
+
+@dataclass(frozen=True)
+class Invariant(_Estimator):
+    """The iterated right-invariant filter: honest about what cannot be observed (docs/invariant.md)."""
+
+    iterations: int = 6
+
+    coordinates: ClassVar[str] = "log"
+    default_gate: ClassVar[float] = math.inf
+    source = corrections.invariant
+    compiled = corrections.compiled_invariant
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ModelError(f"Invariant: iterations is {self.iterations}, expected at least 1")
+
+    def _option(self, map_: StochasticMap) -> int:
+        return self.iterations
+
+
+@dataclass(frozen=True)
+class Fej(_Estimator):
+    """First-estimates Jacobians: consistent while the first estimates are good, lost when they are not."""
+
+    coordinates: ClassVar[str] = "world"
+    default_gate: ClassVar[float] = math.inf
+    source = corrections.first_estimates
+    compiled = corrections.compiled_first_estimates
+
+    def _option(self, map_: StochasticMap) -> Array:
+        return map_.x_first
+
+    def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
+        """Return J (I + (generator(x) - generator(x_first)) e_theta'): displacements counted from x_first."""
+        at = map_.blocks[robot, X_AT]
+        J = J.copy()
+        J[:, 2] += J @ (SE2.generator(map_.x[at : at + 3]) - SE2.generator(map_.x_first[at : at + 3]))
+        return J

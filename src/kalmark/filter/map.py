@@ -1,0 +1,133 @@
+"""The stochastic map: one joint Gaussian over blocks (robots, landmarks, ...), {x, P} of [S] (5)-(6).
+
+A block has a mean in its space and a range in the covariance.  A removed block leaves its slot to the next of its
+size.  The buffers double when they are full, so that a new landmark costs O(n), [S] 2.3.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import MapError
+from kalmark.filter import kernels
+from kalmark.geometry.spaces import REMOVED, Space, Table
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
+
+
+class StochasticMap:
+    """The joint Gaussian of all blocks, dense: predict O(n), correct O(n^2), augment O(n), reduce O(n).
+
+    Blocks are addressed by slots, the rows of `blocks`; names are the caller's business.  P is kept as a lower triangle.
+    """
+
+    def __init__(self, capacity: int = 64) -> None:
+        self.x: Array = np.zeros(capacity)
+        self.P: Array = np.zeros((capacity, capacity))
+        self.x_first: Array = np.zeros(capacity)  # where each block was first estimated, robots last predicted
+        self.blocks: Table = np.zeros((0, 6), dtype=np.int64)
+        self.atoms: Table = np.zeros((0, 3), dtype=np.int64)
+        self.spaces: list[Space | None] = []
+        self.n = 0  # rows of P in use
+        self.x_n = 0  # numbers of x in use
+        self._free: dict[tuple[int, ...], list[int]] = {}
+
+    # ------------------------------------------------------------------ reading
+    def index(self, slot: int) -> Index:
+        """Return the rows of P of a block."""
+        at = self.blocks[slot, P_AT]
+        return np.arange(at, at + self.blocks[slot, P_SIZE])
+
+    def mean(self, slot: int) -> Array:
+        """Return a copy of a block's mean."""
+        at, size = self.blocks[slot, X_AT], self.blocks[slot, X_SIZE]
+        return self.x[at : at + size].copy()
+
+    def covariance(self, slots: Sequence[int]) -> Array:
+        """Return the joint covariance of blocks, in the order given."""
+        return kernels.submatrix(self.P, np.concatenate([self.index(s) for s in slots]))
+
+    # ------------------------------------------------------------------ growing and shrinking
+    def add(self, space: Space, mean: Any, cov: Any = None) -> int:
+        """Add a block that is independent of all others (`cov` None: known exactly); return its slot."""
+        slot = self._place(space, np.asarray(mean, dtype=np.float64))
+        at, d = self.blocks[slot, P_AT], self.blocks[slot, P_SIZE]
+        kernels.clear(self.P, self.n, at, d)
+        if cov is not None:
+            self.P[at : at + d, at : at + d] = cov
+        return slot
+
+    def augment(self, space: Space, mean: Array, index: Index, G: Array, Q: Array) -> int:
+        """Add a block computed from the rows `index`: P_Lx = G P_x, P_LL = G P G' + Q.  [S] (35)-(38)."""
+        slot = self._place(space, mean)
+        kernels.augment(self.P, self.n, self.blocks[slot, P_AT], index, np.ascontiguousarray(G), Q)
+        return slot
+
+    def remove(self, slot: int) -> None:
+        """Marginalise a block out; its slot is free for another of its shape.  [S] Table 1, state reduction."""
+        x_at, x_size, p_at, p_size, atom_at, count = self.blocks[slot]
+        kernels.clear(self.P, self.n, p_at, p_size)
+        self.x[x_at : x_at + x_size] = 0.0
+        space = self.spaces[slot]
+        assert space is not None
+        self._free.setdefault(space.kinds, []).append(slot)
+        self.atoms[atom_at : atom_at + count, 0] = REMOVED
+        self.spaces[slot] = None
+
+    def _place(self, space: Space, mean: Array) -> int:
+        """Return a slot for a block, its mean written, its rows of P not yet."""
+        if mean.shape != (space.size,):
+            raise MapError(f"a {space.name} has {space.size} numbers, got an array of shape {mean.shape}")
+        free = self._free.get(space.kinds)
+        slot = free.pop() if free else self._append(space)
+        x_at, size, _, _, atom_at, count = self.blocks[slot]
+        self.atoms[atom_at : atom_at + count, 0] = space.kinds
+        self.spaces[slot] = space
+        self.x[x_at : x_at + size] = self.x_first[x_at : x_at + size] = mean
+        return slot
+
+    def _append(self, space: Space) -> int:
+        row = [self.x_n, space.size, self.n, space.dof, len(self.atoms), len(space.kinds)]
+        self.blocks = _appended(self.blocks, np.array([row]))
+        self.atoms = _appended(self.atoms, space.atoms + np.array([0, self.x_n, self.n]))
+        self.spaces.append(space)
+        self.x_n, self.n = self.x_n + space.size, self.n + space.dof
+        self._reserve(max(self.x_n, self.n))
+        return len(self.blocks) - 1
+
+    def _reserve(self, size: int) -> None:
+        capacity = len(self.x)
+        if size <= capacity:
+            return
+        bigger = max(size, 2 * capacity)
+        x, x_first, P = np.zeros(bigger), np.zeros(bigger), np.zeros((bigger, bigger))
+        x[:capacity], x_first[:capacity], P[:capacity, :capacity] = self.x, self.x_first, self.P
+        self.x, self.x_first, self.P = x, x_first, P
+
+    # ------------------------------------------------------------------ moving
+    def predict(self, index: Index, F: Array, Q: Array) -> None:
+        """P <- F P F' + Q, F and Q acting on the rows `index` alone.  [S] (15)-(17)."""
+        kernels.predict(self.P, self.n, index, F, Q)
+
+    def set_predicted(self, slot: int, mean: Array) -> None:
+        """Write a block's mean after a motion."""
+        at, size = self.blocks[slot, X_AT], self.blocks[slot, X_SIZE]
+        self.x[at : at + size] = self.x_first[at : at + size] = mean
+
+
+def _appended(table: Table, rows: Table) -> Table:
+    """Return the table with rows at its end, in a buffer that doubles when it is full."""
+    count = len(table)
+    buffer = table.base
+    if buffer is None or count + len(rows) > len(buffer):
+        buffer = np.zeros((max(64, 2 * (count + len(rows))), table.shape[1]), dtype=np.int64)
+        buffer[:count] = table
+    buffer[count : count + len(rows)] = rows
+    return buffer[: count + len(rows)]

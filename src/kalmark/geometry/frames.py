@@ -1,0 +1,156 @@
+"""Frames of the plane, F = (x, y, angle), with Jacobians.  [S] A.2 to A.5, (54)-(64), and App. C.1.
+
+Value first, then Jacobians in argument order; a Jacobian ``OUT_in`` is d OUT / d in.  Points are (2,) or K at once,
+(K, 2); their Jacobians then are (K, 2, 3) and (K, 2, 2).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.geometry.angles import wrap
+
+Array = npt.NDArray[np.float64]
+
+
+@compiled
+def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Return c = a o b (frame b given in frame a), C_a (3, 3) and C_b (3, 3).  [S] (55)."""
+    cos, sin = math.cos(a[2]), math.sin(a[2])
+    x, y = cos * b[0] - sin * b[1], sin * b[0] + cos * b[1]
+    c = np.array([a[0] + x, a[1] + y, wrap(a[2] + b[2])])
+    C_a = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    C_b = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return c, C_a, C_b
+
+
+@compiled
+def inverse(a: Array) -> tuple[Array, Array]:
+    """Return the inverse frame b, with b o a = 0, and B_a (3, 3)."""
+    cos, sin = math.cos(a[2]), math.sin(a[2])
+    x, y = -cos * a[0] - sin * a[1], sin * a[0] - cos * a[1]
+    return np.array([x, y, wrap(-a[2])]), np.array([[-cos, -sin, y], [sin, -cos, -x], [0.0, 0.0, -1.0]])
+
+
+@compiled
+def to_frame_many(f: Array, p: Array) -> tuple[Array, Array, Array]:
+    """Express K global points (K, 2) in frame F.  [S] (56)."""
+    cos, sin = math.cos(f[2]), math.sin(f[2])
+    k = len(p)
+    pf, PF_f, PF_p = np.empty((k, 2)), np.empty((k, 2, 3)), np.empty((k, 2, 2))
+    for i in range(k):
+        dx, dy = p[i, 0] - f[0], p[i, 1] - f[1]
+        pf[i, 0], pf[i, 1] = cos * dx + sin * dy, cos * dy - sin * dx
+        PF_f[i, 0, 0], PF_f[i, 0, 1], PF_f[i, 0, 2] = -cos, -sin, pf[i, 1]
+        PF_f[i, 1, 0], PF_f[i, 1, 1], PF_f[i, 1, 2] = sin, -cos, -pf[i, 0]
+        PF_p[i, 0, 0], PF_p[i, 0, 1] = cos, sin
+        PF_p[i, 1, 0], PF_p[i, 1, 1] = -sin, cos
+    return pf, PF_f, PF_p
+
+
+@compiled
+def from_frame_many(f: Array, pf: Array) -> tuple[Array, Array, Array]:
+    """Express K points (K, 2) of frame F in the global frame.  [S] (55)."""
+    cos, sin = math.cos(f[2]), math.sin(f[2])
+    k = len(pf)
+    pw, PW_f, PW_pf = np.empty((k, 2)), np.empty((k, 2, 3)), np.empty((k, 2, 2))
+    for i in range(k):
+        x, y = cos * pf[i, 0] - sin * pf[i, 1], sin * pf[i, 0] + cos * pf[i, 1]
+        pw[i, 0], pw[i, 1] = f[0] + x, f[1] + y
+        PW_f[i, 0, 0], PW_f[i, 0, 1], PW_f[i, 0, 2] = 1.0, 0.0, -y
+        PW_f[i, 1, 0], PW_f[i, 1, 1], PW_f[i, 1, 2] = 0.0, 1.0, x
+        PW_pf[i, 0, 0], PW_pf[i, 0, 1] = cos, -sin
+        PW_pf[i, 1, 0], PW_pf[i, 1, 1] = sin, cos
+    return pw, PW_f, PW_pf
+
+
+@compiled
+def scan_many(p: Array) -> tuple[Array, Array]:
+    """Measure range and bearing of K points (K, 2) of the sensor's frame; Y_p (K, 2, 2).  [S] (61)."""
+    k = len(p)
+    y, Y_p = np.empty((k, 2)), np.empty((k, 2, 2))
+    for i in range(k):
+        px, py = p[i, 0], p[i, 1]
+        d2 = px * px + py * py
+        d = math.sqrt(d2)
+        y[i, 0], y[i, 1] = d, math.atan2(py, px)
+        Y_p[i, 0, 0], Y_p[i, 0, 1] = px / d, py / d
+        Y_p[i, 1, 0], Y_p[i, 1, 1] = -py / d2, px / d2
+    return y, Y_p
+
+
+@compiled
+def inv_scan_many(y: Array) -> tuple[Array, Array]:
+    """Turn K ranges and bearings (K, 2) into points of the sensor's frame; P_y (K, 2, 2).  [S] (62)."""
+    k = len(y)
+    p, P_y = np.empty((k, 2)), np.empty((k, 2, 2))
+    for i in range(k):
+        d, cos, sin = y[i, 0], math.cos(y[i, 1]), math.sin(y[i, 1])
+        p[i, 0], p[i, 1] = d * cos, d * sin
+        P_y[i, 0, 0], P_y[i, 0, 1] = cos, -d * sin
+        P_y[i, 1, 0], P_y[i, 1, 1] = sin, d * cos
+    return p, P_y
+
+
+def _pose(f: Any) -> Array:
+    return np.ascontiguousarray(f, dtype=np.float64)
+
+
+def _rows(p: Any) -> tuple[Array, bool]:
+    """Return points as (K, 2) and whether a single one was given."""
+    p = np.ascontiguousarray(p, dtype=np.float64)
+    return (p.reshape(1, 2), True) if p.ndim == 1 else (p, False)
+
+
+def _back(single: bool, *arrays: Array) -> tuple[Array, ...]:
+    return tuple(a[0] for a in arrays) if single else arrays
+
+
+def to_frame(f: Any, p: Any) -> tuple[Array, Array, Array]:
+    """Express global points p (2,) or (K, 2) in frame F: pf, PF_f, PF_p.  [S] (56)."""
+    rows, single = _rows(p)
+    return _back(single, *to_frame_many(_pose(f), rows))  # type: ignore[return-value]
+
+
+def from_frame(f: Any, pf: Any) -> tuple[Array, Array, Array]:
+    """Express points pf (2,) or (K, 2) of frame F globally: pw, PW_f, PW_pf.  [S] (55)."""
+    rows, single = _rows(pf)
+    return _back(single, *from_frame_many(_pose(f), rows))  # type: ignore[return-value]
+
+
+def scan(p: Any) -> tuple[Array, Array]:
+    """Measure range (m) and bearing (rad) of points (2,) or (K, 2) of the sensor's frame: y, Y_p.  [S] (61)."""
+    rows, single = _rows(p)
+    return _back(single, *scan_many(rows))  # type: ignore[return-value]
+
+
+def inv_scan(y: Any) -> tuple[Array, Array]:
+    """Turn ranges and bearings (2,) or (K, 2) into points of the sensor's frame: p, P_y.  [S] (62)."""
+    rows, single = _rows(y)
+    return _back(single, *inv_scan_many(rows))  # type: ignore[return-value]
+
+
+def observe(r: Any, p: Any) -> tuple[Array, Array, Array]:
+    """Measure range and bearing of global points p from robot r: y, Y_r, Y_p.  [S] (63); the chain rule of C.2.2."""
+    pr, PR_r, PR_p = to_frame(r, p)
+    y, Y_pr = scan(pr)
+    return y, Y_pr @ PR_r, Y_pr @ PR_p
+
+
+def inv_observe(r: Any, y: Any) -> tuple[Array, Array, Array]:
+    """Find the global points p that robot r sees at ranges and bearings y: p, P_r, P_y.  [S] (64), C.2.3."""
+    pr, PR_y = inv_scan(y)
+    p, P_r, P_pr = from_frame(r, pr)
+    return p, P_r, P_pr @ PR_y
+
+
+def move(r: Any, u: Any, n: Any) -> tuple[Array, Array, Array]:
+    """Move robot r by u + n = (forward, turn), forward along the old heading: ro, RO_r, RO_n (3, 2).  [S] (59)-(60)."""
+    forward, turn = np.asarray(u, dtype=np.float64) + np.asarray(n, dtype=np.float64)
+    ro, RO_r, RO_d = compose(_pose(r), np.array([forward, 0.0, turn]))
+    return ro, RO_r, RO_d[:, [0, 2]]

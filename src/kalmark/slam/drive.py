@@ -1,0 +1,64 @@
+"""A robot's clock: cuts its controls into the parts by which the robot is moved.
+
+A rate acts from its time until the robot's next control, so a scan in between splits its interval.  The error of the
+control is common to both parts.  An increment is the motion that ended at its time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.models.protocols import Motion
+from kalmark.slam.events import Control
+
+Array = npt.NDArray[np.float64]
+
+
+class Part(NamedTuple):
+    """One piece of motion: the control, the covariance N of its error, and its duration.
+
+    `first` and `last` say whether it begins and ends its control's interval: if not both, the error is shared.
+    """
+
+    u: Array
+    N: Array
+    dt_s: float
+    first: bool
+    last: bool
+
+
+class Drive:
+    """The control in force of one robot and how far it has been acted upon."""
+
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+        self.t_ns: int | None = None
+        self.u: Array | None = None
+        self.N: Array | None = None
+        self.fresh = True
+
+    def advance(self, to_ns: int, last: bool = False) -> Part | None:
+        """Return the part from where the robot stands to `to_ns`, or None if it does not move."""
+        if self.u is None or self.N is None or self.t_ns is None or to_ns <= self.t_ns:
+            return None
+        part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last)
+        self.t_ns, self.fresh = to_ns, False
+        return part
+
+    def ends(self) -> bool:
+        """Return whether the control in force has moved the robot in an earlier part."""
+        return self.u is not None and not self.fresh
+
+    def accept(self, control: Control) -> list[Part]:
+        """Take a new control; return the parts of motion it closes."""
+        N = self.motion.control_noise(control.u) if control.cov is None else control.cov
+        if not self.motion.held:
+            dt_s = 0.0 if self.t_ns is None else (control.t_ns - self.t_ns) * 1e-9
+            self.t_ns = control.t_ns
+            return [Part(control.u, N, dt_s, True, True)]
+        part = self.advance(control.t_ns, last=True)
+        self.t_ns, self.u, self.N, self.fresh = control.t_ns, control.u, N, True
+        return [] if part is None else [part]

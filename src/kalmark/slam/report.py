@@ -1,0 +1,102 @@
+"""What `Slam.process` answers: what became of each observation and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.filter.estimators import Correction
+from kalmark.slam.events import Event, Id
+
+Array = npt.NDArray[np.float64]
+
+OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
+NOTHING = np.zeros((0, 0))
+NOTHING.flags.writeable = False
+
+
+class Observation(NamedTuple):
+    """One observation's fate: `outcome` is one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance."""
+
+    index: int
+    id: Id | None
+    outcome: str
+    landmark: Id | None
+    d2: float | None
+    reason: str
+
+
+class Report:
+    """The answer to one event.
+
+    `y`, expectation `e` and innovation `z` are (K, m), its covariance `Z` (K, m, m); rows of observations that were not
+    compared with a landmark are NaN.
+    """
+
+    __slots__ = ("Z", "e", "event", "observations", "y", "z")
+
+    def __init__(self, event: Event, y: Array = NOTHING) -> None:
+        self.event = event
+        self.observations: tuple[Observation, ...] = ()
+        self.y = y
+        self.e: Array = NOTHING
+        self.z: Array = NOTHING
+        self.Z: Array = NOTHING
+
+    @property
+    def t_ns(self) -> int:
+        """The event's time in nanoseconds."""
+        return self.event.t_ns
+
+    @property
+    def robot(self) -> str:
+        """The event's robot."""
+        return self.event.robot
+
+    def fill(self, known: Sequence[int], done: Correction | None) -> None:
+        """Enter what was predicted of the observations `known`; the others stay NaN."""
+        count, m = self.y.shape
+        if done is not None and len(known) == count:
+            self.e, self.z, self.Z = done.e, done.z, done.Z
+            return
+        self.e, self.z = np.full((count, m), np.nan), np.full((count, m), np.nan)
+        self.Z = np.full((count, m, m), np.nan)
+        if done is not None:
+            self.e[known], self.z[known], self.Z[known] = done.e, done.z, done.Z
+
+    def __repr__(self) -> str:
+        counts = {o: sum(obs.outcome == o for obs in self.observations) for o in OUTCOMES}
+        said = ", ".join(f"{n} {o}" for o, n in counts.items() if n) or "no observations"
+        return f"<Report of {type(self.event).__name__} at t={self.event.t_s:.9g} s: {said}>"
+
+
+class LandmarkEstimate(NamedTuple):
+    """One landmark of the map."""
+
+    id: Id
+    kind: str
+    mean: Array
+    covariance: Array
+    observations: int
+
+
+@dataclass(frozen=True)
+class LandmarkTable:
+    """All landmarks of a map, column by column; iterate for `LandmarkEstimate` rows."""
+
+    ids: list[Id]
+    kinds: list[str]
+    means: list[Array]
+    covariances: list[Array]
+    observations: list[int]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __iter__(self) -> Iterator[LandmarkEstimate]:
+        columns: Any = (self.ids, self.kinds, self.means, self.covariances, self.observations)
+        return (LandmarkEstimate(*row) for row in zip(*columns, strict=True))

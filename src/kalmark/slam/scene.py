@@ -1,0 +1,86 @@
+"""A sensor on its mount as the filter sees it, and what an association may ask about one of its scans."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import ModelError
+from kalmark.filter.corrections import innovation, observed_block, residual
+from kalmark.filter.map import StochasticMap
+from kalmark.geometry.frames import compose
+from kalmark.models.landmarks import Point2D, PointSignature2D
+from kalmark.models.observe import linearize, view_of
+from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
+from kalmark.slam.events import Id, Scan
+from kalmark.slam.robot import Mount
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
+
+Array = npt.NDArray[np.float64]
+
+
+class View:
+    """A mounted sensor with its landmark type and gate, ready for the kernels."""
+
+    def __init__(self, mount: Mount, landmarks: Landmark | None, slam: Slam) -> None:
+        self.sensor = mount.sensor
+        self.at: Array = np.array(mount.at)  # writable, like all else: numba compiles per kind of array
+        self.landmark: Landmark = mount.landmark or landmarks or _natural(mount.sensor)
+        self.look = view_of(self.sensor, self.landmark, self.at)
+        self.d = self.landmark.space.size
+        self.angular = np.array(self.sensor.angular, dtype=np.bool_)
+        self.gate = slam.association.threshold(len(self.angular), slam.estimator.default_gate)
+        self.starts = isinstance(self.sensor, FullSensor)
+        self.noise_inside = self.sensor.noise_at if isinstance(self.sensor, NonAdditiveSensor) else None
+        if self.starts:
+            seen = self.sensor.invert(np.ones((1, len(self.angular))))[0].shape[1]  # type: ignore[attr-defined]
+            if seen < self.d:
+                raise ModelError(
+                    f"a {type(self.sensor).__name__} finds {seen} numbers, a {self.landmark.kind} has {self.d}"
+                )
+
+    def noise(self, map_: StochasticMap, robot: int, slots: npt.NDArray[np.int64], R: Array) -> Array:
+        """Return the noise of observations of the blocks `slots`: R, or E_n N E_n' where it enters inside  [F]."""
+        if self.noise_inside is None:
+            return R
+        T, _, _ = compose(map_.mean(robot)[:3], self.at)
+        l = np.array([map_.mean(s)[: self.d] for s in slots])
+        return self.noise_inside(self.landmark.seen_from(T, l)[0])
+
+
+def _natural(sensor: Any) -> Landmark:
+    return PointSignature2D() if "signature" in sensor.columns else Point2D()
+
+
+class Scene:
+    """One scan before it is fused: the association's window on the map."""
+
+    def __init__(self, slam: Slam, view: View, event: Scan, ids: tuple[Id | None, ...], R: Array) -> None:
+        self.ids = ids
+        self._slam, self._view, self._event, self._R = slam, view, event, R
+
+    def dof(self) -> int:
+        """Return the size m of one measurement."""
+        return len(self._view.angular)
+
+    def candidates(self) -> list[Id]:
+        """Return the ids of the landmarks this sensor could have seen."""
+        return self._slam.landmark_ids(self._view.landmark)
+
+    def distances(self, candidates: list[Id]) -> Array:
+        """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83)."""
+        map_, view = self._slam.map, self._view
+        robot = self._slam.slot(self._event.robot)
+        slots = np.array([self._slam.slot(name) for name in candidates])
+        index, _, mean = observed_block(map_.x, map_.blocks, map_.atoms, robot, slots, view.d)
+        e, E_r, E_l = linearize(view.look, mean[:3], mean[3:].reshape(len(slots), view.d))
+        d2 = np.empty((len(self._event.y), len(slots)))
+        for k, y in enumerate(self._event.y):
+            z = residual(np.broadcast_to(y, e.shape), e, view.angular)
+            R = view.noise(map_, robot, slots, np.tile(self._R[k], (len(slots), 1, 1)))
+            _, d2[k] = innovation(map_.P, index, E_r, E_l, R, z)
+        return d2

@@ -1,0 +1,344 @@
+"""EKF-SLAM: the page to read first.  Events come in by one door, `Slam.process`; [S] 2.4 is the loop it serves.
+
+robot moves             -> _move         prediction          [S] (14)-(17)
+sensor sees known ones  -> _correct      correction          [S] (26)-(30)
+sensor sees new ones    -> _initialize   augmentation        [S] (32)-(38)
+landmark is removed     -> remove        reduction           [S] Table 1
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import DivergedError, EventError, MapError, ModelError
+from kalmark.filter.estimators import Estimator, Invariant
+from kalmark.filter.map import X_SIZE, StochasticMap
+from kalmark.geometry.angles import rotation
+from kalmark.geometry.spaces import Rn
+from kalmark.models.landmarks import Point2D
+from kalmark.models.observe import fix_view, inverse_expectation
+from kalmark.models.protocols import Landmark
+from kalmark.slam.association import NEW, Association, ByIdentity, Decision
+from kalmark.slam.checks import covariance, measurements
+from kalmark.slam.drive import Drive, Part
+from kalmark.slam.events import Control, Event, Fix, Id, Scan
+from kalmark.slam.report import LandmarkTable, Observation, Report
+from kalmark.slam.robot import Robot
+from kalmark.slam.scene import Scene, View
+
+Array = npt.NDArray[np.float64]
+
+NOWHERE = np.zeros(3)
+
+
+class Slam:
+    """Robots and landmarks as one joint Gaussian, corrected event by event.
+
+    `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
+    what a landmark is.  Events must come in the order of their times.
+    """
+
+    def __init__(
+        self,
+        robots: Iterable[Robot],
+        association: Association | None = None,
+        estimator: Estimator | None = None,
+        landmarks: Landmark | None = None,
+        map: str = "auto",
+    ) -> None:
+        if map not in ("auto", "dense"):
+            raise ModelError(f"map is {map!r}, expected 'auto' or 'dense'")
+        self.robots: dict[str, Robot] = {}
+        self.association: Association = association or ByIdentity()
+        self.estimator: Estimator = estimator or Invariant()
+        self.t_ns: int | None = None
+        self.map = StochasticMap()
+        self._slots: dict[Id, int] = {}  # every robot and landmark by name
+        self._drives: dict[str, Drive] = {}
+        self._errors: dict[str, int] = {}  # the block of a held control's error, while a scan has split its interval
+        self._kinds: dict[Id, Landmark] = {}
+        self._seen: dict[Id, int] = {}
+        self._unnamed = 0
+        self._views: dict[tuple[str, str], View] = {}
+        for robot in robots:
+            self._place(robot, landmarks)
+        if not self.robots:
+            raise ModelError("a Slam needs at least one robot, got none")
+
+    def _place(self, robot: Robot, landmarks: Landmark | None) -> None:
+        if robot.name in self.robots:
+            raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
+        self.robots[robot.name] = robot
+        self._slots[robot.name] = self.map.add(robot.motion.space, robot.start, robot.cov)
+        self._drives[robot.name] = Drive(robot.motion)
+        for name, mount in robot.sensors.items():
+            self._views[robot.name, name] = View(mount, landmarks, self)
+
+    # ------------------------------------------------------------------ events
+    def process(self, event: Event) -> Report:
+        """Take one event into the map and report what became of it; a bad event changes nothing."""
+        if self.t_ns is not None and event.t_ns < self.t_ns:
+            raise EventError(f"event at t={event.t_s:.9f} s comes after one at t={self.t_ns * 1e-9:.9f} s")
+        drive = self._drives.get(event.robot)
+        if drive is None:
+            raise EventError(
+                f"event at t={event.t_s:.9g} s: robot is {event.robot!r}, expected one of {sorted(self.robots)}"
+            )
+        if isinstance(event, Scan):
+            return self._scan(event)
+        if isinstance(event, Control):
+            return self._control(event, drive)
+        if isinstance(event, Fix):
+            return self._fix(event)
+        raise EventError(f"got {type(event).__name__}, expected a Control, a Scan or a Fix")
+
+    def _control(self, event: Control, drive: Drive) -> Report:
+        size = len(drive.motion.columns)
+        if event.u.shape != (size,):
+            expected = ", ".join(drive.motion.columns)
+            raise EventError(f"control at t={event.t_s:.9g} s: u has shape {event.u.shape}, expected ({expected})")
+        if event.cov is not None:
+            covariance(event.cov, size, f"control at t={event.t_s:.9g} s: cov", definite=False)
+        self.t_ns = event.t_ns
+        for part in drive.accept(event):
+            self._move(event.robot, part)
+        self._forget_error(event.robot)
+        return Report(event)
+
+    def _scan(self, event: Scan) -> Report:
+        view = self._views.get((event.robot, event.sensor))
+        if view is None:
+            names = sorted(self.robots[event.robot].sensors)
+            raise EventError(f"scan at t={event.t_s:.9g} s: sensor is {event.sensor!r}, expected one of {names}")
+        R = measurements(event, view.sensor)
+        self.t_ns = event.t_ns
+        self._advance(event.robot)
+        count = len(event.y)
+        if count == 0:
+            return Report(event)
+        ids = event.ids or (None,) * count
+        for i in ids:
+            if i in self.robots:
+                self._advance(i)  # type: ignore[arg-type]
+        decisions = self.association.associate(Scene(self, view, event, ids, R))
+        return self._fuse(event, view, ids, decisions, R)
+
+    def _fix(self, event: Fix) -> Report:
+        what = f"fix at t={event.t_s:.9g} s"
+        if event.y.shape != (2,):
+            raise EventError(f"{what}: y has shape {event.y.shape}, expected (2,): x and y in m")
+        covariance(event.cov, 2, f"{what}: cov", definite=True)
+        self.t_ns = event.t_ns
+        self._advance(event.robot)
+        slot, report = self._slots[event.robot], Report(event, event.y.reshape(1, 2))
+        gate = self.association.threshold(2, self.estimator.default_gate)
+        y, R, straight = report.y, event.cov.reshape(1, 2, 2), np.zeros(2, dtype=np.bool_)
+        done = self.estimator.correct(self.map, fix_view(NOWHERE), slot, np.array([slot]), 0, y, R, straight, gate)
+        self._healthy(done.healthy, event)
+        report.e, report.z, report.Z = done.e, done.z, done.Z
+        fused = bool(done.d2[0] <= gate)
+        outcome, reason = ("associated", "") if fused else ("rejected", f"outside the gate of {gate:.2f}")
+        report.observations = (Observation(0, event.robot, outcome, event.robot, float(done.d2[0]), reason),)
+        return report
+
+    # ------------------------------------------------------------------ motion
+    def _advance(self, name: str) -> None:
+        """Move a robot up to now by the control it holds."""
+        assert self.t_ns is not None
+        part = self._drives[name].advance(self.t_ns)
+        if part is not None:
+            self._move(name, part)
+
+    def _move(self, name: str, part: Part) -> None:
+        """Predict: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
+        slot, motion = self._slots[name], self.robots[name].motion
+        r, index, u = self.map.mean(slot), self.map.index(slot), part.u
+        if not (part.first and part.last) and name not in self._errors and part.N.any():
+            self._errors[name] = self.map.add(Rn(len(u)), np.zeros(len(u)), part.N)
+        error = self._errors.get(name)
+        if error is not None:
+            u = u + self.map.mean(error)
+        moved, F, R_u = motion.move(r, u, part.dt_s)
+        F = self.estimator.pose_jacobian(self.map, slot, F)
+        D = motion.diffusion(part.u, part.dt_s)
+        if error is None:
+            Q = R_u @ part.N @ R_u.T
+        else:  # the error is a block of the map, common to all parts of its interval
+            index = np.concatenate([index, self.map.index(error)])
+            F = np.block([[F, R_u], [np.zeros((len(u), len(r))), np.eye(len(u))]])
+            Q = np.zeros((len(index), len(index)))
+        if D is not None:
+            turn = rotation(moved[2])
+            Q[:2, :2] += turn @ D[:2, :2] @ turn.T
+            Q[2, 2] += D[2, 2]
+        self.map.predict(index, F, Q)
+        self.map.set_predicted(slot, moved)
+
+    def _forget_error(self, name: str) -> None:
+        error = self._errors.pop(name, None)
+        if error is not None:
+            self.map.remove(error)
+
+    # ------------------------------------------------------------------ scans
+    def _fuse(
+        self, event: Scan, view: View, ids: tuple[Id | None, ...], decisions: Sequence[Decision], R: Array
+    ) -> Report:
+        """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
+        report = Report(event, event.y)
+        known = [k for k, (name, _) in enumerate(decisions) if self._seen_by(view, event.robot, name)]
+        outcomes: list[Observation | None] = [None] * len(decisions)
+        if known:
+            self._correct(report, view, known, decisions, R, outcomes)
+        else:
+            report.fill(known, None)
+        for k, (name, reason) in enumerate(decisions):
+            if outcomes[k] is None:
+                outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
+        report.observations = tuple(outcomes)  # type: ignore[arg-type]
+        return report
+
+    def _correct(
+        self, report: Report, view: View, known: list[int], decisions: Sequence[Decision], R: Array,
+        outcomes: list[Observation | None],
+    ) -> None:  # fmt: skip
+        """Fuse the observations `known` of landmarks in the map.  [S] (26)-(30)."""
+        event = report.event
+        names: list[Id] = [decisions[k][0] for k in known]  # type: ignore[misc]
+        slots = np.array([self._slots[name] for name in names])
+        y = event.y if len(known) == len(event.y) else event.y[known]
+        R = R if len(known) == len(event.y) else R[known]
+        gate, robot = view.gate, self._slots[event.robot]
+        R = view.noise(self.map, robot, slots, R)
+        done = self.estimator.correct(self.map, view.look, robot, slots, view.d, y, R, view.angular, gate)
+        self._healthy(done.healthy, event)
+        report.fill(known, done)
+        for k, name, d2 in zip(known, names, done.d2.tolist(), strict=True):
+            if d2 <= gate:
+                self._seen[name] = self._seen.get(name, 0) + 1
+                outcomes[k] = Observation(k, name, "associated", name, d2, "")
+            else:
+                reason = f"outside the gate of {gate:.2f}" if d2 == d2 else "nothing can be expected of it from here"
+                outcomes[k] = Observation(k, name, "rejected", name, d2, reason)
+
+    def _initialize(
+        self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
+    ) -> Observation:
+        """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
+        if name is None:
+            return Observation(k, id_, "ignored", None, None, reason)
+        if name == event.robot:
+            return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
+        if name in self._slots:
+            return Observation(k, id_, "rejected", name, None, f"it is no {view.landmark.kind}")
+        if not view.starts:
+            kind = type(view.sensor).__name__
+            return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
+        robot = self._slots[event.robot]
+        r = self.map.mean(robot)[:3]
+        one = event.y[k : k + 1]
+        l, L_r, _, L_y = inverse_expectation(r, view.at, view.sensor, view.landmark, one)  # type: ignore[arg-type]
+        noise = R[k] if view.noise_inside is None else view.noise_inside(view.sensor.invert(one)[0])[0]  # type: ignore[attr-defined]
+        G = self.estimator.pose_jacobian(self.map, robot, L_r[0])
+        if not (np.isfinite(l).all() and np.isfinite(G).all() and np.isfinite(L_y).all()):
+            return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
+        if name is NEW:
+            name = self._new_name()
+        index = self.map.index(robot)[:3]
+        self._slots[name] = self.map.augment(view.landmark.space, l[0], index, G, L_y[0] @ noise @ L_y[0].T)
+        self._kinds[name] = view.landmark
+        self._seen[name] = 1
+        return Observation(k, id_, "new", name, None, reason)
+
+    def _seen_by(self, view: View, robot: str, name: Any) -> bool:
+        """Return whether this sensor's model applies to a block of the map."""
+        slot = self._slots.get(name)
+        return slot is not None and name != robot and int(self.map.blocks[slot, X_SIZE]) >= view.d
+
+    def _new_name(self) -> str:
+        while True:
+            self._unnamed += 1
+            name = f"u{self._unnamed}"
+            if name not in self._slots:
+                return name
+
+    def _healthy(self, healthy: bool, event: Event) -> None:
+        if not healthy:
+            raise DivergedError(f"event at t={event.t_s:.9g} s: the innovation's covariance is not positive definite")
+
+    # ------------------------------------------------------------------ reading and editing the map
+    def mean(self, name: Id) -> Array:
+        """Return the mean of a robot, (3,): x, y in m, heading in rad, or of a landmark."""
+        return self.map.mean(self.slot(name))
+
+    def covariance(self, *names: Id) -> Array:
+        """Return the joint covariance of robots and landmarks, in the order given, in standard coordinates."""
+        return self.map.covariance([self.slot(name) for name in names])
+
+    def landmarks(self) -> LandmarkTable:
+        """Return ids, kinds, means, covariances and numbers of observations of all landmarks."""
+        ids = list(self._kinds)
+        return LandmarkTable(
+            ids=ids,
+            kinds=[self._kinds[i].kind for i in ids],
+            means=[self.mean(i) for i in ids],
+            covariances=[self.covariance(i) for i in ids],
+            observations=[self._seen.get(i, 0) for i in ids],
+        )
+
+    def landmark_ids(self, landmark: Landmark) -> list[Id]:
+        """Return the ids of the landmarks of one type."""
+        return [i for i, kind in self._kinds.items() if kind.kind == landmark.kind]
+
+    def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
+        """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
+        kind = landmark or next((v.landmark for v in self._views.values()), Point2D())
+        if name in self._slots:
+            raise MapError(f"landmark {name!r} is in the map already, expected a new id")
+        mean = np.asarray(mean, dtype=np.float64)
+        if mean.shape != (kind.space.size,) or not np.isfinite(mean).all():
+            raise MapError(f"landmark {name!r}: mean is {mean.tolist()}, expected {kind.space.size} finite numbers")
+        if cov is not None:
+            cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False)
+        self._slots[name] = self.map.add(kind.space, mean, cov)
+        self._kinds[name] = kind
+
+    def remove(self, name: Id) -> None:
+        """Remove a landmark; its place goes to the next new one."""
+        if name in self.robots:
+            raise MapError(f"{name!r} is a robot, expected a landmark")
+        self.map.remove(self.slot(name))
+        for table in (self._slots, self._kinds, self._seen):
+            table.pop(name, None)
+
+    def slot(self, name: Id) -> int:
+        """Return the slot of a robot or landmark in `map`."""
+        slot = self._slots.get(name)
+        if slot is None:
+            raise MapError(f"{name!r} is not in the map, expected a robot or a landmark: it has {len(self._kinds)}")
+        return slot
+
+    # ------------------------------------------------------------------ files
+    def save(self, path: str | Path) -> None:
+        """Write the whole state to a file; `load` resumes bit for bit."""
+        from kalmark.slam.store import save
+
+        save(self, Path(path))
+
+    @staticmethod
+    def load(path: str | Path, robots: Iterable[Robot] | None = None) -> Slam:
+        """Read a state written by `save`; `robots` gives models that are not kalmark's own again."""
+        from kalmark.slam.store import load
+
+        return load(Path(path), robots)
+
+    @staticmethod
+    def from_config(path: str | Path) -> Slam:
+        """Build the Slam that a configuration (a path or a shipped name) describes."""
+        from kalmark.config import slam_from_config
+
+        return slam_from_config(path)
