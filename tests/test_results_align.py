@@ -1,0 +1,85 @@
+"""Alignment of paths, against evo and against constructed cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalmark.results.align import identity, rigid, rigid_robust, rmse
+
+
+def rotation_2d(a: float) -> np.ndarray:
+    return np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+
+
+def test_an_exact_motion_is_recovered_in_2d_and_3d() -> None:
+    rng = np.random.default_rng(1)
+    for d in (2, 3):
+        q, _ = np.linalg.qr(rng.normal(size=(d, d)))
+        q *= np.sign(np.linalg.det(q))  # d = 3: a rotation
+        if np.linalg.det(q) < 0:
+            q[:, 0] *= -1
+        shift = rng.normal(size=d)
+        points = rng.normal(size=(30, d))
+        fit = rigid(points, points @ q.T + shift)
+        assert np.allclose(fit.rotation, q, atol=1e-12)
+        assert np.allclose(fit.shift, shift, atol=1e-12)
+        assert np.allclose(fit.inverse()(fit(points)), points, atol=1e-12)
+
+
+def test_a_mirror_image_is_never_aligned_by_a_reflection() -> None:
+    points = np.random.default_rng(2).normal(size=(20, 2))
+    fit = rigid(points, points * [1.0, -1.0])
+    assert np.linalg.det(fit.rotation) == pytest.approx(1.0)
+
+
+def test_no_point_gives_the_identity_and_one_point_a_shift() -> None:
+    assert np.array_equal(rigid(np.empty((0, 2)), np.empty((0, 2))).rotation, identity().rotation)
+    fit = rigid(np.array([[1.0, 2.0]]), np.array([[4.0, 6.0]]))
+    assert np.allclose(fit.rotation, np.eye(2))
+    assert np.allclose(fit.shift, [3.0, 4.0])
+
+
+def test_gross_outliers_barely_move_the_robust_alignment() -> None:
+    rng = np.random.default_rng(3)
+    path = np.cumsum(rng.normal(size=(400, 2)), axis=0)
+    fixes = path @ rotation_2d(0.6).T + [-67.0, -41.0] + 0.3 * rng.normal(size=path.shape)
+    bad = rng.random(400) < 0.1
+    fixes[bad] += [40.0, 25.0]
+    least, robust = rigid(path, fixes), rigid_robust(path, fixes)
+    truth = path @ rotation_2d(0.6).T + [-67.0, -41.0]
+    assert rmse(robust(path) - truth) < 0.3
+    assert rmse(least(path) - truth) > 3.0
+    assert robust.angle == pytest.approx(0.6, abs=0.02)
+
+
+def test_alignment_and_error_agree_with_evo() -> None:
+    metrics = pytest.importorskip("evo.core.metrics")
+    trajectory = pytest.importorskip("evo.core.trajectory")
+    rng = np.random.default_rng(4)
+    for d in (2, 3):
+        truth = np.cumsum(rng.normal(size=(500, d)), axis=0)
+        spin = rotation_2d(0.4) if d == 2 else np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        spin = spin * (np.sign(np.linalg.det(spin)) if d == 3 else 1.0)
+        estimate = truth @ spin.T + 3.0 + 0.5 * rng.normal(size=truth.shape)
+
+        def evo_path(xyz: np.ndarray) -> object:
+            return trajectory.PoseTrajectory3D(
+                positions_xyz=np.pad(xyz, ((0, 0), (0, 3 - xyz.shape[1]))),
+                orientations_quat_wxyz=np.tile([1.0, 0, 0, 0], (len(xyz), 1)),
+                timestamps=np.arange(float(len(xyz))),
+            )
+
+        reference, path = evo_path(truth), evo_path(estimate)
+        raw, aligned = (metrics.APE(metrics.PoseRelation.translation_part) for _ in range(2))
+        raw.process_data((reference, path))
+        rotation, shift, _ = path.align(reference)  # type: ignore[attr-defined]
+        aligned.process_data((reference, path))
+
+        fit = rigid(estimate, truth)
+        assert np.allclose(fit.rotation, rotation[:d, :d], atol=1e-9)
+        assert np.allclose(fit.shift, shift[:d], atol=1e-9)
+        assert rmse(estimate - truth) == pytest.approx(raw.get_statistic(metrics.StatisticsType.rmse), abs=1e-9)
+        assert rmse(fit(estimate) - truth) == pytest.approx(
+            aligned.get_statistic(metrics.StatisticsType.rmse), abs=1e-9
+        )

@@ -1,0 +1,84 @@
+"""NEES and NIS: coordinates, singular covariances, bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from kalmark.geometry import V, V_inverse
+from kalmark.results.consistency import (
+    anees_interval,
+    diverged,
+    left_jacobian_inverse,
+    nees,
+    nis,
+    point_error,
+    pose_error,
+)
+
+
+def test_the_inverse_of_V_for_many_angles_at_once_is_that_for_one() -> None:
+    angles = np.array([1e-9, -1e-5, 1.9e-4, 2.1e-4, 0.3, -2.5, 3.1])
+    assert np.allclose(left_jacobian_inverse(angles), [V_inverse(a) for a in angles], atol=1e-9)
+    assert np.allclose(left_jacobian_inverse(np.zeros(3)), np.eye(2))
+
+
+def test_log_coordinates_undo_the_retraction_of_the_invariant_filter() -> None:
+    """A landmark retracted by V(dtheta) d has the log error d, and the plain difference otherwise."""
+    mean, d, dtheta = np.array([3.0, -2.0]), np.array([0.4, 0.7]), 0.8
+    truth = mean + V(dtheta) @ d
+    assert np.allclose(point_error(mean, truth, dtheta, "log"), d)
+    assert np.allclose(point_error(mean, truth, dtheta, "world"), V(dtheta) @ d)
+    with pytest.raises(ValueError, match="'world' or 'log'"):
+        point_error(mean, truth, dtheta, "body")
+
+
+def test_heading_errors_are_wrapped() -> None:
+    d = pose_error(np.array([0.0, 0.0, 3.1]), np.array([0.0, 0.0, -3.1]))
+    assert d[2] == pytest.approx(2 * np.pi - 6.2)
+
+
+def test_nees_of_gaussian_errors_averages_to_their_dimension() -> None:
+    rng = np.random.default_rng(5)
+    factor = rng.normal(size=(3, 3)) * [[1.0], [10.0], [1e-3]]
+    P = factor @ factor.T
+    d = rng.normal(size=(2000, 3)) @ factor.T
+    values = nees(d, np.broadcast_to(P, (2000, 3, 3)))
+    low, high = anees_interval(3, 2000, 0.999)
+    assert low < values.mean() < high
+    assert values[0] == pytest.approx(d[0] @ np.linalg.inv(P) @ d[0], rel=1e-9)
+
+
+def test_singular_covariances_are_left_out_whatever_their_scale() -> None:
+    d = np.ones((4, 3))
+    direction = np.array([1.0, 2.0, 0.1])
+    P = np.stack([np.zeros((3, 3)), np.outer(direction, direction), 1e-14 * np.eye(3), np.full((3, 3), np.nan)])
+    values = nees(d, P)
+    assert np.isnan(values[[0, 1, 3]]).all()
+    assert values[2] == pytest.approx(3e14)
+
+
+def test_nis_counts_only_the_rows_that_a_sensor_has() -> None:
+    z = np.array([[1.0, 2.0], [3.0, np.nan], [np.nan, np.nan]])
+    Z = np.full((3, 2, 2), np.nan)
+    Z[0], Z[1, 0, 0] = np.diag([1.0, 4.0]), 9.0
+    value, dof = nis(z, Z)
+    assert np.allclose(value[:2], [2.0, 1.0])
+    assert np.isnan(value[2])
+    assert dof.tolist() == [2, 1, 0]
+
+
+def test_bounds_of_an_average_narrow_with_the_number_of_runs() -> None:
+    assert anees_interval(3) == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 3)))
+    low, high = anees_interval(3, 50)
+    assert (low, high) == pytest.approx((2.36, 3.72), abs=0.01)
+
+
+def test_a_run_has_diverged_only_if_far_in_sigmas_and_in_metres() -> None:
+    P = np.broadcast_to(0.01 * np.eye(2), (2, 2, 2))
+    d = np.array([[0.1, 0.0], [1.5, 0.0]])
+    error = np.linalg.norm(d, axis=1)
+    assert diverged(d, P, error, path_m=20.0)
+    assert not diverged(d, P, error, path_m=100.0)
+    assert not diverged(d, 100 * P, error, path_m=20.0)
