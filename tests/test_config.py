@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from kalmark.config import load_config, resolve_config, shipped_configs
+from kalmark.config import documentation, load_config, resolve_config, shipped_configs
 from kalmark.errors import ConfigError
 
 GOOD = """\
@@ -88,14 +88,14 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ("robots.each.motion.sigma_v_mps='1'", "robots.each.motion.sigma_v_mps: got '1', expected a number"),
         (
             "robots.each.motion.type=unicicle",
-            "got 'unicicle', expected one of unicycle, odometry_2d, ackermann; did you",
+            "got 'unicicle', expected one of unicycle, odometry_2d, ackermann; did",
         ),
         ("robots.each.motion.type=odometry_3d", "got 'odometry_3d', which is not available yet, expected one of unic"),
         ("robots.each.motion=3", "robots.each.motion: got 3, expected a mapping with a type: one of unicycle, od"),
         ("robots.each.start.x_m=.inf", "robots.each.start.x_m: got inf, expected a finite number"),
         (
             "robots.each.sensors.camera.detector=x",
-            "sensors.camera.detector: got 'x', expected nothing: this key is res",
+            "sensors.camera.detector: got 'x', expected nothing: this key",
         ),
         ("robots.each.sensors.camera.type=sonar", "robots.each.sensors.camera.type: got 'sonar', expected one of "),
         ("robots.each.sensors=[1]", "robots.each.sensors: got [1], expected a mapping of keys"),
@@ -127,7 +127,7 @@ def test_a_bad_override_is_refused_by_its_own_text(good: Path, override: str, wh
             4,
             "    motion: {type: unicycle, sigma_v_mps: -2}",
             "4:43",
-            "motion.sigma_v_mps: got -2, expected a number >= 0",
+            "sigma_v_mps: got -2, expected a number >= 0",
         ),
         (4, "    motion: {type: car}", "4:20", "motion.type: got 'car', expected one of unicycle"),
         (4, "    motoin: {type: unicycle}", "4:5", "robots.each.motoin: got an unknown key"),
@@ -191,6 +191,11 @@ def test_numbers_as_robot_names_are_names(tmp_path: Path) -> None:
     path = tmp_path / "numbers.yaml"
     path.write_text("robots: {3: {motion: {type: unicycle}}}\n")
     assert list(load_config(path).robots) == ["3"]
+
+
+def test_the_page_of_the_documentation_is_in_step_with_the_model() -> None:
+    page = Path(__file__).parent.parent / "docs" / "configuration.md"
+    assert page.read_text() == documentation.page()
 
 
 @pytest.mark.parametrize("name", sorted(shipped_configs()))

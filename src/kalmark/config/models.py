@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Tag
 
-from kalmark.config.sections import Gate, Limit, NotNegative, Number, Positive, Reserved, Section, type_or
+from kalmark.config.sections import Gate, Limit, NotNegative, Number, Positive, Probability, Reserved, Section, type_or
 
 
 class _Diffusion(Section):
@@ -75,8 +75,10 @@ class NearestAssociation(Section):
     """The nearest landmark by Mahalanobis distance, inside its gate."""
 
     type: Literal["nearest"] = "nearest"
-    gate: Gate = 0.99
-    """Refuse pairs outside this probability; or off, or default."""
+    gate: Probability = 0.99
+    """Pair an observation with a landmark inside this probability."""
+    new_gate: Probability = 0.99999
+    """Beyond this probability from every landmark it is a new one; in between it is left alone."""
 
 
 Association = Annotated[
@@ -119,8 +121,8 @@ class _Sensor(Section):
     """Where the sensor sits on the robot."""
     landmark: Landmark | None = None
     """Landmark type of this sensor; `landmarks` if absent."""
-    association: Association | None = None
-    """Association of this sensor; `association` if absent."""
+    association: Reserved = None
+    """Reserved: an association of this sensor's own."""
     detector: Reserved = None
     """Reserved: how landmarks are found in raw data."""
     range_min_m: NotNegative = 0.0

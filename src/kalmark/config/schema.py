@@ -36,7 +36,7 @@ class LogConfig(Section):
     on_error: Literal["raise", "skip"] = "raise"
     """What to do with bad input: refuse, or leave out."""
     r_max: Positive | None = None
-    """lost_in_the_woods: drop observations beyond this range (m)."""
+    """lost_in_the_woods: drop observations beyond this range."""
     bearing_shift_s: Number | None = None
     """mrclam: added to the time of every observation."""
     detections: Literal["laser", "slsjf", "rfs"] | None = None
@@ -108,7 +108,7 @@ class MapConfig(Section):
     """How the covariance is kept."""
 
     type: Literal["auto", "dense"] = "auto"
-    """Auto: whatever serves best."""
+    """`dense` keeps the full covariance; `auto` chooses."""
 
 
 def _each() -> dict[str, RobotConfig]:
@@ -148,7 +148,14 @@ class Config(Section):
         """The file's name without its ending, or "config"."""
         return self._file.stem if self._file else "config"
 
+    def overridden(self, *path: str) -> bool:
+        """Return whether an override gave the value at `path`."""
+        return self._place(path).startswith("--set ")
+
     def error(self, path: tuple[str, ...], message: str) -> ConfigError:
         """Return the error of the value at `path`, naming the place it was read from."""
-        where = next((self._where[path[:n]] for n in range(len(path), -1, -1) if path[:n] in self._where), "")
+        where = self._place(path)
         return ConfigError(f"{where + ': ' if where else ''}{'.'.join(path)}: {message}")
+
+    def _place(self, path: tuple[str, ...]) -> str:
+        return next((self._where[path[:n]] for n in range(len(path), -1, -1) if path[:n] in self._where), "")

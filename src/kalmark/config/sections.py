@@ -13,6 +13,8 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Limit = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
+Probability = Annotated[float, Field(gt=0, lt=1)]
+
 # What the contract names and later versions bring: refused by name, not as a spelling mistake.
 LATER: dict[str, tuple[str, ...]] = {
     "motion": ("odometry_3d", "constant_velocity_3d", "inertial"),

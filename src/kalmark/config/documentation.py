@@ -1,0 +1,145 @@
+"""The page ``docs/configuration.md``, made from the model: ``python -m kalmark.config.documentation > FILE``."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import math
+import sys
+import textwrap
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from kalmark.config import models, schema
+from kalmark.config.sections import LATER
+
+UNITS = {
+    "_m_per_sqrt_s": "m/sqrt(s)",
+    "_rad_per_sqrt_s": "rad/sqrt(s)",
+    "_mps": "m/s",
+    "_radps": "rad/s",
+    "_rad": "rad",
+    "_m": "m",
+    "_s": "s",
+    "r_max": "m",
+}
+
+HEAD = """\
+# Configuration
+
+*Made from the model by `python -m kalmark.config.documentation`; a test keeps it in step.*
+
+A configuration is a YAML 1.2 file.  `kalmark run CONFIG` takes a path or one of the shipped names ({names}).  A key
+that is left out has the default given here; an unknown key or a bad value is refused with file, line, column, the
+value, what was expected and the nearest key.  `--set a.b=value` overrides one key from the command line, `--log PATH`
+the log.  The `config.yaml` that a run leaves in its folder holds everything that was in force, and can be run again.
+
+```yaml
+log: {{path: my_log}}
+robots:
+  each:
+    motion: {{type: unicycle, sigma_v_mps: 0.05, sigma_w_radps: 0.1}}
+    sensors:
+      lidar: {{type: range_bearing, sigma_range_m: 0.1, sigma_bearing_rad: 0.02, mount: {{x_m: 0.3}}}}
+association: {{type: identity}}
+estimator: {{type: invariant}}
+```
+
+Lengths are metres, angles radians, times seconds.  A control's noise is either the error of the control held over its
+interval (`sigma_v_mps`: the displacement's error is sigma times the duration) or a random walk (`..._per_sqrt_s`),
+which acts while the robot is told to move.  A gate is the probability with which a right observation is let through:
+0.9973 is the 3 sigma of one dimension; `default` is the estimator's own (`ekf`: squared distance below 9; the others:
+no gate).
+"""
+
+
+def page() -> str:
+    """Return the page as Markdown."""
+    names = ", ".join(f"`{name}`" for name in _shipped())
+    parts = [HEAD.format(names=names), _section("The file", schema.Config)]
+    parts += [_section("`log`", schema.LogConfig), _section("`robots.NAME`", schema.RobotConfig)]
+    parts += [_section("`robots.NAME.start`", schema.StartConfig)]
+    parts += [_choice("`robots.NAME.motion`", models.Motion, "motion")]
+    parts += [_choice("`robots.NAME.sensors.SENSOR`", models.Sensor, "sensor")]
+    parts += [_section("`robots.NAME.sensors.SENSOR.mount`", models.MountConfig)]
+    parts += [_choice("`landmarks`, and `landmark` of a sensor", models.Landmark, "landmark")]
+    parts += [_choice("`association`", models.Association, "association")]
+    parts += [_choice("`estimator`", schema.Estimator, "estimator")]
+    parts += [_section("`map`", schema.MapConfig) + _later("map")]
+    return "\n".join(parts)
+
+
+def _shipped() -> list[str]:
+    from kalmark.config.reading import shipped_configs
+
+    return [*shipped_configs()]
+
+
+def _section(title: str, model: type[BaseModel]) -> str:
+    return f"## {title}\n\n{inspect.getdoc(model)}\n\n{_table(model)}\n"
+
+
+def _choice(title: str, union: Any, kind: str) -> str:
+    members = [get_args(member) for member in get_args(get_args(union)[0])]
+    parts = [f"## {title}\n"]
+    for model, tag in members:
+        table = _table(model)
+        parts.append(f"**`type: {tag.tag}`**  {inspect.getdoc(model)}\n" + (f"\n{table}\n" if table else ""))
+    return "\n".join(parts) + _later(kind)
+
+
+def _later(kind: str) -> str:
+    names = ", ".join(f"`{name}`" for name in LATER[kind])
+    return f"\nNot available yet: {names}.\n" if names else ""
+
+
+def _table(model: type[BaseModel]) -> str:
+    rows = [
+        f"| `{name}` | {_default(field)} | {_unit(name)} | {text} |"
+        for name, field, text in ((n, f, _texts(model).get(n, "")) for n, f in model.model_fields.items())
+        if text
+    ]
+    return "\n".join(["| key | default | unit | meaning |", "|---|---|---|---|", *rows]) if rows else ""
+
+
+def _default(field: Any) -> str:
+    value = field.get_default(call_default_factory=True)
+    if value is None or value is PydanticUndefined:
+        return ""
+    if isinstance(value, BaseModel):
+        kind = getattr(value, "type", None)
+        return f"`{{type: {kind}}}`" if kind else "see below"
+    if isinstance(value, dict):
+        return "`{" + ", ".join(f"{key}: {{}}" for key in value) + "}`"
+    if isinstance(value, float):
+        return "`.inf`" if math.isinf(value) else "2 pi" if value == 2 * math.pi else f"`{value:g}`"
+    return f"`{value}`"
+
+
+def _unit(name: str) -> str:
+    return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
+
+
+def _texts(model: type[BaseModel]) -> dict[str, str]:
+    """Return the text that stands below each field in the source, inherited ones included."""
+    out: dict[str, str] = {}
+    for cls in reversed([c for c in model.__mro__ if issubclass(c, BaseModel) and c.__module__.startswith("kalmark")]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        out |= dict(_pairs(body.body))
+    return out
+
+
+def _pairs(body: list[ast.stmt]) -> Iterable[tuple[str, str]]:
+    for field, text in pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
+            assert isinstance(text.value, ast.Constant)
+            yield field.target.id, str(text.value.value)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())
