@@ -7,6 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+
+settings.register_profile("patient", deadline=None)  # a first call may compile
+settings.load_profile("patient")
 
 
 def _finder(variable: str) -> Callable[[str], Path]:

@@ -42,7 +42,7 @@ class Estimator(Protocol):
         self, map_: StochasticMap, view: Any, robot: int, slots: Index, d: int, y: Array, R: Array, angular: Any,
         gate: float,
     ) -> Correction:  # fmt: skip
-        """Fuse the observations y (K, m), noise R (K, m, m), of the first d numbers of `slots`, those with d2 <= gate."""
+        """Fuse y (K, m), noise R (K, m, m), of the first d numbers of the blocks `slots`, where d2 <= gate."""
 
     def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
         """Return the Jacobian J (., 3) with respect to the robot's pose, taken where this estimator linearises."""
@@ -58,7 +58,7 @@ class _Estimator:
         self, map_: StochasticMap, view: Any, robot: int, slots: Index, d: int, y: Array, R: Array, angular: Any,
         gate: float,
     ) -> Correction:  # fmt: skip
-        """Fuse the observations y (K, m), noise R (K, m, m), of the first d numbers of `slots`, those with d2 <= gate."""
+        """Fuse y (K, m), noise R (K, m, m), of the first d numbers of the blocks `slots`, where d2 <= gate."""
         m, run = map_, type(self).compiled if isinstance(view, tuple) else type(self).source
         scan = (robot, slots, d, y, R, angular, gate)
         return Correction(*run(view, m.x, m.P, m.n, m.blocks, m.atoms, *scan, self._option(m)))

@@ -28,7 +28,7 @@ _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
 
 def one_thread() -> Any:
-    """Keep BLAS to one thread: with more, it stalls on the small updates of a filter.  Undo with `.restore_original_limits()`."""
+    """Keep BLAS to one thread: with more, it stalls on the small updates of a filter.  A context manager, too."""
     return ThreadpoolController().limit(limits=1, user_api="blas")
 
 

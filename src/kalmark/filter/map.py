@@ -25,7 +25,7 @@ X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
 class StochasticMap:
     """The joint Gaussian of all blocks, dense: predict O(n), correct O(n^2), augment O(n), reduce O(n).
 
-    Blocks are addressed by slots, the rows of `blocks`; names are the caller's business.  P is kept as a lower triangle.
+    Blocks are addressed by slots, the rows of `blocks`; names are the caller's business.  P is a lower triangle.
     """
 
     def __init__(self, capacity: int = 64) -> None:

@@ -43,7 +43,7 @@ KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 def retract(atoms: Table, x: Array, d: Array, turn: float) -> None:
     """Move the mean in place by the correction d: plain plus for turn 0, the exponential for turn = d_theta.
 
-    With `turn`, points move by V(d_theta) d: rotated by Exp(d_theta), then carried along V xi (MATH: V J l = (E - I) l).
+    With `turn`, points move by V(d_theta) d: rotated by Exp(d_theta), then carried along V xi, for V J l = (E - I) l.
     """
     p, q = exponential_v(turn)
     for i in range(len(atoms)):

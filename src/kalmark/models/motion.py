@@ -1,8 +1,8 @@
 """Motion models in the plane: odometry increments ([S] A.3), unicycle with the exact arc ([F]), Ackermann.
 
 Two kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
-displacement is sigma times the duration.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with time, along,
-across and about the robot, while the control is not zero (a robot told to stand does not wander).
+displacement is sigma times the duration.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with time,
+along, across and about the robot, while the control is not zero (a robot told to stand does not wander).
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def linearize(view: Any, r: Array, l: Array) -> tuple[Array, Array, Array]:
 @overload(linearize, strict=False)  # the annotations differ
 def _compiled_linearize(view: Any, r: Any, l: Any) -> Any:
     if isinstance(view, types.BaseTuple):
-        return lambda view, r, l: linearize_built_in(view, r, l)
+        return lambda view, r, l: linearize_built_in(view, r, l)  # noqa: PLW0108 - numba compares the arguments
     return None
 
 

@@ -1,4 +1,4 @@
-"""Sensors of the plane: what each measures of something at v = (x, y[, signature]) in its own frame.  [S] A.4, Table 2."""
+"""Sensors of the plane: what each measures of something at v = (x, y[, signature]) in its frame.  [S] A.4, Table 2."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Planar:
 
 @dataclass(frozen=True)
 class RangeBearing(Planar):
-    """Range (m) and bearing (rad): a laser, a camera that knows sizes.  sigma_range^2 = a^2 + (b range)^2.  [S] (61)."""
+    """Range (m) and bearing (rad), a laser.  sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61)."""
 
     sigma_range_m: float = 0.1
     sigma_bearing_rad: float = 0.02
@@ -132,7 +132,7 @@ class Bearing(Planar):
 
 @dataclass(frozen=True)
 class Range(Planar):
-    """Range (m) alone: a radio beacon, a sonar with a wide lobe.  sigma_range^2 = a^2 + (b range)^2."""
+    """Range (m) alone: a radio beacon, a sonar with a wide lobe; sigmas as in `RangeBearing`."""
 
     sigma_range_m: float = 0.1
     sigma_range_rel: float = 0.0

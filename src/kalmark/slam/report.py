@@ -20,7 +20,7 @@ NOTHING.flags.writeable = False
 
 
 class Observation(NamedTuple):
-    """One observation's fate: `outcome` is one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance."""
+    """One observation's fate: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance."""
 
     index: int
     id: Id | None

@@ -8,6 +8,7 @@ landmark is removed     -> remove        reduction           [S] Table 1
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -222,7 +223,11 @@ class Slam:
                 self._seen[name] = self._seen.get(name, 0) + 1
                 outcomes[k] = Observation(k, name, "associated", name, d2, "")
             else:
-                reason = f"outside the gate of {gate:.2f}" if d2 == d2 else "nothing can be expected of it from here"
+                reason = (
+                    f"outside the gate of {gate:.2f}"
+                    if not math.isnan(d2)
+                    else "nothing can be expected of it from here"
+                )
                 outcomes[k] = Observation(k, name, "rejected", name, d2, reason)
 
     def _initialize(
