@@ -1,0 +1,174 @@
+"""The figures of a run: errors against truth, consistency, scoring against position fixes.  See docs/evaluation.md."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.results.align import identity, rigid, rigid_robust, rmse
+from kalmark.results.consistency import diverged, nees, nis, pose_error
+from kalmark.results.history import Array, History, Ints
+from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.truth import Fixes, Truth
+from kalmark.slam.report import OUTCOMES
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+FIX_GAP_S = 2.0  # no path is interpolated across a longer gap between scans
+FIX_NEAR_M = 10.0
+
+
+def evaluate(run: Run) -> dict[str, Any]:
+    """Return the figures of ``summary.json``; a figure that needs what is not there is absent or None."""
+    history = run.history
+    robots = {name: robot_figures(run, name) for name in history.robots}
+    summary: dict[str, Any] = {
+        "log": run.log.as_dict(),
+        "estimator": run.estimator,
+        "coordinates": run.coordinates,
+        "frame": run.truth.frame,
+        "events": run.controls + len(history.t_ns) + run.fixes,
+        "controls": run.controls,
+        "scans": len(history.t_ns),
+        "fixes": run.fixes,
+        "fixes_rejected": run.fixes_rejected,
+        "observations": len(history.step),
+        **{name: int(np.sum(history.outcome == name)) for name in OUTCOMES},
+        "landmarks": len(run.landmarks),
+        "skipped": len(run.skipped),
+        "wall_s": run.wall_s,
+        "step_us_median": _quantile(history.step_us, 0.5),
+        "step_us_p99": _quantile(history.step_us, 0.99),
+        "nis_per_dof": nis_per_dof(history),
+        "diverged": bool(run.stopped) or any(figures.get("diverged", False) for figures in robots.values()),
+    }
+    if run.stopped:
+        summary["stopped"] = run.stopped
+    summary["robots"] = robots
+    summary |= landmark_figures(run.landmarks, run.truth)
+    if run.truth.fixes and not np.isfinite(run.truth.poses).any():
+        summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
+    return none_for_nan(summary)
+
+
+def robot_figures(run: Run, name: str) -> dict[str, Any]:
+    """Return the figures of one robot: against its truth if there is one, else against position fixes."""
+    mine = run.history.robot == name
+    mean, P = run.history.mean[mine], run.history.covariance[mine]
+    truth = run.truth.poses_in_map()[mine]
+    figures: dict[str, Any] = {"scans": int(mine.sum())}
+    known = np.isfinite(truth).all(axis=1)
+    if known.any():
+        figures |= pose_figures(mean[known], P[known], truth[known], run.coordinates)
+    elif name in run.truth.fixes:
+        figures |= fix_figures(fix_distances(run, name))
+    return figures
+
+
+def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world") -> dict[str, Any]:
+    """Return errors and NEES of a path (N, 3) with covariances (N, 3, 3) against true poses (N, 3) in one frame."""
+    world = pose_error(mean, truth, "world")
+    own = pose_error(mean, truth, coordinates)
+    path_m = float(np.linalg.norm(np.diff(truth[:, :2], axis=0), axis=1).sum())
+    error_m = np.linalg.norm(world[:, :2], axis=1)
+    values, values_world = nees(own, P), nees(world, P)
+    return {
+        "ate_m": rmse(rigid(mean[:, :2], truth[:, :2])(mean[:, :2]) - truth[:, :2]),
+        "ate_raw_m": rmse(world[:, :2]),
+        "heading_rmse_deg": float(np.degrees(rmse(world[:, 2:]))),
+        "pose_nees": _mean(values),
+        "pose_nees_world": _mean(values_world),
+        "path_m": path_m,
+        "diverged": diverged(own[:, :2], P[:, :2, :2], error_m, path_m),
+    }
+
+
+def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
+    """Return the landmark errors, raw and after their own rigid alignment, over the ids that map and truth share."""
+    true = {str(i): l for i, l in truth.landmarks_in_map().items()}
+    if not true:
+        return {}
+    pairs = [
+        (mean[:2], true[str(i)][:2])
+        for i, kind, mean in zip(landmarks.ids, landmarks.kinds, landmarks.means, strict=True)
+        if str(i) in true and kind.startswith("point")
+    ]
+    estimate, position = (np.array([pair[k] for pair in pairs]).reshape(-1, 2) for k in (0, 1))
+    enough = len(pairs) >= 2
+    return {
+        "landmark_rmse_m": rmse(rigid(estimate, position)(estimate) - position) if enough else float("nan"),
+        "landmark_rmse_raw_m": rmse(estimate - position),
+        "landmarks_compared": len(pairs),
+    }
+
+
+def path_at(history: History, robot: str, t_ns: Ints, max_gap_s: float = FIX_GAP_S) -> Array:
+    """Return poses (N, 3) of a robot's estimated path interpolated at times, NaN outside it and across long gaps."""
+    mine = history.robot == robot
+    t, mean = history.t_ns[mine], history.mean[mine]
+    out = np.full((len(t_ns), 3), np.nan)
+    if len(t) < 2:
+        return out
+    after = np.clip(np.searchsorted(t, t_ns, side="left"), 1, len(t) - 1)
+    gap = t[after] - t[after - 1]
+    inside = (t_ns >= t[0]) & (t_ns <= t[-1]) & (gap <= max_gap_s * 1e9)
+    share = ((t_ns - t[after - 1]) / np.maximum(gap, 1))[:, None]
+    poses = np.column_stack([mean[:, :2], np.unwrap(mean[:, 2])])
+    blend = (1.0 - share) * poses[after - 1] + share * poses[after]
+    out[inside] = blend[inside]
+    return out
+
+
+def antenna_path(history: History, robot: str, fixes: Fixes) -> Array:
+    """Return where a robot's antenna was (N, 2) by the estimated path at the time of each fix, NaN where unknown."""
+    poses = path_at(history, robot, fixes.t_ns)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    x, y = fixes.antenna
+    return poses[:, :2] + np.column_stack([c * x - s * y, s * x + c * y])
+
+
+def fix_distances(run: Run, robot: str) -> Array:
+    """Return the distances of the fixes from the path that is aligned to them robustly (`rigid_robust`)."""
+    fixes = run.truth.fixes[robot]
+    antenna = antenna_path(run.history, robot, fixes)
+    known = np.isfinite(antenna).all(axis=1) & np.isfinite(fixes.xy).all(axis=1)
+    antenna, xy = antenna[known], fixes.xy[known]
+    to_fixes = rigid_robust(antenna, xy) if len(xy) > 1 else identity()
+    return np.linalg.norm(to_fixes(antenna) - xy, axis=1)
+
+
+def fix_figures(distance: Array) -> dict[str, Any]:
+    """Return the median, the RMS of those within 10 m and their share of all, for distances (N,) in metres."""
+    near = distance[distance <= FIX_NEAR_M]
+    return {
+        "fix_median_m": _quantile(distance, 0.5),
+        "fix_rms_10m": rmse(near[:, None]),
+        "fix_within_10m": len(near) / len(distance) if len(distance) else float("nan"),
+        "fixes_compared": len(distance),
+    }
+
+
+def nis_per_dof(history: History) -> float:
+    """Return the sum of the normalised innovations squared of the associated observations over their dimensions."""
+    used = history.outcome == "associated"
+    value, dof = nis(history.z[used], history.Z[used])
+    return float(np.nansum(value) / dof.sum()) if dof.sum() else float("nan")
+
+
+def none_for_nan(value: Any) -> Any:
+    """Return a summary with None in place of every NaN or infinity, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: none_for_nan(item) for key, item in value.items()}
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def _quantile(values: Array, q: float) -> float:
+    return float(np.quantile(values, q)) if len(values) else float("nan")
+
+
+def _mean(values: Array) -> float:
+    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

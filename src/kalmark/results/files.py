@@ -1,0 +1,81 @@
+"""The plain files of a run folder: TUM trajectories, ``associations.csv``, ``config.yaml``."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from kalmark.errors import RunError
+from kalmark.results.describe import plain
+from kalmark.results.history import History
+
+ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
+
+
+def seconds(t_ns: int) -> str:
+    """Return nanoseconds as seconds with nine decimals, exactly (a float would lose up to 256 ns)."""
+    whole, rest = divmod(abs(int(t_ns)), 1_000_000_000)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def tum(history: History, robot: str) -> str:
+    """Return a robot's path after each of its scans as TUM lines: t x y z qx qy qz qw."""
+    mine = history.robot == robot
+    lines = ["# t_s x_m y_m z_m qx qy qz qw"]
+    for t_ns, pose in zip(history.t_ns[mine].tolist(), history.mean[mine].tolist(), strict=True):
+        x, y, z, *q = pose if len(pose) == 7 else _lifted(*pose[:3])
+        lines.append(f"{seconds(t_ns)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
+    return "\n".join(lines) + "\n"
+
+
+def _lifted(x: float, y: float, theta: float) -> tuple[float, ...]:
+    return x, y, 0.0, 0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)
+
+
+def associations_csv(history: History) -> str:
+    """Return one row an observation: when, who, with what, and what became of it."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(ASSOCIATIONS)
+    times = [seconds(t_ns) for t_ns in history.t_ns.tolist()]
+    robots = history.robot.tolist()
+    columns = (history.step, history.sensor, history.index, history.id, history.outcome, history.landmark)
+    for (step, *row), d2, reason in zip(
+        zip(*(column.tolist() for column in columns), strict=True),
+        history.d2.tolist(),
+        history.reason.tolist(),
+        strict=True,
+    ):
+        writer.writerow([times[step], robots[step], *row, "" if math.isnan(d2) else repr(d2), reason])
+    return out.getvalue()
+
+
+def config_yaml(config: dict[str, Any]) -> str:
+    """Return the text of ``config.yaml``: everything that was in force, headed by version and seed."""
+    out = io.StringIO()
+    head = {"version": version("kalmark"), "seed": config.get("seed")}
+    _yaml().dump(plain(head | {key: value for key, value in config.items() if key not in head}), out)
+    return out.getvalue()
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a saved configuration.  Raises RunError if it is not a mapping."""
+    config = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    if not isinstance(config, dict):
+        raise RunError(f"{path}: got {type(config).__name__}, expected a mapping of keys")
+    return config
+
+
+def _yaml() -> YAML:
+    yaml = YAML()
+    yaml.default_flow_style = False
+    yaml.representer.add_representer(
+        type(None), lambda representer, _: representer.represent_scalar("tag:yaml.org,2002:null", "null")
+    )
+    return yaml

@@ -1,0 +1,176 @@
+"use strict";
+const TRUTH = "rgba(139,146,156,0.6)", LANDMARK = "#d2691e", INK = "#2b2f36", BAND = "rgba(31,95,168,0.13)";
+const OUTCOME = {associated: "#4a8f7b", new: "#d2a23c", rejected: "#c8553d", ignored: "#aab0ba",
+                 deferred: "#7c86b8", tentative: "#b48ac0"};
+const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d"]};
+const el = id => document.getElementById(id);
+const axis = title => ({title: {text: title, standoff: 8}, gridcolor: "#e6e8ec", zeroline: false, linecolor: "#c4c8cf",
+                        automargin: true});
+const layout = extra => ({margin: {l: 64, r: 16, t: 10, b: 44}, font: {family: "system-ui, sans-serif", size: 13, color: INK},
+                          paper_bgcolor: "white", plot_bgcolor: "white", hovermode: "closest",
+                          legend: {orientation: "h", y: -0.12, x: 0}, ...extra});
+
+/* The 3-sigma contours of many Gaussians as one broken line. */
+function ellipses(g, from, to, points = 24) {
+  const x = [], y = [];
+  for (let i = from; i < to; i++) {
+    const half = (g.pxx[i] - g.pyy[i]) / 2, mid = (g.pxx[i] + g.pyy[i]) / 2, root = Math.hypot(half, g.pxy[i]);
+    const a = 3 * Math.sqrt(Math.max(mid + root, 0)), b = 3 * Math.sqrt(Math.max(mid - root, 0));
+    const turn = Math.atan2(g.pxy[i], half) / 2, c = Math.cos(turn), s = Math.sin(turn);
+    for (let k = 0; k <= points; k++) {
+      const u = a * Math.cos(2 * Math.PI * k / points), v = b * Math.sin(2 * Math.PI * k / points);
+      x.push(g.x[i] + c * u - s * v);
+      y.push(g.y[i] + s * u + c * v);
+    }
+    x.push(null);
+    y.push(null);
+  }
+  return {x, y};
+}
+
+function extent() {
+  const all = {x: [], y: []};
+  const last = DATA.maps.length ? [DATA.maps[DATA.maps.length - 1]] : [];
+  for (const g of [...DATA.robots, ...DATA.robots.map(r => r.truth || {x: [], y: []}), DATA.trueLandmarks, ...last])
+    for (const k of ["x", "y"]) for (const value of g[k]) if (value !== null) all[k].push(value);
+  const range = values => values.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
+  let [x, y] = [range(all.x), range(all.y)].map(r => r[0] > r[1] ? [-1, 1] : r);
+  const pad = 0.05 * Math.max(x[1] - x[0], y[1] - y[0], 1);
+  return [x, y].map(r => [r[0] - pad, r[1] + pad]);
+}
+
+/* The number of steps of a robot up to a time. */
+function upTo(t, now) {
+  let low = 0, high = t.length;
+  while (low < high) {
+    const mid = (low + high) >> 1;
+    if (t[mid] <= now + 1e-6) low = mid + 1; else high = mid;
+  }
+  return low;
+}
+
+function still() {
+  const traces = [];
+  for (const [robot, f] of Object.entries(DATA.fixes))
+    traces.push({...f, mode: "markers", marker: {color: TRUTH, size: 3}, name: "position fixes (aligned, not used)",
+                 hoverinfo: "skip"});
+  DATA.robots.filter(r => r.truth).forEach((r, i) =>
+    traces.push({...r.truth, mode: "lines", line: {color: TRUTH, width: 3}, name: "true path", legendgroup: "truth",
+                 showlegend: i === 0, hoverinfo: "skip"}));
+  if (DATA.trueLandmarks.x.length)
+    traces.push({x: DATA.trueLandmarks.x, y: DATA.trueLandmarks.y, text: DATA.trueLandmarks.id, mode: "markers",
+                 marker: {symbol: "cross-thin", size: 8, line: {color: INK, width: 1}}, name: "true landmarks",
+                 hovertemplate: "true %{text}: %{x:.3f}, %{y:.3f}<extra></extra>"});
+  return traces;
+}
+
+function moving(frame) {
+  const map = DATA.maps[frame], traces = [];
+  const many = map.x.length > 100;
+  traces.push({...ellipses(map, 0, map.x.length), mode: "lines", line: {color: LANDMARK, width: many ? 0.7 : 1.1},
+               name: "landmarks, 3 sigma", legendgroup: "landmarks", hoverinfo: "skip"});
+  const sigma = map.x.map((_, i) => Math.sqrt(Math.max(map.pxx[i] + map.pyy[i], 0)));
+  traces.push({x: map.x, y: map.y, text: map.id, customdata: sigma, mode: "markers", marker: {color: LANDMARK, size: many ? 3 : 5},
+               legendgroup: "landmarks", showlegend: false,
+               hovertemplate: "%{text}: %{x:.3f}, %{y:.3f}<br>sigma %{customdata:.3g} m<extra></extra>"});
+  for (const r of DATA.robots) {
+    const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path";
+    traces.push({x: r.x.slice(0, n), y: r.y.slice(0, n), mode: "lines", line: {color: r.colour, width: 1.6}, name,
+                 legendgroup: r.name, hoverinfo: "skip"});
+    const at = n ? [n - 1] : [];
+    traces.push({...ellipses(r, Math.max(n - 1, 0), n, 48), mode: "lines", line: {color: r.colour, width: 1.4},
+                 legendgroup: r.name, showlegend: false, hoverinfo: "skip"});
+    traces.push({x: at.map(i => r.x[i]), y: at.map(i => r.y[i]), mode: "markers", legendgroup: r.name, showlegend: false,
+                 marker: {symbol: "triangle-up", size: 13, color: r.colour, line: {color: "white", width: 1},
+                          angle: at.map(i => 90 - r.theta[i] * 180 / Math.PI)},
+                 hovertemplate: r.name + ": %{x:.3f}, %{y:.3f}<extra></extra>"});
+  }
+  return traces;
+}
+
+function drawMap() {
+  if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
+  const [x, y] = extent(), background = still(), slider = el("time");
+  const width = el("map").clientWidth || 1080;
+  const height = Math.min(820, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 90));
+  const page = layout({height, uirevision: "map", xaxis: {...axis("x (m)"), range: x},
+                       yaxis: {...axis("y (m)"), range: y, scaleanchor: "x"}, legend: {orientation: "h", y: 1.02, yanchor: "bottom"}});
+  const show = () => {
+    const map = DATA.maps[+slider.value];
+    el("now").textContent = `${map.t.toFixed(1)} s · ${map.x.length} landmarks`;
+    Plotly.react("map", [...background, ...moving(+slider.value)], page, CONFIG);
+  };
+  slider.max = DATA.maps.length - 1;
+  slider.value = slider.max;
+  slider.addEventListener("input", show);
+  let timer = null;
+  el("play").addEventListener("click", () => {
+    if (timer !== null) { clearInterval(timer); timer = null; el("play").textContent = "Play"; return; }
+    if (+slider.value >= +slider.max) slider.value = 0;
+    el("play").textContent = "Pause";
+    timer = setInterval(() => {
+      if (+slider.value >= +slider.max) { el("play").click(); return; }
+      slider.value = +slider.value + 1;
+      show();
+    }, 120);
+  });
+  show();
+}
+
+function drawErrors(robot) {
+  const names = ["x (m)", "y (m)", "heading (deg)"], traces = [], page = layout({height: 560, showlegend: false});
+  names.forEach((name, i) => {
+    const n = i + 1, at = {xaxis: "x", yaxis: "y" + (i ? n : "")};
+    const band = robot.sigma[i].map(s => s === null ? null : 3 * s);
+    traces.push({x: robot.t, y: band.map(b => b === null ? null : -b), mode: "lines", line: {width: 0}, hoverinfo: "skip", ...at});
+    traces.push({x: robot.t, y: band, mode: "lines", line: {width: 0}, fill: "tonexty", fillcolor: BAND, hoverinfo: "skip", ...at});
+    traces.push({x: robot.t, y: robot.error[i], mode: "lines", line: {color: robot.colour, width: 1.1},
+                 hovertemplate: `%{x:.1f} s: %{y:.4g}<extra>${name}</extra>`, ...at});
+    page["yaxis" + (i ? n : "")] = {...axis(name), domain: [1 - n / 3 + 0.025, 1 - i / 3 - 0.01], zeroline: true, zerolinecolor: "#c4c8cf"};
+  });
+  page.xaxis = {...axis("time (s)"), anchor: "y3"};
+  Plotly.react("errors", traces, page, CONFIG);
+  const [low, high] = DATA.neesBounds, ends = [robot.t[0], robot.t[robot.t.length - 1]];
+  el("nees-note").textContent = `3 degrees of freedom; the band holds 95 % of the values of a consistent filter`;
+  Plotly.react("nees", [...bounds(ends, [low, low], [high, high]),
+    {x: robot.t, y: robot.nees, mode: "lines", line: {color: robot.colour, width: 1.1},
+     hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
+    {x: ends, y: [3, 3], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
+    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: {...axis("NEES"), type: "log", dtick: 1}}), CONFIG);
+}
+
+function bounds(t, low, high) {
+  return [{x: t, y: low, mode: "lines", line: {width: 0}, hoverinfo: "skip"},
+          {x: t, y: high, mode: "lines", line: {width: 0}, fill: "tonexty", fillcolor: BAND, hoverinfo: "skip"}];
+}
+
+function drawNis() {
+  const nis = DATA.nis;
+  el("nis-note").textContent = nis.window > 1
+    ? `mean over windows of ${nis.window} scans; the band holds 95 % of the windows of a filter with the right noise`
+    : "each scan; the band holds 95 % of the scans of a filter with the right noise";
+  Plotly.react("nis", [...bounds(nis.t, nis.low, nis.high),
+    {x: nis.t, y: nis.value, mode: "lines", line: {color: "#1f5fa8", width: 1.1},
+     hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
+    {x: [nis.t[0], nis.t[nis.t.length - 1]], y: [1, 1], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
+    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: {...axis("NIS / dof"), type: "log", dtick: 1}}), CONFIG);
+}
+
+function drawOutcomes() {
+  const traces = Object.entries(DATA.outcomes.counts).map(([name, y]) =>
+    ({x: DATA.outcomes.t, y, type: "bar", name, marker: {color: OUTCOME[name]},
+      hovertemplate: `%{x:.1f} s: %{y} ${name}<extra></extra>`}));
+  Plotly.react("outcomes", traces, layout({height: 280, barmode: "stack", bargap: 0, xaxis: axis("time (s)"), showlegend: true,
+    yaxis: axis("observations"), legend: {orientation: "h", y: 1.02, yanchor: "bottom"}}), CONFIG);
+}
+
+drawMap();
+const judged = DATA.robots.filter(r => r.error);
+if (judged.length) {
+  judged.forEach((r, i) => el("robot").add(new Option(r.name, i)));
+  el("robot").hidden = judged.length < 2;
+  el("robot").addEventListener("change", () => drawErrors(judged[+el("robot").value]));
+  drawErrors(judged[0]);
+} else el("against-truth").remove();
+drawNis();
+drawOutcomes();

@@ -1,0 +1,106 @@
+"""What both pictures of a run show, all in the frame of the map: paths, landmarks, truth, position fixes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.results.align import Rigid, rigid, rigid_robust
+from kalmark.results.evaluate import antenna_path
+from kalmark.results.history import Array
+from kalmark.slam.events import Id
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b0457a", "#6b6f2a")
+TRUTH_COLOUR = "#8b929c"
+LANDMARK_COLOUR = "#d2691e"
+INK = "#2b2f36"
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """By robot: estimated poses (N, 3), true positions (N, 2; NaN: unknown), fixes (N, 2).  True landmarks (2,)."""
+
+    paths: dict[str, Array]
+    truth: dict[str, Array]
+    fixes: dict[str, Array]
+    landmarks: dict[Id, Array]
+
+    @classmethod
+    def of(cls, run: Run) -> Picture:
+        """Return what to draw of a run."""
+        history = run.history
+        to_map = _truth_to_map(run)
+        paths, truth, fixes = {}, {}, {}
+        for robot in history.robots:
+            mine = history.robot == robot
+            paths[robot] = history.mean[mine][:, :3]
+            poses = run.truth.poses[mine]
+            if np.isfinite(poses).any():
+                truth[robot] = to_map(poses[:, :2])
+            elif robot in run.truth.fixes:
+                fixes[robot] = _fixes_in_map(run, robot)
+        return cls(paths, truth, fixes, {i: to_map(l[:2]) for i, l in run.truth.landmarks.items()})
+
+    def colour(self, robot: str) -> str:
+        """Return the robot's colour."""
+        return COLOURS[list(self.paths).index(robot) % len(COLOURS)]
+
+
+def _truth_to_map(run: Run) -> Rigid:
+    """Return what brings the truth into the map: nothing if they share a frame, else the best rigid alignment."""
+    truth = run.truth
+    if truth.frame == "truth":
+        return truth.to_map()
+    known = np.isfinite(truth.poses).all(axis=1)
+    return rigid(truth.poses[known][:, :2], run.history.mean[known][:, :2])
+
+
+def _fixes_in_map(run: Run, robot: str) -> Array:
+    fixes = run.truth.fixes[robot]
+    antenna = antenna_path(run.history, robot, fixes)
+    known = np.isfinite(antenna).all(axis=1)
+    if known.sum() < 2:
+        return np.empty((0, 2))
+    return rigid_robust(antenna[known], fixes.xy[known]).inverse()(fixes.xy)
+
+
+def headline(run: Run) -> tuple[str, list[str]]:
+    """Return the title of a run and its key figures, a few words each."""
+    summary = run.summary or run.evaluate()
+    name = run.log.name or "run"
+    title = f"{name} · {run.estimator}" if run.estimator else name
+    parts = [f"{summary['landmarks']} landmarks", f"{summary['scans']} scans"]
+    errors = [figures for figures in summary["robots"].values() if figures.get("ate_m") is not None]
+    if errors:
+        parts.append(f"position {_mean(errors, 'ate_raw_m'):.3g} m ({_mean(errors, 'ate_m'):.3g} m aligned)")
+        parts.append(f"heading {_mean(errors, 'heading_rmse_deg'):.2g}°")
+    if summary.get("landmark_rmse_m") is not None:
+        parts.append(f"landmarks {summary['landmark_rmse_raw_m']:.3g} m ({summary['landmark_rmse_m']:.3g} m aligned)")
+    if summary.get("fix_median_m") is not None:
+        parts.append(f"fixes: median {summary['fix_median_m']:.2f} m, {summary['fix_within_10m']:.1%} within 10 m")
+    if any(figures.get("pose_nees") is not None for figures in errors):
+        parts.append(f"pose NEES {_mean(errors, 'pose_nees'):.3g}")
+    if summary["nis_per_dof"] is not None:
+        parts.append(f"NIS/dof {summary['nis_per_dof']:.2f}")
+    if summary["diverged"]:
+        parts.append("DIVERGED")
+    return title, parts
+
+
+def _mean(figures: list[dict[str, Any]], key: str) -> float:
+    values = [f[key] for f in figures if f.get(key) is not None]
+    return sum(values) / len(values) if values else float("nan")
+
+
+def ellipses(means: Array, covariances: Array, sigmas: float = 3.0, points: int = 40) -> Array:
+    """Return the contours (K, points + 1, 2) of many 2-D Gaussians at once, closed.  [S] (85)-(87)."""
+    values, axes = np.linalg.eigh(covariances)
+    half = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    alpha = np.linspace(0.0, 2.0 * np.pi, points + 1)
+    circle = np.stack([np.cos(alpha), np.sin(alpha)])
+    return means[:, None, :] + sigmas * np.einsum("kij,jp->kpi", half, circle)

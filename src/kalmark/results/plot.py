@@ -1,0 +1,163 @@
+"""``map.png``: paths, landmarks with their 3-sigma ellipses, and the truth behind them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from kalmark.results.history import Array
+from kalmark.results.picture import INK, LANDMARK_COLOUR, TRUTH_COLOUR, Picture, ellipses, headline
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+CROWD = 100  # with more landmarks than this, everything about them is drawn thinner
+
+
+def save_map(run: Run, path: str | Path) -> None:
+    """Draw the map of a run and write it as a PNG."""
+    figure = draw_map(run)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=130, format="png")
+
+
+def draw_map(run: Run) -> Figure:
+    """Return the figure of a run's map: axes in metres, in the frame of the map."""
+    picture = Picture.of(run)
+    means, covariances = run.landmarks.positions()
+    low, high = _extent(picture, means)
+    figure = Figure(figsize=_size(high - low), layout="constrained", facecolor="white")
+    axes = figure.subplots()
+    _style(axes)
+    _draw_truth(axes, picture, crowded=len(means) > CROWD)
+    _draw_landmarks(axes, means, covariances)
+    for robot in picture.paths:
+        _draw_robot(axes, run, picture, robot)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="box")
+    title, figures = headline(run)
+    _head(axes, title, _lines(figures, width=int(12 * figure.get_figwidth())))
+    figure.legend(handles=_legend(picture, len(means)), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+def _head(axes: Axes, title: str, lines: list[str]) -> None:
+    at: dict[str, Any] = {
+        "xy": (0, 1),
+        "xycoords": "axes fraction",
+        "textcoords": "offset points",
+        "annotation_clip": False,
+    }
+    above = 8 + 12.5 * len(lines)
+    axes.annotate("\n".join(lines), xytext=(0, 8), va="bottom", fontsize=9, color="#555b66", linespacing=1.35, **at)
+    axes.annotate(title, xytext=(0, above + 3), va="bottom", fontsize=13, fontweight="bold", color=INK, **at)
+
+
+def _lines(figures: list[str], width: int) -> list[str]:
+    """Return the key figures joined to lines of at most `width` characters, none of them broken."""
+    lines: list[str] = []
+    for figure in figures:
+        if lines and len(lines[-1]) + len(figure) + 3 <= width:
+            lines[-1] += f" · {figure}"
+        else:
+            lines.append(figure)
+    return lines
+
+
+def _style(axes: Axes) -> None:
+    axes.set_xlabel("x (m)", color=INK)
+    axes.set_ylabel("y (m)", color=INK)
+    axes.grid(True, color="#e6e8ec", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors="#555b66", labelsize=9)
+    for side in axes.spines.values():
+        side.set_color("#c4c8cf")
+
+
+def _extent(picture: Picture, landmarks: Array) -> tuple[Array, Array]:
+    """Return the corners of what is to be seen; ellipses and stray fixes may reach out of it."""
+    parts = [landmarks, *(path[:, :2] for path in picture.paths.values()), *picture.truth.values()]
+    points = np.concatenate([*parts, np.array(list(picture.landmarks.values())).reshape(-1, 2)])
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        return np.array([-1.0, -1.0]), np.array([1.0, 1.0])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = (low + high) / 2, (high - low) / 2
+    half = np.maximum(half * 1.06, max(0.15 * half.max(), 0.5))
+    return middle - half, middle + half
+
+
+def _size(span: Array) -> tuple[float, float]:
+    """Return the size of the figure in inches for an area of this width and height."""
+    shape = float(np.clip(span[1] / span[0], 0.35, 1.6))
+    width = 9.0 if shape <= 1 else 9.0 / shape**0.6
+    return width, width * shape + 1.5
+
+
+def _draw_truth(axes: Axes, picture: Picture, crowded: bool) -> None:
+    for fixes in picture.fixes.values():
+        axes.plot(fixes[:, 0], fixes[:, 1], ".", color=TRUTH_COLOUR, markersize=1.8, zorder=1)
+    for path in picture.truth.values():
+        axes.plot(path[:, 0], path[:, 1], "-", color=TRUTH_COLOUR, linewidth=2.2, alpha=0.6, zorder=2)
+    if picture.landmarks:
+        points = np.array(list(picture.landmarks.values()))
+        size, width = (4, 0.6) if crowded else (8, 1.0)
+        axes.plot(points[:, 0], points[:, 1], "+", color=INK, markersize=size, markeredgewidth=width, zorder=6)
+
+
+def _draw_landmarks(axes: Axes, means: Array, covariances: Array) -> None:
+    if len(means) == 0:
+        return
+    crowded = len(means) > CROWD
+    contours = LineCollection(
+        list(ellipses(means, covariances)), colors=LANDMARK_COLOUR, linewidths=0.5 if crowded else 0.9, zorder=5
+    )
+    axes.add_collection(contours, autolim=False)
+    axes.plot(means[:, 0], means[:, 1], ".", color=LANDMARK_COLOUR, markersize=1.8 if crowded else 3.5, zorder=5)
+
+
+def _draw_robot(axes: Axes, run: Run, picture: Picture, robot: str) -> None:
+    path, colour = picture.paths[robot], picture.colour(robot)
+    if len(path) == 0:
+        return
+    axes.plot(path[:, 0], path[:, 1], "-", color=colour, linewidth=1.0, alpha=0.9, zorder=4)
+    axes.plot(*path[0, :2], "o", markerfacecolor="white", markeredgecolor=colour, markersize=7, zorder=7)
+    heading = np.degrees(path[-1, 2])
+    marker = (3, 0, heading - 90.0)
+    axes.plot(*path[-1, :2], marker=marker, color=colour, markeredgecolor="white", markersize=11, zorder=8)
+    last = run.history.covariance[run.history.robot == robot][-1:, :2, :2]
+    contour = ellipses(path[-1:, :2], last)[0]
+    axes.plot(contour[:, 0], contour[:, 1], "-", color=colour, linewidth=0.9, zorder=7)
+
+
+def _legend(picture: Picture, landmarks: int) -> list[Line2D]:
+    several = len(picture.paths) > 1
+    handles = [
+        Line2D([], [], color=picture.colour(robot), label=robot if several else "estimated path")
+        for robot in picture.paths
+    ]
+    if picture.truth:
+        handles.append(
+            Line2D([], [], color=TRUTH_COLOUR, linewidth=2.2, alpha=0.6, label="true paths" if several else "true path")
+        )
+    if picture.fixes:
+        handles.append(
+            Line2D([], [], color=TRUTH_COLOUR, marker=".", linestyle="", label="position fixes (aligned, not used)")
+        )
+    if picture.landmarks:
+        handles.append(Line2D([], [], color=INK, marker="+", linestyle="", label="true landmarks"))
+    if landmarks:
+        handles.append(Line2D([], [], color=LANDMARK_COLOUR, marker=".", label=r"estimated landmarks, $3\sigma$"))
+    if any(len(path) for path in picture.paths.values()):
+        open_dot: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "linestyle": ""}
+        handles.append(Line2D([], [], color=INK, label="start", **open_dot))
+        handles.append(Line2D([], [], color=INK, marker=(3, 0, -90), linestyle="", label="end", markersize=8))
+    return handles

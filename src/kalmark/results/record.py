@@ -1,0 +1,176 @@
+"""Feed a log to the filter and keep what it said, step by step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import DivergedError, EventError
+from kalmark.results.describe import describe
+from kalmark.results.history import Array, History, MapSnapshot, Start, padded, texts
+from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.progress import track
+from kalmark.results.run import LogReference, Run
+from kalmark.results.truth import Truth
+from kalmark.slam.events import Control, Event, Fix, Scan
+
+if TYPE_CHECKING:
+    from kalmark.logs.log import Log
+    from kalmark.slam.report import Report
+    from kalmark.slam.slam import Slam
+
+SNAPSHOTS = 60
+
+
+def record(
+    slam: Slam,
+    log: Log | Iterable[Event],
+    *,
+    progress: bool = True,
+    on_error: Literal["raise", "skip"] = "raise",
+    config: Mapping[str, Any] | None = None,
+) -> Run:
+    """Process every event of a log (or of any iterable) and return the run, ready to evaluate and save.
+
+    A bar on standard error appears after two seconds unless `progress` is False.  With `on_error` "skip" an event the
+    filter refuses is left out and listed in `run.skipped`.  A filter that diverges so far that it refuses to go on ends
+    the run in either case: `run.stopped` says why and the summary has `diverged`.  `config` is what to save as the
+    run's configuration; by default it is read off the filter's models.
+    """
+    if on_error not in ("raise", "skip"):
+        raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
+    events = log if isinstance(log, list) else list(log)
+    recorder = _Recorder(slam, np.linspace(0, sum(type(e) is Scan for e in events) - 1, SNAPSHOTS))
+    recorder.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in events)
+    recorder.starts = _starts(slam, events)
+    begin = time.perf_counter()
+    for event in track(events, getattr(log, "name", "log"), len(events), show=progress):
+        try:
+            recorder.process(event)
+        except EventError as error:
+            if on_error == "raise":
+                raise
+            recorder.skipped.append(str(error))
+        except DivergedError as error:
+            recorder.stopped = str(error)
+            break
+    wall_s = time.perf_counter() - begin
+    return recorder.run(log, config, wall_s)
+
+
+def _starts(slam: Slam, events: list[Event]) -> tuple[Start, ...]:
+    first: dict[str, int] = {}
+    for event in events:
+        first.setdefault(event.robot, event.t_ns)
+    return tuple(
+        Start(name, np.array(slam.mean(name)), np.array(slam.covariance(name)), first[name])
+        for name in slam.robots
+        if name in first
+    )
+
+
+@dataclass
+class _Recorder:
+    """Gathers one run; `process` is the hot path, everything is put in order afterwards by `run`."""
+
+    slam: Slam
+    snapshot_at: npt.NDArray[np.float64]
+    anchored: bool = False
+    starts: tuple[Start, ...] = ()
+    controls: int = 0
+    fixes: int = 0
+    fixes_rejected: int = 0
+    skipped: list[str] = field(default_factory=list)
+    stopped: str = ""
+    reports: list[Report] = field(default_factory=list)
+    scans: list[Scan] = field(default_factory=list)
+    means: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    step_ns: list[int] = field(default_factory=list)
+    maps: list[MapSnapshot] = field(default_factory=list)
+    _spent_ns: int = 0
+
+    def process(self, event: Event) -> None:
+        """Feed one event and, if it is a scan, keep the step that ends with it."""
+        start = time.perf_counter_ns()
+        try:
+            report = self.slam.process(event)
+        finally:
+            self._spent_ns += time.perf_counter_ns() - start
+        if type(event) is not Scan:
+            self.controls += type(event) is Control
+            if type(event) is Fix:
+                self.fixes += 1
+                self.fixes_rejected += any(o.outcome == "rejected" for o in report.observations)
+            return
+        self.step_ns.append(self._spent_ns)
+        self._spent_ns = 0
+        self.scans.append(event)
+        self.reports.append(report)
+        self.means.append(self.slam.mean(event.robot))
+        self.covariances.append(self.slam.covariance(event.robot))
+        if len(self.maps) < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[len(self.maps)]:
+            self.maps.append(self._snapshot())
+
+    def _snapshot(self) -> MapSnapshot:
+        landmarks = MapLandmarks.of(self.slam.landmarks())
+        return MapSnapshot(len(self.reports) - 1, self.reports[-1].t_ns, tuple(landmarks.ids), *landmarks.positions())
+
+    def run(self, log: Any, config: Mapping[str, Any] | None, wall_s: float) -> Run:
+        """Return the run made of what was gathered."""
+        if self.reports and (not self.maps or self.maps[-1].step < len(self.reports) - 1):
+            self.maps.append(self._snapshot())
+        history = self._history()
+        return Run(
+            history=history,
+            config=dict(config) if config is not None else describe(self.slam, log),
+            landmarks=MapLandmarks.of(self.slam.landmarks()),
+            truth=Truth.of(log, history, self.anchored),
+            log=LogReference.of(log, tuple(self.slam.robots)),
+            coordinates=self.slam.estimator.coordinates,
+            controls=self.controls,
+            fixes=self.fixes,
+            fixes_rejected=self.fixes_rejected,
+            wall_s=wall_s,
+            skipped=[*getattr(log, "skipped", ()), *self.skipped],
+            stopped=self.stopped,
+            slam=self.slam,
+        )
+
+    def _history(self) -> History:
+        steps = self.reports
+        seen = [
+            (s, scan, o)
+            for s, (scan, report) in enumerate(zip(self.scans, steps, strict=True))
+            for o in report.observations
+        ]
+        counts = [len(report.observations) for report in steps]
+        width = max((report.y.shape[1] for report in steps if report.observations), default=2)
+        p = len(self.means[0]) if steps else 3
+        q = len(self.covariances[0]) if steps else 3
+        return History(
+            t_ns=np.array([r.t_ns for r in steps], dtype=np.int64),
+            robot=texts([r.robot for r in steps]),
+            mean=np.array(self.means, dtype=np.float64).reshape(-1, p),
+            covariance=np.array(self.covariances, dtype=np.float64).reshape(-1, q, q),
+            step_us=np.array(self.step_ns, dtype=np.float64) * 1e-3,
+            step=np.array([s for s, _, _ in seen], dtype=np.int64),
+            sensor=texts([scan.sensor for _, scan, _ in seen]),
+            index=np.array([o.index for _, _, o in seen], dtype=np.int64),
+            id=texts([None if scan.ids is None else scan.ids[o.index] for _, scan, o in seen]),
+            outcome=texts([o.outcome for _, _, o in seen]),
+            landmark=texts([o.landmark for _, _, o in seen]),
+            d2=np.array([np.nan if o.d2 is None else o.d2 for _, _, o in seen], dtype=np.float64),
+            reason=texts([o.reason for _, _, o in seen]),
+            y=padded([r.y for r in steps], counts, width),
+            e=padded([r.e for r in steps], counts, width),
+            z=padded([r.z for r in steps], counts, width),
+            Z=padded([r.Z for r in steps], counts, width, matrices=True),
+            maps=tuple(self.maps),
+            starts=self.starts,
+        )

@@ -1,0 +1,135 @@
+"""``report.html``: one file that shows a run, with everything it needs inside."""
+
+from __future__ import annotations
+
+import html
+import json
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+from kalmark.results.files import config_yaml
+from kalmark.results.picture import headline
+from kalmark.results.series import reasons, series
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+_ROBOT_COLUMNS = {
+    "scans": "scans",
+    "path_m": "path (m)",
+    "ate_raw_m": "position RMSE (m)",
+    "ate_m": "aligned (m)",
+    "heading_rmse_deg": "heading RMSE (deg)",
+    "pose_nees": "pose NEES (ideal 3)",
+    "pose_nees_world": "in world coordinates",
+    "fix_median_m": "fixes: median (m)",
+    "fix_rms_10m": "RMS within 10 m (m)",
+    "fix_within_10m": "share within 10 m",
+    "diverged": "diverged",
+}
+
+
+def report_html(run: Run) -> str:
+    """Return the page: the map over time, errors, NEES and NIS, associations, figures and configuration."""
+    title, figures = headline(run)
+    return _TEMPLATE.format(
+        title=html.escape(title),
+        style=_resource("report.css"),
+        figures="".join(f"<span>{html.escape(figure)}</span>" for figure in figures),
+        robots=robot_table(run.summary),
+        summary=_table([(key, show(value)) for key, value in _flat(run.summary)]),
+        reasons=_table(reasons(run), ("outcome", "reason", "observations"))
+        or "<p>No observation came with a reason.</p>",
+        skipped=_skipped(run),
+        config=html.escape(config_yaml(run.config)),
+        plotly=_plotly(),
+        data=json.dumps(series(run), allow_nan=False, separators=(",", ":")).replace("</", "<\\/"),
+        script=_resource("report.js"),
+    )
+
+
+def robot_table(summary: dict[str, Any]) -> str:
+    """Return the table of the figures of each robot."""
+    robots = summary["robots"]
+    columns = [key for key in _ROBOT_COLUMNS if any(key in figures for figures in robots.values())]
+    rows = [(name, *(show(figures.get(key)) for key in columns)) for name, figures in robots.items()]
+    return _table(rows, ("robot", *(_ROBOT_COLUMNS[key] for key in columns)))
+
+
+def show(value: Any) -> str:
+    """Return a figure as it is printed: four significant digits, a dash for what is not there."""
+    if value is None:
+        return "–"  # noqa: RUF001 - a dash
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:,.4g}" if 1e-3 <= abs(value) < 1e5 or value == 0 else f"{value:.3e}"
+    if isinstance(value, list):
+        return ", ".join(str(item) for item in value)
+    return str(value)
+
+
+def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    out: list[tuple[str, Any]] = []
+    for key, value in summary.items():
+        if key == "robots" and not prefix:
+            continue
+        out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
+    return out
+
+
+def _table(rows: list[Any], head: tuple[str, ...] = ()) -> str:
+    if not rows:
+        return ""
+    top = "<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in head) + "</tr>" if head else ""
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table>{top}{body}</table>"
+
+
+def _skipped(run: Run) -> str:
+    lines = ([f"stopped: {run.stopped}"] if run.stopped else []) + run.skipped
+    if not lines:
+        return ""
+    shown = "\n".join(html.escape(line) for line in lines[:200])
+    return f"<h2>Left out <small>{len(lines)}</small></h2><pre>{shown}</pre>"
+
+
+def _resource(name: str) -> str:
+    return (resources.files("kalmark.results") / "page" / name).read_text(encoding="utf-8")
+
+
+def _plotly() -> str:
+    from plotly.offline import get_plotlyjs  # slow to import
+
+    return str(get_plotlyjs())
+
+
+_TEMPLATE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>{style}</style>
+</head>
+<body>
+<header><h1>{title}</h1><p class="figures">{figures}</p></header>
+<main>
+<section><h2>Map <small>3-sigma ellipses; the truth does not move</small></h2>
+<div id="map"></div>
+<div class="slider"><button id="play">Play</button><input id="time" type="range" min="0" value="0" step="1">
+<output id="now"></output></div></section>
+<section id="against-truth"><h2>Errors inside their 3-sigma bands <select id="robot"></select></h2>
+<div id="errors"></div>
+<h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
+<section><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>
+<section><h2>Association</h2><div id="outcomes"></div>{reasons}</section>
+<section><h2>Figures</h2>{robots}{summary}{skipped}</section>
+<section><h2>Configuration</h2><pre>{config}</pre></section>
+</main>
+<script>{plotly}</script>
+<script>const DATA = {data};</script>
+<script>{script}</script>
+</body>
+</html>
+"""
