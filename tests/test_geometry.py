@@ -159,7 +159,7 @@ def test_compounding_adds_uncertainty_and_merging_takes_it_away() -> None:
     ]
     errors = wrapped(np.array(draws) - c, 2)
     np.testing.assert_allclose(np.cov(errors.T), C, atol=0.12 * np.abs(C).max())
-    m, M = g.merge(a, A, a + [0, 0, 2 * np.pi], B)
+    m, M = g.merge(a, A, [1.0, 2.0, 0.3 + 2 * np.pi], B)
     np.testing.assert_allclose(m, a, atol=1e-12)
     np.testing.assert_allclose(np.linalg.inv(M), np.linalg.inv(A) + np.linalg.inv(B), rtol=1e-10)
     assert (np.linalg.eigvalsh(A - M) > 0).all()

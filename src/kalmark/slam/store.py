@@ -146,7 +146,7 @@ def _fill(slam: Slam, state: dict[str, Any], arrays: dict[str, Any]) -> None:
     m.n, m.x_n = state["n"], len(arrays["x"])
     m.x[: m.x_n], m.x_first[: m.x_n] = arrays["x"], arrays["x_first"]
     m.P[: m.n, : m.n][np.tril_indices(m.n)] = arrays["P"]
-    m.blocks, m.atoms = arrays["blocks"], arrays["atoms"]
+    m.blocks, m.atoms = arrays["blocks"].copy(), arrays["atoms"].copy()
     m.spaces = [None if s is None else Space(s[0], tuple(s[1])) for s in state["spaces"]]
     m._free = {tuple(kinds): slots for kinds, slots in state["free"]}
     slam.t_ns, slam._unnamed, slam._errors = state["t_ns"], state["unnamed"], state["errors"]
