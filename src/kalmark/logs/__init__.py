@@ -1,0 +1,20 @@
+"""Logs of many formats as one stream of events, with the truth to score against."""
+
+from kalmark.logs.download import Dataset, cache_folder, fetch, find_data, list_data
+from kalmark.logs.formats import FORMATS, open_log
+from kalmark.logs.log import Log, PositionTrack, Trajectory
+from kalmark.logs.write import write_native
+
+__all__ = [
+    "FORMATS",
+    "Dataset",
+    "Log",
+    "PositionTrack",
+    "Trajectory",
+    "cache_folder",
+    "fetch",
+    "find_data",
+    "list_data",
+    "open_log",
+    "write_native",
+]

@@ -1,0 +1,241 @@
+"""Find datasets on disk, or fetch them from the public repository they come from, every file checked by its hash.
+
+`KALMARK_DATA` names a folder that already has datasets, `KALMARK_ORACLE` one of recordings, `KALMARK_CACHE` the
+download cache (default: the platform's), `KALMARK_DATA_URL` a mirror: a URL with any of {repo}, {commit}, {path} and
+{file}, or the URL of a folder laid out as `KALMARK_DATA` is.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import hashlib
+import json
+import logging
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import platformdirs
+
+from kalmark.errors import DataError, LogError
+from kalmark.logs.source import nearest
+
+ORIGIN = "https://raw.githubusercontent.com/{repo}/{commit}/{path}"
+Progress = Callable[[str, int, int], None]
+"""Called with a file's name, the bytes that are there and the bytes there will be, of the whole dataset."""
+
+
+@dataclass(frozen=True)
+class DataFile:
+    """Name one file of a dataset: where it goes (`file`, below the data folder), its hash and size, its origin."""
+
+    file: str
+    sha256: str
+    bytes: int
+    repo: str
+    commit: str
+    path: str
+    unpack: bool = False
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Describe a dataset that can be fetched; `log` is its path below the data folder."""
+
+    name: str
+    what: str
+    official: str
+    licence: str
+    log: str
+    files: tuple[DataFile, ...]
+
+    @property
+    def bytes(self) -> int:
+        """The size of all its files."""
+        return sum(file.bytes for file in self.files)
+
+
+@cache
+def list_data() -> tuple[Dataset, ...]:
+    """Return the datasets that `fetch` knows."""
+    text = resources.files("kalmark.logs").joinpath("datasets.json").read_text(encoding="utf-8")
+    return tuple(
+        Dataset(**{**entry, "files": tuple(DataFile(**file) for file in entry["files"])}) for entry in json.loads(text)
+    )
+
+
+def cache_folder() -> Path:
+    """Return the download cache."""
+    return Path(os.environ.get("KALMARK_CACHE") or platformdirs.user_cache_path("kalmark") / "data")
+
+
+def fetch(name: str, progress: Progress | None = None) -> Path:
+    """Return the folder of a dataset, or of all whose name starts with `name/`, downloading what is not there.
+
+    Files in `KALMARK_DATA` are used without the network.  A dataset appears in the cache only once all its files
+    have come and fit their hashes.  Raises DataError.
+    """
+    wanted = [dataset for dataset in list_data() if f"{dataset.name}/".startswith(f"{name.strip('/')}/")]
+    if not wanted:
+        names = [dataset.name for dataset in list_data()]
+        raise DataError(f"dataset {name!r} is unknown, expected one of {', '.join(names)}{nearest(name, names)}")
+    roots = {fetch_one(dataset, progress) for dataset in wanted}
+    root = roots.pop() if len(roots) == 1 else cache_folder()
+    return root / (wanted[0].log if len(wanted) == 1 else name.strip("/"))
+
+
+def fetch_one(dataset: Dataset, progress: Progress | None) -> Path:
+    """Return the data folder that has this dataset, downloading it into the cache if none does."""
+    provided = os.environ.get("KALMARK_DATA")
+    if provided and all((Path(provided) / file.file).is_file() for file in dataset.files):
+        for file in dataset.files:
+            check(Path(provided) / file.file, file)
+        return Path(provided)
+    root = cache_folder()
+    if not all(intact(root / file.file, file) for file in dataset.files):
+        download(dataset, root, progress)
+    return root
+
+
+def download(dataset: Dataset, root: Path, progress: Progress | None) -> None:
+    """Download a dataset into a folder aside, and move it to its place when it is complete."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=root, prefix=".fetching-") as aside:
+            done = 0
+            for file in dataset.files:
+                retrieve(file, Path(aside), Transfer(file.file, done, dataset.bytes, progress))
+                done += file.bytes
+                if file.unpack:
+                    unpack(Path(aside) / file.file)
+            target = root / dataset.log
+            if target.exists():
+                shutil.rmtree(target)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (Path(aside) / dataset.log).rename(target)
+    except OSError as error:
+        raise DataError(f"{root}: {error.strerror or error}, expected a cache that can be written") from None
+
+
+def retrieve(file: DataFile, folder: Path, transfer: Transfer) -> None:
+    """Download one file below `folder` and check its hash.  Raises DataError and leaves no file behind."""
+    import pooch
+    import requests
+
+    def checked(url: str, target: Any, source: Any) -> None:
+        pooch.HTTPDownloader(progressbar=transfer, timeout=30)(url, target, source)
+        check(Path(target), file)
+
+    logger = pooch.get_logger()
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    where = url_of(file)
+    try:
+        place = folder / file.file
+        pooch.retrieve(where, f"sha256:{file.sha256}", fname=place.name, path=place.parent, downloader=checked)
+    except (requests.RequestException, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{file.file}: cannot be fetched ({reason}), expected it at {where}") from None
+    finally:
+        logger.setLevel(level)
+
+
+def url_of(file: DataFile) -> str:
+    """Return the URL of a file at its origin, or at the mirror in KALMARK_DATA_URL."""
+    template = os.environ.get("KALMARK_DATA_URL") or ORIGIN
+    if "{" not in template:
+        template = template.rstrip("/") + "/{file}"
+    try:
+        return template.format(repo=file.repo, commit=file.commit, path=quote(file.path), file=quote(file.file))
+    except (KeyError, IndexError, ValueError):
+        raise DataError(
+            f"KALMARK_DATA_URL is {template!r}, expected {{repo}}, {{commit}}, {{path}} or {{file}}"
+        ) from None
+
+
+@dataclass
+class Transfer:
+    """Turn pooch's progress calls for one file into calls about the whole dataset."""
+
+    name: str
+    before: int
+    dataset_bytes: int
+    progress: Progress | None
+    total: int = 0
+    here: int = 0
+
+    def update(self, count: int) -> None:
+        """Report `count` more bytes."""
+        self.here += count
+        if self.progress is not None:
+            self.progress(self.name, self.before + self.here, self.dataset_bytes)
+
+    def reset(self) -> None:
+        """Start again."""
+        self.here = 0
+
+    def close(self) -> None:
+        """Do nothing at the end: the dataset may go on."""
+
+
+def sha256(path: Path) -> str:
+    """Return the hash of a file as hexadecimal text."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def intact(path: Path, file: DataFile) -> bool:
+    """Return whether a file is there with the right hash."""
+    return path.is_file() and sha256(path) == file.sha256
+
+
+def check(path: Path, file: DataFile) -> None:
+    """Raise DataError if a file does not have its hash."""
+    found = sha256(path)
+    if found != file.sha256:
+        raise DataError(f"{file.file}: sha256 is {found}, expected {file.sha256}")
+
+
+def unpack(path: Path) -> None:
+    """Unpack a .zip, .gz or .bz2 beside itself.  Raises DataError if it is damaged."""
+    try:
+        if path.suffix == ".zip":
+            with zipfile.ZipFile(path) as archive:
+                archive.extractall(path.parent)  # strips absolute paths and ".."
+            return
+        opener: Any = {".gz": gzip.open, ".bz2": bz2.open}[path.suffix]
+        with opener(path) as packed, path.with_suffix("").open("wb") as plain:
+            shutil.copyfileobj(packed, plain)
+    except (zipfile.BadZipFile, EOFError, OSError) as error:
+        raise DataError(f"{path.name}: cannot be unpacked ({error}), expected a complete archive") from None
+
+
+def find_data(path: Path | str, base: Path | str | None = None) -> Path:
+    """Return where a log is: a relative path is looked for in `base` (default: the working folder), then in
+    `KALMARK_DATA`, `KALMARK_ORACLE` and the download cache.  Raises LogError if it is in none of them.
+    """
+    path = Path(path).expanduser()
+    folders: list[Path | str | None] = [
+        base or Path(),
+        os.environ.get("KALMARK_DATA"),
+        os.environ.get("KALMARK_ORACLE"),
+    ]
+    places = [path] if path.is_absolute() else [Path(folder) / path for folder in (*folders, cache_folder()) if folder]
+    for place in places:
+        if place.exists():
+            return place
+    looked = ", ".join(str(place.absolute()) for place in places)
+    known = [
+        dataset.name for dataset in list_data() if f"{path.as_posix()}/".startswith(f"{dataset.name.split('/')[0]}/")
+    ]
+    hint = f"; `kalmark data fetch {known[0]}` downloads it" if known else ""
+    raise LogError(f"log {str(path)!r} not found, expected it at {' or '.join(looked.split(', '))}{hint}")

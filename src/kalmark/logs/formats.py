@@ -1,0 +1,144 @@
+"""`open_log`: tell a log's format by what is there, read it, and keep the robots and the time that were asked for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from kalmark.errors import LogError
+from kalmark.logs.dlr import DLR
+from kalmark.logs.download import find_data
+from kalmark.logs.freiburg import FREIBURG
+from kalmark.logs.log import Log
+from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
+from kalmark.logs.mrclam import MRCLAM
+from kalmark.logs.native import NATIVE
+from kalmark.logs.source import Format, Request, choice, nearest, quantity
+from kalmark.logs.text import raising
+from kalmark.logs.victoria_park import VICTORIA_PARK
+from kalmark.slam.events import Event, Scan
+
+FORMATS: dict[str, Format] = {
+    entry.name: entry for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG)
+}
+
+
+def open_log(
+    path: Path | str,
+    format: str | None = None,
+    *,
+    robots: Sequence[str | int] | str | int | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    on_error: Literal["raise", "skip"] = "raise",
+    **options: Any,
+) -> Log:
+    """Read the log at `path`, a folder or file of any known format.
+
+    `robots` keeps some robots (names, or MRCLAM's numbers), `from_s` and `to_s` the events between these seconds
+    from the log's first event.  With `on_error="skip"` bad rows are left out and listed in `log.skipped`.
+    `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
+    Raises LogError, with ``file:line:`` for a bad row.
+    """
+    skipped: list[str] = []
+    refuse = raising if choice(on_error, "on_error", ("raise", "skip")) == "raise" else skipped.append
+    entry, found = recognise(find_data(path), format)
+    for name in options:
+        if name not in entry.options:
+            known = ", ".join(entry.options) or "none"
+            raise LogError(
+                f"log option {name!r} is unknown to {entry.name}, expected {known}{nearest(name, entry.options)}"
+            )
+    request = Request(robot_names(robots, entry), refuse, skipped)
+    log = entry.read(found, request, **options)
+    return between(keep_robots(log, request), from_s, to_s)
+
+
+def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
+    """Return the format of the log at `path` and the path its reader takes.  Raises LogError."""
+    if format is not None:
+        if format not in FORMATS:
+            raise LogError(f"log format is {format!r}, expected one of {', '.join(FORMATS)}{nearest(format, FORMATS)}")
+        found = FORMATS[format].find(path)
+        if found is None:
+            raise LogError(f"{path}: not a log of format {format}, expected {FORMATS[format].what}")
+        return FORMATS[format], found
+    for entry in FORMATS.values():
+        found = entry.find(path)
+        if found is not None:
+            return entry, found
+    below = sorted(child.name for child in path.iterdir() if child.is_dir()) if path.is_dir() else []
+    inside = [name for name in below if any(entry.find(path / name) for entry in FORMATS.values())]
+    hint = f"; it holds the logs {', '.join(inside)}" if inside else ""
+    known = "; ".join(f"{entry.name}: {entry.what}" for entry in FORMATS.values())
+    raise LogError(f"{path}: no known log format, expected one of {known}{hint}")
+
+
+def robot_names(robots: Any, entry: Format) -> tuple[str, ...] | None:
+    """Return the names of the robots asked for; a number is put behind the format's prefix."""
+    if robots is None:
+        return None
+    if isinstance(robots, str | int):
+        robots = [robots]
+    names = (f"{entry.robot_prefix}{robot}" if str(robot).isdecimal() else str(robot) for robot in robots)
+    return tuple(dict.fromkeys(names))
+
+
+def keep_robots(log: Log, request: Request) -> Log:
+    """Return the log of the robots asked for; sightings of the others are left out and listed."""
+    if request.robots is None:
+        return log
+    for robot in request.robots:
+        if robot not in log.robots:
+            hint = nearest(robot, log.robots)
+            raise LogError(f"{log.path}: no robot {robot!r}, expected one of {', '.join(log.robots)}{hint}")
+    others = {f"{MRCLAM.robot_prefix}{n}" for n in range(1, 6)} if log.format == MRCLAM.name else set(log.robots)
+    others -= set(request.robots)
+    left_out: Counter[str] = Counter()
+    kept = (without(event, others, left_out) for event in log if event.robot in request.robots)
+    events = [event for event in kept if event is not None]
+    for robot, count in sorted(left_out.items()):
+        request.skipped.append(f"{log.path}: {count} sightings of {robot}, which was not asked for")
+    return replace(
+        log,
+        robots=tuple(robot for robot in log.robots if robot in request.robots),
+        events=events,
+        truth={robot: value for robot, value in log.truth.items() if robot in request.robots},
+        gps={robot: value for robot, value in log.gps.items() if robot in request.robots},
+        control_columns={key: value for key, value in log.control_columns.items() if key in request.robots},
+        sensor_columns={key: value for key, value in log.sensor_columns.items() if key[0] in request.robots},
+    )
+
+
+def without(event: Event, others: set[str], left_out: Counter[str]) -> Event | None:
+    """Return the event without the sightings of these robots, or None if nothing else was seen."""
+    if not isinstance(event, Scan) or event.ids is None or others.isdisjoint(event.ids):
+        return event
+    left_out.update(id_ for id_ in event.ids if isinstance(id_, str) and id_ in others)
+    keep = np.array([id_ not in others for id_ in event.ids])
+    if not keep.any():
+        return None
+    ids = [id_ for id_ in event.ids if id_ not in others]
+    cov = event.cov[keep] if event.cov is not None and event.cov.ndim == 3 else event.cov
+    return Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor, y=event.y[keep], ids=ids, cov=cov)
+
+
+def between(log: Log, from_s: float | None, to_s: float | None) -> Log:
+    """Return the log with the events from `from_s` to `to_s` (both included), s from its first event."""
+    if not log.events:
+        raise LogError(f"{log.path}: no event that can be used, expected controls and scans")
+    if from_s is None and to_s is None:
+        return log
+    start = log.events[0].t_ns
+    low = start if from_s is None else start + round(quantity(from_s, "from_s", 0.0) * 1e9)
+    high = log.events[-1].t_ns if to_s is None else start + round(quantity(to_s, "to_s", 0.0) * 1e9)
+    events = [event for event in log if low <= event.t_ns <= high]
+    if not events:
+        length = (log.events[-1].t_ns - start) * 1e-9
+        raise LogError(f"{log.path}: no event from {from_s} to {to_s} s, expected times within 0 to {length:.9g} s")
+    return replace(log, events=events)

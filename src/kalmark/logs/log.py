@@ -1,0 +1,134 @@
+"""What a log is: events in time order and, where the source has it, the truth to score against."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import LogError
+from kalmark.geometry.angles import wrap
+from kalmark.slam.events import Event, Id
+
+Array = npt.NDArray[np.float64]
+Times = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Hold the true poses of one robot: `t_ns` (N,) strictly increasing, `poses` (N, 3) x y theta or (N, 7)
+    x y z qx qy qz qw (m, rad; quaternions Hamilton, local to global).  Raises LogError on anything else."""
+
+    t_ns: Times
+    poses: Array
+
+    def __post_init__(self) -> None:
+        t_ns, poses = np.asarray(self.t_ns, dtype=np.int64), np.asarray(self.poses, dtype=np.float64)
+        if poses.ndim != 2 or poses.shape[1] not in (3, 7) or t_ns.shape != poses.shape[:1] or len(t_ns) == 0:
+            raise LogError(
+                f"trajectory: t_ns has shape {t_ns.shape} and poses {poses.shape}, expected (N,) and (N, 3|7)"
+            )
+        if not np.isfinite(poses).all():
+            raise LogError("trajectory: poses hold a value that is not finite, expected finite numbers")
+        if not (np.diff(t_ns) > 0).all():
+            first = int(np.argmin(np.diff(t_ns) > 0))
+            raise LogError(f"trajectory: t_ns goes from {t_ns[first]} to {t_ns[first + 1]}, expected increasing times")
+        object.__setattr__(self, "t_ns", t_ns)
+        object.__setattr__(self, "poses", poses)
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def at(self, t_ns: Any, max_gap_s: float = 0.5) -> Array:
+        """Return the poses at these times (ns), shape (len(t_ns), 3|7), or one pose for one time.
+
+        Positions are interpolated linearly, angles along the shorter arc, quaternions by slerp.  A row is NaN where
+        its time lies outside the trajectory, or inside a gap longer than `max_gap_s`.
+        """
+        query = np.atleast_1d(np.asarray(t_ns, dtype=np.int64))
+        before = np.clip(np.searchsorted(self.t_ns, query, side="right") - 1, 0, len(self) - 1)
+        after = np.minimum(before + 1, len(self) - 1)
+        exact = self.t_ns[before] == query
+        gap = self.t_ns[after] - self.t_ns[before]
+        inside = (query > self.t_ns[0]) & (query < self.t_ns[-1]) & (gap <= round(max_gap_s * 1e9))
+        a = (query - self.t_ns[before]) / np.maximum(gap, 1)
+        poses = interpolate(self.poses[before], self.poses[after], np.where(exact | ~inside, 0.0, a))
+        poses[~(exact | inside)] = np.nan
+        return poses[0] if np.ndim(t_ns) == 0 else poses
+
+
+def interpolate(p: Array, q: Array, a: Array) -> Array:
+    """Return the poses (N, 3|7) at the fractions `a` (N,) of the way from `p` to `q`; exactly `p` where a = 0."""
+    out = p + a[:, None] * (q - p)
+    if p.shape[1] == 3:
+        out[:, 2] = p[:, 2] + a * wrap(q[:, 2] - p[:, 2])
+    else:
+        out[:, 3:] = slerp(p[:, 3:], q[:, 3:], a)
+    return out
+
+
+def slerp(p: Array, q: Array, a: Array) -> Array:
+    """Return the quaternions (N, 4) at the fractions `a` of the shorter rotation from `p` to `q`."""
+    cosine = np.sum(p * q, axis=1) / (np.linalg.norm(p, axis=1) * np.linalg.norm(q, axis=1))
+    q = np.where(cosine[:, None] < 0, -q, q)
+    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    small = angle < 1e-6
+    sine = np.where(small, 1.0, np.sin(angle))
+    w_p = np.where(small, 1 - a, np.sin((1 - a) * angle) / sine)
+    w_q = np.where(small, a, np.sin(a * angle) / sine)
+    out: Array = w_p[:, None] * p + w_q[:, None] * q
+    return np.where((a == 0)[:, None], p, out)
+
+
+@dataclass(frozen=True, eq=False)
+class PositionTrack:
+    """Hold position fixes that serve only to score a run: `t_ns` (N,), `xy` (N, 2) m in a frame of their own,
+    taken at `antenna` (2,) m in the robot's frame."""
+
+    t_ns: Times
+    xy: Array
+    antenna: Array
+
+    def __post_init__(self) -> None:
+        t_ns, xy = np.asarray(self.t_ns, dtype=np.int64), np.asarray(self.xy, dtype=np.float64)
+        antenna = np.asarray(self.antenna, dtype=np.float64)
+        if xy.shape != (*t_ns.shape, 2) or antenna.shape != (2,):
+            shapes = f"t_ns {t_ns.shape}, xy {xy.shape}, antenna {antenna.shape}"
+            raise LogError(f"position track: shapes are {shapes}, expected (N,), (N, 2), (2,)")
+        for name, value in (("t_ns", t_ns), ("xy", xy), ("antenna", antenna)):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Hold one log: `events` sorted by `kalmark.slam.events.order`, and what is known to score them against.
+
+    `truth` and `gps` are by robot, `landmarks` are true positions (2,) or (3,) m by id (all {} where unknown);
+    `skipped` has one line for each thing left out; `control_columns` (by robot) and `sensor_columns` (by robot and
+    sensor) name what the numbers of a control and an observation are.
+    """
+
+    name: str
+    robots: tuple[str, ...]
+    events: list[Event]
+    format: str = "native"
+    path: Path | None = None
+    truth: dict[str, Trajectory] = field(default_factory=dict)
+    landmarks: dict[Id, Array] = field(default_factory=dict)
+    gps: dict[str, PositionTrack] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+    control_columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+
+    def __iter__(self) -> Iterator[Event]:
+        return iter(self.events)
+
+    def __len__(self) -> int:
+        return len(self.events)

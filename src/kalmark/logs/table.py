@@ -1,0 +1,201 @@
+"""CSV tables with a header, read row by row, every complaint with file and line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from kalmark.errors import LogError
+from kalmark.logs.log import Array
+from kalmark.logs.source import Request, nearest
+from kalmark.logs.text import nanoseconds, number, read_text
+
+NAMES = ("t_s", "robot", "sensor", "id")
+CANONICAL = (
+    "v_mps", "w_radps", "steering_rad", "dx_m", "dy_m", "dz_m", "dtheta_rad", "range_m", "bearing_rad", "azimuth_rad",
+    "elevation_rad", "signature", "x_m", "y_m", "z_m", "u_px", "v_px",
+)  # fmt: skip
+"""The order in which known columns make a control or an observation, whatever their order in the file."""
+
+_RANK = {name: rank for rank, name in enumerate(CANONICAL)}
+_COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Hold a CSV file: its header by name, the columns that are values, those of noise, and its rows."""
+
+    path: Path
+    index: dict[str, int]
+    value_columns: tuple[str, ...]
+    noise_columns: tuple[str, ...]
+    content: list[tuple[int, list[str]]]
+
+    def rows(self, request: Request) -> Iterator[Row]:
+        """Yield the rows that have as many cells as the header; refuse the others."""
+        for line, cells in self.content:
+            if len(cells) != len(self.index):
+                names = ", ".join(self.index)
+                request.refuse(f"{self.path}:{line}: {len(cells)} cells, expected {len(self.index)}: {names}")
+                continue
+            yield Row(self, line, cells)
+
+
+def read_table(path: Path, required: tuple[str, ...], allowed: tuple[str, ...] | None = None) -> Table:
+    """Return the table in a CSV file, which must have the columns `required`.
+
+    Other columns must be among `allowed` (None: any); noise columns always may be there.  Raises LogError if the
+    file is missing, empty, has no row after its header, or a header that does not fit.
+    """
+    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
+    try:
+        content = [(reader.line_num, cells) for cells in reader if cells]
+    except csv.Error as error:
+        raise LogError(f"{path}:{reader.line_num}: {error}, expected comma separated values") from None
+    start, header = content[0][0], [cell.strip() for cell in content[0][1]]
+    wanted = ", ".join(required)
+    for name in required:
+        if name not in header:
+            raise LogError(f"{path}:{start}: no column {name}, expected {wanted}{nearest(name, header)}")
+    for name in header:
+        if header.count(name) > 1 or not name:
+            raise LogError(
+                f"{path}:{start}: column {name!r} appears {header.count(name)} times, expected named columns"
+            )
+    noise = tuple(name for name in header if name.startswith(("sigma_", "cov_")))
+    values = [name for name in header if name not in NAMES and name not in noise]
+    for name in values:
+        if allowed is not None and name not in required and name not in allowed:
+            hint = nearest(name, allowed)
+            raise LogError(
+                f"{path}:{start}: column {name!r} is unknown, expected {', '.join((*required, *allowed))}{hint}"
+            )
+    if len(content) == 1:
+        raise LogError(f"{path}:{start}: no rows after the header, expected at least one")
+    values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
+    return Table(path, {name: i for i, name in enumerate(header)}, tuple(values), noise, content[1:])
+
+
+class Row:
+    """One row of a table: its cells by column, its time and names once they have been read."""
+
+    __slots__ = ("cells", "line", "robot", "sensor", "t_ns", "table")
+
+    def __init__(self, table: Table, line: int, cells: list[str]) -> None:
+        self.table, self.line, self.cells = table, line, cells
+        self.t_ns, self.robot, self.sensor = 0, "", ""
+
+    def text(self, column: str) -> str:
+        """Return the text of a cell."""
+        return self.cells[self.table.index[column]].strip()
+
+    def refuse(self, request: Request, message: str) -> Literal[False]:
+        """Refuse this row with its file and line."""
+        request.refuse(f"{self.table.path}:{self.line}: {message}")
+        return False
+
+    def read_time(self, request: Request) -> bool:
+        """Read the column t_s exactly; return False if the row was refused."""
+        try:
+            self.t_ns = nanoseconds(self.text("t_s"))
+        except ValueError:
+            return self.refuse(request, f"t_s is {self.text('t_s')!r}, expected a finite number of seconds")
+        return True
+
+    def read_names(self, request: Request, with_sensor: bool) -> bool:
+        """Read the robot and, if asked, the sensor; return False if the row was refused."""
+        self.robot = self.text("robot")
+        if with_sensor:
+            self.sensor = self.text("sensor")
+        if not self.robot or (with_sensor and not self.sensor):
+            return self.refuse(request, f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
+        return True
+
+    def numbers(self, columns: tuple[str, ...], request: Request) -> list[float] | None:
+        """Return the finite numbers in these columns, or None if the row was refused."""
+        cells, index = self.cells, self.table.index
+        values = []
+        for column in columns:
+            try:
+                value = number(cells[index[column]])
+            except ValueError:
+                self.refuse(request, f"{column} is {self.text(column)!r}, expected a finite number")
+                return None
+            if value < 0 and column == "range_m":
+                self.refuse(request, f"range_m is {self.text(column)}, expected a range of at least 0")
+                return None
+            values.append(value)
+        return values
+
+    def values(self, columns: dict[Any, tuple[str, ...]], key: Hashable, request: Request) -> list[float] | None:
+        """Return this row's values; the first row of `key` settles which columns it has, in `columns`."""
+        used = columns.get(key)
+        if used is None:
+            used = tuple(name for name in self.table.value_columns if self.text(name))
+            if not used:
+                names = ", ".join(self.table.value_columns) or "a column of values"
+                self.refuse(request, f"no value in the row, expected numbers in {names}")
+                return None
+        values = self.numbers(used, request)
+        if values is None:
+            return None
+        for name in self.table.value_columns:
+            if name not in used and self.text(name):
+                who = " ".join(key) if isinstance(key, tuple) else key
+                self.refuse(request, f"{name} is {self.text(name)}, expected an empty cell as in {who}'s first row")
+                return None
+        columns.setdefault(key, used)
+        return values
+
+    def own_noise(self, columns: tuple[str, ...], request: Request, *, definite: bool) -> Array | Literal[False] | None:
+        """Return the covariance (m, m) that this row gives for `columns`, None if none, False if it was refused."""
+        given = [name for name in self.table.noise_columns if self.text(name)]
+        if not given:
+            return None
+        numbers = self.numbers(tuple(given), request)
+        if numbers is None:
+            return False
+        try:
+            cov = covariance(dict(zip(given, numbers, strict=True)), columns)
+        except ValueError as error:
+            return self.refuse(request, str(error))
+        lowest = float(np.linalg.eigvalsh(cov)[0])
+        if lowest < -1e-12 * float(np.abs(cov).max()) or (definite and lowest <= 0):
+            wanted = "positive definite" if definite else "positive semidefinite"
+            return self.refuse(request, f"noise {cov.tolist()} has eigenvalue {lowest:.3g}, expected it {wanted}")
+        return cov
+
+
+def covariance(given: dict[str, float], columns: tuple[str, ...]) -> Array:
+    """Return the covariance that `sigma_<column>` or `cov_ij` numbers describe.  Raises ValueError."""
+    size = len(columns)
+    sigmas = [f"sigma_{name}" for name in columns]
+    if any(name.startswith("sigma_") for name in given):
+        if sorted(given) != sorted(sigmas):
+            raise ValueError(f"noise in {', '.join(given)}, expected {', '.join(sigmas)}")
+        if any(value < 0 for value in given.values()):
+            raise ValueError(f"noise {given}, expected standard deviations of at least 0")
+        return np.diag([given[name] ** 2 for name in sigmas])
+    axes = {**{str(i): i for i in range(size)}, **{name[0]: i for i, name in enumerate(columns) if name[1:] == "_m"}}
+    cov = np.full((size, size), np.nan)
+    for name, value in given.items():
+        match = _COV.fullmatch(name)
+        i, j = (axes.get(axis) for axis in match.groups()) if match else (None, None)
+        if i is None or j is None or not np.isnan(cov[i, j]):
+            raise ValueError(f"noise in {', '.join(given)}, expected {', '.join(cov_columns(size))}")
+        cov[i, j] = cov[j, i] = value
+    if np.isnan(cov).any():
+        raise ValueError(f"noise in {', '.join(given)}, expected {', '.join(cov_columns(size))}")
+    return cov
+
+
+def cov_columns(size: int, axes: str = "0123456789") -> list[str]:
+    """Return the names of the upper triangle of a covariance, row by row."""
+    return [f"cov_{axes[i]}{axes[j]}" for i in range(size) for j in range(i, size)]

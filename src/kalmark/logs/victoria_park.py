@@ -1,0 +1,126 @@
+"""Read Victoria Park (E. Nebot, ACFR Sydney): a car with a laser among trees, encoders, a poor GPS, 26 minutes.
+
+Everything is put on the clock of the `.mat` files; the ascii files run 20.967 s behind it.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kalmark.errors import LogError
+from kalmark.logs.log import Array, Log, PositionTrack, Times
+from kalmark.logs.matlab import arrays, column
+from kalmark.logs.source import Format, Request, choice, folder_of
+from kalmark.logs.text import timed_rows
+from kalmark.slam.events import Control, Event, Scan, order
+
+ROBOT, SENSOR = "car", "laser"
+ASCII_ZIP, ASCII_DR, MAT_DR, GPS = "victoria_park_ascii.zip", "DRS.txt", "aa3_dr.mat", "aa3_gpsx.mat"
+SLSJF = Path("slsjf") / "data_sensor_clean_clean.mat"
+ASCII_BEHIND_NS = 20_967_000_000
+ANTENNA = np.array([3.78, 0.5])
+"""Laser and GPS antenna from the centre of the rear axle, m: a + L ahead (0.95 + 2.83), b to the left."""
+IGNORE = -1
+
+
+def find(path: Path) -> Path | None:
+    """Return the dataset's folder, given it or one of its files."""
+    return folder_of(path, (ASCII_ZIP, ASCII_DR, MAT_DR))
+
+
+def read(path: Path, request: Request, detections: Any = "slsjf", steering: Any = "ascii") -> Log:
+    """Return the log with trees of known identity (`slsjf`) and the encoders' calibration `ascii` or `mat`."""
+    wanted = choice(detections, "detections", ("slsjf", "rfs", "laser"))
+    if wanted != "slsjf":
+        raise LogError(
+            f"log option detections is {wanted!r}, which is not read yet; expected 'slsjf' (trees with known ids)"
+        )
+    if choice(steering, "steering", ("ascii", "mat")) == "ascii":
+        events = ascii_controls(path, request)
+    else:
+        events = mat_controls(path / MAT_DR)
+    events += slsjf_scans(path / SLSJF, request)
+    return Log(
+        name="victoria_park",
+        format="victoria_park",
+        path=path,
+        robots=(ROBOT,),
+        events=sorted(events, key=order),
+        gps={ROBOT: read_gps(path / GPS)} if (path / GPS).is_file() else {},
+        skipped=request.skipped,
+        control_columns={ROBOT: ("v_mps", "steering_rad")},
+        sensor_columns={(ROBOT, SENSOR): ("range_m", "bearing_rad")},
+    )
+
+
+def ascii_controls(path: Path, request: Request) -> list[Event]:
+    """Return speed and steering of the ascii files (recalibrated), from DRS.txt or the zip that holds it."""
+    file, text = path / ASCII_DR, None
+    if not file.is_file():
+        file = path / ASCII_ZIP
+        try:
+            with zipfile.ZipFile(file) as archive:
+                text = archive.read(ASCII_DR).decode("ascii")
+        except (OSError, KeyError, UnicodeDecodeError, zipfile.BadZipFile) as error:
+            raise LogError(f"{file}: {error}, expected a zip with {ASCII_DR} (or steering: mat)") from None
+        file = file / ASCII_DR
+    table = timed_rows(file, ("v_mps", "steering_rad"), request.refuse, text)
+    return [Control(t_ns=t_ns + ASCII_BEHIND_NS, robot=ROBOT, u=u) for _, t_ns, u in table]
+
+
+def mat_controls(path: Path) -> list[Event]:
+    """Return speed and steering of the .mat file."""
+    data = arrays(path, ("time", "speed", "steering"))
+    t_ns = milliseconds(column(data["time"]), path, "time")
+    u = np.column_stack([column(data["speed"]), column(data["steering"])])
+    return [Control(t_ns=t, robot=ROBOT, u=row) for t, row in zip(t_ns.tolist(), u, strict=True)]
+
+
+def slsjf_scans(path: Path, request: Request) -> list[Event]:
+    """Return the scans of trees with known ids; bearings are turned so that 0 is forward."""
+    (table,) = arrays(path, ("data_sensor_clean_clean",)).values()
+    if table.ndim != 2 or table.shape[1] != 6:
+        raise LogError(f"{path}: table has shape {table.shape}, expected 6 columns: t range bearing x y id")
+    if (table[:, 1] < 0).any():
+        row = int(np.argmax(table[:, 1] < 0)) + 1
+        raise LogError(f"{path}: row {row} has range {table[row - 1, 1]}, expected a range of at least 0")
+    ids = table[:, 5].astype(np.int64)
+    if (ids == IGNORE).any():
+        request.skipped.append(f"{path}: {int((ids == IGNORE).sum())} detections of poor quality (id -1)")
+    table, ids = table[ids != IGNORE], ids[ids != IGNORE]
+    t_ns = milliseconds(table[:, 0], path, "t")
+    y = np.column_stack([table[:, 1], table[:, 2] - np.pi / 2])
+    starts = np.flatnonzero(np.diff(t_ns, prepend=-1))
+    return [
+        Scan(t_ns=int(t_ns[a]), robot=ROBOT, sensor=SENSOR, y=y[a:b], ids=ids[a:b].tolist())
+        for a, b in zip(starts, [*starts[1:], len(t_ns)], strict=True)
+    ]
+
+
+def read_gps(path: Path) -> PositionTrack:
+    """Return the GPS fixes (x = Lo_m, y = La_m), which jump and drop out: for scoring only."""
+    data = arrays(path, ("timeGps", "Lo_m", "La_m"))
+    xy = np.column_stack([column(data["Lo_m"]), column(data["La_m"])])
+    return PositionTrack(milliseconds(column(data["timeGps"]), path, "timeGps"), xy, ANTENNA)
+
+
+def milliseconds(values: Array, path: Path, name: str) -> Times:
+    """Return times in ms as integer ns.  Raises LogError if they run backwards."""
+    t_ns = np.rint(values * 1e6).astype(np.int64)
+    if (np.diff(t_ns) < 0).any():
+        row = int(np.argmax(np.diff(t_ns) < 0)) + 2
+        raise LogError(f"{path}: {name} row {row} is before row {row - 1}, expected times that never run backwards")
+    return t_ns
+
+
+VICTORIA_PARK = Format(
+    "victoria_park",
+    f"a folder with {ASCII_ZIP} or {MAT_DR}, and {SLSJF.as_posix()}",
+    find,
+    read,
+    options=("detections", "steering"),
+)
