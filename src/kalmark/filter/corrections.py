@@ -217,12 +217,12 @@ def textbook(
     e, z, Z, d2 = np.empty((k, m)), np.empty((k, m)), np.empty((k, m, m)), np.empty(k)
     for i in range(k):
         one = slice(i, i + 1)
-        index, _, mean = observed_block(x, blocks, atoms, robot, slots[one], d)
+        index, _table, mean = observed_block(x, blocks, atoms, robot, slots[one], d)
         e[one], E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(1, d))
         z[one] = residual(y[one], e[one], angular)
         Z[one], d2[one] = innovation(P, index, E_r, E_l, R[one], z[one])
         if d2[i] < gate:
-            M, _ = cholesky_inverse(Z[i])
+            M, _positive = cholesky_inverse(Z[i])
             retract(atoms, x, fuse(P, n, index, stacked(E_r, E_l), M, z[i].copy()), 0.0)
     return e, z, Z, d2, True
 

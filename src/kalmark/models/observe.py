@@ -70,7 +70,7 @@ def linearize(view: Any, r: Array, l: Array) -> tuple[Array, Array, Array]:
     return linearize_built_in(view, r, l) if isinstance(view, tuple) else view.linearize(r, l)
 
 
-@overload(linearize, strict=False)  # the annotations differ
+@overload(linearize, strict=False)  # type: ignore[untyped-decorator]  # strict: the annotations differ
 def _compiled_linearize(view: Any, r: Any, l: Any) -> Any:
     if isinstance(view, types.BaseTuple):
         return lambda view, r, l: linearize_built_in(view, r, l)  # noqa: PLW0108 - numba compares the arguments

@@ -22,7 +22,7 @@ NOTHING.flags.writeable = False
 class Observation(NamedTuple):
     """One observation's fate: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance."""
 
-    index: int
+    index: int  # type: ignore[assignment]  # of the observation in its scan; hides tuple.index
     id: Id | None
     outcome: str
     landmark: Id | None

@@ -9,7 +9,7 @@ landmark is removed     -> remove        reduction           [S] Table 1
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +125,7 @@ class Slam:
         ids = event.ids or (None,) * count
         for i in ids:
             if i in self.robots:
-                self._advance(i)  # type: ignore[arg-type]
+                self._advance(i)
         decisions = self.association.associate(Scene(self, view, event, ids, R))
         return self._fuse(event, view, ids, decisions, R)
 
@@ -194,7 +194,8 @@ class Slam:
         known = [k for k, (name, _) in enumerate(decisions) if self._seen_by(view, event.robot, name)]
         outcomes: list[Observation | None] = [None] * len(decisions)
         if known:
-            self._correct(report, view, known, decisions, R, outcomes)
+            for seen in self._correct(event, report, view, known, ids, decisions, R):
+                outcomes[seen.index] = seen
         else:
             report.fill(known, None)
         for k, (name, reason) in enumerate(decisions):
@@ -204,11 +205,10 @@ class Slam:
         return report
 
     def _correct(
-        self, report: Report, view: View, known: list[int], decisions: Sequence[Decision], R: Array,
-        outcomes: list[Observation | None],
-    ) -> None:  # fmt: skip
+        self, event: Scan, report: Report, view: View, known: list[int], ids: tuple[Id | None, ...],
+        decisions: Sequence[Decision], R: Array,
+    ) -> Iterator[Observation]:  # fmt: skip
         """Fuse the observations `known` of landmarks in the map.  [S] (26)-(30)."""
-        event = report.event
         names: list[Id] = [decisions[k][0] for k in known]  # type: ignore[misc]
         slots = np.array([self._slots[name] for name in names])
         y = event.y if len(known) == len(event.y) else event.y[known]
@@ -221,14 +221,11 @@ class Slam:
         for k, name, d2 in zip(known, names, done.d2.tolist(), strict=True):
             if d2 <= gate:
                 self._seen[name] = self._seen.get(name, 0) + 1
-                outcomes[k] = Observation(k, name, "associated", name, d2, "")
+                yield Observation(k, ids[k], "associated", name, d2, "")
+            elif math.isnan(d2):
+                yield Observation(k, ids[k], "rejected", name, None, "nothing can be expected of it from here")
             else:
-                reason = (
-                    f"outside the gate of {gate:.2f}"
-                    if not math.isnan(d2)
-                    else "nothing can be expected of it from here"
-                )
-                outcomes[k] = Observation(k, name, "rejected", name, d2, reason)
+                yield Observation(k, ids[k], "rejected", name, d2, f"outside the gate of {gate:.2f}")
 
     def _initialize(
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array

@@ -35,7 +35,7 @@ def _described(model: Any) -> dict[str, Any]:
     own = is_dataclass(model) and any(type(model) is getattr(m, type(model).__name__, None) for m in MODULES.values())
     if not own:
         return {"python": type(model).__qualname__}
-    values = {f.name: getattr(model, f.name) for f in fields(model)}  # type: ignore[arg-type]
+    values = {f.name: getattr(model, f.name) for f in fields(model)}
     kept = {k: v for k, v in values.items() if not (isinstance(v, float) and not math.isfinite(v))}
     return {"type": type(model).__name__, **kept}
 
