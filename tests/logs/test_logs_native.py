@@ -1,0 +1,348 @@
+"""Native logs: what is written is read back exactly, and every bad row is named by file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kalmark.errors import LogError
+from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
+from kalmark.logs.text import nanoseconds, seconds
+from kalmark.slam.events import Control, Event, Fix, Scan, order
+
+CONTROLS = "t_s, robot, v_mps, w_radps\n0.1, rover, 0.5, 0.02\n0.2, rover, 0.5, 0.02\n"
+SCANS = "t_s,robot,sensor,id,range_m,bearing_rad\n0.2,rover,lidar,7,4.2,0.3\n0.2,rover,lidar,,3.1,-1\n"
+
+
+def native(folder: Path, **files: str) -> Path:
+    for name, text in {"controls": CONTROLS, "scans": SCANS, **files}.items():
+        (folder / f"{name}.csv").write_text(text)
+    return folder
+
+
+def same(a: np.ndarray | None, b: np.ndarray | None, shape: tuple[int, ...]) -> bool:
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(np.broadcast_to(a, shape), np.broadcast_to(b, shape))
+
+
+def equal(a: Event, b: Event) -> bool:
+    if type(a) is not type(b) or (a.t_ns, a.robot) != (b.t_ns, b.robot):
+        return False
+    if isinstance(a, Scan):
+        assert isinstance(b, Scan)
+        count, size = a.y.shape
+        ids = a.ids or (None,) * count
+        return (
+            (a.sensor, ids) == (b.sensor, b.ids)
+            and np.array_equal(a.y, b.y)
+            and same(a.cov, b.cov, (count, size, size))
+        )
+    if isinstance(a, Fix):
+        return np.array_equal(a.y, b.y) and np.array_equal(a.cov, b.cov)
+    return np.array_equal(a.u, b.u) and same(a.cov, b.cov, (len(a.u),) * 2)
+
+
+def rich_log() -> Log:
+    third = 1 / 3
+    events: list[Event] = [
+        Control(t_ns=1_600_000_000_123_456_789, robot="rover", u=(third, -1e-300)),
+        Control(t_ns=1_600_000_000_123_456_790, robot="rover", u=(0.1, 0.2), cov=[[0.1, 0.01], [0.01, third]]),
+        Control(t_ns=-5, robot="cart, blue", u=(1e-17, 2.0, np.pi)),
+        Scan(t_ns=7, robot="rover", sensor="lidar", y=[[4.2, third], [5.0, 0.1]], ids=["tree", None]),
+        Scan(t_ns=7, robot="rover", sensor="ranger", y=[[2.0]], ids=[3], cov=[[third]]),
+        Scan(t_ns=8, robot="rover", sensor="lidar", y=[[1.0, 2.0], [3.0, 4.0]], cov=[[0.1, 0.02], [0.02, 0.3]]),
+        Scan(t_ns=8, robot="cart, blue", sensor="eye", y=[[1.5, -2.5]], ids=[-4]),
+        Fix(t_ns=9, robot="rover", y=(1.0, third), cov=[[2.0, 0.1], [0.1, third]]),
+    ]
+    times = np.array([1, 2, 1_600_000_000_000_000_001])
+    return Log(
+        name="rich",
+        robots=("cart, blue", "rover"),
+        events=sorted(events, key=order),
+        truth={"rover": Trajectory(times, np.arange(9.0).reshape(3, 3) / 7)},
+        landmarks={"tree": np.array([third, 2.0]), 3: np.array([-1e-9, 4.0])},
+        gps={"rover": PositionTrack(times, np.arange(6.0).reshape(3, 2) / 7, np.array([3.78, 0.5]))},
+        control_columns={"rover": ("v_mps", "w_radps"), "cart, blue": ("dx_m", "dy_m", "dtheta_rad")},
+        sensor_columns={
+            ("rover", "lidar"): ("range_m", "bearing_rad"),
+            ("rover", "ranger"): ("range_m",),
+            ("cart, blue", "eye"): ("x_m", "y_m"),
+        },
+    )
+
+
+def assert_same_log(a: Log, b: Log) -> None:
+    assert len(a) == len(b) and all(equal(x, y) for x, y in zip(a, b, strict=True))
+    assert a.truth.keys() == b.truth.keys() and a.gps.keys() == b.gps.keys()
+    for robot, path in a.truth.items():
+        assert np.array_equal(path.t_ns, b.truth[robot].t_ns) and np.array_equal(path.poses, b.truth[robot].poses)
+    for robot, track in a.gps.items():
+        assert np.array_equal(track.t_ns, b.gps[robot].t_ns) and np.array_equal(track.xy, b.gps[robot].xy)
+        assert np.array_equal(track.antenna, b.gps[robot].antenna)
+    assert a.landmarks.keys() == b.landmarks.keys()
+    assert all(np.array_equal(position, b.landmarks[id_]) for id_, position in a.landmarks.items())
+    assert a.control_columns == b.control_columns and a.sensor_columns == b.sensor_columns
+
+
+def test_a_log_comes_back_to_the_nanosecond_and_to_the_last_bit(tmp_path: Path) -> None:
+    log = rich_log()
+    again = open_log(write_native(log, tmp_path / "log"))
+    assert again.format == "native"
+    assert again.robots == log.robots
+    assert_same_log(log, again)
+
+
+def test_poses_in_space_and_landmarks_in_space_come_back(tmp_path: Path) -> None:
+    pose = [1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8]
+    log = Log(
+        name="space",
+        robots=("r",),
+        events=[Fix(t_ns=1, robot="r", y=(1, 2, 3), cov=np.eye(3) / 3)],
+        truth={"r": Trajectory(np.array([1]), np.array([pose]))},
+        landmarks={"a": np.array([1.0, 2.0, 3.0])},
+    )
+    assert_same_log(log, open_log(write_native(log, tmp_path)))
+
+
+finite = st.floats(-1e150, 1e150)
+times = st.integers(-(2**62), 2**62)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(times, finite, finite), min_size=1, max_size=20), st.data())
+def test_any_controls_and_scans_come_back(
+    tmp_path_factory: pytest.TempPathFactory, rows: list, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("native")
+    events: list[Event] = [Control(t_ns=t, robot="r", u=(a, b)) for t, a, b in rows]
+    for t in {t for t, _, _ in rows}:
+        ids = data.draw(st.lists(st.one_of(st.integers(), st.sampled_from(["u1", "robot2"])), unique=True, max_size=4))
+        y = data.draw(st.lists(st.tuples(finite.map(abs), finite), min_size=len(ids), max_size=len(ids)))
+        if ids:
+            events.append(Scan(t_ns=t, robot="r", sensor="s", y=y, ids=ids))
+    log = Log(
+        name="any",
+        robots=("r",),
+        events=sorted(events, key=order),
+        control_columns={"r": ("v_mps", "w_radps")},
+        sensor_columns={("r", "s"): ("range_m", "bearing_rad")},
+    )
+    again = open_log(write_native(log, folder))
+    assert len(log) == len(again) and all(equal(a, b) for a, b in zip(log, again, strict=True))
+
+
+@given(times)
+def test_times_are_written_and_read_exactly(t_ns: int) -> None:
+    assert nanoseconds(seconds(t_ns)) == t_ns
+
+
+def test_times_are_read_exactly_in_every_notation() -> None:
+    assert nanoseconds("1288971842.161") == 1_288_971_842_161_000_000
+    assert nanoseconds("-0.5") == -500_000_000
+    assert nanoseconds("1e-3") == nanoseconds(".001") == nanoseconds("+0.001") == 1_000_000
+    assert nanoseconds("0.1234567894") == 123_456_789
+    for text in ("", "nan", "inf", "1,5", "one", "1e300"):
+        with pytest.raises(ValueError):
+            nanoseconds(text)
+
+
+def test_rows_of_one_robot_sensor_and_time_are_one_scan(tmp_path: Path) -> None:
+    scan = next(event for event in open_log(native(tmp_path)) if isinstance(event, Scan))
+    assert scan.ids == (7, None)
+    assert scan.y.tolist() == [[4.2, 0.3], [3.1, -1.0]]
+    assert scan.cov is None
+
+
+def test_columns_may_come_in_any_order(tmp_path: Path) -> None:
+    text = "id,bearing_rad,sensor,range_m,robot,t_s\n7,0.3,lidar,4.2,rover,0.2\n"
+    log = open_log(native(tmp_path, scans=text, controls="w_radps,t_s,v_mps,robot\n0.02,0.1,0.5,rover\n"))
+    assert log.sensor_columns == {("rover", "lidar"): ("range_m", "bearing_rad")}
+    assert log.events[1].y.tolist() == [[4.2, 0.3]]
+    assert log.events[0].u.tolist() == [0.5, 0.02]
+
+
+def test_sensors_leave_each_others_columns_empty(tmp_path: Path) -> None:
+    text = "t_s,robot,sensor,id,range_m,bearing_rad,u_px,v_px\n1,r,lidar,1,4,0.3,,\n1,r,eye,2,,,320,240\n"
+    log = open_log(native(tmp_path, scans=text))
+    assert log.sensor_columns == {("r", "lidar"): ("range_m", "bearing_rad"), ("r", "eye"): ("u_px", "v_px")}
+
+
+def test_observations_may_bring_their_own_noise_as_sigmas_or_covariance(tmp_path: Path) -> None:
+    head = "t_s,robot,sensor,id,range_m,bearing_rad"
+    by_sigma = native(
+        tmp_path, scans=f"{head},sigma_range_m,sigma_bearing_rad\n1,r,s,1,4,0.3,0.5,0.1\n1,r,s,2,4,0,1,1\n"
+    )
+    scan = open_log(by_sigma).events[-1]
+    assert np.allclose(scan.cov, [np.diag([0.25, 0.01]), np.eye(2)])
+    by_cov = native(tmp_path, scans=f"{head},cov_00,cov_01,cov_11\n1,r,s,1,4,0.3,2,0.5,1\n2,r,s,1,4,0.3,,,\n")
+    first, second = open_log(by_cov).events[-2:]
+    assert first.cov.tolist() == [[[2.0, 0.5], [0.5, 1.0]]]
+    assert second.cov is None
+
+
+def test_a_control_may_bring_its_own_noise_even_a_singular_one(tmp_path: Path) -> None:
+    text = "t_s,robot,v_mps,w_radps,sigma_v_mps,sigma_w_radps\n1,r,1,0,0.5,0\n2,r,1,0,,\n"
+    first, second = open_log(native(tmp_path, controls=text)).events[1:]
+    assert first.cov.tolist() == [[0.25, 0.0], [0.0, 0.0]]
+    assert second.cov is None
+
+
+def test_fixes_name_their_covariance_by_axis_or_by_number(tmp_path: Path) -> None:
+    for names in ("cov_xx,cov_xy,cov_yy", "cov_00,cov_01,cov_11"):
+        text = f"t_s,robot,x_m,y_m,{names}\n1,rover,3,4,2,0.5,1\n"
+        fix = open_log(native(tmp_path, fixes=text)).events[-1]
+        assert isinstance(fix, Fix)
+        assert fix.y.tolist() == [3, 4] and fix.cov.tolist() == [[2, 0.5], [0.5, 1]]
+
+
+HEAD = "t_s,robot,sensor,id,range_m,bearing_rad"
+GOOD = "0.1,rover,lidar,7,4.2,0.3"
+BAD_ROWS = {
+    "a value that is NaN": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,nan,0.3\n", 3, "range_m is 'nan'", "finite"),
+    "an infinite value": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,4,inf\n", 3, "bearing_rad is 'inf'", "finite"),
+    "text for a number": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,four,0.3\n", 3, "range_m is 'four'", "number"),
+    "an empty cell": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,,0.3\n", 3, "range_m is ''", "finite number"),
+    "a bad time": (f"{HEAD}\n{GOOD}\nsoon,rover,lidar,7,4,0.3\n", 3, "t_s is 'soon'", "seconds"),
+    "too few cells": (f"{HEAD}\n{GOOD}\n0.2,rover,li", 3, "3 cells", "expected 6"),
+    "too many cells": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,4,0.3,9\n", 3, "7 cells", "expected 6"),
+    "a negative range": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,-4.2,0.3\n", 3, "range_m is -4.2", "at least 0"),
+    "a landmark twice in a scan": (
+        f"{HEAD}\n{GOOD}\n0.1,rover,lidar,7,4,0\n",
+        3,
+        "id 7",
+        "expected each landmark once",
+    ),
+    "time running backwards": (
+        f"{HEAD}\n{GOOD}\n0.05,rover,lidar,7,4,0\n",
+        3,
+        "0.05 s after 0.1 s",
+        "never run backwards",
+    ),
+    "no robot": (f"{HEAD}\n0.1,,lidar,7,4,0\n", 2, "robot is empty", "a name"),
+    "no sensor": (f"{HEAD}\n0.1,rover,,7,4,0\n", 2, "sensor is empty", "a name"),
+    "a missing column": ("t_s,robot,sensor,range_m\n0.1,r,s,4\n", 1, "no column id", "t_s, robot, sensor, id"),
+    "a column twice": (f"{HEAD},range_m\n{GOOD},4\n", 1, "'range_m' appears 2 times", "expected"),
+    "a header and nothing else": (f"{HEAD}\n", 1, "no rows", "at least one"),
+    "an empty file": ("", 1, "empty", "expected"),
+    "blanks only": ("\n \n", 1, "empty", "expected"),
+    "a quote left open": (f'{HEAD}\n0.1,"rover,lidar,7,4.2,0.3\n', 2, "end of data", "comma separated"),
+    "half a noise": (f"{HEAD},sigma_range_m,sigma_bearing_rad\n{GOOD},0.1,\n", 2, "sigma_range_m", "sigma_bearing_rad"),
+    "noise that is negative": (f"{HEAD},sigma_range_m,sigma_bearing_rad\n{GOOD},0.1,-1\n", 2, "-1.0", "at least 0"),
+    "noise of zero": (
+        f"{HEAD},sigma_range_m,sigma_bearing_rad\n{GOOD},0.1,0\n",
+        2,
+        "eigenvalue 0",
+        "positive definite",
+    ),
+    "noise that is indefinite": (
+        f"{HEAD},cov_00,cov_01,cov_11\n{GOOD},1,2,1\n",
+        2,
+        "eigenvalue -1",
+        "positive definite",
+    ),
+    "noise with a wrong name": (f"{HEAD},cov_00,cov_01,cov_22\n{GOOD},1,0,1\n", 2, "cov_22", "cov_00, cov_01, cov_11"),
+    "noise for one of two": (
+        f"{HEAD},cov_00,cov_01,cov_11\n{GOOD},1,0,1\n0.1,rover,lidar,8,4,0,,,\n",
+        3,
+        "own noise",
+        "all",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD_ROWS)
+def test_a_bad_row_is_refused_with_file_line_value_and_expectation(what: str, tmp_path: Path) -> None:
+    text, line, value, expected = BAD_ROWS[what]
+    native(tmp_path, scans=text)
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    message = str(refused.value)
+    assert message.startswith(f"{tmp_path / 'scans.csv'}:{line}: ")
+    assert value in message and expected in message
+    assert "\n" not in message
+
+
+OTHER_FILES = {
+    "controls.csv": ("t_s,robot,v_mps,w_radps\n0.1,r,nan,0\n", 2, "v_mps is 'nan'"),
+    "controls.csv without values": ("t_s,robot,v_mps,w_radps\n0.1,r,,\n", 2, "no value in the row"),
+    "controls.csv with negative noise": ("t_s,robot,v_mps,cov_00\n0.1,r,1,-1\n", 2, "positive semidefinite"),
+    "fixes.csv": ("t_s,robot,x_m,y_m,cov_xx,cov_xy,cov_yy\n0.1,r,1,2,1,0,\n", 2, "cov_xx, cov_xy"),
+    "fixes.csv without noise": ("t_s,robot,x_m,y_m\n0.1,r,1,2\n", 1, "no column of noise"),
+    "fixes.csv with an empty noise": ("t_s,robot,x_m,y_m,sigma_x_m,sigma_y_m\n0.1,r,1,2,,\n", 2, "no noise"),
+    "truth.csv": ("t_s,robot,x_m,y_m,theta_rad\n0.1,r,1,2,x\n", 2, "theta_rad is 'x'"),
+    "truth.csv with a time twice": ("t_s,robot,x_m,y_m,theta_rad\n1,r,1,2,0\n1,r,1,2,0\n", 3, "increasing times"),
+    "truth.csv with half a pose": ("t_s,robot,x_m,y_m\n1,r,1,2\n", 1, "theta_rad"),
+    "truth.csv with a bad quaternion": ("t_s,robot,x_m,y_m,z_m,qx,qy,qz,qw\n1,r,0,0,0,0,0,0,2\n", 2, "norm 2"),
+    "landmarks.csv": ("id,x_m,y_m\n1,2,3\n1,4,5\n", 3, "already"),
+    "landmarks.csv without id": ("id,x_m,y_m\n,2,3\n", 2, "id is empty"),
+    "landmarks.csv with a typo": ("id,x_m,y_n\n1,2,3\n", 1, "did you mean 'y_n'"),
+    "gps.csv": ("t_s,robot,x_m,y_m,antenna_x_m,antenna_y_m\n1,r,0,0,1,1\n2,r,0,0,1,2\n", 3, "antenna"),
+}
+
+
+@pytest.mark.parametrize("what", OTHER_FILES)
+def test_every_other_file_is_checked_too(what: str, tmp_path: Path) -> None:
+    text, line, value = OTHER_FILES[what]
+    name = what.split(" ", maxsplit=1)[0]
+    native(tmp_path, **{name.removesuffix(".csv"): text})
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    assert str(refused.value).startswith(f"{tmp_path / name}:{line}: ")
+    assert value in str(refused.value)
+
+
+def test_a_file_cut_anywhere_inside_a_row_is_refused(tmp_path: Path) -> None:
+    whole = SCANS.rstrip("\n")
+    row = whole.rindex("\n") + 1
+    for end in range(row + 1, row + whole[row:].rindex(",") + 1):
+        native(tmp_path, scans=whole[:end])
+        with pytest.raises(LogError, match=r"scans\.csv:3: "):
+            open_log(tmp_path)
+
+
+def test_with_skip_a_bad_row_takes_its_scan_along_and_is_listed(tmp_path: Path) -> None:
+    text = f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,nan,0.3\n0.2,rover,lidar,8,4,0.3\n0.3,rover,lidar,8,4,0.3\n"
+    log = open_log(native(tmp_path, scans=text), on_error="skip")
+    scans = [event for event in log if isinstance(event, Scan)]
+    assert [scan.t_ns for scan in scans] == [100_000_000, 300_000_000]
+    assert len(log.skipped) == 2
+    assert "scans.csv:3: range_m is 'nan'" in log.skipped[0]
+    assert "t=0.200000000 s" in log.skipped[1]
+
+
+def test_a_byte_that_is_not_text_is_refused(tmp_path: Path) -> None:
+    native(tmp_path)
+    (tmp_path / "scans.csv").write_bytes(HEAD.encode() + b"\n\xff\xfe")
+    with pytest.raises(LogError, match="not text"):
+        open_log(tmp_path)
+
+
+def test_writing_replaces_an_older_log_as_a_whole(tmp_path: Path) -> None:
+    write_native(rich_log(), tmp_path)
+    small = Log("small", ("r",), [Control(t_ns=1, robot="r", u=(1.0,))], control_columns={"r": ("v_mps",)})
+    write_native(small, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["controls.csv"]
+
+
+@pytest.mark.parametrize(
+    ("events", "message"),
+    [
+        ([Scan(t_ns=1, robot="r", sensor="s", y=[[1.0]], ids=["7"])], "'7' would be read back as 7"),
+        ([Scan(t_ns=1, robot="r", sensor="s", y=[[1.0]], ids=[" a"])], "without space"),
+        ([Scan(t_ns=1, robot="r", sensor="s", y=[[1.0]])] * 2, "one at a time"),
+        ([Scan(t_ns=1, robot="r", sensor="t", y=[[1.0]])], "expected the names"),
+        ([Scan(t_ns=1, robot="r", sensor="s", y=[[1.0, 2.0]])], "its 2 numbers"),
+        ([Scan(t_ns=1, robot="r", sensor="u", y=[[1.0, 2.0]])], "another order"),
+        ([Fix(t_ns=1, robot="r", y=(1, 2), cov=[[1, 0.5], [0, 1]])], "not symmetric"),
+    ],
+)
+def test_what_would_not_come_back_is_not_written(events: list[Event], message: str, tmp_path: Path) -> None:
+    columns = {("r", "s"): ("range_m",), ("r", "u"): ("bearing_rad", "range_m")}
+    with pytest.raises(LogError, match=message):
+        write_native(Log("bad", ("r",), events, sensor_columns=columns), tmp_path / "log")
+    assert not (tmp_path / "log").exists()
