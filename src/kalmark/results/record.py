@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError
+from kalmark.logs.start import begins_at
 from kalmark.results.describe import describe
 from kalmark.results.history import Array, History, MapSnapshot, Start, padded, texts
 from kalmark.results.landmarks import MapLandmarks
@@ -64,13 +65,11 @@ def record(
 
 
 def _starts(slam: Slam, events: list[Event]) -> tuple[Start, ...]:
-    first: dict[str, int] = {}
-    for event in events:
-        first.setdefault(event.robot, event.t_ns)
+    begins = {name: begins_at(events, name, robot.motion.held) for name, robot in slam.robots.items()}
     return tuple(
-        Start(name, np.array(slam.mean(name)), np.array(slam.covariance(name)), first[name])
-        for name in slam.robots
-        if name in first
+        Start(name, np.array(slam.mean(name)), np.array(slam.covariance(name)), t_ns)
+        for name, t_ns in begins.items()
+        if t_ns is not None
     )
 
 
