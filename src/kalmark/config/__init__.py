@@ -1,6 +1,17 @@
 """Configuration: which log, which robots and sensors, which filter, with every default in one frozen model."""
 
+from kalmark.config.building import build_slam, config_dict, in_force, open_config_log, slam_from_config
 from kalmark.config.reading import load_config, resolve_config, shipped_configs
 from kalmark.config.schema import Config
 
-__all__ = ["Config", "load_config", "resolve_config", "shipped_configs"]
+__all__ = [
+    "Config",
+    "build_slam",
+    "config_dict",
+    "in_force",
+    "load_config",
+    "open_config_log",
+    "resolve_config",
+    "shipped_configs",
+    "slam_from_config",
+]

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from kalmark.config.locate import find_log
+from kalmark.config.locate import check_format, find_log
 from kalmark.config.models import Landmark, Motion, MountConfig, Sensor
 from kalmark.config.reading import did_you_mean, load_config
 from kalmark.config.schema import Config, RobotConfig, StartConfig
@@ -17,6 +17,7 @@ from kalmark.errors import ModelError
 from kalmark.filter import estimators
 from kalmark.logs import open_log
 from kalmark.logs.log import Log
+from kalmark.logs.start import true_start
 from kalmark.models import landmarks, motion, sensors
 from kalmark.slam import association
 from kalmark.slam.robot import Mount, Robot
@@ -52,9 +53,10 @@ def in_force(config: Config, log_path: str | Path | None = None) -> Config:
 
 def open_config_log(config: Config, log_path: str | Path | None = None) -> Log:
     """Return the log that a configuration names, or the one at `log_path` read in the same way."""
-    log = config.log
+    log, path = config.log, find_log(config, log_path)
+    check_format(config, path)
     return open_log(
-        find_log(config, log_path),
+        path,
         log.format,
         robots=None if log.robots is None else list(log.robots),
         from_s=log.from_s,
@@ -99,8 +101,8 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
         near = did_you_mean(name, [*config.robots])
         raise config.error(("robots",), f"got {', '.join(config.robots)}, expected {name!r} of the log, or each{near}")
     robot, path = config.robots[key], ("robots", key)
-    start, cov = _start(robot, name, log)
     moves = _build(config, (*path, "motion"), robot.motion)
+    start, cov = _start(robot, name, log, moves.held)
     columns = None if log is None else log.control_columns.get(name)
     if columns is not None and tuple(columns) != moves.columns:
         what = f"takes {', '.join(moves.columns)}, expected the log's controls {', '.join(columns)}"
@@ -120,18 +122,13 @@ def _names(config: Config, log: Log | None) -> list[str]:
     return list(log.robots)
 
 
-def _start(robot: RobotConfig, name: str, log: Log | None) -> tuple[Any, Any]:
-    """Return the start (3,) and its covariance: as configured, else the truth at the robot's first event, else 0."""
+def _start(robot: RobotConfig, name: str, log: Log | None, held: bool) -> tuple[Any, Any]:
+    """Return the start (3,) and its covariance: as configured, else the truth before the first motion, else 0."""
     if robot.start is not None:
         s: StartConfig = robot.start
         return (s.x_m, s.y_m, s.theta_rad), np.diag(np.square([s.sigma_xy_m, s.sigma_xy_m, s.sigma_theta_rad]))
-    truth = None if log is None else log.truth.get(name)
-    first = None if log is None else next((event.t_ns for event in log.events if event.robot == name), None)
-    if truth is not None and first is not None and truth.poses.shape[1] == 3:
-        pose = truth.at(np.array([first]))[0]
-        if np.isfinite(pose).all():
-            return pose, None
-    return (0.0, 0.0, 0.0), None
+    pose = None if log is None else true_start(log, name, held)
+    return ((0.0, 0.0, 0.0) if pose is None or len(pose) != 3 else pose), None
 
 
 def _mount(config: Config, path: tuple[str, ...], sensor: Sensor) -> Mount:

@@ -1,42 +1,43 @@
-"""Where a configuration's log is."""
+"""Where a configuration's log is, and whether its format takes what the configuration says of it."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
-from kalmark.config.reading import shipped_configs
+from kalmark.config.reading import did_you_mean, shipped_configs
 from kalmark.config.schema import Config
 from kalmark.errors import LogError
-from kalmark.logs.download import cache_folder
+from kalmark.logs import FORMATS, find_data
+from kalmark.logs.formats import recognise
 
 
 def find_log(config: Config, log_path: str | Path | None = None) -> Path:
     """Return where the log is: beside the configuration, in ``KALMARK_DATA``, or in the download cache.
 
-    A path given from outside (`log_path`, or an override) is looked for in the working directory instead of beside
-    the configuration.  Raises ConfigError or LogError, naming all places.
+    A path given from outside (`log_path`, an override) is looked for in the working directory instead of beside the
+    configuration.  Raises ConfigError or LogError, naming all places.
     """
-    name = log_path if log_path is not None else config.log.path
-    if name is None:
-        raise config.error(("log", "path"), "got nothing, expected the path of a log: here, or with --log PATH")
-    tried = [folder / Path(name).expanduser() for folder in _folders(config, log_path is not None)]
-    for path in tried:
-        if path.exists():
-            return path.resolve()
-    looked = ", ".join(str(path) for path in dict.fromkeys(tried))
-    hint = "" if os.environ.get("KALMARK_DATA") else " (KALMARK_DATA is not set)"
     if log_path is not None:
-        raise LogError(f"{log_path}: no such log, expected one of {looked}{hint}")
-    raise config.error(("log", "path"), f"got {name!r}, expected a log at one of {looked}{hint}")
+        return find_data(log_path).resolve()
+    if config.log.path is None:
+        raise config.error(("log", "path"), "got nothing, expected the path of a log: here, or with --log PATH")
+    own = config.file is not None and config.file not in shipped_configs().values()
+    beside = config.file.resolve().parent if config.file and own and not config.overridden("log", "path") else None
+    try:
+        return find_data(config.log.path, beside).resolve()
+    except LogError as error:
+        raise config.error(("log", "path"), str(error)) from None
 
 
-def _folders(config: Config, from_outside: bool) -> Iterator[Path]:
-    if from_outside or config.file is None or config.overridden("log", "path"):
-        yield Path.cwd()
-    elif config.file not in shipped_configs().values():
-        yield config.file.resolve().parent
-    if os.environ.get("KALMARK_DATA"):
-        yield Path(os.environ["KALMARK_DATA"])
-    yield cache_folder()
+def check_format(config: Config, path: Path) -> None:
+    """Refuse a format that does not exist and options that the log's format does not have."""
+    name = config.log.format
+    if name is not None and name not in FORMATS:
+        message = f"got {name!r}, expected one of {', '.join(FORMATS)}{did_you_mean(name, [*FORMATS])}"
+        raise config.error(("log", "format"), message)
+    entry, _ = recognise(path, name)
+    for key, value in config.log.options().items():
+        if key not in entry.options:
+            known = f"one of {', '.join(entry.options)}" if entry.options else "none"
+            message = f"got {value!r}, which logs of format {entry.name} do not take, expected {known} of their options"
+            raise config.error(("log", key), message)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, PrivateAttr, Tag
 
@@ -39,12 +39,14 @@ class LogConfig(Section):
     """lost_in_the_woods: drop observations beyond this range."""
     bearing_shift_s: Number | None = None
     """mrclam: added to the time of every observation."""
+    robot_sightings: bool | None = None
+    """mrclam: use the robots' sightings of each other (true if absent)."""
     detections: Literal["laser", "slsjf", "rfs"] | None = None
     """victoria_park: which detections."""
     steering: Literal["ascii", "mat"] | None = None
     """victoria_park: which steering calibration."""
 
-    def options(self) -> dict[str, float | str]:
+    def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""
         common = {"path", "format", "robots", "from_s", "to_s", "on_error"}
         return self.model_dump(exclude=common, exclude_none=True)
