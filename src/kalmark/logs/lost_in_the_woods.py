@@ -29,7 +29,8 @@ def find(path: Path) -> Path | None:
 def read(path: Path, request: Request, r_max: Any = None) -> Log:
     """Return the log; ranges over `r_max` m are dropped, as the course does (None: all are kept).
 
-    A control at t acts from t on and the scan at t is of the same instant; a range of 0 means "not seen".
+    A control at t acts from t on and the scan at t is of the same instant; a range of 0 means "not seen".  A scan that
+    saw nothing stays in the log, empty: the robot's path is scored there too.
     """
     limit = float("inf") if r_max is None else quantity(r_max, "r_max", 0.0)
     data = arrays(path, NAMES)
@@ -51,9 +52,8 @@ def read(path: Path, request: Request, r_max: Any = None) -> Log:
     for t, u, r, b in zip(t_ns.tolist(), controls, data["r"], data["b"], strict=True):
         events.append(Control(t_ns=t, robot=ROBOT, u=u))
         seen = np.flatnonzero((r > 0) & (r <= limit))
-        if seen.size:
-            y = np.column_stack([r[seen], b[seen]])
-            events.append(Scan(t_ns=t, robot=ROBOT, sensor=SENSOR, y=y, ids=(seen + 1).tolist()))
+        y = np.column_stack([r[seen], b[seen]])
+        events.append(Scan(t_ns=t, robot=ROBOT, sensor=SENSOR, y=y, ids=(seen + 1).tolist()))
     return Log(
         name="lost_in_the_woods",
         format="lost_in_the_woods",
