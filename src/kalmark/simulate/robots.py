@@ -17,12 +17,11 @@ import numpy.typing as npt
 from numpy.random import Generator, SeedSequence
 from scipy.spatial import cKDTree
 
+from kalmark.config.building import CLASSES
 from kalmark.config.sections import Section
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
 from kalmark.logs.log import Log, Trajectory
-from kalmark.models import motion as motions
-from kalmark.models import sensors
 from kalmark.models.landmarks import Point2D
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.worlds import SimulatedRobot, World
@@ -31,14 +30,6 @@ from kalmark.slam.events import Control, Event, Id, Scan, order
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-_MOTIONS = {"odometry_2d": motions.Odometry2D, "unicycle": motions.Unicycle, "ackermann": motions.Ackermann}
-_SENSORS = {
-    "range_bearing": sensors.RangeBearing,
-    "bearing": sensors.Bearing,
-    "range": sensors.Range,
-    "position": sensors.Position2D,
-    "range_bearing_signature": sensors.RangeBearingSignature,
-}
 _LOOK = Point2D()
 
 
@@ -109,17 +100,17 @@ def landmarks_of(world: World, rng: Generator) -> Landmarks:
 def sim_robot(name: str, robot: SimulatedRobot, dt_s: float, area: Array, rng: Generator) -> SimRobot:
     """Put a robot at its start, drawn from the start's Gaussian if it has sigmas."""
     start = robot.start
-    motion = model(robot.motion, _MOTIONS)
+    motion = model(robot.motion)
     sigma = np.array([start.sigma_xy_m, start.sigma_xy_m, start.sigma_theta_rad])
     pose = np.array([start.x_m, start.y_m, start.theta_rad]) + sigma * rng.standard_normal(3)
-    mounted = {key: (model(s, _SENSORS), mount(s)) for key, s in robot.sensors.items()}
+    mounted = {key: (model(s), mount(s)) for key, s in robot.sensors.items()}
     return SimRobot(name, motion, pose, robot.route.driver(motion, dt_s, area, rng), mounted)
 
 
-def model(section: Section, classes: dict[str, Any]) -> Any:
+def model(section: Section) -> Any:
     """Return the model that a section of the world describes."""
     keys = section.model_dump(exclude={"mount", "landmark", "association", "detector"})
-    return classes[keys.pop("type")](**keys)
+    return CLASSES[keys.pop("type")](**keys)
 
 
 def mount(section: Any) -> Array:
@@ -182,12 +173,15 @@ def measure(sensor: Any, v: Array, rng: Generator) -> Array:
     if len(v) == 0:
         return np.empty((0, len(sensor.columns)))
     e, _ = sensor.expect(v)
-    y = e + np.array([gaussian(R, rng) for R in sensor.noise(e)])
+    y = e + gaussian(sensor.noise(e), rng)
     return np.where(sensor.angular, wrap(y), y)
 
 
 def gaussian(cov: Array, rng: Generator) -> Array:
-    """Draw from a zero-mean Gaussian with a positive semidefinite covariance (n, n)."""
-    variances, axes = np.linalg.eigh(cov) if np.any(cov - np.diag(np.diagonal(cov))) else (np.diagonal(cov), None)
-    draw = np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(len(cov))
-    return draw if axes is None else axes @ draw
+    """Draw from zero-mean Gaussians with positive semidefinite covariances (..., n, n)."""
+    variances = np.einsum("...ii->...i", cov)
+    if np.count_nonzero(cov) == np.count_nonzero(variances):
+        return np.sqrt(variances) * rng.standard_normal(variances.shape)
+    variances, axes = np.linalg.eigh(cov)
+    draw = np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(variances.shape)
+    return np.einsum("...ij,...j->...i", axes, draw)

@@ -1,0 +1,73 @@
+"""`Campaign`: what N runs of each estimator gave, as figures, a table a step, and a picture."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kalmark.campaign.scoring import Scores
+from kalmark.campaign.statistics import Anees, figures
+from kalmark.results.evaluate import none_for_nan
+
+_COLUMNS = ("pose", "pose_world", "heading", "landmarks", "landmarks_world", "joint", "joint_world")
+
+
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """N runs of a world, each estimator on the same logs: `scores[estimator][run]`, `t_s` the time of each step."""
+
+    world: str
+    seed: int
+    runs: int
+    map_every: int
+    robots: tuple[str, ...]
+    t_s: tuple[float, ...]
+    scores: dict[str, tuple[Scores, ...]]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures of ``summary.json``: a section for each estimator."""
+        estimators = {name: figures(scores) for name, scores in self.scores.items()}
+        head = {"world": self.world, "seed": self.seed, "runs": self.runs, "steps": len(self.t_s)}
+        return none_for_nan({**head, "map_every": self.map_every, "estimators": estimators})
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``summary.json``, ``anees.csv`` (a row an estimator, robot and step) and ``anees.png``."""
+        from kalmark.campaign.picture import draw
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+        self._write_steps(folder / "anees.csv")
+        draw(self, folder / "anees.png")
+        return folder
+
+    def _write_steps(self, path: Path) -> None:
+        bands = [f"{name}_{what}" for name in _COLUMNS for what in ("anees", "low", "high")]
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(
+                ["estimator", "robot", "step", "t_s", "runs", *bands, "position_rmse_m", "heading_rmse_rad"]
+            )
+            for estimator, scores in self.scores.items():
+                anees = [Anees(name, scores) for name in _COLUMNS]
+                columns = [column for a in anees for column in (a.mean, a.low, a.high)]
+                columns += [_rms(scores, name) for name in ("position_m", "heading_rad")]
+                for i, robot in enumerate(self.robots):
+                    for k, t_s in enumerate(self.t_s):
+                        row = [_text(column[i, k]) for column in columns]
+                        writer.writerow([estimator, robot, k + 1, f"{t_s:.9f}", anees[0].runs[i, k], *row])
+
+
+def _rms(scores: tuple[Scores, ...], name: str) -> Any:
+    values = np.array([s.series[name] for s in scores])
+    count = np.isfinite(values).sum(axis=0)
+    return np.where(count > 0, np.sqrt(np.nansum(values**2, axis=0) / np.maximum(count, 1)), np.nan)
+
+
+def _text(value: float) -> str:
+    return f"{value:.9g}" if np.isfinite(value) else ""

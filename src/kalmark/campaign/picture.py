@@ -1,0 +1,55 @@
+"""The picture of a campaign: average NEES over time with its 95 % band, a row a quantity, a line an estimator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.campaign.statistics import DOF, Anees
+from kalmark.results.picture import COLOURS
+
+if TYPE_CHECKING:
+    from kalmark.campaign.campaign import Campaign
+
+_ROWS = {
+    "pose": "pose (3)",
+    "heading": "heading (1)",
+    "landmarks": "landmarks (2)",
+    "joint": "joint, per dimension (1)",
+}
+
+
+def draw(campaign: Campaign, path: Path) -> None:
+    """Write the picture to a PNG file.  NEES in the estimator's coordinates, robots averaged, logarithmic."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 10), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(_ROWS), 1, sharex=True)
+    for axis, name in zip(axes, _ROWS, strict=True):
+        _draw_row(axis, campaign, name)
+    axes[-1].set_xlabel("time (s)")
+    figure.suptitle(f"{campaign.world}: average NEES of {campaign.runs} runs, seed {campaign.seed}")
+    figure.savefig(path, dpi=110)
+
+
+def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
+    t_s = np.array(campaign.t_s)
+    for i, (estimator, scores) in enumerate(campaign.scores.items()):
+        anees = Anees(name, scores)
+        value, low, high = (np.nanmean(np.ma.masked_invalid(a), axis=0) for a in (anees.mean, anees.low, anees.high))
+        some = ~np.ma.getmaskarray(value)
+        label = f"{estimator} ({anees.average:.3g}; {100 * anees.inside:.0f} % inside)"
+        if i == 0:
+            axis.fill_between(t_s[some], low[some], high[some], color="0.85", linewidth=0, label="95 % band")
+        axis.plot(t_s[some], value[some], color=COLOURS[i % len(COLOURS)], linewidth=0.9, label=label)
+    axis.axhline(DOF.get(name, 1), color="0.4", linewidth=0.6)
+    axis.set_yscale("log")
+    for which in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+        which("{x:g}")
+    axis.set_ylabel(_ROWS[name])
+    axis.grid(visible=True, which="both", linewidth=0.3)
+    axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False, borderpad=0.1)

@@ -1,0 +1,94 @@
+"""The campaign's statistics against the chi-square distribution they rest on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalmark.campaign.scoring import SERIES, Scores, joint_nees, nees_of_points
+from kalmark.campaign.statistics import Anees, figures
+from kalmark.results.consistency import anees_interval, nees
+
+STEPS = 2000
+
+
+def scores(rng: np.random.Generator, scale: float = 1.0, joint_dof: float = 7.0, diverged: bool = False) -> Scores:
+    """Return independent chi-square draws at each step, times `scale`."""
+    dof = {"pose": 3, "heading": 1, "landmarks": 2, "joint": joint_dof}
+    shape = (1, STEPS)
+    series = {key: np.abs(rng.standard_normal(shape)) for key in SERIES}
+    for key in SERIES:
+        kind = key.removesuffix("_world")
+        if kind in dof:
+            series[key] = scale * rng.chisquare(dof[kind], shape)
+    series["joint_dof"] = np.full(shape, joint_dof)
+    return Scores(series, 0.3, 0.4, 5, 20.0, 10, diverged, "")
+
+
+def test_a_consistent_estimator_is_inside_its_bands_95_percent_of_the_time() -> None:
+    rng = np.random.default_rng(0)
+    f = figures([scores(rng) for _ in range(20)])
+    for name, ideal in (("pose", 3), ("heading", 1), ("landmarks", 2), ("joint", 1)):
+        assert f[f"{name}_anees"] == pytest.approx(ideal, rel=0.03)
+        assert f[f"{name}_inside"] == pytest.approx(0.95, abs=0.02)
+    assert f["position_rmse_m"] == pytest.approx(1.0, rel=0.02)
+    assert (f["landmark_rmse_m"], f["landmark_rmse_raw_m"], f["nis_per_dof"]) == pytest.approx((0.3, 0.4, 2.0))
+
+
+def test_an_overconfident_estimator_is_outside_its_bands() -> None:
+    rng = np.random.default_rng(0)
+    f = figures([scores(rng, scale=3.0) for _ in range(20)])
+    assert f["pose_anees"] == pytest.approx(9.0, rel=0.03)
+    assert f["pose_inside"] < 0.02 and f["joint_inside"] < 0.001
+
+
+def test_the_joint_band_adds_up_the_dimensions_of_maps_of_different_sizes() -> None:
+    rng = np.random.default_rng(0)
+    mixed = [scores(rng, joint_dof=float(dof)) for dof in (3, 5, 31, 75)]
+    anees = Anees("joint", mixed)
+    assert anees.average == pytest.approx(1.0, rel=0.02)
+    assert anees.inside == pytest.approx(0.95, abs=0.02)
+    low, high = anees_interval(114)
+    assert (anees.low[0, 0], anees.high[0, 0]) == pytest.approx((low / 114, high / 114))
+
+
+def test_runs_without_a_value_at_a_step_widen_its_band_and_an_empty_step_counts_nowhere() -> None:
+    rng = np.random.default_rng(0)
+    few = [scores(rng) for _ in range(4)]
+    for s in few[1:]:
+        s.series["pose"][0, 0] = np.nan
+    for s in few:
+        s.series["pose"][0, 1] = np.nan
+    anees = Anees("pose", few)
+    assert anees.runs[0, :3].tolist() == [1, 0, 4]
+    assert (anees.low[0, 0], anees.high[0, 0]) == pytest.approx(anees_interval(3, 1))
+    assert (anees.low[0, 2], anees.high[0, 2]) == pytest.approx(anees_interval(3, 4))
+    assert np.isnan([anees.mean[0, 1], anees.low[0, 1], anees.high[0, 1]]).all()
+    assert anees.average == pytest.approx(np.nanmean(anees.mean))
+
+
+def test_divergences_are_counted_and_their_reasons_kept() -> None:
+    rng = np.random.default_rng(0)
+    f = figures([scores(rng), scores(rng, diverged=True), scores(rng, diverged=True)])
+    assert (f["runs"], f["diverged"]) == (3, 2)
+    assert "stopped" not in f
+
+
+def test_the_joint_nees_is_the_quadratic_form_and_nothing_for_a_singular_covariance() -> None:
+    rng = np.random.default_rng(2)
+    A = rng.standard_normal((6, 6)) * np.logspace(-4, 3, 6)[:, None]
+    d = rng.standard_normal((2, 6)) * np.logspace(-4, 3, 6)
+    assert joint_nees(d, A @ A.T) == pytest.approx(nees(d, np.broadcast_to(A @ A.T, (2, 6, 6))), rel=1e-6)
+    A[3] = A[1] + A[2]
+    assert np.isnan(joint_nees(d, A @ A.T)).all()
+    assert np.isnan(joint_nees(d, np.zeros((6, 6)))).all()
+
+
+def test_the_nees_of_points_is_the_quadratic_form_and_nothing_where_a_covariance_is_singular() -> None:
+    rng = np.random.default_rng(3)
+    A = rng.standard_normal((50, 2, 2))
+    P, d = A @ A.swapaxes(1, 2), rng.standard_normal((50, 2))
+    P[7], P[8] = 0.0, [[1.0, 2.0], [2.0, 4.0]]
+    expected = nees(d, P)
+    assert np.isnan(expected).nonzero()[0].tolist() == [7, 8]
+    assert nees_of_points(d, P) == pytest.approx(expected, rel=1e-6, nan_ok=True)
