@@ -123,8 +123,7 @@ def test_any_controls_and_scans_come_back(
     for t in {t for t, _, _ in rows}:
         ids = data.draw(st.lists(st.one_of(st.integers(), st.sampled_from(["u1", "robot2"])), unique=True, max_size=4))
         y = data.draw(st.lists(st.tuples(finite.map(abs), finite), min_size=len(ids), max_size=len(ids)))
-        if ids:
-            events.append(Scan(t_ns=t, robot="r", sensor="s", y=y, ids=ids))
+        events.append(Scan(t_ns=t, robot="r", sensor="s", y=y, ids=ids))
     log = Log(
         name="any",
         robots=("r",),
@@ -156,6 +155,15 @@ def test_rows_of_one_robot_sensor_and_time_are_one_scan(tmp_path: Path) -> None:
     assert scan.ids == (7, None)
     assert scan.y.tolist() == [[4.2, 0.3], [3.1, -1.0]]
     assert scan.cov is None
+
+
+def test_a_row_without_id_and_values_is_a_scan_that_saw_nothing(tmp_path: Path) -> None:
+    log = open_log(native(tmp_path, scans=f"{HEAD}\n0.1,rover,lidar,,,\n{GOOD.replace('0.1', '0.2')}\n"))
+    assert [len(event.y) for event in log if isinstance(event, Scan)] == [0, 1]
+    assert log.sensor_columns == {("rover", "lidar"): ("range_m", "bearing_rad")}
+    for rows in (f"{GOOD}\n0.1,rover,lidar,,,\n", f"0.1,rover,lidar,,,\n{GOOD}\n"):
+        with pytest.raises(LogError, match=r"scans\.csv:3: an empty row and others in one scan"):
+            open_log(native(tmp_path, scans=f"{HEAD}\n{rows}"))
 
 
 def test_columns_may_come_in_any_order(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,12 @@ from kalmark.logs import Log, open_log, write_native
 from kalmark.slam.events import Control, Scan, order
 
 Data = Callable[[str], Path]
+
+
+@cache
+def opened(path: Path, **options: object) -> Log:
+    """Open a log once for all tests here, which only read it."""
+    return open_log(path, **options)
 
 
 def controls(log: Log, robot: str | None = None) -> list[Control]:
@@ -51,7 +58,7 @@ D6 = {  # odometry rows, sightings of landmarks, of robots, of nobody, truth row
 @pytest.mark.parametrize("n", D6)
 def test_mrclam_6_has_its_counts(n: int, data: Data) -> None:
     odometry, landmarks, robots, nobody, truth = D6[n]
-    log = open_log(data("mrclam/MRCLAM_Dataset6"), robots=[n])
+    log = opened(data("mrclam/MRCLAM_Dataset6"), robots=n)
     assert log.format == "mrclam" and log.robots == (f"robot{n}",)
     assert len(controls(log)) == odometry
     assert sum(sightings(log).values()) == landmarks
@@ -65,18 +72,19 @@ def test_mrclam_6_has_its_counts(n: int, data: Data) -> None:
 
 
 def test_mrclam_robots_that_sight_each_other_are_named(data: Data) -> None:
-    log = open_log(data("mrclam/MRCLAM_Dataset6"), robots=["robot4", 1])
+    log = opened(data("mrclam/MRCLAM_Dataset6"), robots=(4, 1))
     seen = sightings(log, "robot4")
     assert seen["robot1"] > 0 and not {"robot2", "robot3", "robot5"} & set(seen)
     assert log.robots == ("robot1", "robot4")
-    assert log.events == sorted(log.events, key=order)
-    alone = open_log(data("mrclam/MRCLAM_Dataset6"), robots=["robot4", 1], robot_sightings=False)
+    assert [order(event) for event in log] == sorted(order(event) for event in log)
+    alone = opened(data("mrclam/MRCLAM_Dataset9"), robots=5, robot_sightings=False)
     assert all(isinstance(id_, int) for id_ in sightings(alone))
+    assert any("robot_sightings is false" in line for line in alone.skipped)
 
 
 def test_mrclam_stamps_are_exact_and_measurements_can_be_shifted(data: Data) -> None:
     folder = data("mrclam/MRCLAM_Dataset6")
-    plain, shifted = open_log(folder, robots=4), open_log(folder, robots=4, bearing_shift_s=-0.05)
+    plain, shifted = opened(folder, robots=4), opened(folder, robots=4, bearing_shift_s=-0.05)
     stamps = [scan.t_ns for scan in scans(plain)]
     assert all(t_ns % 1_000_000 == 0 for t_ns in stamps)
     assert [scan.t_ns for scan in scans(shifted)] == [t_ns - 50_000_000 for t_ns in stamps]
@@ -84,7 +92,7 @@ def test_mrclam_stamps_are_exact_and_measurements_can_be_shifted(data: Data) -> 
 
 
 def test_mrclam_truth_has_the_gap_of_robot_4_and_ends_early_for_robot_1(data: Data) -> None:
-    log = open_log(data("mrclam/MRCLAM_Dataset6"), robots=[1, 4])
+    log = opened(data("mrclam/MRCLAM_Dataset6"), robots=(4, 1))
     gap = np.diff(log.truth["robot4"].t_ns)
     where = int(gap.argmax())
     assert 1.9e9 < gap[where] < 2.1e9
@@ -95,7 +103,7 @@ def test_mrclam_truth_has_the_gap_of_robot_4_and_ends_early_for_robot_1(data: Da
 
 
 def test_mrclam_residuals_against_truth_are_those_of_the_set(data: Data) -> None:
-    log = open_log(data("mrclam/MRCLAM_Dataset6"), robots=[2])
+    log = opened(data("mrclam/MRCLAM_Dataset6"), robots=2)
     errors = []
     for scan in scans(log):
         pose = log.truth["robot2"].at(scan.t_ns)
@@ -111,13 +119,13 @@ def test_mrclam_residuals_against_truth_are_those_of_the_set(data: Data) -> None
 def test_mrclam_9_names_the_line_whose_time_runs_backwards(data: Data) -> None:
     folder = data("mrclam/MRCLAM_Dataset9")
     for n in range(1, 5):
-        with pytest.raises(LogError, match=rf"Robot{n}_Odometry\.dat:6: time .*20? s after .*0? s, expected times"):
-            open_log(folder, robots=[n])
-    assert open_log(folder, robots=[5]).robots == ("robot5",)
+        with pytest.raises(LogError, match=rf"Robot{n}_Odometry\.dat:6: time [\d.]+ s after [\d.]+ s, expected times"):
+            opened(folder, robots=n)
+    assert opened(folder, robots=5).robots == ("robot5",)
 
 
 def test_mrclam_9_can_be_read_without_its_bad_rows(data: Data) -> None:
-    log = open_log(data("mrclam/MRCLAM_Dataset9"), on_error="skip")
+    log = opened(data("mrclam/MRCLAM_Dataset9"), on_error="skip")
     counts = {1: 10_193, 2: 9_099, 3: 9_253, 4: 4_510, 5: 10_102}
     unknown = {1: 1, 5: 1}
     for n, count in counts.items():
@@ -133,7 +141,7 @@ def test_mrclam_8_has_no_odometry_and_says_so(data: Data) -> None:
     folder = data("mrclam/MRCLAM_Dataset8")
     with pytest.raises(LogError, match=r"Robot1_Odometry\.dat: no such file, expected the odometry of robot1"):
         open_log(folder)
-    log = open_log(folder, on_error="skip")
+    log = opened(folder, on_error="skip")
     assert controls(log) == [] and len(log.landmarks) == 14
     by_robot = [605, 894, 1_973, 819, 1_294]
     listed = [line.split(": ")[1] for line in log.skipped if "barcode 61" in line]
@@ -146,26 +154,28 @@ def test_mrclam_8_has_no_odometry_and_says_so(data: Data) -> None:
 
 def test_mrclam_refuses_a_robot_it_does_not_have(data: Data) -> None:
     with pytest.raises(LogError, match="no robot 'robot7', expected one of robot1, robot2"):
-        open_log(data("mrclam/MRCLAM_Dataset6"), robots=[7])
+        opened(data("mrclam/MRCLAM_Dataset6"), robots=7)
     with pytest.raises(LogError, match="it holds the logs MRCLAM_Dataset6, MRCLAM_Dataset8, MRCLAM_Dataset9"):
-        open_log(data("mrclam"))
+        opened(data("mrclam"))
 
 
 def test_lost_in_the_woods_has_its_counts(data: Data) -> None:
-    log = open_log(data("lost_in_the_woods"))
+    log = opened(data("lost_in_the_woods"))
     assert log.format == "lost_in_the_woods"
     assert len(controls(log)) == 12_609 and sum(sightings(log).values()) == 61_086
     assert set(log.landmarks) == set(range(1, 18))
-    assert all((scan.y[:, 0] > 0).all() for scan in scans(log))
+    seen = [scan for scan in scans(log) if len(scan.y)]
+    assert all((scan.y[:, 0] > 0).all() for scan in seen)
+    assert len(scans(log)) == 12_609 and 0.005 < 1 - len(seen) / 12_609 < 0.007
     assert controls(log)[-1].t_ns == 1_260_800_000_000
     assert 0.973 < len(log.truth["robot"]) / 12_609 < 0.975
-    near = open_log(data("lost_in_the_woods/dataset2.mat"), r_max=1.0)
-    assert max(scan.y[:, 0].max() for scan in scans(near)) <= 1.0
+    near = opened(data("lost_in_the_woods/dataset2.mat"), r_max=1.0)
+    assert max(scan.y[:, 0].max() for scan in scans(near) if len(scan.y)) <= 1.0
     assert len(controls(near)) == 12_609
 
 
 def test_lost_in_the_woods_fits_its_truth_with_the_laser_ahead(data: Data) -> None:
-    log = open_log(data("lost_in_the_woods"))
+    log = opened(data("lost_in_the_woods"))
     errors = []
     for scan in scans(log)[::10]:
         x, y, theta = log.truth["robot"].at(scan.t_ns)
@@ -178,7 +188,7 @@ def test_lost_in_the_woods_fits_its_truth_with_the_laser_ahead(data: Data) -> No
 
 
 def test_freiburg_has_its_counts_and_its_odometry(data: Data) -> None:
-    log = open_log(data("freiburg_course"))
+    log = opened(data("freiburg_course"))
     assert log.format == "freiburg_course"
     assert len(controls(log)) == 331
     assert sum(sightings(log).values()) + len(log.skipped) == 1_212
@@ -189,7 +199,7 @@ def test_freiburg_has_its_counts_and_its_odometry(data: Data) -> None:
 
 
 def test_freiburg_residuals_are_small_in_the_beginning(data: Data) -> None:
-    log = open_log(data("freiburg_course/sensor_data.dat"))
+    log = opened(data("freiburg_course/sensor_data.dat"))
     path, errors = dead_reckoning(log), []
     for scan in scans(log):
         x, y, theta = path[scan.t_ns // 1_000_000_000 - 1]
@@ -202,7 +212,7 @@ def test_freiburg_residuals_are_small_in_the_beginning(data: Data) -> None:
 
 @pytest.mark.parametrize(("steering", "rows"), [("ascii", 61_763), ("mat", 61_945)])
 def test_victoria_park_has_its_counts(steering: str, rows: int, data: Data) -> None:
-    log = open_log(data("victoria_park"), steering=steering)
+    log = opened(data("victoria_park"), steering=steering)
     assert log.format == "victoria_park"
     assert len(controls(log)) == rows
     assert sum(sightings(log).values()) == 46_860 and len(scans(log)) == 7_122 and len(sightings(log)) == 299
@@ -213,7 +223,7 @@ def test_victoria_park_has_its_counts(steering: str, rows: int, data: Data) -> N
 
 
 def test_victoria_park_clocks_agree(data: Data) -> None:
-    ascii_, mat = (controls(open_log(data("victoria_park"), steering=name)) for name in ("ascii", "mat"))
+    ascii_, mat = (controls(opened(data("victoria_park"), steering=name)) for name in ("ascii", "mat"))
     assert [c.t_ns for c in ascii_] == [c.t_ns for c in mat[: len(ascii_)]]
     speed = np.array([a.u[0] - b.u[0] for a, b in zip(ascii_, mat, strict=False)])
     steering = np.array([a.u[1] - b.u[1] for a, b in zip(ascii_, mat, strict=False)])
@@ -233,11 +243,11 @@ def test_victoria_park_clocks_agree(data: Data) -> None:
 )
 def test_victoria_park_names_what_is_available(options: dict, message: str, data: Data) -> None:
     with pytest.raises(LogError, match=message):
-        open_log(data("victoria_park"), **options)
+        opened(data("victoria_park"), **options)
 
 
 def test_dlr_has_its_counts(data: Data) -> None:
-    log = open_log(data("dlr/map.circles"))
+    log = opened(data("dlr/map.circles"))
     seen = sightings(log)
     assert log.format == "dlr"
     assert len(controls(log)) == 3_297 and sum(seen.values()) == 14_745
@@ -248,7 +258,7 @@ def test_dlr_has_its_counts(data: Data) -> None:
 
 
 def test_dlr_is_turned_into_x_forward_y_left(data: Data) -> None:
-    log = open_log(data("dlr"))
+    log = opened(data("dlr"))
     x, y, theta = dead_reckoning(log)[-1]
     assert np.allclose((-y, -x, -theta), (-13.40, -9.88, 42.15), atol=0.01)
     first, scan = controls(log)[0], scans(log)[0]
@@ -263,7 +273,7 @@ def test_dlr_is_turned_into_x_forward_y_left(data: Data) -> None:
 
 
 def test_dlr_landmarks_seen_again_are_where_the_step_says(data: Data) -> None:
-    log = open_log(data("dlr"))
+    log = opened(data("dlr"))
     before: dict = {}
     errors = []
     by_time = {scan.t_ns: scan for scan in scans(log)}
@@ -281,7 +291,7 @@ def test_dlr_landmarks_seen_again_are_where_the_step_says(data: Data) -> None:
 
 @pytest.mark.parametrize("name", ["lost_in_the_woods", "dlr", "freiburg_course", "victoria_park"])
 def test_every_log_can_be_converted_to_a_native_one(name: str, data: Data, tmp_path: Path) -> None:
-    log = open_log(data(name), to_s=100.0)
+    log = opened(data(name), to_s=100.0)
     again = open_log(write_native(log, tmp_path))
     assert len(again) == len(log)
     for a, b in zip(log, again, strict=True):
@@ -304,4 +314,4 @@ def test_truncated_files_are_refused_by_file_and_line(data: Data, tmp_path: Path
         if n == 1:
             (folder / "aa3_dr.mat").write_bytes(data("victoria_park/aa3_dr.mat").read_bytes())
         with pytest.raises(LogError, match="expected"):
-            open_log(folder, **({"steering": "mat"} if n else {}))
+            opened(folder, **({"steering": "mat"} if n else {}))

@@ -113,7 +113,7 @@ def download(dataset: Dataset, root: Path, progress: Progress | None) -> None:
         with tempfile.TemporaryDirectory(dir=root, prefix=".fetching-") as aside:
             done = 0
             for file in dataset.files:
-                retrieve(file, Path(aside), Transfer(file.file, done, dataset.bytes, progress))
+                retrieve(file, Path(aside), Transfer(file, done, dataset.bytes, progress))
                 done += file.bytes
                 if file.unpack:
                     unpack(Path(aside) / file.file)
@@ -166,7 +166,7 @@ def url_of(file: DataFile) -> str:
 class Transfer:
     """Turn pooch's progress calls for one file into calls about the whole dataset."""
 
-    name: str
+    file: DataFile
     before: int
     dataset_bytes: int
     progress: Progress | None
@@ -174,14 +174,13 @@ class Transfer:
     here: int = 0
 
     def update(self, count: int) -> None:
-        """Report `count` more bytes."""
-        self.here += count
+        """Report `count` more bytes (the last chunk is counted as a full one)."""
+        self.here = min(self.here + count, self.file.bytes)
         if self.progress is not None:
-            self.progress(self.name, self.before + self.here, self.dataset_bytes)
+            self.progress(self.file.file, self.before + self.here, self.dataset_bytes)
 
     def reset(self) -> None:
-        """Start again."""
-        self.here = 0
+        """Do nothing: the end of a file, told once more."""
 
     def close(self) -> None:
         """Do nothing at the end: the dataset may go on."""

@@ -7,6 +7,8 @@
 `landmarks.csv` id, x_m, y_m[, z_m]
 `gps.csv`       t_s, robot, x_m, y_m, antenna_x_m, antenna_y_m: fixes that only score a run
 
+A row of `scans.csv` whose id and values are all empty is a scan that saw nothing.
+
 Own noise is either a column `sigma_<column>` for each column, or the upper triangle `cov_00, cov_01, cov_11, ...`
 numbered in the order of the columns (`cov_xx, cov_xy, cov_yy, ...` where they are x_m, y_m[, z_m]).
 """
@@ -79,13 +81,14 @@ def read_controls(path: Path, request: Request, columns: dict[str, tuple[str, ..
 
 @dataclass
 class Rows:
-    """Gather the observations of one scan; a bad row refuses the whole scan."""
+    """Gather the observations of one scan; a bad row refuses the whole scan, an empty one says it saw nothing."""
 
     y: list[list[float]] = field(default_factory=list)
     ids: list[Id | None] = field(default_factory=list)
     covs: list[Array | None] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
     bad: bool = False
+    empty: bool = False
 
 
 def read_scans(path: Path, request: Request, columns: dict[Any, tuple[str, ...]]) -> list[Event]:
@@ -109,6 +112,12 @@ def read_scans(path: Path, request: Request, columns: dict[Any, tuple[str, ...]]
 def add_row(rows: Rows, row: Row, request: Request, columns: dict[Any, tuple[str, ...]]) -> bool:
     """Add one row of `scans.csv` to its scan; return False if it was refused."""
     key = (row.robot, row.sensor)
+    empty = not any(row.text(name) for name in ("id", *row.table.value_columns, *row.table.noise_columns))
+    if rows.empty or (empty and rows.lines):
+        return row.refuse(request, "an empty row and others in one scan, expected it alone: the scan saw nothing")
+    if empty:
+        rows.empty = True
+        return True
     y = row.values(columns, key, request)
     if y is None:
         return False

@@ -22,9 +22,8 @@ Table = tuple[list[str], list[list[str]]]
 def write_native(log: Log, folder: Path | str) -> Path:
     """Write `log` as a native log and return its folder; files of an earlier native log there are replaced.
 
-    Files without a row are not written, and a scan without observations leaves no trace.  Raises LogError if the
-    log has something that the files cannot hold (an unnamed column, two scans of one sensor at one time, an id
-    that would be read as another).
+    Files without a row are not written.  Raises LogError if the log has something that the files cannot hold (an
+    unnamed column, two scans of one sensor at one time, an id that would be read as another).
     """
     folder = Path(folder)
     tables = {
@@ -64,8 +63,8 @@ def controls_table(log: Log) -> Table:
 
 def scans_table(log: Log) -> Table:
     """Return header and rows of scans.csv."""
-    scans = [event for event in log if isinstance(event, Scan) and len(event.y)]
-    columns = union(checked(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in scans)
+    scans = [event for event in log if isinstance(event, Scan)]
+    columns = union(checked(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in scans if len(s.y))
     noise = noise_columns((s.y.shape[1] for s in scans if s.cov is not None), columns)
     rows: list[list[str]] = []
     seen: set[tuple[int, str, str]] = set()
@@ -74,6 +73,9 @@ def scans_table(log: Log) -> Table:
         if key in seen:
             raise LogError(f"two scans of {s.robot!r} by {s.sensor!r} at t={seconds(s.t_ns)} s, expected one at a time")
         seen.add(key)
+        if len(s.y) == 0:
+            rows.append([seconds(s.t_ns), name(s.robot), name(s.sensor), "", *[""] * (len(columns) + len(noise))])
+            continue
         used, size = log.sensor_columns[s.robot, s.sensor], s.y.shape[1]
         covs = [None] * len(s.y) if s.cov is None else np.broadcast_to(s.cov, (len(s.y), size, size))
         start = [seconds(s.t_ns), name(s.robot), name(s.sensor)]
