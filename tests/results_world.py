@@ -68,7 +68,7 @@ def start_of(robots: tuple[str, ...], name: str) -> np.ndarray:
 def sight(t_ns: int, robot: str, pose: np.ndarray, points: np.ndarray, rng: np.random.Generator) -> Scan:
     d = points - pose[:2]
     distance = np.linalg.norm(d, axis=1)
-    seen = np.flatnonzero(distance < 6.0)
+    seen = np.flatnonzero((distance > 0.5) & (distance < 6.0))
     bearing = np.arctan2(d[seen, 1], d[seen, 0]) - pose[2] + 0.02 * rng.normal(size=len(seen))
     y = np.column_stack([distance[seen] + 0.05 * rng.normal(size=len(seen)), (bearing + np.pi) % (2 * np.pi) - np.pi])
     return Scan(t_ns=t_ns, robot=robot, sensor="lidar", y=y, ids=[int(i) + 1 for i in seen])

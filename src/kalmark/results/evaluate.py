@@ -16,7 +16,7 @@ from kalmark.slam.report import OUTCOMES
 if TYPE_CHECKING:
     from kalmark.results.run import Run
 
-FIX_GAP_S = 2.0  # no path is interpolated across a longer gap between scans
+FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0
 
 
@@ -28,7 +28,7 @@ def evaluate(run: Run) -> dict[str, Any]:
         "log": run.log.as_dict(),
         "estimator": run.estimator,
         "coordinates": run.coordinates,
-        "frame": run.truth.frame,
+        "frame": run.truth.frame if run.truth else None,
         "events": run.controls + len(history.t_ns) + run.fixes,
         "controls": run.controls,
         "scans": len(history.t_ns),
@@ -121,18 +121,22 @@ def path_at(history: History, robot: str, t_ns: Ints, max_gap_s: float = FIX_GAP
     return out
 
 
-def antenna_path(history: History, robot: str, fixes: Fixes) -> Array:
-    """Return where a robot's antenna was (N, 2) by the estimated path at the time of each fix, NaN where unknown."""
+def antenna_path(history: History, robot: str, fixes: Fixes) -> tuple[Array, Array]:
+    """Return where a robot's antenna was by its estimated path at the time of each fix, and its offset from the robot.
+
+    Both (N, 2) in the frame of the map, NaN where the path is not known.
+    """
     poses = path_at(history, robot, fixes.t_ns)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = fixes.antenna
-    return poses[:, :2] + np.column_stack([c * x - s * y, s * x + c * y])
+    offset = np.column_stack([c * x - s * y, s * x + c * y])
+    return poses[:, :2] + offset, offset
 
 
 def fix_distances(run: Run, robot: str) -> Array:
     """Return the distances of the fixes from the path that is aligned to them robustly (`rigid_robust`)."""
     fixes = run.truth.fixes[robot]
-    antenna = antenna_path(run.history, robot, fixes)
+    antenna, _ = antenna_path(run.history, robot, fixes)
     known = np.isfinite(antenna).all(axis=1) & np.isfinite(fixes.xy).all(axis=1)
     antenna, xy = antenna[known], fixes.xy[known]
     to_fixes = rigid_robust(antenna, xy) if len(xy) > 1 else identity()

@@ -61,12 +61,13 @@ def _truth_to_map(run: Run) -> Rigid:
 
 
 def _fixes_in_map(run: Run, robot: str) -> Array:
+    """Return where the robot was (N, 2) by each fix: aligned robustly, the antenna's offset taken off."""
     fixes = run.truth.fixes[robot]
-    antenna = antenna_path(run.history, robot, fixes)
+    antenna, offset = antenna_path(run.history, robot, fixes)
     known = np.isfinite(antenna).all(axis=1)
     if known.sum() < 2:
         return np.empty((0, 2))
-    return rigid_robust(antenna[known], fixes.xy[known]).inverse()(fixes.xy)
+    return rigid_robust(antenna[known], fixes.xy[known]).inverse()(fixes.xy[known]) - offset[known]
 
 
 def headline(run: Run) -> tuple[str, list[str]]:

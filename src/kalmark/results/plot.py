@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from kalmark.results.history import Array
@@ -18,6 +19,7 @@ from kalmark.results.picture import INK, LANDMARK_COLOUR, TRUTH_COLOUR, Picture,
 if TYPE_CHECKING:
     from kalmark.results.run import Run
 
+LONG = 3000  # a path of more steps than this is drawn thinner
 CROWD = 100  # with more landmarks than this, everything about them is drawn thinner
 
 
@@ -33,7 +35,7 @@ def draw_map(run: Run) -> Figure:
     picture = Picture.of(run)
     means, covariances = run.landmarks.positions()
     low, high = _extent(picture, means)
-    figure = Figure(figsize=_size(high - low), layout="constrained", facecolor="white")
+    figure = Figure(figsize=_size(high - low), layout=ConstrainedLayoutEngine(h_pad=0.09), facecolor="white")
     axes = figure.subplots()
     _style(axes)
     _draw_truth(axes, picture, crowded=len(means) > CROWD)
@@ -99,7 +101,7 @@ def _size(span: Array) -> tuple[float, float]:
     """Return the size of the figure in inches for an area of this width and height."""
     shape = float(np.clip(span[1] / span[0], 0.35, 1.6))
     width = 9.0 if shape <= 1 else 9.0 / shape**0.6
-    return width, width * shape + 1.5
+    return width, (width - 0.7) * shape + 1.9
 
 
 def _draw_truth(axes: Axes, picture: Picture, crowded: bool) -> None:
@@ -128,7 +130,8 @@ def _draw_robot(axes: Axes, run: Run, picture: Picture, robot: str) -> None:
     path, colour = picture.paths[robot], picture.colour(robot)
     if len(path) == 0:
         return
-    axes.plot(path[:, 0], path[:, 1], "-", color=colour, linewidth=1.0, alpha=0.9, zorder=4)
+    width = 0.8 if len(path) > LONG else 1.1
+    axes.plot(path[:, 0], path[:, 1], "-", color=colour, linewidth=width, alpha=0.9, zorder=4)
     axes.plot(*path[0, :2], "o", markerfacecolor="white", markeredgecolor=colour, markersize=7, zorder=7)
     heading = np.degrees(path[-1, 2])
     marker = (3, 0, heading - 90.0)

@@ -139,6 +139,7 @@ class _Recorder:
             skipped=[*getattr(log, "skipped", ()), *self.skipped],
             stopped=self.stopped,
             slam=self.slam,
+            source=log,
         )
 
     def _history(self) -> History:

@@ -115,7 +115,7 @@ _TEMPLATE = """<!DOCTYPE html>
 <body>
 <header><h1>{title}</h1><p class="figures">{figures}</p></header>
 <main>
-<section><h2>Map <small>3-sigma ellipses; the truth does not move</small></h2>
+<section><h2>Map <small>3-sigma ellipses; drag the slider through time</small></h2>
 <div id="map"></div>
 <div class="slider"><button id="play">Play</button><input id="time" type="range" min="0" value="0" step="1">
 <output id="now"></output></div></section>

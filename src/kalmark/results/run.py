@@ -53,8 +53,8 @@ class LogReference:
 class Run:
     """One log through one filter: the history, the final map, the truth to judge them by, the configuration.
 
-    `summary` is what `evaluate` last returned.  `slam` is the filter after the last event (read from ``map.kmk`` on
-    demand for a loaded run: see `final_slam`).
+    `summary` is what `evaluate` last returned.  `slam`, the filter after the last event, and `source`, the log itself,
+    are None in a run that was loaded; `final_slam` reads the filter from ``map.kmk``.
     """
 
     history: History
@@ -70,6 +70,7 @@ class Run:
     skipped: list[str] = field(default_factory=list)
     stopped: str = ""
     slam: Slam | None = None
+    source: Any = None
     folder: Path | None = None
     summary: dict[str, Any] = field(default_factory=dict)
 
@@ -85,7 +86,7 @@ class Run:
         if batch:
             from kalmark.results.batch import compare  # heavy, and seldom wanted
 
-            summary["batch"] = compare(self)
+            summary["batch"] = compare(self, self.source)
         elif "batch" in self.summary:
             summary["batch"] = self.summary["batch"]
         self.summary.clear()

@@ -107,13 +107,14 @@ def _outcomes(run: Run, t: Array) -> dict[str, Any]:
 
 
 def reasons(run: Run, most: int = 15) -> list[tuple[str, str, int]]:
-    """Return (outcome, reason, count) of the observations that came with a reason; numbers in it count as equal."""
-    history = run.history
-    said = Counter(
-        (outcome, re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "…", reason))
-        for outcome, reason in zip(history.outcome.tolist(), history.reason.tolist(), strict=True)
-        if reason
-    )
+    """Return the commonest (outcome, reason, count); of too many, those that differ in a number only count as one."""
+    pairs = zip(run.history.outcome.tolist(), run.history.reason.tolist(), strict=True)
+    said = Counter((outcome, reason) for outcome, reason in pairs if reason)
+    if len(said) > most:
+        merged: Counter[tuple[str, str]] = Counter()
+        for (outcome, reason), count in said.items():
+            merged[outcome, re.sub(r"(?<!\bd)\d+(\.\d+)?(e[+-]?\d+)?", "…", reason)] += count
+        said = merged
     return [(outcome, reason, count) for (outcome, reason), count in said.most_common(most)]
 
 

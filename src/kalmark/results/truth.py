@@ -57,6 +57,9 @@ class Truth:
         offset = np.zeros(3) if anchored else _offset(trajectories, history.starts)
         return cls(poses, dict(getattr(log, "landmarks", None) or {}), fixes, offset, anchored)
 
+    def __bool__(self) -> bool:
+        return bool(self.landmarks) or bool(np.isfinite(self.poses).any())
+
     @property
     def frame(self) -> str:
         """Whether the map is in the frame of the truth ("truth") or in that of the first robot's start ("start")."""

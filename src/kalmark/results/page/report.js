@@ -92,9 +92,10 @@ function drawMap() {
   if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
   const [x, y] = extent(), background = still(), slider = el("time");
   const width = el("map").clientWidth || 1080;
-  const height = Math.min(820, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 90));
+  const height = Math.min(820, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 120));
   const page = layout({height, uirevision: "map", xaxis: {...axis("x (m)"), range: x},
-                       yaxis: {...axis("y (m)"), range: y, scaleanchor: "x"}, legend: {orientation: "h", y: 1.02, yanchor: "bottom"}});
+                       yaxis: {...axis("y (m)"), range: y, scaleanchor: "x"}, margin: {l: 64, r: 16, t: 32, b: 44},
+                       legend: {orientation: "h", y: -48 / (height - 100), yanchor: "top"}});
   const show = () => {
     const map = DATA.maps[+slider.value];
     el("now").textContent = `${map.t.toFixed(1)} s · ${map.x.length} landmarks`;

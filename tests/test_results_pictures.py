@@ -1,0 +1,167 @@
+"""The two pictures of a run: they show what is there, for every kind of log."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kalmark.geometry import ellipse
+from kalmark.logs.log import Log, PositionTrack
+from kalmark.results.picture import Picture, ellipses, headline
+from kalmark.results.plot import draw_map, save_map
+from kalmark.results.record import record
+from kalmark.results.report import report_html, show
+from kalmark.results.run import Run
+from kalmark.results.series import POINTS, reasons, series
+from kalmark.slam.events import Control, Scan
+from results_world import circle, slam_for
+
+
+def recorded(log: Log, **options: Any) -> Run:
+    return record(slam_for(log, **options), log, progress=False)
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return recorded(circle(steps=60))
+
+
+def page_data(page: str) -> dict[str, Any]:
+    found = re.search(r"<script>const DATA = (.*?);</script>", page, flags=re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def test_many_ellipses_at_once_are_the_ellipses_of_the_guide() -> None:
+    rng = np.random.default_rng(1)
+    factors = rng.normal(size=(5, 2, 2))
+    covariances, means = factors @ factors.transpose(0, 2, 1), rng.normal(size=(5, 2))
+    for contour, mean, P in zip(ellipses(means, covariances), means, covariances, strict=True):
+        d = contour - mean
+        assert np.allclose(np.einsum("ni,ij,nj->n", d, np.linalg.inv(P), d), 9.0)
+        guide = ellipse(mean, P, sigmas=3, points=40)
+        assert np.allclose(np.ptp(contour, axis=0), np.ptp(guide, axis=0), rtol=0.02)
+
+
+def test_the_map_is_a_png_with_labelled_axes_in_metres(run: Run, tmp_path: Path) -> None:
+    save_map(run, tmp_path / "map.png")
+    assert (tmp_path / "map.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    figure = draw_map(run)
+    (axes,) = figure.axes
+    assert axes.get_xlabel() == "x (m)"
+    assert axes.get_ylabel() == "y (m)"
+    assert axes.get_aspect() == 1.0
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[:3] == ["estimated path", "true path", "true landmarks"]
+    assert len(axes.collections[0].get_segments()) == len(run.landmarks)
+
+
+@pytest.mark.parametrize(
+    "log",
+    [
+        circle(robots=("a", "b", "c"), steps=10),
+        circle(steps=10, truth=False),
+        circle(steps=10, truth=False, gps=True),
+        circle(steps=10, landmarks=0),
+        circle(steps=10, landmarks=600),
+    ],
+    ids=["several robots", "no truth", "position fixes", "no landmarks", "600 landmarks"],
+)
+def test_every_kind_of_run_has_its_pictures(log: Log, tmp_path: Path) -> None:
+    run = recorded(log)
+    save_map(run, tmp_path / "map.png")
+    data = page_data(report_html(run))
+    assert [robot["name"] for robot in data["robots"]] == list(log.robots)
+    assert all(("error" in robot) == bool(log.truth) for robot in data["robots"])
+    assert len(data["maps"][-1]["id"]) == len(run.landmarks)
+    assert set(data["fixes"]) == set(log.gps)
+
+
+def test_a_run_without_scans_has_its_pictures() -> None:
+    log = circle(steps=2)
+    run = record(slam_for(log), [Control(t_ns=0, robot="rover", u=(1.0, 0.0))], progress=False)
+    draw_map(run)
+    assert page_data(report_html(run))["maps"] == []
+
+
+def test_truth_is_shown_in_the_frame_of_the_map() -> None:
+    log = circle(steps=60)
+    elsewhere = recorded(log, start=(7.0, -3.0, 1.2))
+    picture = Picture.of(elsewhere)
+    gap = picture.truth["rover"] - picture.paths["rover"][:, :2]
+    assert np.linalg.norm(gap, axis=1).max() < 0.2
+    means, _ = elsewhere.landmarks.positions()
+    true = np.array([picture.landmarks[i] for i in elsewhere.landmarks.ids])
+    assert np.linalg.norm(true - means, axis=1).max() < 0.5
+
+
+def test_position_fixes_are_shown_where_the_robot_was_and_not_its_antenna() -> None:
+    log = circle(steps=300, truth=False, gps=True)
+    poses = circle(steps=300).truth["rover"].poses[::3]
+    lever = np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])]) * 2.0
+    track = log.gps["rover"]
+    log.gps["rover"] = PositionTrack(track.t_ns, track.xy + lever, np.array([2.0, 0.0]))
+    run = recorded(log)
+    fixes = Picture.of(run).fixes["rover"]
+    assert np.abs(np.linalg.norm(fixes - [0.0, 5.0], axis=1) - 5.0).max() < 0.5
+    assert run.evaluate()["fix_median_m"] < 0.2
+
+
+def test_the_report_is_one_file_that_asks_nothing_of_the_network(run: Run) -> None:
+    page = report_html(run)
+    markup = re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+    assert "http" not in markup
+    assert not re.search(r"<(link|img|iframe)\b|\bsrc=", markup)
+    assert len(page) < 8e6
+
+
+def test_text_from_a_log_cannot_break_out_of_the_page() -> None:
+    log = circle(steps=5)
+    evil = "</script><b>&"
+    events = [
+        Scan(t_ns=e.t_ns, robot="rover", sensor="lidar", y=e.y[:1], ids=[evil]) for e in log if isinstance(e, Scan)
+    ]
+    page = report_html(record(slam_for(log), events, progress=False))
+    assert evil not in page
+    assert page_data(page)["maps"][-1]["id"] == [evil]
+
+
+def test_long_logs_are_thinned_but_keep_their_end() -> None:
+    run = recorded(circle(steps=2 * POINTS + 10, landmarks=3))
+    data = series(run)
+    (robot,) = data["robots"]
+    assert POINTS / 2 < len(robot["t"]) <= POINTS + 1
+    assert len(robot["error"]) == len(robot["sigma"]) == 3
+    assert robot["t"][-1] == pytest.approx((run.history.t_ns[-1] - run.history.t_ns[0]) * 1e-9)
+    assert len(data["maps"]) <= 61
+    assert data["maps"][-1]["t"] == pytest.approx(robot["t"][-1], abs=1e-3)
+    assert sum(sum(column) for column in data["outcomes"]["counts"].values()) == len(run.history.step)
+
+
+def test_the_nis_curve_averages_to_the_figure_of_the_summary(run: Run) -> None:
+    nis = series(run)["nis"]
+    assert nis["window"] == 1
+    assert np.mean(nis["value"]) == pytest.approx(run.evaluate()["nis_per_dof"], rel=0.2)
+    assert all(low < 1 < high for low, high in zip(nis["low"], nis["high"], strict=True))
+
+
+def test_reasons_that_differ_in_a_number_are_merged_when_there_are_many(run: Run) -> None:
+    count = len(run.history.outcome)
+    run = recorded(circle(steps=60))
+    run.history.outcome[:] = "rejected"
+    object.__setattr__(run.history, "reason", np.array([f"d2 {k}.5 too large" for k in range(count)]))
+    assert reasons(run) == [("rejected", "d2 … too large", count)]
+
+
+def test_the_headline_names_the_key_figures(run: Run) -> None:
+    title, figures = headline(run)
+    assert title == "circle · invariant"
+    assert figures[:2] == [f"{len(run.landmarks)} landmarks", "60 scans"]
+    assert any(figure.startswith("position ") for figure in figures)
+    assert show(None) != show(0.0) == "0"
+    assert show(1234567.0) == "1.235e+06"
