@@ -8,20 +8,70 @@ slam.process(km.Control(t_s=0.0, robot="rover", u=(0.5, 0.02)))
 report = slam.process(km.Scan(t_s=0.1, robot="rover", sensor="lidar", y=[[4.2, 0.3]], ids=[7]))
 """
 
-from kalmark import geometry
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from kalmark.errors import KalmarkError
-from kalmark.filter import estimators
-from kalmark.models import landmarks, motion, sensors
-from kalmark.models.pointwise import pointwise
-from kalmark.slam import association
-from kalmark.slam.events import Control, Fix, Scan
-from kalmark.slam.report import Observation, Report
-from kalmark.slam.robot import Mount, Robot
-from kalmark.slam.slam import Slam
+
+if TYPE_CHECKING:
+    from kalmark import geometry
+    from kalmark.filter import estimators
+    from kalmark.logs import Log, open_log
+    from kalmark.models import landmarks, motion, sensors
+    from kalmark.models.pointwise import pointwise
+    from kalmark.results.record import record
+    from kalmark.results.run import Run
+    from kalmark.slam import association
+    from kalmark.slam.events import Control, Fix, Scan
+    from kalmark.slam.report import Observation, Report
+    from kalmark.slam.robot import Mount, Robot
+    from kalmark.slam.slam import Slam
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Control", "Fix", "KalmarkError", "Mount", "Observation", "Report", "Robot", "Scan", "Slam", "association",
-    "estimators", "geometry", "landmarks", "motion", "pointwise", "sensors",
+    "Control", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run", "Scan", "Slam",
+    "association", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise", "record", "sensors",
 ]  # fmt: skip
+
+_MODULES = {
+    "association": "kalmark.slam.association",
+    "estimators": "kalmark.filter.estimators",
+    "geometry": "kalmark.geometry",
+    "landmarks": "kalmark.models.landmarks",
+    "motion": "kalmark.models.motion",
+    "sensors": "kalmark.models.sensors",
+}
+_NAMES = {
+    "Control": "kalmark.slam.events",
+    "Fix": "kalmark.slam.events",
+    "Log": "kalmark.logs",
+    "Mount": "kalmark.slam.robot",
+    "Observation": "kalmark.slam.report",
+    "Report": "kalmark.slam.report",
+    "Robot": "kalmark.slam.robot",
+    "Run": "kalmark.results.run",
+    "Scan": "kalmark.slam.events",
+    "Slam": "kalmark.slam.slam",
+    "open_log": "kalmark.logs",
+    "pointwise": "kalmark.models.pointwise",
+    "record": "kalmark.results.record",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for on first use: the compiled models take a second that `kalmark --help` need not wait."""
+    if name in _MODULES:
+        value: Any = import_module(_MODULES[name])
+    elif name in _NAMES:
+        value = getattr(import_module(_NAMES[name]), name)
+    else:
+        raise AttributeError(f"module 'kalmark' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

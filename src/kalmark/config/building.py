@@ -106,7 +106,7 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     columns = None if log is None else log.control_columns.get(name)
     if columns is not None and tuple(columns) != moves.columns:
         what = f"takes {', '.join(moves.columns)}, expected the log's controls {', '.join(columns)}"
-        raise config.error((*path, "motion"), f"got {robot.motion.type}, which {what}")
+        raise config.error((*path, "motion", "type"), f"got {robot.motion.type}, which {what}")
     mounts = {s: _mount(config, (*path, "sensors", s), sensor) for s, sensor in robot.sensors.items()}
     return Robot(name, moves, start=start, sensors=mounts, cov=cov)
 

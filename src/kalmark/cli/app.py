@@ -1,0 +1,83 @@
+"""`kalmark`: the verbs, and the one place where errors become lines and exit statuses."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from kalmark.cli.campaign import campaign
+from kalmark.cli.check import check
+from kalmark.cli.coming import COMING, coming
+from kalmark.cli.convert import convert
+from kalmark.cli.data import data
+from kalmark.cli.demo import demo
+from kalmark.cli.evaluate import evaluate
+from kalmark.cli.report import report
+from kalmark.cli.run import run
+from kalmark.cli.simulate import simulate
+from kalmark.errors import KalmarkError
+
+USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="kalmark",
+    help="EKF-SLAM with a covariance that stays honest.",
+    epilog="CONFIG and WORLD are paths of YAML files or shipped names.  Start with: kalmark demo",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for verb in (demo, run, simulate, evaluate, report, campaign, convert, check):
+    app.command()(verb)
+app.add_typer(data, name="data")
+for name, what in COMING.items():
+    app.command(name, help=f"{what}  (coming)", context_settings={"ignore_unknown_options": True})(coming(name, what))
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"kalmark {version('kalmark')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_show_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    try:
+        return int(app(args=None if arguments is None else list(arguments), standalone_mode=False) or 0)
+    except KalmarkError as error:
+        return _refuse(" ".join(str(error).splitlines()))
+    except USAGE as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            error.show()  # type: ignore[attr-defined]
+            return 2
+        return _refuse(f"{error.format_message().rstrip('.')}; see kalmark --help")  # type: ignore[attr-defined]
+    except (KeyboardInterrupt, typer.Abort):
+        sys.stderr.write("kalmark: interrupted\n")
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 0
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _refuse(f"{error.filename}: {error.strerror}")
+
+
+def _refuse(line: str) -> int:
+    sys.stderr.write(f"kalmark: {line}\n")
+    return 2

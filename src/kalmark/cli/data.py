@@ -1,0 +1,51 @@
+"""`kalmark data`: the datasets, listed and fetched."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kalmark.cli.tables import print_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+data = typer.Typer(help="List and fetch datasets.", no_args_is_help=True)
+
+
+@data.command("list")
+def list_() -> None:
+    """List the datasets that can be fetched."""
+    from kalmark.logs.download import list_data
+
+    rows = [(d.name, f"{d.bytes / 1e6:.1f} MB", d.what, d.licence) for d in list_data()]
+    print_table("", ("name", "size", "what", "licence"), rows, align="<><<")
+
+
+@data.command()
+def fetch(name: Annotated[str, typer.Argument(help="A dataset, or a group like mrclam.")]) -> None:
+    """Download a dataset into the cache, every file checked by its hash; what KALMARK_DATA has is used from there."""
+    typer.echo(str(fetch_with_bar(name)))
+
+
+def fetch_with_bar(name: str) -> Path:
+    """Return the folder of a dataset, showing a bar while it downloads."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from kalmark.logs.download import fetch as fetch_data
+
+    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn()
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task(name, total=None)
+
+    def show(file: str, done: int, total: int) -> None:
+        bar.start()
+        bar.update(task, description=file, completed=done, total=total)
+
+    try:
+        return fetch_data(name, show)
+    finally:
+        if bar.live.is_started:
+            bar.stop()

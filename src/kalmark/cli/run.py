@@ -1,0 +1,77 @@
+"""`kalmark run`: one log through one filter."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kalmark.cli.options import Overrides, one_blas_thread, writable
+from kalmark.cli.tables import print_summary
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+SHOWN = 5
+
+
+class OnError(StrEnum):
+    """What to do with bad input."""
+
+    RAISE = "raise"
+    SKIP = "skip"
+
+
+def run_log(
+    config_path: str | Path,
+    log_path: str | Path | None = None,
+    *,
+    overrides: Sequence[str] = (),
+    on_error: str | None = None,
+    progress: bool = True,
+) -> Run:
+    """Return the run of a configuration over the log that it names, or over another one read in the same way."""
+    from kalmark import config as cfg
+    from kalmark.results.record import record
+
+    override = [] if on_error is None else [f"log.on_error={on_error}"]
+    config = cfg.in_force(cfg.load_config(config_path, [*overrides, *override]), log_path)
+    log = cfg.open_config_log(config)
+    slam = cfg.build_slam(config, log)
+    return record(slam, log, progress=progress, on_error=config.log.on_error, config=cfg.config_dict(config))
+
+
+def run(
+    config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
+    log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The run folder to write.  [default: out/CONFIG]")] = None,
+    overrides: Overrides = None,
+    on_error: Annotated[
+        OnError | None, typer.Option(help="Refuse bad input, or leave it out and list it.  [default: raise]")
+    ] = None,
+) -> None:
+    """Run one log through one filter and write a run folder."""
+    out = writable(out or Path("out") / Path(config).stem)
+    with one_blas_thread():
+        result = run_log(config, log, overrides=overrides or (), on_error=on_error.value if on_error else None)
+        summary = result.evaluate()
+        result.save(out)
+    finish(result, out, f"{Path(config).stem} on {result.log.name}")
+    if summary.get("stopped"):
+        sys.stderr.write(f"kalmark: the filter stopped: {summary['stopped']}\n")
+
+
+def finish(result: Run, out: Path, title: str) -> None:
+    """Print a run's figures, what was left out, and where the run folder is."""
+    print_summary(title, result.summary)
+    if result.skipped:
+        typer.echo(f"{len(result.skipped)} left out:")
+        for line in result.skipped[:SHOWN]:
+            typer.echo(f"  {line}")
+        if len(result.skipped) > SHOWN:
+            typer.echo("  ...")
+    typer.echo(f"{out}: map.png, report.html and the rest of the run")

@@ -1,0 +1,85 @@
+"""Figures as tables on standard output."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+TOTALS: tuple[tuple[str, str, str], ...] = (
+    ("observations", "observations", ""),
+    ("associated", "  associated", ""),
+    ("new", "  new landmarks", ""),
+    ("rejected", "  rejected by the gate", ""),
+    ("ignored", "  ignored", ""),
+    ("deferred", "  deferred", ""),
+    ("tentative", "  tentative", ""),
+    ("landmarks", "landmarks in the map", ""),
+    ("nis_per_dof", "NIS per degree of freedom", ""),
+    ("landmark_rmse_m", "landmark RMSE, aligned", "m"),
+    ("landmark_rmse_raw_m", "landmark RMSE, raw", "m"),
+    ("fix_median_m", "distance to position fixes, median", "m"),
+    ("fix_rms_10m", "distance to position fixes, RMS within 10 m", "m"),
+    ("fix_within_10m", "position fixes within 10 m", "%"),
+    ("step_us_median", "time a step, median", "us"),
+    ("step_us_p99", "time a step, 99 %", "us"),
+)
+ROBOT: tuple[tuple[str, str, str], ...] = (
+    ("ate_m", "position RMSE, aligned", "m"),
+    ("ate_raw_m", "position RMSE, raw", "m"),
+    ("heading_rmse_deg", "heading RMSE", "deg"),
+    ("pose_nees", "pose NEES (3 is consistent)", ""),
+    ("fix_median_m", "distance to position fixes, median", "m"),
+    ("fix_within_10m", "position fixes within 10 m", "%"),
+)
+_SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected"}
+
+
+def print_summary(title: str, summary: Mapping[str, Any]) -> None:
+    """Print the key figures of a run's summary."""
+    rows = [
+        (label, number(summary[key], unit), unit)
+        for key, label, unit in TOTALS
+        if summary.get(key) is not None and (summary[key] or key not in _SHOWN_IF_ANY)
+    ]
+    print_table(title, ("", "", ""), rows, align="<><")
+    robots: Mapping[str, Any] = summary.get("robots", {})
+    shown = [(key, f"{label} ({unit})" if unit else label, unit) for key, label, unit in ROBOT]
+    shown = [row for row in shown if any(figures.get(row[0]) is not None for figures in robots.values())]
+    if shown:
+        columns = ("robot", *(label for _, label, _ in shown))
+        table = [(name, *(number(f.get(key), unit) for key, _, unit in shown)) for name, f in robots.items()]
+        print_table("", columns, table, align="<" + ">" * len(shown))
+    batch: Mapping[str, Any] = summary.get("batch", {})
+    if batch:
+        print_table("against the batch solution", ("", ""), [(k, number(v)) for k, v in batch.items()], align="<>")
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:
+    """Print rows of text; `align` has one of < and > for each column.  A header appears if any column has a name."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=box.SIMPLE, show_header=any(columns))
+    for column, side in zip(columns, align, strict=True):
+        table.add_column(Text(column), justify="right" if side == ">" else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console()
+    if not console.is_terminal:
+        console.width = 140  # into a file or a pipe: whole lines
+    if title:
+        console.print(Text(title, style="bold"))
+    console.print(table)
+
+
+def number(value: Any, unit: str = "") -> str:
+    """Return a figure as a table shows it."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool | str) or (isinstance(value, int) and unit != "%"):
+        return str(value)
+    if unit == "%":
+        return f"{100 * value:.1f}"
+    return f"{value:.3f}" if abs(value) < 100 else f"{value:.0f}"
