@@ -12,7 +12,7 @@ from kalmark.filter.corrections import innovation, observed_block, residual
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry.frames import compose
 from kalmark.models.landmarks import Point2D, PointSignature2D
-from kalmark.models.observe import linearize, view_of
+from kalmark.models.observe import inverse_expectation, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.robot import Mount
@@ -36,12 +36,8 @@ class View:
         self.gate = slam.association.threshold(len(self.angular), slam.estimator.default_gate)
         self.starts = isinstance(self.sensor, FullSensor)
         self.noise_inside = self.sensor.noise_at if isinstance(self.sensor, NonAdditiveSensor) else None
-        if self.starts:
-            seen = self.sensor.invert(np.ones((1, len(self.angular))))[0].shape[1]  # type: ignore[attr-defined]
-            if seen < self.d:
-                raise ModelError(
-                    f"a {type(self.sensor).__name__} finds {seen} numbers, a {self.landmark.kind} has {self.d}"
-                )
+        if getattr(self.sensor, "code", 0) and self.d > 2 and "signature" not in self.sensor.columns:
+            raise ModelError(f"a {type(self.sensor).__name__} finds 2 numbers, a {self.landmark.kind} has {self.d}")
 
     def noise(self, map_: StochasticMap, robot: int, slots: npt.NDArray[np.int64], R: Array) -> Array:
         """Return the noise of observations of the blocks `slots`: R, or E_n N E_n' where it enters inside  [F]."""
@@ -50,6 +46,16 @@ class View:
         T, _, _ = compose(map_.mean(robot)[:3], self.at)
         l = np.array([map_.mean(s)[: self.d] for s in slots])
         return self.noise_inside(self.landmark.seen_from(T, l)[0])
+
+    def explain(self, r: Array, y: Array, R: Array) -> tuple[Array, Array, Array]:
+        """Return the landmark (n,) that explains y (1, m) from r, L_r (n, 3) and Q = L_y R L_y'.  [S] (32)-(35)."""
+        l, L_r, _, L_y = inverse_expectation(r, self.at, self.sensor, self.landmark, y)  # type: ignore[arg-type]
+        if l.shape[1] != self.d:
+            kind = type(self.sensor).__name__
+            raise ModelError(f"a {kind} finds {l.shape[1]} numbers, a {self.landmark.kind} has {self.d}")
+        if self.noise_inside is not None:
+            R = self.noise_inside(self.sensor.invert(y)[0])[0]  # type: ignore[attr-defined]
+        return l[0], L_r[0], L_y[0] @ R @ L_y[0].T
 
 
 def _natural(sensor: Any) -> Landmark:

@@ -22,7 +22,7 @@ from kalmark.filter.map import X_SIZE, StochasticMap
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.spaces import Rn
 from kalmark.models.landmarks import Point2D
-from kalmark.models.observe import fix_view, inverse_expectation
+from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import NEW, Association, ByIdentity, Decision
 from kalmark.slam.checks import covariance, measurements
@@ -241,17 +241,13 @@ class Slam:
             kind = type(view.sensor).__name__
             return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
         robot = self._slots[event.robot]
-        r = self.map.mean(robot)[:3]
-        one = event.y[k : k + 1]
-        l, L_r, _, L_y = inverse_expectation(r, view.at, view.sensor, view.landmark, one)  # type: ignore[arg-type]
-        noise = R[k] if view.noise_inside is None else view.noise_inside(view.sensor.invert(one)[0])[0]  # type: ignore[attr-defined]
-        G = self.estimator.pose_jacobian(self.map, robot, L_r[0])
-        if not (np.isfinite(l).all() and np.isfinite(G).all() and np.isfinite(L_y).all()):
+        l, L_r, Q = view.explain(self.map.mean(robot)[:3], event.y[k : k + 1], R[k])
+        if not (np.isfinite(l).all() and np.isfinite(L_r).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
         if name is NEW:
             name = self._new_name()
-        index = self.map.index(robot)[:3]
-        self._slots[name] = self.map.augment(view.landmark.space, l[0], index, G, L_y[0] @ noise @ L_y[0].T)
+        G, index = self.estimator.pose_jacobian(self.map, robot, L_r), self.map.index(robot)[:3]
+        self._slots[name] = self.map.augment(view.landmark.space, l, index, G, Q)
         self._kinds[name] = view.landmark
         self._seen[name] = 1
         return Observation(k, id_, "new", name, None, reason)

@@ -27,7 +27,13 @@ from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 
 VERSION = 1
-MODULES = {"motion": motion, "sensor": sensors, "landmark": landmarks, "estimator": estimators, "association": association}
+MODULES = {
+    "motion": motion,
+    "sensor": sensors,
+    "landmark": landmarks,
+    "estimator": estimators,
+    "association": association,
+}
 
 
 def _described(model: Any) -> dict[str, Any]:
