@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-
 settings.register_profile("patient", deadline=None)  # a first call may compile
 settings.load_profile("patient")
 
