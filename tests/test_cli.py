@@ -146,6 +146,28 @@ def test_a_campaign_prints_estimators_side_by_side(kalmark: Kalmark, tmp_path: P
     assert list(summary["estimators"]) == ["invariant", "ekf"]
 
 
+@pytest.mark.parametrize(
+    ("name", "log"),
+    [
+        ("lost_in_the_woods", "lost_in_the_woods"),
+        ("mrclam", "mrclam/MRCLAM_Dataset6"),
+        ("victoria_park_known", "victoria_park"),
+        ("dlr", "dlr"),
+        ("freiburg_course", "freiburg_course"),
+    ],
+)
+def test_a_shipped_configuration_runs_its_log_without_another_word(
+    kalmark: Kalmark, data: Callable[[str], Path], tmp_path: Path, name: str, log: str
+) -> None:
+    data(log)
+    done = kalmark("run", name, "--set", "log.to_s=60")
+    assert done.status == 0
+    summary = json.loads((tmp_path / "out" / name / "summary.json").read_text())
+    assert summary["landmarks"] >= 5
+    assert summary["associated"] > 10 * summary["rejected"]
+    assert not summary["diverged"]
+
+
 def test_data_list_names_every_dataset(kalmark: Kalmark) -> None:
     done = kalmark("data", "list")
     assert done.status == 0

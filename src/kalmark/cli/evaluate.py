@@ -13,21 +13,29 @@ from kalmark.cli.tables import print_summary
 
 
 def evaluate_run(folder: Path, truth: Path | None = None, *, batch: bool = False) -> dict[str, Any]:
-    """Return the figures of a run, judged by its own truth or by that of another log."""
-    from kalmark.results.run import Run
+    """Return the figures of a run, judged by its own truth or by that of another log.
+
+    The comparison with the batch solution is kept in the run's ``summary.json`` (if judged by its own truth).
+    """
+    from kalmark.results.run import Run, write
 
     run = Run.load(folder)
     if truth is not None:
         from kalmark.logs import open_log
 
         run = run.with_truth(open_log(truth))
-    return run.evaluate(batch=batch)
+    summary = run.evaluate(batch=batch)
+    if batch and truth is None:
+        write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    return summary
 
 
 def evaluate(
     run: RunFolder,
     truth: Annotated[Path | None, typer.Option(metavar="LOG", help="Judge by the truth of this log.")] = None,
-    batch: Annotated[bool, typer.Option("--batch", help="Compare with the batch solution of the same log.")] = False,
+    batch: Annotated[
+        bool, typer.Option("--batch", help="Compare with the batch solution, and keep that in the run.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
 ) -> None:
     """Print the figures of a run."""

@@ -28,8 +28,6 @@ ROBOT: tuple[tuple[str, str, str], ...] = (
     ("ate_raw_m", "position RMSE, raw", "m"),
     ("heading_rmse_deg", "heading RMSE", "deg"),
     ("pose_nees", "pose NEES (3 is consistent)", ""),
-    ("fix_median_m", "distance to position fixes, median", "m"),
-    ("fix_within_10m", "position fixes within 10 m", "%"),
 )
 _SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected"}
 
