@@ -58,7 +58,9 @@ def _root(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     try:
-        return int(app(args=None if arguments is None else list(arguments), standalone_mode=False) or 0)
+        return int(
+            app(args=None if arguments is None else list(arguments), prog_name="kalmark", standalone_mode=False) or 0
+        )
     except KalmarkError as error:
         return _refuse(" ".join(str(error).splitlines()))
     except USAGE as error:

@@ -40,12 +40,12 @@ def campaign(
     runs: Annotated[int, typer.Option(min=1, help="How many runs of each estimator.")],
     estimator: Annotated[
         list[str] | None,
-        typer.Option(help="invariant, ekf, fej, invariant:iterations=1; may be given again.  [default: the world's]"),
+        typer.Option(help="invariant, ekf, fej, invariant:iterations=1; may be given again. (default: the world's)"),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the campaign.")] = 0,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes. (default: one a core)")] = None,
     backend: Annotated[Backend, typer.Option(help="Who runs the processes.")] = Backend.LOKY,
-    out: Annotated[Path | None, typer.Option(help="The folder to write.  [default: out/campaign-WORLD]")] = None,
+    out: Annotated[Path | None, typer.Option(help="The folder to write. (default: out/campaign-WORLD)")] = None,
     overrides: Overrides = None,
 ) -> None:
     """Run a world many times: ANEES and its band, RMSE, divergences, estimators side by side."""

@@ -48,10 +48,10 @@ def run_log(
 def run(
     config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
     log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
-    out: Annotated[Path | None, typer.Option(help="The run folder to write.  [default: out/CONFIG]")] = None,
+    out: Annotated[Path | None, typer.Option(help="The run folder to write. (default: out/CONFIG)")] = None,
     overrides: Overrides = None,
     on_error: Annotated[
-        OnError | None, typer.Option(help="Refuse bad input, or leave it out and list it.  [default: raise]")
+        OnError | None, typer.Option(help="Refuse bad input, or leave it out and list it. (default: raise)")
     ] = None,
 ) -> None:
     """Run one log through one filter and write a run folder."""
