@@ -1,0 +1,42 @@
+"""The README, the documentation and the examples run as they are printed."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = [
+    (page, number, block)
+    for page in PAGES
+    for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.S))
+]
+
+
+def run(arguments: list[str], folder: Path) -> str:
+    done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(("page", "number", "block"), BLOCKS, ids=lambda v: getattr(v, "name", str(v)[:3].strip()))
+def test_a_page_s_code_runs(page: Path, number: int, block: str, tmp_path: Path) -> None:
+    if "data" in block and "open_log(" in block:
+        pytest.skip("needs a real log")
+    run(["-c", block], tmp_path)
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
+def test_an_example_runs(example: Path, tmp_path: Path) -> None:
+    assert run([str(example)], tmp_path)
+
+
+def test_every_page_the_documentation_points_to_exists() -> None:
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name} points to {target}"
