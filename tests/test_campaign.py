@@ -70,7 +70,8 @@ def test_on_a_nearly_linear_world_both_filters_are_consistent_and_agree(tmp_path
 
 
 def test_a_filter_told_too_little_noise_is_found_out(tmp_path: Path) -> None:
-    sure = "filter={association: {gate: off}, robots: {rover: {sensors: {tracker: {sigma_x_m: 0.05, sigma_y_m: 0.025}}}}}"
+    half = "{tracker: {sigma_x_m: 0.05, sigma_y_m: 0.025}}"
+    sure = f"filter={{association: {{gate: off}}, robots: {{rover: {{sensors: {half}}}}}}}"
     f = run_campaign(load_world(linear(tmp_path), [sure]), 20, seed=1, jobs=1).summary()["estimators"]["invariant"]
     assert f["nis_per_dof"] > 1.8
     assert f["joint_anees"] > 1.8 and f["joint_inside"] < 0.2
@@ -104,6 +105,7 @@ def test_a_saved_campaign_has_figures_a_row_a_step_and_a_picture(small: Campaign
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == small.summary()
     assert set(summary["estimators"]) == {"invariant", "ekf"}
+    assert load_world(folder / "world.yaml").model_dump() == load_world("cloister", [*FAST, "steps=40"]).model_dump()
     with (folder / "anees.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 40

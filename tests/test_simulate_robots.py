@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, scan_many, to_frame_many
@@ -184,11 +183,10 @@ def test_a_covariance_with_correlation_is_drawn_as_given() -> None:
 
 
 def test_a_simulated_log_is_written_and_read_back(tmp_path: Path) -> None:
-    native = pytest.importorskip("kalmark.logs.native")
-    open_log = pytest.importorskip("kalmark.logs.open").open_log
+    from kalmark.logs import open_log, write_native
 
     log = simulate(load_world("two_robots", ["steps=40"]), 2)
-    native.write_native(log, tmp_path / "log")
+    write_native(log, tmp_path / "log")
     back = open_log(tmp_path / "log")
     assert len(back) == len(log)
     assert all(a.t_ns == b.t_ns and type(a) is type(b) for a, b in zip(log, back, strict=True))

@@ -13,11 +13,12 @@ import pytest
 
 from kalmark.errors import ConfigError
 from kalmark.simulate import World, load_world, shipped_worlds, simulate
-from kalmark.simulate.layouts import Loop, RandomField, cloister
-from kalmark.simulate.routes import control
+from kalmark.simulate.layouts import Cloister, Listed, Loop, RandomField, cloister
+from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control
 from kalmark.simulate.worlds import merged
 
 SMALL = ["steps=20"]
+PAGE = Path(__file__).parents[1] / "docs" / "worlds.md"
 
 
 def written(tmp_path: Path, text: str) -> Path:
@@ -178,6 +179,12 @@ def test_an_unknown_world_names_the_nearest() -> None:
         load_world("cloyster")
 
 
+def test_a_world_is_written_as_a_file_and_read_back(tmp_path: Path) -> None:
+    for name in shipped_worlds():
+        world = load_world(name, ["filter={estimator: {type: fej}}"])
+        assert load_world(written(tmp_path, world.to_yaml())).model_dump() == world.model_dump()
+
+
 def test_a_world_can_be_written_in_python() -> None:
     world = World(
         world={"type": "cloister", "n": 5},
@@ -185,3 +192,25 @@ def test_a_world_can_be_written_in_python() -> None:
         steps=3,
     )
     assert len(simulate(world, 0).truth["r"]) == 4
+
+
+def test_the_page_about_worlds_names_every_world_key_and_figure() -> None:
+    from kalmark.campaign import run_campaign
+
+    page = PAGE.read_text(encoding="utf-8")
+    sections = (World, Cloister, Loop, RandomField, Listed, Constant, Waypoints, Wander, Lanes)
+    keys = {key for section in sections for key in section.model_fields} - {"type"}
+    assert not [key for key in [*keys, *shipped_worlds()] if f"`{key}`" not in page]
+    figures = run_campaign(load_world("cloister", ["steps=2"]), 1, jobs=1).summary()["estimators"]["invariant"]
+    plain = {key for key in figures if not key.endswith(("_world", "_inside"))} - {"runs", "landmarks"}
+    assert not [key for key in plain if f"`{key}`" not in page]
+
+
+def test_the_examples_on_the_page_about_worlds_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    world = load_world(written(tmp_path, page.split("```yaml")[1].split("```")[0]), SMALL)
+    assert len(simulate(world, 0).truth["rover"]) == 21
+    assert world.config().robots["rover"].motion.sigma_w_radps == 0.04
+    monkeypatch.chdir(tmp_path)
+    exec(page.split("```python")[1].split("```")[0].replace("steps=300", "steps=30"), {})
+    assert (tmp_path / "out/two_robots/map.png").exists()

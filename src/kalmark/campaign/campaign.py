@@ -19,9 +19,13 @@ _COLUMNS = ("pose", "pose_world", "heading", "landmarks", "landmarks_world", "jo
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """N runs of a world, each estimator on the same logs: `scores[estimator][run]`, `t_s` the time of each step."""
+    """N runs of a world, each estimator on the same logs: `scores[estimator][run]`, `t_s` the time of each step.
+
+    `description` is the world as it was in force, in YAML.
+    """
 
     world: str
+    description: str
     seed: int
     runs: int
     map_every: int
@@ -36,12 +40,13 @@ class Campaign:
         return none_for_nan({**head, "map_every": self.map_every, "estimators": estimators})
 
     def save(self, folder: str | Path) -> Path:
-        """Write ``summary.json``, ``anees.csv`` (a row an estimator, robot and step) and ``anees.png``."""
+        """Write ``summary.json``, ``world.yaml``, ``anees.csv`` (a row an estimator, robot and step), ``anees.png``."""
         from kalmark.campaign.picture import draw
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+        (folder / "world.yaml").write_text(self.description, encoding="utf-8")
         self._write_steps(folder / "anees.csv")
         draw(self, folder / "anees.png")
         return folder

@@ -85,6 +85,7 @@ def run_campaign(
     results = list(track(results_of(plan, runs, jobs, backend), f"campaign {world.name}", runs, show=progress))
     return Campaign(
         world=world.name,
+        description=world.to_yaml(),
         seed=seed,
         runs=runs,
         map_every=map_every,

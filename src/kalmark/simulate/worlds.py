@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from copy import deepcopy
 from importlib import resources
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
+from ruamel.yaml import YAML
 
 from kalmark.config.models import Motion, RangeBearingSignatureSensor, Sensor
 from kalmark.config.reading import resolve_name, validate
@@ -105,6 +107,13 @@ class World(Section):
         values["association"] = {"type": "identity" if self.ids else "nearest"}
         values["landmarks"] = {"type": "point_signature" if self.has_signatures else "point"}
         return validate(self._laid_over(values), Config)
+
+    def to_yaml(self) -> str:
+        """Return the text of a file that describes this world, every default written out; `load_world` reads it."""
+        yaml, out = YAML(), io.StringIO()
+        yaml.default_flow_style = False
+        yaml.dump(self.model_dump(mode="json", exclude_none=True), out)
+        return out.getvalue()
 
     def _laid_over(self, values: dict[str, Any]) -> Tree:
         """Return `values` with `filter` laid over, its keys remembering where they were written."""
