@@ -39,11 +39,11 @@ class PointwiseSensor:
     inverse: Callable[[Array], Any] | None = None
     measure_jacobian: Callable[[Array], Any] | None = None
     inverse_jacobian: Callable[[Array], Any] | None = None
-    noisy: bool = False
+    additive: bool = True
     name: str = field(default="pointwise", compare=False)
 
     def _value(self, v: Array) -> Array:
-        n = (np.zeros(len(self.R)),) if self.noisy else ()
+        n = (np.zeros(len(self.R)),) if not self.additive else ()
         return np.atleast_1d(np.asarray(self.measure(v, *n), dtype=np.float64))
 
     def expect(self, v: Array) -> tuple[Array, Array]:
@@ -125,5 +125,5 @@ def pointwise(
         inverse=inverse,
         measure_jacobian=jacobian,
         inverse_jacobian=inverse_jacobian,
-        noisy=noise_inside,
+        additive=not noise_inside,
     )

@@ -70,7 +70,15 @@ class FullSensor(Sensor, Protocol):
 
 @runtime_checkable
 class NonAdditiveSensor(Sensor, Protocol):
-    """A sensor whose noise enters inside the measurement, y = g(v, n)  [F]."""
+    """A sensor whose noise depends on what it looks at, or enters inside the measurement, y = g(v, n)  [F].
+
+    The measured values must not weigh themselves: a range noise that grows with the range, taken at the measured range,
+    trusts the short ones more and pulls every landmark nearer.
+    """
+
+    @property
+    def additive(self) -> bool:
+        """Return True if `noise` says it all."""
 
     def noise_at(self, v: Array) -> Array:
         """Return E_n N E_n' (K, m, m) at v (K, d)."""

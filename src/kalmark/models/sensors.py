@@ -69,6 +69,19 @@ class Planar:
         """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
         return expect(self.code, np.ascontiguousarray(v, dtype=np.float64))
 
+    @property
+    def additive(self) -> bool:
+        """Whether the noise is the same wherever the landmark is; if not, it is taken where the filter expects it."""
+        return getattr(self, "sigma_range_rel", 0.0) == 0.0
+
+    def noise_at(self, v: Array) -> Array:
+        """Return the noise R (K, m, m) of measuring v (K, d): of the expected range, not of the noisy one."""
+        return self.noise(self.expect(v)[0])
+
+    def noise(self, y: Array) -> Array:
+        """Return the noise R (K, m, m) of measurements y (K, m)."""
+        raise NotImplementedError
+
     def sees(self, v: Array) -> npt.NDArray[np.bool_]:
         """Return which of v (K, d) lie within the sensor's range limits and field of view."""
         distance, bearing = np.hypot(v[:, 0], v[:, 1]), np.abs(np.arctan2(v[:, 1], v[:, 0]))

@@ -35,26 +35,29 @@ class View:
         self.angular = np.array(self.sensor.angular, dtype=np.bool_)
         self.gate = slam.association.threshold(len(self.angular), slam.estimator.default_gate)
         self.starts = isinstance(self.sensor, FullSensor)
-        self.noise_inside = self.sensor.noise_at if isinstance(self.sensor, NonAdditiveSensor) else None
+        varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
+        self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
         if getattr(self.sensor, "code", 0) and self.d > 2 and "signature" not in self.sensor.columns:
             raise ModelError(f"a {type(self.sensor).__name__} finds 2 numbers, a {self.landmark.kind} has {self.d}")
 
-    def noise(self, map_: StochasticMap, robot: int, slots: npt.NDArray[np.int64], R: Array) -> Array:
-        """Return the noise of observations of the blocks `slots`: R, or E_n N E_n' where it enters inside  [F]."""
-        if self.noise_inside is None:
+    def noise(
+        self, map_: StochasticMap, robot: int, slots: npt.NDArray[np.int64], R: Array, event: Scan
+    ) -> Array:  # fmt: skip
+        """Return the noise of observations of the blocks `slots`: R, unless it depends on where they are  [F]."""
+        if self.noise_at is None or event.cov is not None:
             return R
         T, _, _ = compose(map_.mean(robot)[:3], self.at)
         l = np.array([map_.mean(s)[: self.d] for s in slots])
-        return self.noise_inside(self.landmark.seen_from(T, l)[0])
+        return self.noise_at(self.landmark.seen_from(T, l)[0])
 
-    def explain(self, r: Array, y: Array, R: Array) -> tuple[Array, Array, Array]:
+    def explain(self, r: Array, y: Array, R: Array, event: Scan) -> tuple[Array, Array, Array]:
         """Return the landmark (n,) that explains y (1, m) from r, L_r (n, 3) and Q = L_y R L_y'.  [S] (32)-(35)."""
         l, L_r, _, L_y = inverse_expectation(r, self.at, self.sensor, self.landmark, y)  # type: ignore[arg-type]
         if l.shape[1] != self.d:
             kind = type(self.sensor).__name__
             raise ModelError(f"a {kind} finds {l.shape[1]} numbers, a {self.landmark.kind} has {self.d}")
-        if self.noise_inside is not None:
-            R = self.noise_inside(self.sensor.invert(y)[0])[0]  # type: ignore[attr-defined]
+        if self.noise_at is not None and event.cov is None:
+            R = self.noise_at(self.sensor.invert(y)[0])[0]  # type: ignore[attr-defined]
         return l[0], L_r[0], L_y[0] @ R @ L_y[0].T
 
 
@@ -87,6 +90,6 @@ class Scene:
         d2 = np.empty((len(self._event.y), len(slots)))
         for k, y in enumerate(self._event.y):
             z = residual(np.broadcast_to(y, e.shape), e, view.angular)
-            R = view.noise(map_, robot, slots, np.tile(self._R[k], (len(slots), 1, 1)))
+            R = view.noise(map_, robot, slots, np.tile(self._R[k], (len(slots), 1, 1)), self._event)
             _, d2[k] = innovation(map_.P, index, E_r, E_l, R, z)
         return d2

@@ -214,7 +214,7 @@ class Slam:
         y = event.y if len(known) == len(event.y) else event.y[known]
         R = R if len(known) == len(event.y) else R[known]
         gate, robot = view.gate, self._slots[event.robot]
-        R = view.noise(self.map, robot, slots, R)
+        R = view.noise(self.map, robot, slots, R, event)
         done = self.estimator.correct(self.map, view.look, robot, slots, view.d, y, R, view.angular, gate)
         self._healthy(done.healthy, event)
         report.fill(known, done)
@@ -241,7 +241,7 @@ class Slam:
             kind = type(view.sensor).__name__
             return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
         robot = self._slots[event.robot]
-        l, L_r, Q = view.explain(self.map.mean(robot)[:3], event.y[k : k + 1], R[k])
+        l, L_r, Q = view.explain(self.map.mean(robot)[:3], event.y[k : k + 1], R[k], event)
         if not (np.isfinite(l).all() and np.isfinite(L_r).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
         if name is NEW:
