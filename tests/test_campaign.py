@@ -77,9 +77,9 @@ def test_a_filter_told_too_little_noise_is_found_out(tmp_path: Path) -> None:
     assert f["joint_anees"] > 1.8 and f["joint_inside"] < 0.2
 
 
-def test_map_and_joint_state_are_scored_every_so_many_steps_and_at_the_end(small: Campaign) -> None:
+def test_map_and_joint_state_are_scored_every_so_many_steps_and_at_the_last(small: Campaign) -> None:
     series = small.scores["invariant"][0].series
-    assert np.isfinite(series["landmarks"][0]).nonzero()[0].tolist() == [0, 10, 20, 30, 39]
+    assert np.isfinite(series["landmarks"][0]).nonzero()[0].tolist() == [9, 19, 29, 39]
     assert np.isfinite(series["position_m"]).all()
     assert series["joint_dof"][0, 39] == 3 + 2 * small.scores["invariant"][0].landmarks
 

@@ -37,6 +37,8 @@ def draw(campaign: Campaign, path: Path) -> None:
 
 
 def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     t_s = np.array(campaign.t_s)
     for i, (estimator, scores) in enumerate(campaign.scores.items()):
         anees = Anees(name, scores)
@@ -48,8 +50,9 @@ def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
         axis.plot(t_s[some], value[some], color=COLOURS[i % len(COLOURS)], linewidth=0.9, label=label)
     axis.axhline(DOF.get(name, 1), color="0.4", linewidth=0.6)
     axis.set_yscale("log")
-    for which in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
-        which("{x:g}")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
     axis.set_ylabel(_ROWS[name])
     axis.grid(visible=True, which="both", linewidth=0.3)
     axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False, borderpad=0.1)

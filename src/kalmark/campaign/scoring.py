@@ -77,7 +77,7 @@ class _Scorer:
         self.slam, self.log, self.map_every = slam, log, map_every
         self.at = {t: k for k, t in enumerate(steps)}
         self.rows = {name: i for i, name in enumerate(log.robots)}
-        self.last = max((e.t_ns for e in log.events if isinstance(e, Scan)), default=0)
+        self.last = len(steps) - 1
         shape = (len(self.rows), len(steps))
         self.truth = np.array([log.truth[name].at(np.array(steps, dtype=np.int64)) for name in self.rows])
         self.mean, self.P = np.full((*shape, 3), np.nan), np.full((*shape, 3, 3), np.nan)
@@ -96,7 +96,7 @@ class _Scorer:
                 self.nis_dof += scan.y.shape[1]
         row, k = self.rows[scan.robot], self.at[scan.t_ns]
         self.mean[row, k], self.P[row, k] = self.slam.mean(scan.robot), self.slam.covariance(scan.robot)
-        if k % self.map_every == 0 or scan.t_ns == self.last:
+        if (k + 1) % self.map_every == 0 or k == self.last:
             self._score_map(scan.robot, row, k)
 
     def _score_map(self, robot: str, row: int, k: int) -> None:
