@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.options import Overrides, writable
+from kalmark.cli.options import Overrides, announce_compilation, writable
 from kalmark.cli.tables import number, print_table
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ def campaign(
     overrides: Overrides = None,
 ) -> None:
     """Run a world many times: ANEES and its band, RMSE, divergences, estimators side by side."""
+    announce_compilation()
     from kalmark.campaign import run_campaign
     from kalmark.simulate import load_world
 

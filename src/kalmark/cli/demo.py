@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.options import one_blas_thread, writable
+from kalmark.cli.options import computing, writable
 from kalmark.cli.run import finish
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def demo(
 ) -> None:
     """Simulate Sola's cloister, map it, and write a run folder with the picture."""
     writable(out)
-    with one_blas_thread():
+    with computing():
         result = run_world("cloister", seed)
         result.save(out)
     finish(result, out, f"Sola's cloister, seed {seed}")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from kalmark.cli.options import RunFolder, one_blas_thread
+from kalmark.cli.options import RunFolder, computing
 from kalmark.cli.tables import print_summary
 
 
@@ -39,7 +39,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
 ) -> None:
     """Print the figures of a run."""
-    with one_blas_thread():
+    with computing():
         summary = evaluate_run(run, truth, batch=batch)
     if as_json:
         typer.echo(json.dumps(summary, indent=2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,13 +19,25 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that 
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Keep BLAS to one thread: the matrices of a scan are small, and threads only wait for each other."""
+def computing() -> Iterator[None]:
+    """Say so if the inner loops are yet to be compiled, and keep BLAS to one thread.
+
+    The matrices of a scan are small: with more threads, they only wait for each other.
+    """
+    announce_compilation()
     import scipy.linalg  # noqa: F401 - loads its BLAS, so that the limit takes hold of it
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1):
         yield
+
+
+def announce_compilation() -> None:
+    """Say on stderr that the first run of this version will take longer."""
+    from kalmark.compiled import cache_folder
+
+    if not Path(cache_folder()).exists():
+        sys.stderr.write("kalmark: compiling its inner loops, this once; it takes about half a minute\n")
 
 
 def writable(folder: Path) -> Path:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.options import Overrides, one_blas_thread, writable
+from kalmark.cli.options import Overrides, computing, writable
 from kalmark.cli.tables import print_summary
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def run(
 ) -> None:
     """Run one log through one filter and write a run folder."""
     out = writable(out or Path("out") / Path(config).stem)
-    with one_blas_thread():
+    with computing():
         result = run_log(config, log, overrides=overrides or (), on_error=on_error.value if on_error else None)
         summary = result.evaluate()
         result.save(out)
