@@ -1,0 +1,60 @@
+"""How far the filters are from the optimum of the same data, on the real logs.
+
+    KALMARK_DATA=... python benchmarks/filter_vs_batch.py [NAME ...] [--estimator invariant ekf]
+
+One line a log and filter: the figures of `Batch.compare`, and the wall times of the filter and of the batch solution.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from kalmark.config import load_config
+from kalmark.config.building import build_slam, open_config_log
+from kalmark.results.batch import solve_batch
+from kalmark.results.record import record
+
+CASES = {
+    "lost_in_the_woods": ("lost_in_the_woods", ()),
+    "lost_in_the_woods_3m": ("lost_in_the_woods", ("log.r_max=3.0",)),
+    "lost_in_the_woods_1m": ("lost_in_the_woods", ("log.r_max=1.0",)),
+    **{f"mrclam_{k}": ("mrclam", (f"log.robots=[{k}]",)) for k in range(1, 6)},
+    "mrclam_all": ("mrclam", ("log.robots=[1, 2, 3, 4, 5]",)),
+    "victoria_park_known": ("victoria_park_known", ()),
+    "dlr": ("dlr", ()),
+    "freiburg_course": ("freiburg_course", ()),
+}
+COLUMNS = ["sigma_ratio", "map_difference_m", "map_difference_sigma", "path_ratio", "path_difference_m"]
+COLUMNS += ["chi2_per_dof", "iterations"]
+
+
+def row(name: str, estimator: str) -> str:
+    """Run one case and return its line."""
+    config_name, overrides = CASES[name]
+    config = load_config(config_name, [*overrides, f"estimator.type={estimator}"])
+    log = open_config_log(config)
+    start = time.perf_counter()
+    run = record(build_slam(config, log), log, progress=False)
+    filtered = time.perf_counter()
+    batch = solve_batch(run, log)
+    solved = time.perf_counter()
+    figures = batch.compare(run)
+    cells = " ".join(f"{figures[c]:>20.4g}" if figures[c] is not None else f"{'-':>20}" for c in COLUMNS)
+    return f"{name:<22} {estimator:<10} {cells} {filtered - start:>8.1f} {solved - filtered:>8.1f}"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", default=[*CASES], metavar="NAME", help=", ".join(CASES))
+    parser.add_argument("--estimator", nargs="+", default=["invariant", "ekf"])
+    given = parser.parse_args()
+    print(f"{'log':<22} {'filter':<10} " + " ".join(f"{c:>20}" for c in COLUMNS) + f" {'filter_s':>8} {'batch_s':>8}")
+    for name in given.names:
+        for estimator in given.estimator:
+            print(row(name, estimator), flush=True)
+
+
+if __name__ == "__main__":
+    main()
