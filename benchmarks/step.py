@@ -84,9 +84,8 @@ def by_kernels(log: list[Step]) -> Callable[[int], None]:
         u, y, _ = log[t]
         m.x[:3], F, G = increment(m.x[:3], u)
         kernels.predict(m.P, m.n, index, F, G @ N @ G.T)
-        corrections.compiled_invariant(
-            view.look, m.x, m.P, m.n, m.blocks, m.atoms, 0, slots[t], 2, y, noise, view.angular, np.inf, 6
-        )
+        scan = (0, slots[t], 2, y, noise, view.angular, np.inf)
+        corrections.compiled_invariant(view.look, (m.x, m.P, m.n, m.blocks, m.atoms), scan, 6)
 
     return step
 

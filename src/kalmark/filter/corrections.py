@@ -1,8 +1,9 @@
 """The corrections: textbook, invariant and first-estimates, each one function from innovation to corrected map.
 
 The same source runs twice: compiled for the built-in models, as plain Python for a user's (`linearize` is the only
-place that differs).  `blocks` and `atoms` are the map's tables, `robot` and `slots` rows of `blocks`; a scan's
-observations of K landmarks are y (K, m) with noise R (K, m, m).  Nothing is changed unless all of it succeeds.
+place that differs).  A map is its mean x, covariance P with n rows in use, and tables of `blocks` and `atoms`.  A scan
+is the slot of its robot, the slots of K landmarks of which the first d numbers are seen, measurements y (K, m) with
+noise R (K, m, m), which of them are `angular`, and the gate on d2.  Nothing is changed unless all of it succeeds.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from kalmark.models.observe import linearize
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+Map = tuple[Array, Array, int, Table, Table]  # x, P, n, blocks, atoms
+Scan = tuple[int, Index, int, Array, Array, Flags, float]  # robot, slots, d, y, R, angular, gate
 
 POSE = 3  # numbers and degrees of freedom of a planar pose; its heading is the last
 HEADING = 2
@@ -156,25 +159,14 @@ def fuse(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> Array:
 
 
 def invariant(
-    view: Any,
-    x: Array,
-    P: Array,
-    n: int,
-    blocks: Table,
-    atoms: Table,
-    robot: int,
-    slots: Index,
-    d: int,
-    y: Array,
-    R: Array,
-    angular: Flags,
-    gate: float,
-    most: int,
-) -> tuple[Array, Array, Array, Array, bool]:
-    """Correct with one scan: gate, iterate, fuse, retract, transport.  MATH: the invariant filter, 1 to 3.
+    view: Any, map_: Map, scan: Scan, most: int
+) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
+    """Correct with one scan: gate, iterate, fuse, retract, transport.  docs/invariant.md.
 
     Returns e, z, Z, d2 at the prediction and whether the filter could go on; d2 <= gate were fused.
     """
+    x, P, n, blocks, atoms = map_
+    robot, slots, d, y, R, angular, gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, slots, d)
     e, E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(len(slots), d))
     z = residual(y, e, angular)
@@ -197,22 +189,11 @@ def invariant(
 
 
 def textbook(
-    view: Any,
-    x: Array,
-    P: Array,
-    n: int,
-    blocks: Table,
-    atoms: Table,
-    robot: int,
-    slots: Index,
-    d: int,
-    y: Array,
-    R: Array,
-    angular: Flags,
-    gate: float,
-    _: None,
-) -> tuple[Array, Array, Array, Array, bool]:
+    view: Any, map_: Map, scan: Scan, _: None
+) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
     """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3."""
+    x, P, n, blocks, atoms = map_
+    robot, slots, d, y, R, angular, gate = scan
     k, m = y.shape
     e, z, Z, d2 = np.empty((k, m)), np.empty((k, m)), np.empty((k, m, m)), np.empty(k)
     for i in range(k):
@@ -228,22 +209,11 @@ def textbook(
 
 
 def first_estimates(
-    view: Any,
-    x: Array,
-    P: Array,
-    n: int,
-    blocks: Table,
-    atoms: Table,
-    robot: int,
-    slots: Index,
-    d: int,
-    y: Array,
-    R: Array,
-    angular: Flags,
-    gate: float,
-    x_first: Array,
-) -> tuple[Array, Array, Array, Array, bool]:
+    view: Any, map_: Map, scan: Scan, x_first: Array
+) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
     """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
+    x, P, n, blocks, atoms = map_
+    robot, slots, d, y, R, angular, gate = scan
     k = len(slots)
     index, _, mean = observed_block(x, blocks, atoms, robot, slots, d)
     _, _, first = observed_block(x_first, blocks, atoms, robot, slots, d)

@@ -61,7 +61,7 @@ class _Estimator:
         """Fuse y (K, m), noise R (K, m, m), of the first d numbers of the blocks `slots`, where d2 <= gate."""
         m, run = map_, type(self).compiled if isinstance(view, tuple) else type(self).source
         scan = (robot, slots, d, y, R, angular, gate)
-        return Correction(*run(view, m.x, m.P, m.n, m.blocks, m.atoms, *scan, self._option(m)))
+        return Correction(*run(view, (m.x, m.P, m.n, m.blocks, m.atoms), scan, self._option(m)))
 
     def _option(self, map_: StochasticMap) -> Any:
         return None
