@@ -1,165 +1,240 @@
-"""A Slam on disk: one zip of arrays and a JSON description, never pickle, so that loading a file runs nothing of it.
+"""A Slam on disk: one zip of arrays, a JSON description and their checksums, never pickle: loading runs nothing of it.
 
-Models that are kalmark's own are written by name and parameters.  A user's model is written by its name alone: `load`
-then wants the robots again.
+The tables of the map are not written but built anew from the list of its blocks, so none can point outside its arrays.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
-import math
 import os
 import zipfile
-from collections.abc import Iterable
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from kalmark.errors import MapError
-from kalmark.filter import estimators
+from kalmark.errors import KalmarkError, MapError
+from kalmark.filter.estimators import Estimator
 from kalmark.filter.map import StochasticMap
-from kalmark.geometry.spaces import Space
-from kalmark.models import landmarks, motion, sensors
-from kalmark.slam import association
-from kalmark.slam.robot import Mount, Robot
+from kalmark.geometry.spaces import Rn, Space
+from kalmark.models.protocols import Landmark
+from kalmark.slam.association import Association
+from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
+from kalmark.slam.events import Id
+from kalmark.slam.robot import Robot
 from kalmark.slam.slam import Slam
 
-VERSION = 1
-MODULES = {
-    "motion": motion,
-    "sensor": sensors,
-    "landmark": landmarks,
-    "estimator": estimators,
-    "association": association,
-}
+Array = npt.NDArray[np.float64]
+
+VERSION = 2
+DESCRIPTION, SUMS = "slam.json", "sha256"
 
 
-def _described(model: Any) -> dict[str, Any]:
-    """Return a model as its name and those parameters that differ from the defaults."""
-    own = is_dataclass(model) and any(type(model) is getattr(m, type(model).__name__, None) for m in MODULES.values())
-    if not own:
-        return {"python": type(model).__qualname__}
-    values = {f.name: getattr(model, f.name) for f in fields(model)}
-    kept = {k: v for k, v in values.items() if not (isinstance(v, float) and not math.isfinite(v))}
-    return {"type": type(model).__name__, **kept}
-
-
-def _restored(kind: str, description: dict[str, Any]) -> Any:
-    description = dict(description)
-    if "python" in description:
-        raise MapError(f"{kind} is {description['python']}, a model of your own: give the robots to load() again")
-    name = description.pop("type")
-    model = getattr(MODULES[kind], name, None)
-    if not is_dataclass(model):
-        raise MapError(f"{kind} is {name!r}, expected one of kalmark's")
-    return model(**description)  # type: ignore[operator]
-
-
-def _robot_described(robot: Robot) -> dict[str, Any]:
-    mounts = {
-        name: {
-            "sensor": _described(mount.sensor),
-            "at": list(mount.at),
-            "landmark": None if mount.landmark is None else _described(mount.landmark),
-        }
-        for name, mount in robot.sensors.items()
-    }
-    cov = None if robot.cov is None else np.asarray(robot.cov).tolist()
-    start = {"start": list(robot.start), "cov": cov}
-    return {"name": robot.name, "motion": _described(robot.motion), **start, "sensors": mounts}
-
-
-def _robot_restored(d: dict[str, Any]) -> Robot:
-    mounts = {
-        name: Mount(
-            _restored("sensor", m["sensor"]),
-            m["at"],
-            None if m["landmark"] is None else _restored("landmark", m["landmark"]),
-        )
-        for name, m in d["sensors"].items()
-    }
-    return Robot(d["name"], _restored("motion", d["motion"]), d["start"], mounts, d["cov"])
-
-
+# ---------------------------------------------------------------------- saving
 def save(slam: Slam, path: Path) -> None:
-    """Write the state; the file appears whole or not at all."""
-    m, drives = slam.map, slam._drives
-    lower = np.tril_indices(m.n)
-    arrays: dict[str, Any] = {
-        "x": m.x[: m.x_n], "x_first": m.x_first[: m.x_n], "P": m.P[: m.n, : m.n][lower], "blocks": m.blocks,
-        "atoms": m.atoms,
-    }  # fmt: skip
-    for i, drive in enumerate(drives.values()):
-        if drive.u is not None and drive.N is not None:
-            arrays[f"u{i}"], arrays[f"N{i}"] = drive.u, drive.N
-    state = {
+    """Write the state; the file appears whole or not at all.  What a model of the user's remembers is not written."""
+    members = {DESCRIPTION: json.dumps(_state(slam), default=_item, allow_nan=False).encode()}
+    members |= {f"{name}.npy": _npy(array) for name, array in _arrays(slam)}
+    sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in members.items()).encode()
+    temporary = path.with_name(path.name + ".part")
+    try:
+        try:
+            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+                for name, data in (members | {SUMS: sums}).items():
+                    archive.writestr(name, data)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise MapError(f"{path}: {error.strerror}, expected a file that can be written") from error
+
+
+def _state(slam: Slam) -> State:
+    m, type_ = slam.map, getattr(slam, "landmark_type", None)
+    removed = {slot: kinds for kinds, slots in m._free.items() for slot in slots}
+    spaces = [Space("removed", removed[i]) if space is None else space for i, space in enumerate(m.spaces)]
+    return {
         "kalmark": VERSION,
-        "robots": [_robot_described(r) for r in slam.robots.values()],
-        "association": _described(slam.association),
-        "estimator": _described(slam.estimator),
+        "robots": [robot_described(r) for r in slam.robots.values()],
+        "association": described(slam.association),
+        "estimator": described(slam.estimator),
+        "landmarks": None if type_ is None else described(type_),
         "t_ns": slam.t_ns,
-        "n": m.n,
         "capacity": len(m.x),
-        "spaces": [None if s is None else [s.name, list(s.kinds)] for s in m.spaces],
-        "free": [[list(kinds), slots] for kinds, slots in m._free.items()],
-        "slots": [[name, slot] for name, slot in slam._slots.items()],
-        "kinds": [[name, _described(kind)] for name, kind in slam._kinds.items()],
-        "seen": [[name, count] for name, count in slam._seen.items()],
+        "blocks": [[space.name, list(space.kinds)] for space in spaces],
+        "free": list(removed),  # of each shape the last removed is the first to be filled again
+        "slots": [[_id(name), slot] for name, slot in slam._slots.items()],
+        "kinds": [[_id(name), described(kind)] for name, kind in slam._kinds.items()],
+        "seen": [[_id(name), count] for name, count in slam._seen.items()],
         "errors": slam._errors,
-        "drives": [[drive.t_ns, drive.fresh] for drive in drives.values()],
+        "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
         "unnamed": slam._unnamed,
     }
-    temporary = path.with_name(path.name + ".part")
-    with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("slam.json", json.dumps(state))
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w") as file:
-                np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
-    os.replace(temporary, path)
 
 
-def load(path: Path, robots: Iterable[Robot] | None = None) -> Slam:
-    """Read a state written by `save`."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            state = json.loads(archive.read("slam.json"))
-            arrays = {}
-            for name in archive.namelist():
-                if name.endswith(".npy"):
-                    with archive.open(name) as file:
-                        arrays[name[:-4]] = np.lib.format.read_array(file, allow_pickle=False)
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise MapError(f"{path}: {error}, expected a map written by save()") from None
-    if state.get("kalmark") != VERSION:
-        raise MapError(f"{path}: version {state.get('kalmark')!r}, expected {VERSION}")
+def _id(name: Any) -> Any:
+    name = name.item() if isinstance(name, np.generic) else name
+    if not isinstance(name, int | str):
+        raise MapError(f"landmark {name!r} cannot be saved, expected an id that is an integer or a text")
+    return name
+
+
+def _item(value: Any) -> Any:
+    """Return a NumPy number that JSON does not know."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise MapError(f"{value!r} cannot be saved, expected a number or a text")
+
+
+def _arrays(slam: Slam) -> Iterator[tuple[str, Array]]:
+    m = slam.map
+    yield "x", m.x[: m.x_n]
+    yield "x_first", m.x_first[: m.x_n]
+    yield "P", m.P[: m.n, : m.n][np.tril_indices(m.n)]
+    for i, drive in enumerate(slam._drives.values()):
+        if drive.u is not None and drive.N is not None:
+            yield f"u{i}", drive.u
+            yield f"N{i}", drive.N
+
+
+def _npy(array: Array) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.ascontiguousarray(array, dtype="<f8"), (1, 0), allow_pickle=False)
+    return file.getvalue()
+
+
+# ---------------------------------------------------------------------- loading
+def load(
+    path: Path,
+    robots: Iterable[Robot] | None = None,
+    association: Association | None = None,
+    estimator: Estimator | None = None,
+    landmarks: Landmark | None = None,
+) -> Slam:
+    """Read a state written by `save`; models of the user's own are given again.
+
+    Raises MapError if the file is damaged, lacks a model, or was saved with other robots or landmarks.
+    """
     given = None if robots is None else list(robots)
-    slam = Slam(
-        [_robot_restored(r) for r in state["robots"]] if given is None else given,
-        _restored("association", state["association"]),
-        _restored("estimator", state["estimator"]),
-    )
-    names = [r["name"] for r in state["robots"]]
-    if list(slam.robots) != names:
-        raise MapError(f"{path}: robots are {list(slam.robots)}, expected {names}")
-    _fill(slam, state, arrays)
+    try:
+        state, members = _read(path)
+        slam = Slam(
+            robots_restored(state["robots"], given),
+            association or restored("association", state["association"], "association", "association"),
+            estimator or restored("estimator", state["estimator"], "estimator", "estimator"),
+            landmark_type(state, landmarks),
+        )
+        _fill(slam, state, members, landmarks)
+    except KalmarkError as error:
+        raise MapError(f"{path}: {error}") from error
+    except OSError as error:
+        raise MapError(f"{path}: {error.strerror or error}, expected a map written by save()") from error
+    except Exception as error:  # a damaged file fails in any way: in zlib, json, numpy or a model
+        said = " ".join(str(error).split())
+        raise MapError(f"{path}: {type(error).__name__}: {said}, expected a map written by save()") from error
     return slam
 
 
-def _fill(slam: Slam, state: dict[str, Any], arrays: dict[str, Any]) -> None:
-    slam.map = m = StochasticMap(state["capacity"])
-    m.n, m.x_n = state["n"], len(arrays["x"])
-    m.x[: m.x_n], m.x_first[: m.x_n] = arrays["x"], arrays["x_first"]
-    m.P[: m.n, : m.n][np.tril_indices(m.n)] = arrays["P"]
-    m.blocks, m.atoms = arrays["blocks"].copy(), arrays["atoms"].copy()
-    m.spaces = [None if s is None else Space(s[0], tuple(s[1])) for s in state["spaces"]]
-    m._free = {tuple(kinds): slots for kinds, slots in state["free"]}
-    slam.t_ns, slam._unnamed, slam._errors = state["t_ns"], state["unnamed"], state["errors"]
-    slam._slots = dict(map(tuple, state["slots"]))
-    slam._seen = dict(map(tuple, state["seen"]))
-    mine = {type(v.landmark).__qualname__: v.landmark for v in slam._views.values()}
-    slam._kinds = {i: mine.get(d.get("python", "")) or _restored("landmark", d) for i, d in state["kinds"]}
+def _read(path: Path) -> tuple[State, dict[str, bytes]]:
+    """Return the description and the arrays' files, their checksums compared."""
+    with zipfile.ZipFile(path) as archive:
+        state = json.loads(archive.read(DESCRIPTION))
+        if state.get("kalmark") != VERSION:
+            raise MapError(f"version is {state.get('kalmark')!r}, expected {VERSION}")
+        sums = {name: sum_ for sum_, name in map(str.split, archive.read(SUMS).decode().splitlines())}
+        members = {name: archive.read(name) for name in {DESCRIPTION, *sums}}
+    for name, data in members.items():
+        if hashlib.sha256(data).hexdigest() != sums.get(name):
+            raise MapError(f"{name} is damaged: its checksum is not {sums.get(name)}")
+    return state, members
+
+
+def _array(members: dict[str, bytes], name: str, shape: tuple[int, ...]) -> Array:
+    """Return an array, its header compared with what is expected before anything is made of it."""
+    file = io.BytesIO(members[f"{name}.npy"])
+    version = np.lib.format.read_magic(file)
+    got, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    if (version, got, fortran, dtype) != ((1, 0), shape, False, np.dtype("<f8")):
+        raise MapError(f"{name} is an array {got} of {dtype}, expected {shape} of float64")
+    return np.frombuffer(file.read(), "<f8").reshape(shape).astype(np.float64)
+
+
+def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark | None) -> None:
+    slam.map = _map(state, members)
+    own = [view.landmark for view in slam._views.values()] + ([] if given is None else [given])
+    slam._kinds = {i: _kind(i, d, own) for i, d in state["kinds"]}
+    slam._slots, slam._errors = dict(map(tuple, state["slots"])), dict(state["errors"])
+    slam._seen = {i: _count(count, f"observations of {i!r}") for i, count in state["seen"]}
+    slam._unnamed = _count(state["unnamed"], "unnamed")
+    slam.t_ns = _time(state["t_ns"])
+    _check_owners(slam)
     for i, (drive, (t_ns, fresh)) in enumerate(zip(slam._drives.values(), state["drives"], strict=True)):
-        drive.t_ns, drive.fresh = t_ns, fresh
-        drive.u, drive.N = arrays.get(f"u{i}"), arrays.get(f"N{i}")
+        drive.t_ns, drive.fresh, k = _time(t_ns), bool(fresh), len(drive.motion.columns)
+        if f"u{i}.npy" in members:
+            drive.u, drive.N = _array(members, f"u{i}", (k,)), _array(members, f"N{i}", (k, k))
+
+
+def _map(state: State, members: dict[str, bytes]) -> StochasticMap:
+    """Build the map again block by block, then remove what was removed: its tables fit each other by construction."""
+    spaces = [Space(str(name), tuple(kinds)) for name, kinds in state["blocks"]]
+    n, x_n, capacity = sum(s.dof for s in spaces), sum(s.size for s in spaces), state["capacity"]
+    if type(capacity) is not int or not max(n, x_n) <= capacity <= max(1024, 2 * n, 2 * x_n):
+        raise MapError(f"capacity is {capacity!r}, expected at least {max(n, x_n)} for the blocks of the map")
+    m = StochasticMap(capacity)
+    x, x_first, P = _array(members, "x", (x_n,)), _array(members, "x_first", (x_n,)), n * (n + 1) // 2
+    lower = _array(members, "P", (P,))
+    for space in spaces:
+        m.add(space, np.zeros(space.size))
+    for slot in state["free"]:
+        if _count(slot, "removed slot") >= len(spaces) or m.spaces[slot] is None:
+            raise MapError(f"removed slot is {slot}, expected each one of {len(spaces)} once")
+        m.remove(slot)
+    m.x[:x_n], m.x_first[:x_n] = x, x_first
+    m.P[:n, :n][np.tril_indices(n)] = lower
+    return m
+
+
+def _kind(name: Id, description: State, own: list[Landmark]) -> Landmark:
+    """Return the type of a landmark: the user's own, if it is that, or one of kalmark's."""
+    for landmark in own:
+        if same(landmark, description):
+            return landmark
+    return restored("landmark", description, f"landmark {name!r}", "landmarks")
+
+
+def _check_owners(slam: Slam) -> None:
+    """Refuse a map whose blocks are not each one robot, one landmark or one control's error, of their shapes."""
+    spaces: dict[Id, Space] = {name: robot.motion.space for name, robot in slam.robots.items()}
+    spaces |= {name: kind.space for name, kind in slam._kinds.items()}
+    if (
+        slam.robots.keys() & slam._kinds.keys()
+        or spaces.keys() != slam._slots.keys()
+        or not spaces.keys() >= slam._seen.keys()
+    ):
+        raise MapError("the slots' names are not those of the robots and landmarks")
+    owners = [(f"{name!r}", slot, spaces[name]) for name, slot in slam._slots.items()]
+    for name, slot in slam._errors.items():
+        owners.append((f"the error of {name!r}", slot, Rn(len(slam.robots[name].motion.columns))))
+    used = [i for i, space in enumerate(slam.map.spaces) if space is not None]
+    if sorted(_count(slot, f"slot of {what}") for what, slot, _ in owners) != used:
+        raise MapError(f"the slots of the map are not used once each: {len(owners)} names, {len(used)} blocks")
+    for what, slot, space in owners:
+        block = slam.map.spaces[slot]
+        if block is None or block.kinds != space.kinds:
+            raise MapError(f"{what} is a {space.name} of {space.size} numbers, its block in the map is {block}")
+
+
+def _count(value: Any, what: str) -> int:
+    if type(value) is not int or value < 0:
+        raise MapError(f"{what} is {value!r}, expected an integer of at least 0")
+    return value
+
+
+def _time(value: Any) -> int | None:
+    if value is not None and type(value) is not int:
+        raise MapError(f"t_ns is {value!r}, expected an integer or none")
+    return value

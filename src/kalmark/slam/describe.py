@@ -1,0 +1,128 @@
+"""Models and robots as JSON: kalmark's own by name and parameters, a user's by its name alone, to be given again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from kalmark.errors import MapError
+from kalmark.filter import estimators
+from kalmark.models import landmarks, motion, sensors
+from kalmark.models.protocols import Landmark
+from kalmark.slam import association
+from kalmark.slam.robot import Mount, Robot
+
+State = dict[str, Any]
+
+MODULES = {
+    "motion": (motion, "move"),
+    "sensor": (sensors, "expect"),
+    "landmark": (landmarks, "seen_from"),
+    "estimator": (estimators, "correct"),
+    "association": (association, "associate"),
+}
+NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
+
+
+def described(model: Any) -> State:
+    """Return a model as its name and parameters, one of the user's as its name."""
+    name = type(model).__name__
+    if not is_dataclass(model) or not any(type(model) is getattr(m, name, None) for m, _ in MODULES.values()):
+        return {"python": name, "kind": str(getattr(model, "kind", ""))}
+    return {"type": name, **{f.name: _plain(getattr(model, f.name)) for f in fields(model)}}
+
+
+def _plain(value: Any) -> Any:
+    """Return NumPy's numbers as Python's, and those JSON has no word for as text."""
+    value = value.item() if isinstance(value, np.generic) else value
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def restored(kind: str, description: State, what: str, argument: str) -> Any:
+    """Make a model of kalmark's again; of the user's own, say which argument of `load` has to give it."""
+    if "python" in description:
+        raise MapError(f"{what} is {_name(description)}, a model of your own: give the {argument} to load() again")
+    module, method = MODULES[kind]
+    model = getattr(module, description["type"], None)
+    if not isinstance(model, type) or not is_dataclass(model) or not hasattr(model, method):
+        raise MapError(f"{what} is {description['type']!r}, expected one of kalmark's")
+    parameters = {k: v for k, v in description.items() if k != "type"}
+    return model(**{k: float(v) if v in NOT_FINITE else v for k, v in parameters.items()})
+
+
+def _name(description: State) -> str:
+    return str(description.get("type") or description["python"])
+
+
+def same(landmark: Any, description: State | None) -> bool:
+    """Return whether a landmark type is the one that was saved."""
+    if description is None:
+        return False
+    mine = described(landmark)
+    return _name(mine) == _name(description) and mine.get("kind") == description.get("kind")
+
+
+def robot_described(robot: Robot) -> State:
+    """Return a robot with its motion, its start and its mounted sensors."""
+    mounts = [
+        [
+            name,
+            {
+                "sensor": described(mount.sensor),
+                "at": list(mount.at),
+                "landmark": None if mount.landmark is None else described(mount.landmark),
+            },
+        ]
+        for name, mount in robot.sensors.items()
+    ]
+    cov = None if robot.cov is None else np.asarray(robot.cov).tolist()
+    moved = {"motion": described(robot.motion), "columns": list(robot.motion.columns)}
+    return {"name": robot.name, **moved, "start": list(robot.start), "cov": cov, "sensors": mounts}
+
+
+def _robot_restored(d: State) -> Robot:
+    who, mounts = f"robot {d['name']!r}", {}
+    for name, m in d["sensors"]:
+        what = f"{who}: sensor {name!r}"
+        landmark = m["landmark"] and restored("landmark", m["landmark"], f"{what}: landmark", "robots")
+        mounts[name] = Mount(restored("sensor", m["sensor"], what, "robots"), m["at"], landmark)
+    return Robot(d["name"], restored("motion", d["motion"], f"{who}: motion", "robots"), d["start"], mounts, d["cov"])
+
+
+def robots_restored(saved: list[State], given: list[Robot] | None) -> list[Robot]:
+    """Return the robots in the order saved: restored, or those given again if they are the same."""
+    if given is None:
+        return [_robot_restored(d) for d in saved]
+    for robot in given:
+        if not isinstance(robot, Robot):
+            raise MapError(f"robots holds {robot!r}, expected nothing but robots")
+    names = [d["name"] for d in saved]
+    got = [robot.name for robot in given]
+    if sorted(got) != sorted(names):
+        raise MapError(f"robots are {got}, expected {names}")
+    given = sorted(given, key=lambda robot: names.index(robot.name))
+    for robot, d in zip(given, saved, strict=True):
+        for what, mine, expected in (
+            ("motion is", type(robot.motion).__name__, _name(d["motion"])),
+            ("columns of the motion are", list(robot.motion.columns), d["columns"]),
+            ("sensors are", sorted(map(str, robot.sensors)), sorted(str(name) for name, _ in d["sensors"])),
+        ):
+            if mine != expected:
+                raise MapError(f"robot {robot.name!r}: {what} {mine}, expected {expected}")
+    return given
+
+
+def landmark_type(state: State, given: Landmark | None) -> Landmark | None:
+    """Return the slam's type of landmark; one given again must be one that was saved."""
+    saved = state["landmarks"]
+    if given is not None:
+        known = [saved, *(d for _, d in state["kinds"])]
+        if not any(same(given, d) for d in known):
+            names = sorted({_name(d) for d in known if d is not None})
+            raise MapError(f"landmarks is {type(given).__name__}, expected {' or '.join(names) or 'None'}")
+        if same(given, saved):
+            return given
+    return None if saved is None else restored("landmark", saved, "landmarks", "landmarks")
