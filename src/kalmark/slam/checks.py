@@ -1,4 +1,4 @@
-"""The boundary: what a covariance and a scan must be before they are let in."""
+"""The boundary: what a model, a covariance and a scan must be before they are let in."""
 
 from __future__ import annotations
 
@@ -7,57 +7,60 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import EventError
+from kalmark.errors import EventError, KalmarkError, ModelError
 from kalmark.models.protocols import Sensor
-from kalmark.slam.events import Scan
+from kalmark.slam.events import Scan, finite, seconds, shown
 
 Array = npt.NDArray[np.float64]
 
 
-def covariance(value: Any, size: int, what: str, *, definite: bool) -> Array:
-    """Return a (size, size) covariance, refusing one that is asymmetric or not positive (semi)definite."""
-    cov = np.asarray(value, dtype=np.float64)
+def covariance(value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError) -> Array:
+    """Return a copy of a (size, size) covariance; raise `error` if it is asymmetric or not positive (semi)definite."""
+    cov = finite(value, what, error)
     if cov.shape != (size, size):
-        raise EventError(f"{what} has shape {cov.shape}, expected ({size}, {size})")
-    _refuse_indefinite(cov[None], what, definite)
+        raise error(f"{what} has shape {cov.shape}, expected ({size}, {size})")
+    _refuse_indefinite(cov[None], what, definite, error)
     return cov
 
 
-def _refuse_indefinite(covs: Array, what: str, definite: bool) -> None:
-    if not np.isfinite(covs).all():
-        raise EventError(f"{what} holds {covs[~np.isfinite(covs)][0]}, expected finite numbers")
+def instance(value: Any, protocol: type, what: str, expected: str) -> None:
+    """Raise ModelError if `value` is not of that protocol or class, or is a class itself instead of one of its kind."""
+    if isinstance(value, type):
+        raise ModelError(f"{what} is the class {value.__name__}, expected an instance: {value.__name__}(...)")
+    if not isinstance(value, protocol):
+        raise ModelError(f"{what} is {shown(value)}, expected {expected}")
+
+
+def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[KalmarkError] = EventError) -> None:
+    """Refuse finite matrices (K, m, m) that are not covariances."""
     scale = np.abs(covs).max(axis=(1, 2), initial=0.0)
-    skew = np.abs(covs - covs.swapaxes(1, 2)).max(axis=(1, 2), initial=0.0)
-    if (skew > 1e-9 * scale).any():
-        raise EventError(f"{what} is {covs[np.argmax(skew)].tolist()}, expected a symmetric matrix")
+    with np.errstate(over="ignore"):
+        skewed = np.abs(covs - covs.swapaxes(1, 2)).max(axis=(1, 2), initial=0.0) > 1e-9 * scale
+    if skewed.any():
+        raise error(f"{what} is {shown(covs[np.argmax(skewed)].tolist())}, expected a symmetric matrix")
     lowest = np.linalg.eigvalsh(covs).min(axis=1)
-    bad = lowest <= 0 if definite else lowest < -1e-9 * scale
+    bad = ~(lowest > 0) if definite else ~(lowest >= -1e-9 * scale)
     if bad.any():
-        i = int(np.argmax(bad))
         kind = "positive definite" if definite else "positive semidefinite"
-        raise EventError(f"{what} has the eigenvalue {lowest[i]:.3g}, expected a {kind} matrix")
+        raise error(f"{what} has the eigenvalue {lowest[np.argmax(bad)]:.3g}, expected a {kind} matrix")
 
 
 def measurements(event: Scan, sensor: Sensor) -> Array:
     """Return the noise R (K, m, m) of a scan, refusing measurements its sensor cannot have made."""
     m, count = len(sensor.columns), len(event.y)
-    if count == 0:
-        return np.zeros((0, m, m))
-    if event.y.shape[1] != m:
-        raise EventError(
-            f"scan at t={event.t_s:.9g} s: y has {event.y.shape[1]} columns, expected {m}: {', '.join(sensor.columns)}"
-        )
+    if event.width != m and (count or event.width):
+        expected = f"expected {m}: {', '.join(sensor.columns)}"
+        raise EventError(f"scan at t={seconds(event.t_ns)} s: y has {event.width} columns, {expected}")
     check = getattr(sensor, "check", None)
-    if check is not None:
+    if check is not None and count:
         try:
             check(event.y)
         except EventError as error:
-            raise EventError(f"scan at t={event.t_s:.9g} s: {error}") from None
+            raise EventError(f"scan at t={seconds(event.t_ns)} s: {error}") from None
     if event.cov is None:
-        return sensor.noise(event.y)
-    what = f"scan at t={event.t_s:.9g} s: cov"
+        return sensor.noise(event.y) if count else np.zeros((0, m, m))
+    what = f"scan at t={seconds(event.t_ns)} s: cov"
     if event.cov.shape not in ((m, m), (count, m, m)):
         raise EventError(f"{what} has shape {event.cov.shape}, expected ({m}, {m}) or ({count}, {m}, {m})")
-    R = np.ascontiguousarray(np.broadcast_to(event.cov, (count, m, m)))
-    _refuse_indefinite(R, what, definite=True)
-    return R
+    _refuse_indefinite(event.cov.reshape(-1, m, m), what, definite=True)
+    return np.ascontiguousarray(np.broadcast_to(event.cov, (count, m, m)))

@@ -6,41 +6,132 @@ Logs, the simulator and a live robot all speak these three.  Time is int64 nanos
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import operator
+from collections.abc import Mapping, Set
+from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import EventError
+from kalmark.errors import EventError, KalmarkError
 
 Array = npt.NDArray[np.float64]
 Id = int | str
 
+FLOAT = np.dtype(np.float64)
+LATEST_NS = 2**63  # times are int64
+LONGEST = 80  # characters of a value in a message
 
-def nanoseconds(t_s: float | None, t_ns: int | None, what: str) -> int:
-    """Return the event time in integer nanoseconds, from exactly one of seconds and nanoseconds."""
+
+def seconds(t_ns: int) -> str:
+    """Return integer nanoseconds as text in seconds, exactly, without trailing zeros."""
+    whole, rest = divmod(abs(t_ns), 1_000_000_000)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}".rstrip("0").rstrip(".")
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it: on one line, and cut where it is long."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # a value that cannot even be shown is refused all the same
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
+
+
+def nanoseconds(t_s: Any, t_ns: Any, kind: str, robot: Any) -> int:
+    """Return the time of an event in integer nanoseconds, from exactly one of seconds and nanoseconds."""
+    if t_ns is None and isinstance(t_s, float) and -9e9 < t_s < 9e9:
+        return round(t_s * 1e9)
+    if t_s is None and type(t_ns) is int and -LATEST_NS < t_ns < LATEST_NS:
+        return t_ns
+    try:
+        return _nanoseconds(t_s, t_ns)
+    except EventError as error:
+        raise EventError(f"{kind} of {shown(robot)}: {error}") from None
+
+
+def _nanoseconds(t_s: Any, t_ns: Any) -> int:
     if (t_s is None) == (t_ns is None):
-        raise EventError(f"{what}: expected exactly one of t_s and t_ns, got t_s={t_s!r} and t_ns={t_ns!r}")
-    if t_ns is not None:
-        return int(t_ns)
+        raise EventError(f"expected exactly one of t_s and t_ns, got t_s={shown(t_s)} and t_ns={shown(t_ns)}")
+    name, value, expected = "t_s", t_s, "a finite number of seconds"
     try:
-        return round(float(t_s) * 1e9)  # type: ignore[arg-type]
+        if t_s is None:
+            name, value, expected = "t_ns", t_ns, "a whole number of nanoseconds"
+            whole: Any = None if isinstance(t_ns, bool) else t_ns
+            time = operator.index(whole)
+        else:
+            wrong = isinstance(t_s, bool | np.timedelta64) or not isinstance(t_s, Real)
+            time = round(float("nan" if wrong else t_s) * 1e9)
     except (TypeError, ValueError, OverflowError):
-        raise EventError(f"{what}: t_s is {t_s!r}, expected a finite number of seconds") from None
+        raise EventError(f"{name} is {shown(value)}, expected {expected}") from None
+    if abs(time) >= LATEST_NS:
+        raise EventError(f"{name} is {shown(value)}, expected a time within 292 years of 0, 2**63 ns")
+    return time
 
 
-def finite(value: Any, what: str) -> Array:
-    """Return a copy of `value` as a float array, or refuse it if anything in it is not a finite number."""
+def finite(value: Any, what: str, error: type[KalmarkError] = EventError) -> Array:
+    """Return a copy of `value` as a float array, or raise `error` if anything in it is not a finite number."""
     try:
-        array = np.array(value, dtype=np.float64, order="C")
+        array = np.array(value, order="C")
     except (TypeError, ValueError):
-        raise EventError(f"{what} is {value!r}, expected numbers") from None
+        raise error(f"{what} is {shown(value)}, expected numbers") from None
+    if array.dtype is not FLOAT:
+        if array.dtype.kind not in "iuf":
+            raise error(f"{what} is {shown(value)}, expected numbers")
+        with np.errstate(over="ignore"):
+            array = array.astype(FLOAT)
     flat = array.ravel()
-    if not math.isfinite(flat @ flat) and not np.isfinite(flat).all():
-        bad = flat[~np.isfinite(flat)][0]
-        raise EventError(f"{what} holds {bad}, expected finite numbers")
+    if not math.isfinite(sum(flat.tolist())) and not np.isfinite(flat).all():
+        raise error(f"{what} holds {flat[~np.isfinite(flat)][0]}, expected finite numbers")
     return array
+
+
+def checked_id(value: Any, what: str) -> Id:
+    """Return a landmark's id as int or str, refusing all but whole numbers and texts that are not empty."""
+    if isinstance(value, np.generic) and value.dtype.kind in "iufU":
+        value = value.item()
+    if isinstance(value, str) and value:
+        return str(value)
+    if isinstance(value, int) and not isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    raise EventError(f"{what} is {shown(value)}, expected a whole number or a text that is not empty")
+
+
+def checked_ids(ids: Any, count: int) -> tuple[Id | None, ...]:
+    """Return the landmark ids of one scan (None: unknown), refusing a wrong number of them and duplicates."""
+    if isinstance(ids, np.ndarray) and ids.dtype.kind in "iufU":
+        ids = ids.tolist()
+    try:
+        ids = tuple(None if isinstance(ids, str | bytes | Mapping | Set) else ids)  # type: ignore[arg-type]
+    except TypeError:
+        raise EventError(f"ids is {shown(ids)}, expected a list with one id for each observation") from None
+    if len(ids) != count:
+        raise EventError(f"{len(ids)} ids for {count} observations, expected one id each")
+    ids = tuple([i if type(i) is int or i is None else checked_id(i, "an id") for i in ids])
+    known = [i for i in ids if i is not None]
+    if len(set(known)) != len(known):
+        twice = next(i for i in known if known.count(i) > 1)
+        raise EventError(f"id {twice!r} appears twice, expected each landmark once in a scan")
+    return ids
+
+
+def _text(value: Any, what: str) -> str:
+    if not isinstance(value, str):
+        raise EventError(f"{what} is {shown(value)}, expected a text")
+    return value
+
+
+def _rows(y: Array) -> Array:
+    """Return the measurements of one scan, (K, m); () and [] are a scan that saw nothing."""
+    if y.shape == (0,):
+        return y.reshape(0, 0)
+    if y.ndim != 2 or (len(y) and not y.size):
+        raise EventError(f"y has shape {y.shape}, expected (K, m): one row an observation")
+    return y
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
@@ -59,12 +150,14 @@ class Control:
         self, t_s: float | None = None, robot: str = "", u: Any = (), cov: Any = None, *, t_ns: int | None = None
     ) -> None:
         set_ = object.__setattr__
-        t_ns = nanoseconds(t_s, t_ns, f"control of {robot!r}")
-        what = "control of %r at t=%.9g s: " % (robot, t_ns * 1e-9)  # noqa: UP031 - on the hot path
-        set_(self, "t_ns", t_ns)
-        set_(self, "robot", robot)
-        set_(self, "u", finite(u, what + "u"))
-        set_(self, "cov", None if cov is None else finite(cov, what + "cov"))
+        t_ns = nanoseconds(t_s, t_ns, "control", robot)
+        try:
+            set_(self, "t_ns", t_ns)
+            set_(self, "robot", _text(robot, "robot"))
+            set_(self, "u", finite(u, "u"))
+            set_(self, "cov", None if cov is None else finite(cov, "cov"))
+        except EventError as error:
+            raise EventError(f"control of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
 
     @property
     def t_s(self) -> float:
@@ -77,7 +170,8 @@ class Scan:
     """What one sensor of one robot saw at one instant: K observations `y` of shape (K, m).
 
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
-    overrides the noise of the sensor model.
+    overrides the noise of the sensor model.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
+    `width` is the m it was given, 0 for ().
     """
 
     t_ns: int
@@ -86,6 +180,7 @@ class Scan:
     y: Array
     ids: tuple[Id | None, ...] | None
     cov: Array | None
+    width: int = field(repr=False)
 
     def __init__(
         self,
@@ -99,19 +194,19 @@ class Scan:
         t_ns: int | None = None,
     ) -> None:
         set_ = object.__setattr__
-        t_ns = nanoseconds(t_s, t_ns, f"scan of {robot!r}")
-        what = "scan of %r by %r at t=%.9g s: " % (sensor, robot, t_ns * 1e-9)  # noqa: UP031 - on the hot path
-        y = finite(y, what + "y")
-        if y.size == 0:
-            y = y.reshape(0, 0)
-        if y.ndim != 2:
-            raise EventError(f"{what}y has shape {y.shape}, expected (K, m): one row an observation")
-        set_(self, "t_ns", t_ns)
-        set_(self, "robot", robot)
-        set_(self, "sensor", sensor)
-        set_(self, "y", y)
-        set_(self, "ids", None if ids is None else checked_ids(ids, len(y), what))
-        set_(self, "cov", None if cov is None else finite(cov, what + "cov"))
+        t_ns = nanoseconds(t_s, t_ns, "scan", robot)
+        try:
+            y = _rows(finite(y, "y"))
+            set_(self, "t_ns", t_ns)
+            set_(self, "robot", _text(robot, "robot"))
+            set_(self, "sensor", _text(sensor, "sensor"))
+            set_(self, "width", y.shape[1])
+            set_(self, "y", y if len(y) else y.reshape(0, 0))
+            set_(self, "ids", None if ids is None else checked_ids(ids, len(y)))
+            set_(self, "cov", None if cov is None else finite(cov, "cov"))
+        except EventError as error:
+            what = f"scan of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
+            raise EventError(f"{what}: {error}") from None
 
     @property
     def t_s(self) -> float:
@@ -132,14 +227,16 @@ class Fix:
         self, t_s: float | None = None, robot: str = "", y: Any = (), cov: Any = None, *, t_ns: int | None = None
     ) -> None:
         set_ = object.__setattr__
-        t_ns = nanoseconds(t_s, t_ns, f"fix of {robot!r}")
-        what = f"fix of {robot!r} at t={t_ns * 1e-9:.9g} s: "
-        if cov is None:
-            raise EventError(f"{what}cov is missing, expected a covariance in m^2")
-        set_(self, "t_ns", t_ns)
-        set_(self, "robot", robot)
-        set_(self, "y", finite(y, what + "y"))
-        set_(self, "cov", finite(cov, what + "cov"))
+        t_ns = nanoseconds(t_s, t_ns, "fix", robot)
+        try:
+            if cov is None:
+                raise EventError("cov is missing, expected a covariance in m^2")
+            set_(self, "t_ns", t_ns)
+            set_(self, "robot", _text(robot, "robot"))
+            set_(self, "y", finite(y, "y"))
+            set_(self, "cov", finite(cov, "cov"))
+        except EventError as error:
+            raise EventError(f"fix of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
 
     @property
     def t_s(self) -> float:
@@ -150,18 +247,6 @@ class Fix:
 Event = Control | Scan | Fix
 
 _RANK = {Control: 0, Scan: 1, Fix: 2}
-
-
-def checked_ids(ids: Any, count: int, what: str) -> tuple[Id | None, ...]:
-    """Return the landmark ids of one scan, refusing a wrong number of them and duplicates."""
-    ids = tuple(i.item() if isinstance(i, np.generic) else i for i in ids)
-    if len(ids) != count:
-        raise EventError(f"{what}{len(ids)} ids for {count} observations, expected one id each")
-    known = [i for i in ids if i is not None]
-    if len(set(known)) != len(known):
-        twice = next(i for i in known if known.count(i) > 1)
-        raise EventError(f"{what}id {twice!r} appears twice, expected each landmark once in a scan")
-    return ids
 
 
 def order(event: Event) -> tuple[int, int, str, str]:
