@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 import kalmark as km
 from kalmark.errors import EventError, KalmarkError, MapError, ModelError
+from kalmark.geometry.spaces import Rn
 from kalmark.slam.checks import covariance, measurements
 from kalmark.slam.events import checked_id, seconds
 
@@ -276,3 +278,45 @@ def test_one_bad_covariance_of_many_is_found_and_shown() -> None:
     event = scan(np.ones((3, 2)), cov=covs)
     assert "[[1.0, 1e-06], [0.0, 1.0]], expected a symmetric" in refusal(lambda: measurements(event, LIDAR), EventError)
     assert measurements(scan(np.ones((3, 2)), cov=np.eye(2)), LIDAR).shape == (3, 2, 2)
+
+
+# ---------------------------------------------------------------------- robots and mounts
+@dataclass(frozen=True)
+class Drone(km.motion.Unicycle):
+    space = Rn(4)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda m: km.Robot("r", m, sensors={"l": LIDAR}), "sensor 'l' is RangeBearing("),
+        (lambda m: km.Robot("r", m, sensors={"l": LIDAR}), "expected a Mount: Mount(sensor"),
+        (lambda m: km.Robot("r", m, sensors={"l": km.sensors.RangeBearing}), "expected a Mount"),
+        (lambda m: km.Robot("r", m, sensors={"l": km.Mount}), "expected a Mount"),
+        (lambda m: km.Robot("r", m, sensors=km.Mount(LIDAR)), "expected a mapping of names to Mounts"),
+        (lambda m: km.Robot("r", m, sensors={3: km.Mount(LIDAR)}), "the name of a sensor is 3"),
+        (lambda m: km.Robot("r", m, sensors={"": km.Mount(LIDAR)}), "the name of a sensor is ''"),
+        (lambda m: km.Robot("r", type(m)), "robot 'r': motion is the class Unicycle, expected an instance: U"),
+        (lambda m: km.Robot("r", LIDAR), "expected a motion model"),
+        (lambda m: km.Robot(7, m), "Robot: name is 7"),
+        (lambda m: km.Robot("r", m, cov="x"), "robot 'r': cov is 'x', expected numbers"),
+        (lambda m: km.Robot("r", m, cov=np.eye(2)), "expected (3, 3)"),
+        (lambda m: km.Robot("r", m, cov=NAN * np.eye(3)), "finite"),
+        (lambda m: km.Robot("r", m, start="here"), "start is 'here', expected three finite numbers"),
+        (lambda m: km.Robot("r", m, start=("0", "0", "0")), "expected three finite numbers"),
+        (lambda m: km.Robot("r", Drone(), start=(0, 0, 0)), "motion is in R4, expected SE2: other spaces are not"),
+        (lambda m: km.Mount(km.sensors.RangeBearing), "Mount: sensor is the class RangeBearing, expected an instance"),
+        (lambda m: km.Mount(LIDAR, at=(0, 0)), "Mount: at is (0, 0), expected three"),
+        (lambda m: km.Mount(LIDAR, landmark=km.landmarks.Point2D), "landmark is the class Point2D"),
+        (lambda m: km.Mount(LIDAR, landmark="point"), "landmark is 'point', expected a landmark model"),
+    ],
+)  # fmt: skip
+def test_a_robot_that_cannot_work_is_refused_when_it_is_made(make: Any, message: str) -> None:
+    assert message in refusal(lambda: make(km.motion.Unicycle()), ModelError)
+
+
+def test_a_robot_keeps_its_sensors_when_the_callers_mapping_changes() -> None:
+    sensors = {"lidar": km.Mount(LIDAR)}
+    robot = km.Robot("r", km.motion.Unicycle(), sensors=sensors)
+    sensors.clear()
+    assert list(robot.sensors) == ["lidar"]
