@@ -41,6 +41,8 @@ class LogConfig(Section):
     """mrclam: added to the time of every observation."""
     robot_sightings: bool | None = None
     """mrclam: use the robots' sightings of each other (true if absent)."""
+    covariance_scale: Positive | None = None
+    """dlr: multiplies all covariances of the file."""
     detections: Literal["laser", "slsjf", "rfs"] | None = None
     """victoria_park: which detections."""
     steering: Literal["ascii", "mat"] | None = None

@@ -64,10 +64,14 @@ def residual(y: Array, e: Array, angular: Flags) -> Array:
 
 
 @compiled
-def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array]:
-    """Return each observation's innovation covariance Z (K, m, m) and d2 = z' Z^-1 z (K,).  [S] (27), (83)."""
+def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array, bool]:
+    """Return each observation's innovation covariance Z (K, m, m) and d2 = z' Z^-1 z (K,).  [S] (27), (83).
+
+    d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a Z is not positive
+    definite: the filter is broken.
+    """
     k, m, d = E_l.shape
-    Z, d2 = np.empty((k, m, m)), np.empty(k)
+    Z, d2, healthy = np.empty((k, m, m)), np.empty(k), True
     rows, H = np.empty(POSE + d, np.int64), np.empty((m, POSE + d))
     rows[:POSE] = index[:POSE]
     for i in range(k):
@@ -93,7 +97,9 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
                     s += M[a, b] * z[i, b]
                 w += s * s
             d2[i] = w
-    return Z, d2
+        elif np.isfinite(Z[i]).all():
+            healthy = False
+    return Z, d2, healthy
 
 
 @compiled
@@ -160,57 +166,60 @@ def fuse(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> Array:
 
 def invariant(
     view: Any, map_: Map, scan: Scan, most: int
-) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan: gate, iterate, fuse, retract, transport.  docs/invariant.md.
 
-    Returns e, z, Z, d2 at the prediction and whether the filter could go on; d2 <= gate were fused.
+    Returns e, z, Z, d2 at the prediction, which were fused, and whether the filter can go on.
     """
     x, P, n, blocks, atoms = map_
     robot, slots, d, y, R, angular, gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, slots, d)
     e, E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(len(slots), d))
     z = residual(y, e, angular)
-    Z, d2 = innovation(P, index, E_r, E_l, R, z)
-    near = d2 <= gate
-    if not near.any():
-        return e, z, Z, d2, True
+    Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
+    near = (d2 <= gate) & (d2 < np.inf)
+    if not healthy or not near.any():
+        return e, z, Z, d2, near, healthy
     if not near.all():
         y, R = y[near], R[near]
         index, table, mean = observed_block(x, blocks, atoms, robot, slots[near], d)
     H, M, v, positive = iterate(view, table, mean, submatrix(P, index), y, R, angular, most, 1e-7)
     if not positive:
-        return e, z, Z, d2, False
+        return e, z, Z, d2, near, False
     before = generator(atoms, x, n)
     correction = fuse(P, n, index, H, M, v)
     theta = index[HEADING]
     retract(atoms, x, correction, correction[theta])
     transport(P, generator(atoms, x, n) - before, theta)
-    return e, z, Z, d2, True
+    return e, z, Z, d2, near, True
 
 
 def textbook(
     view: Any, map_: Map, scan: Scan, _: None
-) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3."""
     x, P, n, blocks, atoms = map_
     robot, slots, d, y, R, angular, gate = scan
     k, m = y.shape
     e, z, Z, d2 = np.empty((k, m)), np.empty((k, m)), np.empty((k, m, m)), np.empty(k)
+    near, healthy = np.zeros(k, np.bool_), True
     for i in range(k):
         one = slice(i, i + 1)
         index, _table, mean = observed_block(x, blocks, atoms, robot, slots[one], d)
         e[one], E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(1, d))
         z[one] = residual(y[one], e[one], angular)
-        Z[one], d2[one] = innovation(P, index, E_r, E_l, R[one], z[one])
-        if d2[i] < gate:
+        Z[one], d2[one], sound = innovation(P, index, E_r, E_l, R[one], z[one])
+        healthy = healthy and sound
+        near[i] = d2[i] < gate
+        if near[i]:
             M, _positive = cholesky_inverse(Z[i])
             retract(atoms, x, fuse(P, n, index, stacked(E_r, E_l), M, z[i].copy()), 0.0)
-    return e, z, Z, d2, True
+    return e, z, Z, d2, near, healthy
 
 
 def first_estimates(
     view: Any, map_: Map, scan: Scan, x_first: Array
-) -> tuple[Array, Array, Array, Array, bool]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
     x, P, n, blocks, atoms = map_
     robot, slots, d, y, R, angular, gate = scan
@@ -220,10 +229,10 @@ def first_estimates(
     e, _, _ = linearize(view, mean[:POSE], mean[POSE:].reshape(k, d))
     _, E_r, E_l = linearize(view, first[:POSE], first[POSE:].reshape(k, d))
     z = residual(y, e, angular)
-    Z, d2 = innovation(P, index, E_r, E_l, R, z)
-    near = d2 <= gate
-    if not near.any():
-        return e, z, Z, d2, True
+    Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
+    near = (d2 <= gate) & (d2 < np.inf)
+    if not healthy or not near.any():
+        return e, z, Z, d2, near, healthy
     index, _, _ = observed_block(x, blocks, atoms, robot, slots[near], d)
     H = stacked(E_r[near], E_l[near])
     Z_all = H @ (submatrix(P, index) @ H.T)
@@ -231,7 +240,7 @@ def first_estimates(
     M, positive = cholesky_inverse(Z_all)
     if positive:
         retract(atoms, x, fuse(P, n, index, H, M, z[near].ravel()), 0.0)
-    return e, z, Z, d2, positive
+    return e, z, Z, d2, near, positive
 
 
 compiled_invariant = compiled(invariant)

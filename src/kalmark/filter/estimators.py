@@ -23,12 +23,13 @@ Index = npt.NDArray[np.int64]
 
 
 class Correction(NamedTuple):
-    """What a scan of K known landmarks said: expectation, innovation, its covariance, squared distance, and health."""
+    """What K known landmarks said: expectation, innovation and its covariance, squared distance, fused, health."""
 
     e: Array
     z: Array
     Z: Array
     d2: Array
+    fused: npt.NDArray[np.bool_]
     healthy: bool
 
 
@@ -43,6 +44,9 @@ class Estimator(Protocol):
         gate: float,
     ) -> Correction:  # fmt: skip
         """Fuse y (K, m), noise R (K, m, m), of the first d numbers of the blocks `slots`, where d2 <= gate."""
+
+    def for_fixes(self) -> Estimator:
+        """Return the estimator that fuses absolute positions."""
 
     def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
         """Return the Jacobian J (., 3) with respect to the robot's pose, taken where this estimator linearises."""
@@ -66,6 +70,10 @@ class _Estimator:
     def _option(self, map_: StochasticMap) -> Any:
         return None
 
+    def for_fixes(self) -> Any:
+        """Return the estimator that fuses absolute positions."""
+        return self
+
     def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
         """Return J as it is: everything is linearised at the estimate."""
         return J
@@ -83,7 +91,11 @@ class Ekf(_Estimator):
 
 @dataclass(frozen=True)
 class Invariant(_Estimator):
-    """The iterated right-invariant filter: honest about what cannot be observed (docs/invariant.md)."""
+    """The iterated right-invariant filter: honest about what cannot be observed (docs/invariant.md).
+
+    One iteration is enough for small corrections by relative measurements; fixes are always iterated, and so should be
+    landmarks known beforehand.
+    """
 
     iterations: int = 6
 
@@ -98,6 +110,10 @@ class Invariant(_Estimator):
 
     def _option(self, map_: StochasticMap) -> int:
         return self.iterations
+
+    def for_fixes(self) -> Invariant:
+        """Return the estimator that fuses absolute positions: a large step must be iterated."""
+        return Invariant(max(6, self.iterations))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from numba.extending import get_cython_function_address
 from threadpoolctl import ThreadpoolController
 
 from kalmark.compiled import compiled
-from kalmark.geometry.spaces import Table
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -170,10 +169,6 @@ def cholesky_inverse(S: Array) -> tuple[Array, bool]:
 
 
 @compiled
-def gather(blocks: Table, x: Array, slots: Index, d: int) -> Array:
-    """Return the first d numbers of the means of the blocks `slots`, (K, d)."""
-    l = np.empty((len(slots), d))
-    for i in range(len(slots)):
-        at = blocks[slots[i], 0]
-        l[i] = x[at : at + d]
-    return l
+def all_finite(a: Array, B: Array, C: Array) -> bool:
+    """Return whether a vector and two matrices hold finite numbers only."""
+    return bool(np.isfinite(a).all() and np.isfinite(B).all() and np.isfinite(C).all())

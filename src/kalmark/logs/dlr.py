@@ -12,12 +12,13 @@ file's frame becomes one in kalmark's by the same exchange of axes.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.logs.log import Array, Log
-from kalmark.logs.source import Format, Request
+from kalmark.logs.source import Format, Request, quantity
 from kalmark.logs.steps import Steps
 from kalmark.logs.text import landmark_id, number, rows
 
@@ -36,18 +37,23 @@ def find(path: Path) -> Path | None:
     return file if b"\nSTEP " in start or b"\nLANDMARK_C " in start else None
 
 
-def read(path: Path, request: Request) -> Log:
-    """Return the log: step k ends at k seconds; the id -1 (spurious) becomes None."""
+def read(path: Path, request: Request, covariance_scale: Any = None) -> Log:
+    """Return the log: step k ends at k seconds; the id -1 (spurious) becomes None.
+
+    `covariance_scale` multiplies all covariances of the file (None: they stay as they are).
+    """
+    scale = 1.0 if covariance_scale is None else quantity(covariance_scale, "covariance_scale", 1e-9)
     steps = Steps(ROBOT, SENSOR)
     for line, cells in rows(path):
         where = f"{path}:{line}"
         try:
             if cells[0] == "STEP" and len(cells) == 11:
-                steps.step(*step([number(cell) for cell in cells[2:]]))
+                u, cov = step([number(cell) for cell in cells[2:]])
+                steps.step(u, scale * cov)
             elif cells[0] in ("LANDMARK_C", "LANDMARK") and len(cells) == 8:
                 id_ = landmark_id(cells[7])
                 y, cov = observation([number(cell) for cell in cells[1:7]])
-                steps.see(y, None if id_ == SPURIOUS else id_, request.refuse, where, cov)
+                steps.see(y, None if id_ == SPURIOUS else id_, request.refuse, where, scale * cov)
             else:
                 raise ValueError
         except ValueError:
@@ -93,4 +99,4 @@ def definite(cov: Array) -> Array:
     return cov
 
 
-DLR = Format("dlr", f"{FILE} or its folder", find, read)
+DLR = Format("dlr", f"{FILE} or its folder", find, read, options=("covariance_scale",))

@@ -49,7 +49,6 @@ class Point2D:
 
     kind: ClassVar[str] = "point"
     space: ClassVar[Space] = POINT2
-    built_in: ClassVar[bool] = True
 
     def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
         """Return v (K, d), V_T (K, d, 3), V_l (K, d, d)."""
@@ -66,3 +65,6 @@ class PointSignature2D(Point2D):
 
     kind: ClassVar[str] = "point_signature"
     space: ClassVar[Space] = Space("point_signature", (VECTOR, SCALAR))
+
+
+BUILT_IN = (Point2D, PointSignature2D)

@@ -10,16 +10,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
-from kalmark.errors import ModelError
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import SE2, Space
+from kalmark.models.parameters import check_parameters
 
 Array = npt.NDArray[np.float64]
 
@@ -59,14 +59,6 @@ def ackermann(r: Array, u: Array, dt: float, wheelbase: float, offset: float) ->
     return r2, R_r, R_vw @ VW_u
 
 
-def positive(model: Any, *, zero: bool = True) -> None:
-    """Refuse a model whose sigmas or lengths are negative or not finite."""
-    for name, value in vars(model).items():
-        low = value < 0 if zero else value <= 0
-        if isinstance(value, int | float) and (low or math.isnan(value)):
-            raise ModelError(f"{type(model).__name__}: {name} is {value}, expected a number of at least 0")
-
-
 class Planar:
     """What the planar motions share: the space and the diffusion."""
 
@@ -76,7 +68,7 @@ class Planar:
     sigma_theta_rad_per_sqrt_s: float
 
     def __post_init__(self) -> None:
-        positive(self)
+        check_parameters(self)
 
     @cached_property
     def _density(self) -> Array | None:
@@ -92,7 +84,7 @@ class Planar:
 class Odometry2D(Planar):
     """Odometry: u = (dx, dy, dtheta) in the robot's frame, the motion that ended at its time.  [S] (57)-(60).
 
-    The sigmas are those of one increment.
+    The sigmas are those of one increment.  A diffusion counts the time since the last increment, none for the first.
     """
 
     sigma_x_m: float = 0.01
@@ -148,7 +140,8 @@ class Unicycle(Planar):
 class Ackermann(Planar):
     """Car: u = (speed of the left rear wheel m/s, steering rad), held; the state is the rear axle's centre.
 
-    `encoder_offset_m` is the wheel's distance to the left of the centre line (0: the speed is the axle's own).
+    `encoder_offset_m` is the wheel's distance to the left of the centre line, negative to the right; 0 for a speed that
+    is the axle's own.
     """
 
     wheelbase_m: float = 2.83
@@ -163,9 +156,7 @@ class Ackermann(Planar):
     held: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        positive(self)
-        if self.wheelbase_m == 0:
-            raise ModelError("Ackermann: wheelbase_m is 0, expected a positive length")
+        check_parameters(self, positive=("wheelbase_m",))
 
     @cached_property
     def _N(self) -> Array:

@@ -16,6 +16,7 @@ from numba.extending import overload
 
 from kalmark.compiled import compiled
 from kalmark.geometry.frames import compose
+from kalmark.models import landmarks, sensors
 from kalmark.models.landmarks import seen_from
 from kalmark.models.protocols import FullSensor, Landmark, Sensor
 from kalmark.models.sensors import POSITION_FIX, expect
@@ -60,7 +61,7 @@ def fix_view(antenna: Array) -> tuple[int, Array]:
 
 def view_of(sensor: Sensor, landmark: Landmark, mount: Array) -> Any:
     """Return what `linearize` takes: (code, mount) for the compiled models, a `PythonView` for others."""
-    if getattr(sensor, "code", 0) and getattr(landmark, "built_in", False):
+    if type(sensor) in sensors.BUILT_IN and type(landmark) in landmarks.BUILT_IN:  # not a user's subclass of them
         return int(sensor.code), mount  # type: ignore[attr-defined]
     return PythonView(sensor, landmark, mount)
 

@@ -110,6 +110,8 @@ def pointwise(
     R = np.atleast_2d(np.asarray(noise, dtype=np.float64))
     if R.ndim != 2 or R.shape[0] != R.shape[1] or not np.isfinite(R).all():
         raise ModelError(f"pointwise sensor: noise has shape {R.shape}, expected a finite square covariance")
+    if not np.allclose(R, R.T) or np.linalg.eigvalsh(R).min() <= 0:
+        raise ModelError(f"pointwise sensor: noise is {R.tolist()}, expected a symmetric positive definite matrix")
     m = len(angular) or len(columns) or len(R)
     kinds = {
         (False, False): PointwiseSensor,

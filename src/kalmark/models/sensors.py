@@ -13,7 +13,7 @@ import numpy.typing as npt
 from kalmark.compiled import compiled
 from kalmark.errors import EventError
 from kalmark.geometry.frames import inv_scan_many, scan_many
-from kalmark.models.motion import positive
+from kalmark.models.parameters import check_parameters
 
 Array = npt.NDArray[np.float64]
 
@@ -43,8 +43,12 @@ def expect(code: int, v: Array) -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=256)
-def _constant(variances: tuple[float, ...], count: int) -> Array:
+def _cached(variances: tuple[float, ...], count: int) -> Array:
     return np.tile(np.diag(variances), (count, 1, 1))
+
+
+def _constant(variances: tuple[float, ...], count: int) -> Array:
+    return _cached(variances, count).copy()
 
 
 def refuse_negative_ranges(y: Array) -> None:
@@ -63,7 +67,7 @@ class Planar:
     fov_rad: float
 
     def __post_init__(self) -> None:
-        positive(self)
+        check_parameters(self, noise="sigma")
 
     def expect(self, v: Array) -> tuple[Array, Array]:
         """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
@@ -223,3 +227,6 @@ class RangeBearingSignature(Planar):
     def check(self, y: Array) -> None:
         """Refuse negative ranges."""
         refuse_negative_ranges(y)
+
+
+BUILT_IN = (RangeBearing, Bearing, Range, Position2D, RangeBearingSignature)

@@ -6,11 +6,14 @@ control is common to both parts.  An increment is the motion that ended at its t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.errors import EventError
 from kalmark.models.protocols import Motion
 from kalmark.slam.events import Control
 
@@ -48,9 +51,15 @@ class Drive:
         self.t_ns, self.fresh = to_ns, False
         return part
 
-    def ends(self) -> bool:
-        """Return whether the control in force has moved the robot in an earlier part."""
-        return self.u is not None and not self.fresh
+    @contextmanager
+    def kept_on_error(self) -> Iterator[None]:
+        """Put the clock back if what the robot is told turns out to be impossible."""
+        state = self.t_ns, self.u, self.N, self.fresh
+        try:
+            yield
+        except EventError:
+            self.t_ns, self.u, self.N, self.fresh = state
+            raise
 
     def accept(self, control: Control) -> list[Part]:
         """Take a new control; return the parts of motion it closes."""

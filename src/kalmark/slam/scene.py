@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from kalmark.errors import ModelError
 from kalmark.filter.corrections import innovation, observed_block, residual
-from kalmark.filter.map import StochasticMap
+from kalmark.filter.map import X_AT, StochasticMap
 from kalmark.geometry.frames import compose
 from kalmark.models.landmarks import Point2D, PointSignature2D
 from kalmark.models.observe import inverse_expectation, linearize, view_of
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
+
+NOTHING = np.zeros((0, 0, 0))
+
+
+ROBOT = "robot"
+SEEN_AS = {"point": ("point", "point_signature", ROBOT)}  # kinds of blocks that a view of one kind applies to
 
 
 class View:
@@ -37,8 +43,12 @@ class View:
         self.starts = isinstance(self.sensor, FullSensor)
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
         self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
-        if getattr(self.sensor, "code", 0) and self.d > 2 and "signature" not in self.sensor.columns:
-            raise ModelError(f"a {type(self.sensor).__name__} finds 2 numbers, a {self.landmark.kind} has {self.d}")
+        self.sees = SEEN_AS.get(self.landmark.kind, (self.landmark.kind,))
+        numbers = 3 if "signature" in self.sensor.columns else 2
+        if isinstance(self.look, tuple) and numbers != self.d:
+            raise ModelError(
+                f"a {type(self.sensor).__name__} finds {numbers} numbers, a {self.landmark.kind} has {self.d}"
+            )
 
     def noise(
         self, map_: StochasticMap, robot: int, slots: npt.NDArray[np.int64], R: Array, event: Scan
@@ -47,15 +57,12 @@ class View:
         if self.noise_at is None or event.cov is not None:
             return R
         T, _, _ = compose(map_.mean(robot)[:3], self.at)
-        l = np.array([map_.mean(s)[: self.d] for s in slots])
+        l = map_.x[map_.blocks[slots, X_AT][:, None] + np.arange(self.d)]
         return self.noise_at(self.landmark.seen_from(T, l)[0])
 
     def explain(self, r: Array, y: Array, R: Array, event: Scan) -> tuple[Array, Array, Array]:
         """Return the landmark (n,) that explains y (1, m) from r, L_r (n, 3) and Q = L_y R L_y'.  [S] (32)-(35)."""
         l, L_r, _, L_y = inverse_expectation(r, self.at, self.sensor, self.landmark, y)  # type: ignore[arg-type]
-        if l.shape[1] != self.d:
-            kind = type(self.sensor).__name__
-            raise ModelError(f"a {kind} finds {l.shape[1]} numbers, a {self.landmark.kind} has {self.d}")
         if self.noise_at is not None and event.cov is None:
             R = self.noise_at(self.sensor.invert(y)[0])[0]  # type: ignore[attr-defined]
         return l[0], L_r[0], L_y[0] @ R @ L_y[0].T
@@ -88,8 +95,9 @@ class Scene:
         index, _, mean = observed_block(map_.x, map_.blocks, map_.atoms, robot, slots, view.d)
         e, E_r, E_l = linearize(view.look, mean[:3], mean[3:].reshape(len(slots), view.d))
         d2 = np.empty((len(self._event.y), len(slots)))
+        there = view.noise(map_, robot, slots, NOTHING, self._event)
         for k, y in enumerate(self._event.y):
-            z = residual(np.broadcast_to(y, e.shape), e, view.angular)
-            R = view.noise(map_, robot, slots, np.tile(self._R[k], (len(slots), 1, 1)), self._event)
-            _, d2[k] = innovation(map_.P, index, E_r, E_l, R, z)
+            z = residual(np.broadcast_to(y, e.shape).copy(), e, view.angular)
+            R = np.tile(self._R[k], (len(slots), 1, 1)) if there is NOTHING else there
+            _, d2[k], _ = innovation(map_.P, index, E_r, E_l, R, z)
         return d2

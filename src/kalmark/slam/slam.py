@@ -18,7 +18,8 @@ import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.filter.estimators import Estimator, Invariant
-from kalmark.filter.map import X_SIZE, StochasticMap
+from kalmark.filter.kernels import all_finite
+from kalmark.filter.map import StochasticMap
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.spaces import Rn
 from kalmark.models.landmarks import Point2D
@@ -27,10 +28,10 @@ from kalmark.models.protocols import Landmark
 from kalmark.slam.association import NEW, Association, ByIdentity, Decision
 from kalmark.slam.checks import covariance, measurements
 from kalmark.slam.drive import Drive, Part
-from kalmark.slam.events import Control, Event, Fix, Id, Scan
+from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds
 from kalmark.slam.report import LandmarkTable, Observation, Report
 from kalmark.slam.robot import Robot
-from kalmark.slam.scene import Scene, View
+from kalmark.slam.scene import ROBOT, Scene, View
 
 Array = npt.NDArray[np.float64]
 
@@ -59,6 +60,7 @@ class Slam:
         self.estimator: Estimator = estimator or Invariant()
         self.t_ns: int | None = None
         self.map = StochasticMap()
+        self.landmark_type = landmarks
         self._slots: dict[Id, int] = {}  # every robot and landmark by name
         self._drives: dict[str, Drive] = {}
         self._errors: dict[str, int] = {}  # the block of a held control's error, while a scan has split its interval
@@ -66,6 +68,7 @@ class Slam:
         self._seen: dict[Id, int] = {}
         self._unnamed = 0
         self._views: dict[tuple[str, str], View] = {}
+        self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
         for robot in robots:
             self._place(robot, landmarks)
         if not self.robots:
@@ -82,32 +85,37 @@ class Slam:
 
     # ------------------------------------------------------------------ events
     def process(self, event: Event) -> Report:
-        """Take one event into the map and report what became of it; a bad event changes nothing."""
-        if self.t_ns is not None and event.t_ns < self.t_ns:
-            raise EventError(f"event at t={event.t_s:.9f} s comes after one at t={self.t_ns * 1e-9:.9f} s")
-        drive = self._drives.get(event.robot)
-        if drive is None:
-            raise EventError(
-                f"event at t={event.t_s:.9g} s: robot is {event.robot!r}, expected one of {sorted(self.robots)}"
-            )
-        if isinstance(event, Scan):
-            return self._scan(event)
-        if isinstance(event, Control):
-            return self._control(event, drive)
-        if isinstance(event, Fix):
-            return self._fix(event)
-        raise EventError(f"got {type(event).__name__}, expected a Control, a Scan or a Fix")
+        """Take one event into the map and report what became of it; a bad event changes nothing.
 
-    def _control(self, event: Control, drive: Drive) -> Report:
+        Raises EventError for an event that cannot be used, DivergedError when the filter cannot go on.
+        """
+        take = self._takes.get(type(event))
+        if take is None:
+            raise EventError(f"got {type(event).__name__}, expected a Control, a Scan or a Fix")
+        before = self.t_ns
+        if before is not None and event.t_ns < before:
+            raise EventError(f"{_when(event)} comes after one at t={seconds(before)} s")
+        if event.robot not in self.robots:
+            names = sorted(self.robots)
+            raise EventError(f"{_when(event)}: robot is {event.robot!r}, expected one of {names}")
+        try:
+            return take(event)
+        except EventError:
+            self.t_ns = before
+            raise
+
+    def _control(self, event: Control) -> Report:
+        drive = self._drives[event.robot]
         size = len(drive.motion.columns)
         if event.u.shape != (size,):
             expected = ", ".join(drive.motion.columns)
-            raise EventError(f"control at t={event.t_s:.9g} s: u has shape {event.u.shape}, expected ({expected})")
+            raise EventError(f"{_when(event)}: u has shape {event.u.shape}, expected ({expected})")
         if event.cov is not None:
-            covariance(event.cov, size, f"control at t={event.t_s:.9g} s: cov", definite=False)
+            covariance(event.cov, size, f"{_when(event)}: cov", definite=False)
         self.t_ns = event.t_ns
-        for part in drive.accept(event):
-            self._move(event.robot, part)
+        with drive.kept_on_error():
+            for part in drive.accept(event):
+                self._move(event.robot, part)
         self._forget_error(event.robot)
         return Report(event)
 
@@ -115,7 +123,7 @@ class Slam:
         view = self._views.get((event.robot, event.sensor))
         if view is None:
             names = sorted(self.robots[event.robot].sensors)
-            raise EventError(f"scan at t={event.t_s:.9g} s: sensor is {event.sensor!r}, expected one of {names}")
+            raise EventError(f"{_when(event)}: sensor is {event.sensor!r}, expected one of {names}")
         R = measurements(event, view.sensor)
         self.t_ns = event.t_ns
         self._advance(event.robot)
@@ -130,7 +138,7 @@ class Slam:
         return self._fuse(event, view, ids, decisions, R)
 
     def _fix(self, event: Fix) -> Report:
-        what = f"fix at t={event.t_s:.9g} s"
+        what = _when(event)
         if event.y.shape != (2,):
             raise EventError(f"{what}: y has shape {event.y.shape}, expected (2,): x and y in m")
         covariance(event.cov, 2, f"{what}: cov", definite=True)
@@ -139,11 +147,11 @@ class Slam:
         slot, report = self._slots[event.robot], Report(event, event.y.reshape(1, 2))
         gate = self.association.threshold(2, self.estimator.default_gate)
         y, R, straight = report.y, event.cov.reshape(1, 2, 2), np.zeros(2, dtype=np.bool_)
-        done = self.estimator.correct(self.map, fix_view(NOWHERE), slot, np.array([slot]), 0, y, R, straight, gate)
+        view, estimator = fix_view(NOWHERE), self.estimator.for_fixes()
+        done = estimator.correct(self.map, view, slot, np.array([slot]), 0, y, R, straight, gate)
         self._healthy(done.healthy, event)
         report.e, report.z, report.Z = done.e, done.z, done.Z
-        fused = bool(done.d2[0] <= gate)
-        outcome, reason = ("associated", "") if fused else ("rejected", f"outside the gate of {gate:.2f}")
+        outcome, reason = ("associated", "") if done.fused[0] else ("rejected", f"outside the gate of {gate:.2f}")
         report.observations = (Observation(0, event.robot, outcome, event.robot, float(done.d2[0]), reason),)
         return report
 
@@ -151,32 +159,35 @@ class Slam:
     def _advance(self, name: str) -> None:
         """Move a robot up to now by the control it holds."""
         assert self.t_ns is not None
-        part = self._drives[name].advance(self.t_ns)
-        if part is not None:
-            self._move(name, part)
+        drive = self._drives[name]
+        with drive.kept_on_error():
+            part = drive.advance(self.t_ns)
+            if part is not None:
+                self._move(name, part)
 
     def _move(self, name: str, part: Part) -> None:
         """Predict: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
         slot, motion = self._slots[name], self.robots[name].motion
-        r, index, u = self.map.mean(slot), self.map.index(slot), part.u
-        if not (part.first and part.last) and name not in self._errors and part.N.any():
-            self._errors[name] = self.map.add(Rn(len(u)), np.zeros(len(u)), part.N)
         error = self._errors.get(name)
-        if error is not None:
-            u = u + self.map.mean(error)
+        r, index = self.map.mean(slot), self.map.index(slot)
+        u = part.u if error is None else part.u + self.map.mean(error)
         moved, F, R_u = motion.move(r, u, part.dt_s)
         F = self.estimator.pose_jacobian(self.map, slot, F)
-        D = motion.diffusion(part.u, part.dt_s)
-        if error is None:
-            Q = R_u @ part.N @ R_u.T
-        else:  # the error is a block of the map, common to all parts of its interval
+        Q = R_u @ part.N @ R_u.T
+        if not all_finite(moved, F, Q):
+            when = f"{name!r} at t={seconds(self.t_ns or 0)} s"
+            raise EventError(f"{when}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
+        if error is None and part.N.any() and not (part.first and part.last):
+            error = self._errors[name] = self.map.add(Rn(len(u)), np.zeros(len(u)), part.N)
+        if error is not None:  # the control's error is a block of the map, common to all parts of its interval
             index = np.concatenate([index, self.map.index(error)])
             F = np.block([[F, R_u], [np.zeros((len(u), len(r))), np.eye(len(u))]])
             Q = np.zeros((len(index), len(index)))
+        D = motion.diffusion(part.u, part.dt_s)
         if D is not None:
-            turn = rotation(moved[2])
-            Q[:2, :2] += turn @ D[:2, :2] @ turn.T
-            Q[2, 2] += D[2, 2]
+            G = np.eye(3)
+            G[:2, :2] = rotation(moved[2])
+            Q[:3, :3] += G @ D @ G.T
         self.map.predict(index, F, Q)
         self.map.set_predicted(slot, moved)
 
@@ -218,8 +229,8 @@ class Slam:
         done = self.estimator.correct(self.map, view.look, robot, slots, view.d, y, R, view.angular, gate)
         self._healthy(done.healthy, event)
         report.fill(known, done)
-        for k, name, d2 in zip(known, names, done.d2.tolist(), strict=True):
-            if d2 <= gate:
+        for k, name, d2, fused in zip(known, names, done.d2.tolist(), done.fused.tolist(), strict=True):
+            if fused:
                 self._seen[name] = self._seen.get(name, 0) + 1
                 yield Observation(k, ids[k], "associated", name, d2, "")
             elif math.isnan(d2):
@@ -242,6 +253,9 @@ class Slam:
             return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
         robot = self._slots[event.robot]
         l, L_r, Q = view.explain(self.map.mean(robot)[:3], event.y[k : k + 1], R[k], event)
+        if l.shape != (view.d,):
+            found = f"it finds {len(l)} numbers, a {view.landmark.kind} has {view.d}"
+            return Observation(k, id_, "ignored", None, None, found)
         if not (np.isfinite(l).all() and np.isfinite(L_r).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
         if name is NEW:
@@ -254,8 +268,9 @@ class Slam:
 
     def _seen_by(self, view: View, robot: str, name: Any) -> bool:
         """Return whether this sensor's model applies to a block of the map."""
-        slot = self._slots.get(name)
-        return slot is not None and name != robot and int(self.map.blocks[slot, X_SIZE]) >= view.d
+        if name not in self._slots or name == robot:
+            return False
+        return (ROBOT if name in self.robots else self._kinds[name].kind) in view.sees
 
     def _new_name(self) -> str:
         while True:
@@ -266,7 +281,7 @@ class Slam:
 
     def _healthy(self, healthy: bool, event: Event) -> None:
         if not healthy:
-            raise DivergedError(f"event at t={event.t_s:.9g} s: the innovation's covariance is not positive definite")
+            raise DivergedError(f"{_when(event)}: the innovation's covariance is not positive definite")
 
     # ------------------------------------------------------------------ reading and editing the map
     def mean(self, name: Id) -> Array:
@@ -294,14 +309,18 @@ class Slam:
 
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
+        name = checked_id(name, "landmark")
         kind = landmark or next((v.landmark for v in self._views.values()), Point2D())
         if name in self._slots:
             raise MapError(f"landmark {name!r} is in the map already, expected a new id")
-        mean = np.asarray(mean, dtype=np.float64)
+        try:
+            mean = np.array(mean, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise MapError(f"landmark {name!r}: mean is {mean!r}, expected {kind.space.size} finite numbers") from None
         if mean.shape != (kind.space.size,) or not np.isfinite(mean).all():
             raise MapError(f"landmark {name!r}: mean is {mean.tolist()}, expected {kind.space.size} finite numbers")
         if cov is not None:
-            cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False)
+            cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         self._slots[name] = self.map.add(kind.space, mean, cov)
         self._kinds[name] = kind
 
@@ -328,11 +347,17 @@ class Slam:
         save(self, Path(path))
 
     @staticmethod
-    def load(path: str | Path, robots: Iterable[Robot] | None = None) -> Slam:
-        """Read a state written by `save`; `robots` gives models that are not kalmark's own again."""
+    def load(
+        path: str | Path,
+        robots: Iterable[Robot] | None = None,
+        association: Association | None = None,
+        estimator: Estimator | None = None,
+        landmarks: Landmark | None = None,
+    ) -> Slam:
+        """Read a state written by `save`; what is not kalmark's own (a user's models) must be given again."""
         from kalmark.slam.store import load
 
-        return load(Path(path), robots)
+        return load(Path(path), robots, association, estimator, landmarks)
 
     @staticmethod
     def from_config(path: str | Path) -> Slam:
@@ -340,3 +365,8 @@ class Slam:
         from kalmark.config import slam_from_config
 
         return slam_from_config(path)
+
+
+def _when(event: Event) -> str:
+    """Return what kind of event it is and its time, for an error's line."""
+    return f"{type(event).__name__.lower()} at t={seconds(event.t_ns)} s"

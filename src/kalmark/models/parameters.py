@@ -1,0 +1,28 @@
+"""The check that a model's parameters are numbers it can work with."""
+
+from __future__ import annotations
+
+import math
+from numbers import Real
+from typing import Any
+
+from kalmark.errors import ModelError
+
+
+def check_parameters(model: Any, *, noise: str = "", positive: tuple[str, ...] = ()) -> None:
+    """Refuse a model with a parameter that is not finite, a negative sigma, or a `noise` sigma or `positive` of zero.
+
+    Limits of sight (`..._max_m`) may be infinite.
+    """
+    name = type(model).__name__
+    for key, value in vars(model).items():
+        if not isinstance(value, Real) or isinstance(value, bool):
+            raise ModelError(f"{name}: {key} is {value!r}, expected a number")
+        number = float(value)
+        if math.isnan(number) or (math.isinf(number) and not key.endswith("_max_m")):
+            raise ModelError(f"{name}: {key} is {value}, expected a finite number")
+        above = key in positive or (noise and key.startswith(noise) and not key.endswith("_rel"))
+        if above and number <= 0:
+            raise ModelError(f"{name}: {key} is {value}, expected a positive number")
+        if number < 0 and not key.startswith("encoder_offset"):
+            raise ModelError(f"{name}: {key} is {value}, expected a number of at least 0")
