@@ -126,7 +126,7 @@ def test_diffusion_acts_while_the_control_is_not_zero() -> None:
 
 @pytest.mark.parametrize("model", [km.motion.Unicycle, km.sensors.RangeBearing])
 def test_a_negative_sigma_is_refused(model: type) -> None:
-    with pytest.raises(ModelError, match="expected a (number of at least 0|positive number)"):
+    with pytest.raises(ModelError, match=r"expected a (number of at least 0|positive number)"):
         model(-0.1)
 
 

@@ -22,6 +22,8 @@ def check_parameters(model: Any, *, noise: str = "", positive: tuple[str, ...] =
         if math.isnan(number) or (math.isinf(number) and not key.endswith("_max_m")):
             raise ModelError(f"{name}: {key} is {value}, expected a finite number")
         above = key in positive or (noise and key.startswith(noise) and not key.endswith("_rel"))
+        if key == "sigma_range_m" and getattr(model, "sigma_range_rel", 0.0) > 0:
+            above = False  # the noise may be all relative
         if above and number <= 0:
             raise ModelError(f"{name}: {key} is {value}, expected a positive number")
         if number < 0 and not key.startswith("encoder_offset"):

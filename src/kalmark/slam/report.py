@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.filter.estimators import Correction
-from kalmark.slam.events import Event, Id
+from kalmark.slam.events import Event, Id, seconds
 
 Array = npt.NDArray[np.float64]
 
@@ -71,7 +71,7 @@ class Report:
     def __repr__(self) -> str:
         counts = {o: sum(obs.outcome == o for obs in self.observations) for o in OUTCOMES}
         said = ", ".join(f"{n} {o}" for o, n in counts.items() if n) or "no observations"
-        return f"<Report of {type(self.event).__name__} at t={self.event.t_s:.9g} s: {said}>"
+        return f"<Report of {type(self.event).__name__} at t={seconds(self.event.t_ns)} s: {said}>"
 
 
 class LandmarkEstimate(NamedTuple):
