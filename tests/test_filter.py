@@ -301,7 +301,7 @@ def test_the_downdate_and_the_transport_equal_their_dense_forms(blocks: int) -> 
     np.testing.assert_allclose(full(m), P, atol=1e-11)
     A = np.eye(m.n)
     A[:, 2] += a
-    kernels.transport(m.P, a, 2)
+    kernels.transport(m.P, a[:, None].copy(), 2)
     np.testing.assert_allclose(full(m), A @ P @ A.T, atol=1e-10)
 
 

@@ -25,8 +25,11 @@ Flags = npt.NDArray[np.bool_]
 Map = tuple[Array, Array, int, Table, Table]  # x, P, n, blocks, atoms
 Scan = tuple[int, Index, int, Array, Array, Flags, float]  # robot, slots, d, y, R, angular, gate
 
-POSE = 3  # numbers and degrees of freedom of a planar pose; its heading is the last
-HEADING = 2
+
+@compiled
+def pose_sizes(blocks: Table, atoms: Table, robot: int) -> tuple[int, int, int]:
+    """Return the numbers of a robot's pose, its degrees of freedom, and the axes it turns about: its last rows."""
+    return (3, 3, 1) if atoms[blocks[robot, 4] + 1, 0] == 2 else (7, 6, 3)
 
 
 @compiled
@@ -34,22 +37,27 @@ def observed_block(
     x: Array, blocks: Table, atoms: Table, robot: int, slots: Index, d: int
 ) -> tuple[Index, Table, Array]:
     """Return the rows in P, the atoms and the mean of the robot's pose and the first d numbers of K landmarks."""
-    size = POSE + d * len(slots)
+    pose, _, _ = pose_sizes(blocks, atoms, robot)
+    size = pose + d * len(slots)
     index, mean = np.empty(size, np.int64), np.empty(size)
     table = np.empty((size, 3), np.int64)
-    count = at = 0
+    count = x_to = p_to = 0
     for i in range(len(slots) + 1):
-        slot, width = (robot, POSE) if i == 0 else (slots[i - 1], d)
+        slot, width = (robot, pose) if i == 0 else (slots[i - 1], d)
         x_at, p_at, first = blocks[slot, 0], blocks[slot, 2], blocks[slot, 4]
-        for j in range(width):
-            index[at + j], mean[at + j] = p_at + j, x[x_at + j]
+        mean[x_to : x_to + width] = x[x_at : x_at + width]
+        rows = 0
         for a in range(first, first + blocks[slot, 5]):
             if atoms[a, 1] - x_at < width:
-                table[count, 0] = atoms[a, 0]
-                table[count, 1], table[count, 2] = at + atoms[a, 1] - x_at, at + atoms[a, 2] - p_at
+                kind = atoms[a, 0]
+                table[count, 0] = kind
+                table[count, 1], table[count, 2] = x_to + atoms[a, 1] - x_at, p_to + rows
+                rows += 3 if kind >= 4 else (2 if kind == 1 else 1)
                 count += 1
-        at += width
-    return index, table[:count], mean
+        for j in range(rows):
+            index[p_to + j] = p_at + j
+        x_to, p_to = x_to + width, p_to + rows
+    return index[:p_to], table[:count], mean
 
 
 @compiled
@@ -71,19 +79,20 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
     definite: the filter is broken.
     """
     k, m, d = E_l.shape
+    pose = E_r.shape[2]
     Z, d2, healthy = np.empty((k, m, m)), np.empty(k), True
-    rows, H = np.empty(POSE + d, np.int64), np.empty((m, POSE + d))
-    rows[:POSE] = index[:POSE]
+    rows, H = np.empty(pose + d, np.int64), np.empty((m, pose + d))
+    rows[:pose] = index[:pose]
     for i in range(k):
-        rows[POSE:] = index[POSE + i * d : POSE + (i + 1) * d]
-        H[:, :POSE], H[:, POSE:] = E_r[i], E_l[i]
+        rows[pose:] = index[pose + i * d : pose + (i + 1) * d]
+        H[:, :pose], H[:, pose:] = E_r[i], E_l[i]
         S = submatrix(P, rows)
         for a in range(m):
             for b in range(a + 1):
                 s = R[i, a, b]
-                for c in range(POSE + d):
+                for c in range(pose + d):
                     t = 0.0
-                    for f in range(POSE + d):
+                    for f in range(pose + d):
                         t += S[c, f] * H[b, f]
                     s += H[a, c] * t
                 Z[i, a, b] = Z[i, b, a] = s
@@ -104,12 +113,13 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
 
 @compiled
 def stacked(E_r: Array, E_l: Array) -> Array:
-    """Return the Jacobian H (K m, 3 + K d) of all observations of a scan with respect to the observed block."""
+    """Return the Jacobian H (K m, pose + K d) of all observations of a scan with respect to the observed block."""
     k, m, d = E_l.shape
-    H = np.zeros((k * m, POSE + k * d))
+    pose = E_r.shape[2]
+    H = np.zeros((k * m, pose + k * d))
     for i in range(k):
-        H[i * m : (i + 1) * m, :POSE] = E_r[i]
-        H[i * m : (i + 1) * m, POSE + i * d : POSE + (i + 1) * d] = E_l[i]
+        H[i * m : (i + 1) * m, :pose] = E_r[i]
+        H[i * m : (i + 1) * m, pose + i * d : pose + (i + 1) * d] = E_l[i]
     return H
 
 
@@ -123,21 +133,31 @@ def add_blocks(S: Array, R: Array) -> None:
 
 @register_jitable  # type: ignore[untyped-decorator]
 def iterate(
-    view: Any, table: Table, mean: Array, P_ss: Array, y: Array, R: Array, angular: Flags, most: int, tolerance: float
+    view: Any,
+    sizes: tuple[int, int, int],
+    table: Table,
+    mean: Array,
+    P_ss: Array,
+    y: Array,
+    R: Array,
+    angular: Flags,
+    most: int,
+    tolerance: float,
 ) -> tuple[Array, Array, Array, bool]:
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
 
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta').
     """
-    k, d = len(y), (len(mean) - POSE) // len(y)
-    correction = np.zeros(len(mean))
-    turned = generator(table, mean, len(mean))
+    pose, dof, axes = sizes
+    k, d = len(y), (len(mean) - pose) // len(y)
+    correction = np.zeros(len(P_ss))
+    turned = generator(table, mean, len(P_ss), axes)
     x_j = mean
     for _ in range(most):
-        e, E_r, E_l = linearize(view, x_j[:POSE], x_j[POSE:].reshape(k, d))
+        e, E_r, E_l = linearize(view, x_j[:pose], x_j[pose:].reshape(k, d))
         H = stacked(E_r, E_l)
-        H[:, HEADING] += H @ (generator(table, x_j, len(mean)) - turned)
+        H[:, dof - axes : dof] += H @ (generator(table, x_j, len(P_ss), axes) - turned)
         v = residual(y, e, angular).ravel() + H @ correction
         PH = P_ss @ H.T
         Z = H @ PH
@@ -149,7 +169,7 @@ def iterate(
         change = np.abs(step - correction).max()
         correction = step
         x_j = mean.copy()
-        retract(table, x_j, correction, correction[HEADING])
+        retract(table, x_j, correction, correction[dof - axes : dof])
         if change < tolerance:
             break
     return H, M, v, positive
@@ -174,7 +194,8 @@ def invariant(
     x, P, n, blocks, atoms = map_
     robot, slots, d, y, R, angular, gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, slots, d)
-    e, E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(len(slots), d))
+    pose, dof, axes = pose_sizes(blocks, atoms, robot)
+    e, E_r, E_l = linearize(view, mean[:pose], mean[pose:].reshape(len(slots), d))
     z = residual(y, e, angular)
     Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
     near = (d2 <= gate) & (d2 < np.inf)
@@ -183,14 +204,14 @@ def invariant(
     if not near.all():
         y, R = y[near], R[near]
         index, table, mean = observed_block(x, blocks, atoms, robot, slots[near], d)
-    H, M, v, positive = iterate(view, table, mean, submatrix(P, index), y, R, angular, most, 1e-7)
+    H, M, v, positive = iterate(view, (pose, dof, axes), table, mean, submatrix(P, index), y, R, angular, most, 1e-7)
     if not positive:
         return e, z, Z, d2, near, False
-    before = generator(atoms, x, n)
+    before = generator(atoms, x, n, axes)
     correction = fuse(P, n, index, H, M, v)
-    theta = index[HEADING]
-    retract(atoms, x, correction, correction[theta])
-    transport(P, generator(atoms, x, n) - before, theta)
+    theta = index[dof - axes]
+    retract(atoms, x, correction, correction[theta : theta + axes].copy())
+    transport(P, generator(atoms, x, n, axes) - before, theta)
     return e, z, Z, d2, near, True
 
 
@@ -202,18 +223,18 @@ def textbook(
     robot, slots, d, y, R, angular, gate = scan
     k, m = y.shape
     e, z, Z, d2 = np.empty((k, m)), np.empty((k, m)), np.empty((k, m, m)), np.empty(k)
-    near, healthy = np.zeros(k, np.bool_), True
+    near, healthy, pose = np.zeros(k, np.bool_), True, pose_sizes(blocks, atoms, robot)[0]
     for i in range(k):
         one = slice(i, i + 1)
         index, _table, mean = observed_block(x, blocks, atoms, robot, slots[one], d)
-        e[one], E_r, E_l = linearize(view, mean[:POSE], mean[POSE:].reshape(1, d))
+        e[one], E_r, E_l = linearize(view, mean[:pose], mean[pose:].reshape(1, d))
         z[one] = residual(y[one], e[one], angular)
         Z[one], d2[one], sound = innovation(P, index, E_r, E_l, R[one], z[one])
         healthy = healthy and sound
         near[i] = d2[i] < gate
         if near[i]:
             M, _positive = cholesky_inverse(Z[i])
-            retract(atoms, x, fuse(P, n, index, stacked(E_r, E_l), M, z[i].copy()), 0.0)
+            retract(atoms, x, fuse(P, n, index, stacked(E_r, E_l), M, z[i].copy()), np.zeros(0))
     return e, z, Z, d2, near, healthy
 
 
@@ -223,11 +244,11 @@ def first_estimates(
     """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
     x, P, n, blocks, atoms = map_
     robot, slots, d, y, R, angular, gate = scan
-    k = len(slots)
+    k, pose = len(slots), pose_sizes(blocks, atoms, robot)[0]
     index, _, mean = observed_block(x, blocks, atoms, robot, slots, d)
     _, _, first = observed_block(x_first, blocks, atoms, robot, slots, d)
-    e, _, _ = linearize(view, mean[:POSE], mean[POSE:].reshape(k, d))
-    _, E_r, E_l = linearize(view, first[:POSE], first[POSE:].reshape(k, d))
+    e, _, _ = linearize(view, mean[:pose], mean[pose:].reshape(k, d))
+    _, E_r, E_l = linearize(view, first[:pose], first[pose:].reshape(k, d))
     z = residual(y, e, angular)
     Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
     near = (d2 <= gate) & (d2 < np.inf)
@@ -239,7 +260,7 @@ def first_estimates(
     add_blocks(Z_all, R[near])
     M, positive = cholesky_inverse(Z_all)
     if positive:
-        retract(atoms, x, fuse(P, n, index, H, M, z[near].ravel()), 0.0)
+        retract(atoms, x, fuse(P, n, index, H, M, z[near].ravel()), np.zeros(0))
     return e, z, Z, d2, near, positive
 
 

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from kalmark.errors import ModelError
 from kalmark.filter import corrections
 from kalmark.filter.map import X_AT, StochasticMap
-from kalmark.geometry.spaces import SE2
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -130,7 +129,10 @@ class Fej(_Estimator):
 
     def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
         """Return J (I + (generator(x) - generator(x_first)) e_theta'): displacements counted from x_first."""
-        at = map_.blocks[robot, X_AT]
+        space = map_.spaces[robot]
+        assert space is not None
+        x_at, dof, axes = map_.blocks[robot, X_AT], J.shape[1], space.axes
+        now, first = (space.generator(x[x_at : x_at + space.size])[:dof] for x in (map_.x, map_.x_first))
         J = J.copy()
-        J[:, 2] += J @ (SE2.generator(map_.x[at : at + 3]) - SE2.generator(map_.x_first[at : at + 3]))
+        J[:, dof - axes : dof] += J @ (now - first)
         return J

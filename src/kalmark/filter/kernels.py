@@ -129,16 +129,16 @@ def downdate(P: Array, W: Array) -> None:
 
 @compiled
 def transport(P: Array, a: Array, theta: int) -> None:
-    """P <- A P A' with A = I + a e_theta': P += a w' + w a', w = P[:, theta] + P[theta, theta] a / 2."""
-    n = len(a)
-    w = np.empty(n)
-    half = 0.5 * P[theta, theta]
-    for i in range(n):
-        w[i] = (P[i, theta] if i >= theta else P[theta, i]) + half * a[i]
-    for i in range(n):
-        a_i, w_i = a[i], w[i]
-        for j in range(i + 1):
-            P[i, j] += a_i * w[j] + w_i * a[j]
+    """P <- A P A' with A = I + a e_theta', a (n, 1 or 3): P += a w' + w a', w = P[:, theta] + a P[theta, theta] / 2."""
+    n, axes = a.shape
+    rows = np.arange(theta, theta + axes)
+    w = columns(P, rows, n) + a @ (0.5 * submatrix(P, rows))
+    for c in range(axes):
+        a_c, w_c = a[:, c].copy(), w[:, c].copy()
+        for i in range(n):
+            a_i, w_i = a_c[i], w_c[i]
+            for j in range(i + 1):
+                P[i, j] += a_i * w_c[j] + w_i * a_c[j]
 
 
 @compiled

@@ -21,10 +21,11 @@ from kalmark.geometry.gaussian import (
     sigma_probability,
     sigma_table,
 )
-from kalmark.geometry.spaces import POINT2, SE2, Rn, Space
+from kalmark.geometry.spaces import POINT2, POINT3, SE2, SE3, Rn, Space
 
 __all__ = [
-    "POINT2", "SE2", "Rn", "Space", "V", "V_inverse", "compose", "compound", "ellipse", "from_frame", "gate",
+    "POINT2", "POINT3", "SE2", "SE3", "Rn", "Space", "V", "V_inverse", "compose", "compound", "ellipse", "from_frame",
+    "gate",
     "inv_observe", "inv_scan", "inverse", "mahalanobis", "merge", "move", "observe", "rotation", "scan",
     "sigma_probability", "sigma_table", "to_frame", "wrap",
 ]  # fmt: skip

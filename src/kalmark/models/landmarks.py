@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.geometry import frames3d
 from kalmark.geometry.frames import from_frame_many, to_frame_many
-from kalmark.geometry.spaces import POINT2, SCALAR, VECTOR, Space
+from kalmark.geometry.spaces import POINT2, POINT3, SCALAR, VECTOR, Space
 
 Array = npt.NDArray[np.float64]
 
@@ -67,4 +68,20 @@ class PointSignature2D(Point2D):
     space: ClassVar[Space] = Space("point_signature", (VECTOR, SCALAR))
 
 
-BUILT_IN = (Point2D, PointSignature2D)
+@dataclass(frozen=True)
+class Point3D:
+    """A point (x, y, z) in metres."""
+
+    kind: ClassVar[str] = "point3"
+    space: ClassVar[Space] = POINT3
+
+    def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
+        """Return v (K, 3), V_T (K, 3, 6), V_l (K, 3, 3)."""
+        return frames3d.to_frame_many(T, np.ascontiguousarray(l))
+
+    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return l (K, 3), L_T (K, 3, 6), L_v (K, 3, 3)."""
+        return frames3d.from_frame_many(T, np.ascontiguousarray(v))
+
+
+BUILT_IN = (Point2D, PointSignature2D, Point3D)

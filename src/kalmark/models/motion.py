@@ -16,9 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.geometry import frames3d
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
-from kalmark.geometry.spaces import SE2, Space
+from kalmark.geometry.rotations import exp, left_jacobian
+from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.parameters import check_parameters
 
 Array = npt.NDArray[np.float64]
@@ -57,6 +59,17 @@ def ackermann(r: Array, u: Array, dt: float, wheelbase: float, offset: float) ->
     VW_u = np.array([[slip, v_s], [slip * tan / wheelbase, (v_s * tan + v * tan_s) / wheelbase]])
     r2, R_r, R_vw = arc(r, v, w, dt)
     return r2, R_r, R_vw @ VW_u
+
+
+@compiled
+def increment3d(r: Array, u: Array) -> tuple[Array, Array, Array]:
+    """Move r (7,) by u = (translation, rotation vector) in its own frame; R_u (6, 6)."""
+    step = np.empty(7)
+    step[:3], step[3:] = u[:3], exp(u[3:])
+    r2, R_r, R_s = frames3d.compose(r, step)
+    R_u = R_s.copy()
+    R_u[3:, 3:] = R_s[3:, 3:].copy() @ left_jacobian(u[3:])
+    return r2, R_r, R_u
 
 
 class Planar:
@@ -108,6 +121,42 @@ class Odometry2D(Planar):
     def control_noise(self, u: Array) -> Array:
         """Return N (3, 3) of one increment."""
         return self._N
+
+
+@dataclass(frozen=True)
+class Odometry3D:
+    """Odometry in space: u = (dx, dy, dz, rx, ry, rz), translation and rotation vector in the robot's frame, m and rad.
+
+    The sigmas are those of one increment.
+    """
+
+    sigma_x_m: float = 0.01
+    sigma_y_m: float = 0.01
+    sigma_z_m: float = 0.01
+    sigma_rotation_rad: float = 0.005
+
+    space: ClassVar[Space] = SE3
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    held: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    @cached_property
+    def _N(self) -> Array:
+        return np.diag(np.square([self.sigma_x_m, self.sigma_y_m, self.sigma_z_m, *3 * [self.sigma_rotation_rad]]))
+
+    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        """Return the moved pose (7,), R_r (6, 6), R_u (6, 6)."""
+        return increment3d(r, u)
+
+    def control_noise(self, u: Array) -> Array:
+        """Return N (6, 6) of one increment."""
+        return self._N
+
+    def diffusion(self, u: Array, dt_s: float) -> Array | None:
+        """Return None: an increment's noise is all in its control."""
+        return None
 
 
 @dataclass(frozen=True)

@@ -15,18 +15,24 @@ from numba import types
 from numba.extending import overload
 
 from kalmark.compiled import compiled
+from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.models import landmarks, sensors
 from kalmark.models.landmarks import seen_from
 from kalmark.models.protocols import FullSensor, Landmark, Sensor
-from kalmark.models.sensors import POSITION_FIX, expect
+from kalmark.models.sensors import POSITION_FIX, expect, expect3d
 
 Array = npt.NDArray[np.float64]
 
 
+def composed(r: Array, mount: Array) -> tuple[Array, Array, Array]:
+    """Return the sensor's pose T = r o mount with T_r and T_s, in the plane (3,) or in space (7,)."""
+    return compose(r, mount) if len(r) == 3 else frames3d.compose(r, mount)
+
+
 def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: Array) -> tuple[Array, ...]:
     """Return e = h(v) (K, m) and E_r, E_s, E_l, v being landmarks l (K, n) seen from T = r o mount.  [S] (63)."""
-    T, T_r, T_s = compose(r, mount)
+    T, T_r, T_s = composed(r, mount)
     v, V_T, V_l = landmark.seen_from(T, l)
     e, E_v = sensor.expect(v)
     return e, E_v @ V_T @ T_r, E_v @ V_T @ T_s, E_v @ V_l  # E_s calibrates the mount, for free
@@ -34,7 +40,7 @@ def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: A
 
 def inverse_expectation(r: Array, mount: Array, sensor: FullSensor, landmark: Landmark, y: Array) -> tuple[Array, ...]:
     """Return the landmarks l (K, n) that explain y (K, m), with L_r, L_s and L_y.  [S] (64), (31)-(34)."""
-    T, T_r, T_s = compose(r, mount)
+    T, T_r, T_s = composed(r, mount)
     v, V_y = sensor.invert(y)
     l, L_T, L_v = landmark.from_view(T, v)
     return l, L_T @ T_r, L_T @ T_s, L_v @ V_y
@@ -82,21 +88,44 @@ def _compiled_linearize(view: Any, r: Any, l: Any) -> Any:
 def linearize_built_in(view: tuple[int, Array], r: Array, l: Array) -> tuple[Array, Array, Array]:
     """`expectation`, compiled."""
     code, mount = view
-    T, T_r, _ = compose(r, mount)
-    if code == 6:  # an absolute position fix looks at no landmark
-        return T[:2].copy().reshape(1, 2), T_r[:2].copy().reshape(1, 2, 3), np.zeros((1, 2, l.shape[1]))
-    v, V_T, V_l = seen_from(T, l)
-    e, E_v = expect(code, v)
-    k, m = e.shape
-    d = v.shape[1]
-    E_r, E_l = np.zeros((k, m, 3)), np.zeros((k, m, l.shape[1]))
+    if len(r) == 3:
+        T, T_r, _ = compose(r, mount)
+        if code == 6:  # an absolute position fix looks at no landmark
+            return T[:2].copy().reshape(1, 2), T_r[:2].copy().reshape(1, 2, 3), np.zeros((1, 2, l.shape[1]))
+        v, V_T, V_l = seen_from(T, l)
+        e, E_v = expect(code, v)
+    else:
+        T, T_r, _ = frames3d.compose(r, mount)
+        if code == 6:
+            return T[:3].copy().reshape(1, 3), T_r[:3].copy().reshape(1, 3, 6), np.zeros((1, 3, l.shape[1]))
+        v, V_T, V_l = frames3d.to_frame_many(T, l)
+        e, E_v = expect3d(code, v)
+    return e, turned(chained(E_v, V_T), T_r), chained(E_v, V_l)
+
+
+@compiled
+def chained(A: Array, B: Array) -> Array:
+    """Return A @ B (K, m, n) of A (K, m, d) and B (K, d, n)."""
+    k, m, d = A.shape
+    n = B.shape[2]
+    C = np.zeros((k, m, n))
     for i in range(k):
         for a in range(m):
             for b in range(d):
-                E_T = E_v[i, a, b]
-                for c in range(3):  # E_r = E_v V_T T_r, T_r being the identity but for its last column
-                    E_r[i, a, c] += E_T * V_T[i, b, c]
-                for c in range(l.shape[1]):
-                    E_l[i, a, c] += E_T * V_l[i, b, c]
-            E_r[i, a, 2] += E_r[i, a, 0] * T_r[0, 2] + E_r[i, a, 1] * T_r[1, 2]
-    return e, E_r, E_l
+                A_ab = A[i, a, b]
+                for c in range(n):
+                    C[i, a, c] += A_ab * B[i, b, c]
+    return C
+
+
+@compiled
+def turned(E_T: Array, T_r: Array) -> Array:
+    """Return E_T @ T_r in place: T_r is the identity but for how a turn of the robot moves the sensor."""
+    k, m, n = E_T.shape
+    first = 2 if n == 3 else 3
+    for i in range(k):
+        for a in range(m):
+            for c in range(first, n):
+                for b in range(first):
+                    E_T[i, a, c] += E_T[i, a, b] * T_r[b, c]
+    return E_T

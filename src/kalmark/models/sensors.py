@@ -18,6 +18,7 @@ from kalmark.models.parameters import check_parameters
 Array = npt.NDArray[np.float64]
 
 PYTHON, RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE, POSITION_FIX = range(7)
+RANGE_BEARING_3D, POSITION_3D = 10, 11
 
 
 @compiled
@@ -39,6 +40,26 @@ def expect(code: int, v: Array) -> tuple[Array, Array]:
             E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
         if code == 5:
             e[i, 2], E_v[i, 2, 2] = v[i, 2], 1.0
+    return e, E_v
+
+
+@compiled
+def expect3d(code: int, v: Array) -> tuple[Array, Array]:
+    """Return the measurements (K, 3) that the built-in spatial sensor `code` makes of v (K, 3), and E_v (K, 3, 3)."""
+    k = len(v)
+    e, E_v = v.copy(), np.zeros((k, 3, 3))
+    for i in range(k):
+        if code == 11:
+            E_v[i] = np.eye(3)
+            continue
+        x, y, z = v[i, 0], v[i, 1], v[i, 2]
+        flat2 = x * x + y * y
+        flat, r2 = math.sqrt(flat2), flat2 + z * z
+        r = math.sqrt(r2)
+        e[i, 0], e[i, 1], e[i, 2] = r, math.atan2(y, x), math.atan2(z, flat)
+        E_v[i, 0, 0], E_v[i, 0, 1], E_v[i, 0, 2] = x / r, y / r, z / r
+        E_v[i, 1, 0], E_v[i, 1, 1] = -y / flat2, x / flat2
+        E_v[i, 2, 0], E_v[i, 2, 1], E_v[i, 2, 2] = -x * z / (r2 * flat), -y * z / (r2 * flat), flat / r2
     return e, E_v
 
 
@@ -229,4 +250,83 @@ class RangeBearingSignature(Planar):
         refuse_negative_ranges(y)
 
 
-BUILT_IN = (RangeBearing, Bearing, Range, Position2D, RangeBearingSignature)
+class Spatial:
+    """What the spatial sensors share: limits of sight, built-in expectation."""
+
+    code: ClassVar[int]
+    range_min_m: float
+    range_max_m: float
+    fov_rad: float
+    additive: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_parameters(self, noise="sigma")
+
+    def expect(self, v: Array) -> tuple[Array, Array]:
+        """Return the expected measurements (K, 3) of v (K, 3), and E_v (K, 3, 3)."""
+        return expect3d(self.code, np.ascontiguousarray(v, dtype=np.float64))
+
+    def sees(self, v: Array) -> npt.NDArray[np.bool_]:
+        """Return which of v (K, 3) lie within the range limits and the cone of sight about x."""
+        distance = np.linalg.norm(v, axis=1)
+        off = np.arctan2(np.hypot(v[:, 1], v[:, 2]), v[:, 0])
+        return (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
+
+
+@dataclass(frozen=True)
+class RangeBearing3D(Spatial):
+    """Range (m), azimuth and elevation (rad) of a point in the sensor's frame: a 3-D laser, a radar."""
+
+    sigma_range_m: float = 0.1
+    sigma_azimuth_rad: float = 0.02
+    sigma_elevation_rad: float = 0.02
+    range_min_m: float = 0.0
+    range_max_m: float = math.inf
+    fov_rad: float = 2 * math.pi
+
+    code: ClassVar[int] = RANGE_BEARING_3D
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad")
+    angular: ClassVar[tuple[bool, ...]] = (False, True, True)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 3, 3)."""
+        return _constant((self.sigma_range_m**2, self.sigma_azimuth_rad**2, self.sigma_elevation_rad**2), len(y))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return points v (K, 3) and V_y (K, 3, 3)."""
+        r, (ca, sa), (ce, se) = y[:, 0], *((np.cos(a), np.sin(a)) for a in (y[:, 1], y[:, 2]))
+        ray = np.stack([ce * ca, ce * sa, se], axis=1)
+        V_a = np.stack([-r * ce * sa, r * ce * ca, 0 * r], axis=1)
+        V_e = np.stack([-r * se * ca, -r * se * sa, r * ce], axis=1)
+        return r[:, None] * ray, np.stack([ray, V_a, V_e], axis=2)
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
+@dataclass(frozen=True)
+class Position3D(Spatial):
+    """Position (x, y, z) in the sensor's frame, in metres: an RGB-D camera, a stereo pair, a lidar."""
+
+    sigma_x_m: float = 0.1
+    sigma_y_m: float = 0.1
+    sigma_z_m: float = 0.1
+    range_min_m: float = 0.0
+    range_max_m: float = math.inf
+    fov_rad: float = 2 * math.pi
+
+    code: ClassVar[int] = POSITION_3D
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
+    angular: ClassVar[tuple[bool, ...]] = (False, False, False)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 3, 3)."""
+        return _constant((self.sigma_x_m**2, self.sigma_y_m**2, self.sigma_z_m**2), len(y))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the points themselves and the identity."""
+        return y.copy(), np.tile(np.eye(3), (len(y), 1, 1))
+
+
+BUILT_IN = (RangeBearing, Bearing, Range, Position2D, RangeBearingSignature, RangeBearing3D, Position3D)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +10,8 @@ import numpy.typing as npt
 from kalmark.errors import ModelError
 from kalmark.filter.corrections import innovation, observed_block, residual
 from kalmark.filter.map import X_AT, StochasticMap
-from kalmark.geometry.frames import compose
-from kalmark.models.landmarks import Point2D, PointSignature2D
-from kalmark.models.observe import inverse_expectation, linearize, view_of
+from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D
+from kalmark.models.observe import composed, inverse_expectation, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.robot import Mount
@@ -26,7 +25,10 @@ NOTHING = np.zeros((0, 0, 0))
 
 
 ROBOT = "robot"
-SEEN_AS = {"point": ("point", "point_signature", ROBOT)}  # kinds of blocks that a view of one kind applies to
+SEEN_AS = {
+    "point": ("point", "point_signature", ROBOT),
+    "point3": ("point3", ROBOT),
+}  # kinds of blocks that a view of one kind applies to
 
 
 class View:
@@ -35,7 +37,7 @@ class View:
     def __init__(self, mount: Mount, landmarks: Landmark | None, slam: Slam) -> None:
         self.sensor = mount.sensor
         self.at: Array = np.array(mount.at)  # writable, like all else: numba compiles per kind of array
-        self.landmark: Landmark = mount.landmark or landmarks or _natural(mount.sensor)
+        self.landmark: Landmark = mount.landmark or landmarks or _natural(mount)
         self.look = view_of(self.sensor, self.landmark, self.at)
         self.d = self.landmark.space.size
         self.angular = np.array(self.sensor.angular, dtype=np.bool_)
@@ -44,7 +46,7 @@ class View:
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
         self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
         self.sees = SEEN_AS.get(self.landmark.kind, (self.landmark.kind,))
-        numbers = 3 if "signature" in self.sensor.columns else 2
+        numbers = 3 if len(self.at) == 7 or "signature" in self.sensor.columns else 2
         if isinstance(self.look, tuple) and numbers != self.d:
             raise ModelError(
                 f"a {type(self.sensor).__name__} finds {numbers} numbers, a {self.landmark.kind} has {self.d}"
@@ -56,7 +58,7 @@ class View:
         """Return the noise of observations of the blocks `slots`: R, unless it depends on where they are  [F]."""
         if self.noise_at is None or event.cov is not None:
             return R
-        T, _, _ = compose(map_.mean(robot)[:3], self.at)
+        T, _, _ = composed(map_.mean(robot)[: len(self.at)], self.at)
         l = map_.x[map_.blocks[slots, X_AT][:, None] + np.arange(self.d)]
         return self.noise_at(self.landmark.seen_from(T, l)[0])
 
@@ -68,8 +70,10 @@ class View:
         return l[0], L_r[0], L_y[0] @ R @ L_y[0].T
 
 
-def _natural(sensor: Any) -> Landmark:
-    return PointSignature2D() if "signature" in sensor.columns else Point2D()
+def _natural(mount: Mount) -> Landmark:
+    if len(mount.at) == 7:
+        return Point3D()
+    return PointSignature2D() if "signature" in mount.sensor.columns else Point2D()
 
 
 class Scene:
@@ -92,8 +96,9 @@ class Scene:
         map_, view = self._slam.map, self._view
         robot = self._slam.slot(self._event.robot)
         slots = np.array([self._slam.slot(name) for name in candidates])
+        pose = len(view.at)
         index, _, mean = observed_block(map_.x, map_.blocks, map_.atoms, robot, slots, view.d)
-        e, E_r, E_l = linearize(view.look, mean[:3], mean[3:].reshape(len(slots), view.d))
+        e, E_r, E_l = linearize(view.look, mean[:pose], mean[pose:].reshape(len(slots), view.d))
         d2 = np.empty((len(self._event.y), len(slots)))
         there = view.noise(map_, robot, slots, NOTHING, self._event)
         for k, y in enumerate(self._event.y):

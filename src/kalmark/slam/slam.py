@@ -35,7 +35,7 @@ from kalmark.slam.scene import ROBOT, Scene, View
 
 Array = npt.NDArray[np.float64]
 
-NOWHERE = np.zeros(3)
+ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 
 
 class Slam:
@@ -139,15 +139,18 @@ class Slam:
 
     def _fix(self, event: Fix) -> Report:
         what = _when(event)
-        if event.y.shape != (2,):
-            raise EventError(f"{what}: y has shape {event.y.shape}, expected (2,): x and y in m")
-        covariance(event.cov, 2, f"{what}: cov", definite=True)
+        pose = len(self.robots[event.robot].start)
+        size = 2 if pose == 3 else 3
+        if event.y.shape != (size,):
+            expected = "x and y in m" if size == 2 else "x, y and z in m"
+            raise EventError(f"{what}: y has shape {event.y.shape}, expected ({size},): {expected}")
+        covariance(event.cov, size, f"{what}: cov", definite=True)
         self.t_ns = event.t_ns
         self._advance(event.robot)
-        slot, report = self._slots[event.robot], Report(event, event.y.reshape(1, 2))
-        gate = self.association.threshold(2, self.estimator.default_gate)
-        y, R, straight = report.y, event.cov.reshape(1, 2, 2), np.zeros(2, dtype=np.bool_)
-        view, estimator = fix_view(NOWHERE), self.estimator.for_fixes()
+        slot, report = self._slots[event.robot], Report(event, event.y.reshape(1, size))
+        gate = self.association.threshold(size, self.estimator.default_gate)
+        y, R, straight = report.y, event.cov.reshape(1, size, size), np.zeros(size, dtype=np.bool_)
+        view, estimator = fix_view(ORIGIN[pose]), self.estimator.for_fixes()
         done = estimator.correct(self.map, view, slot, np.array([slot]), 0, y, R, straight, gate)
         self._healthy(done.healthy, event)
         report.e, report.z, report.Z = done.e, done.z, done.Z
@@ -252,7 +255,7 @@ class Slam:
             kind = type(view.sensor).__name__
             return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
         robot = self._slots[event.robot]
-        l, L_r, Q = view.explain(self.map.mean(robot)[:3], event.y[k : k + 1], R[k], event)
+        l, L_r, Q = view.explain(self.map.mean(robot)[: len(view.at)], event.y[k : k + 1], R[k], event)
         if l.shape != (view.d,):
             found = f"it finds {len(l)} numbers, a {view.landmark.kind} has {view.d}"
             return Observation(k, id_, "ignored", None, None, found)
@@ -260,7 +263,7 @@ class Slam:
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
         if name is NEW:
             name = self._new_name()
-        G, index = self.estimator.pose_jacobian(self.map, robot, L_r), self.map.index(robot)[:3]
+        G, index = self.estimator.pose_jacobian(self.map, robot, L_r), self.map.index(robot)[: L_r.shape[1]]
         self._slots[name] = self.map.augment(view.landmark.space, l, index, G, Q)
         self._kinds[name] = view.landmark
         self._seen[name] = 1
@@ -285,7 +288,7 @@ class Slam:
 
     # ------------------------------------------------------------------ reading and editing the map
     def mean(self, name: Id) -> Array:
-        """Return the mean of a robot, (3,): x, y in m, heading in rad, or of a landmark."""
+        """Return the mean of a landmark or of a robot: (x, y, heading) in m and rad, or (x, y, z, qx, qy, qz, qw)."""
         return self.map.mean(self.slot(name))
 
     def covariance(self, *names: Id) -> Array:
