@@ -1,0 +1,195 @@
+"""Rotations of space: quaternions xyzw, rotation vectors, Euler angles, and SO(3)'s exponential with its Jacobian.
+
+Quaternions are Hamilton's, real part last, local to global: p_global = Q p_local with Q = `matrix(q)`.  An
+orientation's error is a rotation vector in the **world** frame, Q = Exp(d) Q_hat, as the heading's is in two
+dimensions.  In these coordinates the Jacobian of `exp` is `left_jacobian`, that of `log` its inverse, that of
+`multiply(a, b)` is I and `matrix(a)`, that of `conjugate` -`matrix` of the result.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.geometry.angles import wrap
+
+Array = npt.NDArray[np.float64]
+
+
+@compiled
+def skew(v: Array) -> Array:
+    """Return [v]x (3, 3), with [v]x w = v x w."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@compiled
+def normalised(q: Array) -> Array:
+    """Return the unit quaternion along q."""
+    return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+
+
+@compiled
+def multiply(a: Array, b: Array) -> Array:
+    """Return the product of two unit quaternions, normalised: the rotation b, then a."""
+    return normalised(
+        np.array(
+            [
+                a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1],
+                a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0],
+                a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3],
+                a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2],
+            ]
+        )
+    )
+
+
+@compiled
+def conjugate(q: Array) -> Array:
+    """Return the inverse of a unit quaternion."""
+    return np.array([-q[0], -q[1], -q[2], q[3]])
+
+
+@compiled
+def matrix(q: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,)."""
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@compiled
+def from_matrix(Q: Array) -> Array:
+    """Return the unit quaternion, w >= 0, of a rotation matrix (3, 3); divides by its largest component."""
+    trace = Q[0, 0] + Q[1, 1] + Q[2, 2]
+    q = np.empty(4)
+    if trace > max(Q[0, 0], Q[1, 1], Q[2, 2]):
+        q[0], q[1], q[2] = Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1]
+        q[3] = 1 + trace
+    else:
+        i = 0
+        for a in range(1, 3):
+            if Q[a, a] > Q[i, i]:
+                i = a
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[i] = 1 + 2 * Q[i, i] - trace
+        q[j], q[k] = Q[j, i] + Q[i, j], Q[k, i] + Q[i, k]
+        q[3] = Q[k, j] - Q[j, k]
+    return normalised(q) if q[3] >= 0 else normalised(-q)
+
+
+@compiled
+def exp(v: Array) -> Array:
+    """Return the quaternion of a rotation vector (3,), rad."""
+    a = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    s = math.sin(0.5 * a) / a if a > 1e-12 else 0.5
+    return np.array([s * v[0], s * v[1], s * v[2], math.cos(0.5 * a)])
+
+
+@compiled
+def log(q: Array) -> Array:
+    """Return the rotation vector (3,) of a unit quaternion, of length at most pi."""
+    s = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    sign = -1.0 if q[3] < 0 else 1.0
+    k = sign * (2.0 * math.atan2(s, abs(q[3])) / s if s > 1e-12 else 2.0)
+    return np.array([k * q[0], k * q[1], k * q[2]])
+
+
+@compiled
+def left_jacobian(v: Array) -> Array:
+    """Return V(v) (3, 3) of SO(3): Exp(v + d) = Exp(V d) Exp(v) to first order, and (Exp(v) - I) p = V(v) (v x p).
+
+    The right Jacobian is that of -v.
+    """
+    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if a2 < 1e-2:
+        p = 1 / 2 - a2 * (1 / 24 - a2 * (1 / 720 - a2 / 40320))
+        q = 1 / 6 - a2 * (1 / 120 - a2 * (1 / 5040 - a2 / 362880))
+    else:
+        a = math.sqrt(a2)
+        half = math.sin(0.5 * a)
+        p, q = 2.0 * half * half / a2, (a - math.sin(a)) / (a2 * a)
+    S = skew(v)
+    return np.eye(3) + p * S + q * (S @ S)
+
+
+@compiled
+def left_jacobian_inverse(v: Array) -> Array:
+    """Return V(v)^-1 (3, 3): Log(Exp(d) Exp(v)) = v + V^-1 d to first order; regular for |v| below 2 pi."""
+    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if a2 < 1e-2:
+        q = 1 / 12 + a2 * (1 / 720 + a2 * (1 / 30240 + a2 / 1209600))
+    else:
+        half = 0.5 * math.sqrt(a2)
+        q = (1.0 - half * math.cos(half) / math.sin(half)) / a2
+    S = skew(v)
+    return np.eye(3) - 0.5 * S + q * (S @ S)
+
+
+@compiled
+def rotate(q: Array, p: Array) -> tuple[Array, Array, Array]:
+    """Return the point or direction p (3,) turned by q: pw, PW_q (3, 3), PW_p (3, 3)."""
+    Q = matrix(q)
+    pw = Q @ np.ascontiguousarray(p)
+    return pw, -skew(pw), Q
+
+
+@compiled
+def from_euler(e: Array) -> tuple[Array, Array]:
+    """Return the quaternion of (roll, pitch, yaw), rad, about x, then y, then z: Q = Qz Qy Qx; and Q_e (3, 3)."""
+    cr, cp, cy = math.cos(0.5 * e[0]), math.cos(0.5 * e[1]), math.cos(0.5 * e[2])
+    sr, sp, sy = math.sin(0.5 * e[0]), math.sin(0.5 * e[1]), math.sin(0.5 * e[2])
+    q = np.array(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+    cos_p, sin_p, cos_y, sin_y = math.cos(e[1]), math.sin(e[1]), math.cos(e[2]), math.sin(e[2])
+    return q, np.array([[cos_p * cos_y, -sin_y, 0.0], [cos_p * sin_y, cos_y, 0.0], [-sin_p, 0.0, 1.0]])
+
+
+@compiled
+def to_euler(q: Array) -> tuple[Array, Array]:
+    """Return (roll, pitch, yaw), rad, of a unit quaternion, pitch within +-pi/2; and E_q (3, 3).
+
+    Through the half sum and half difference of roll and yaw, so that the rotation is kept to the last digit near
+    pitch = +-pi/2 too.  There only one of the two is defined: roll is 0, and E_q grows without bound.
+    """
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    above, below = math.hypot(x - z, w + y), math.hypot(x + z, w - y)  # sqrt(1 +- sin pitch)
+    half_difference, half_sum = math.atan2(x - z, w + y), math.atan2(x + z, w - y)
+    if below < 1e-15:
+        half_sum = -half_difference
+    elif above < 1e-15:
+        half_difference = -half_sum
+    pitch = 2.0 * math.atan2(above, below) - 0.5 * math.pi
+    roll, yaw = wrap(half_sum + half_difference), wrap(half_sum - half_difference)
+    c, s, cos_p = math.cos(yaw), math.sin(yaw), above * below
+    t = math.sin(pitch) / cos_p
+    E_q = np.array([[c / cos_p, s / cos_p, 0.0], [-s, c, 0.0], [t * c, t * s, 1.0]])
+    return np.array([roll, pitch, yaw]), E_q
+
+
+def batched(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function`, made for single rotations or frames, for K of them: arguments (K, n), outputs stacked."""
+
+    def over(*arguments: Any) -> Any:
+        rows = [np.ascontiguousarray(a, dtype=np.float64) for a in arguments]
+        outputs = [function(*one) for one in zip(*rows, strict=True)]
+        if outputs and isinstance(outputs[0], tuple):
+            return tuple(np.array(each) for each in zip(*outputs, strict=True))
+        return np.array(outputs)
+
+    return over
