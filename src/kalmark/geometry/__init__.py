@@ -1,5 +1,6 @@
-"""Geometry of the plane with Jacobians, spaces of the map's blocks, and Gaussians."""
+"""Geometry of the plane and of space with Jacobians, spaces of the map's blocks, and Gaussians."""
 
+from kalmark.geometry import directions, frames3d, rotations
 from kalmark.geometry.angles import V, V_inverse, rotation, wrap
 from kalmark.geometry.frames import (
     compose,
@@ -24,8 +25,7 @@ from kalmark.geometry.gaussian import (
 from kalmark.geometry.spaces import POINT2, POINT3, SE2, SE3, Rn, Space
 
 __all__ = [
-    "POINT2", "POINT3", "SE2", "SE3", "Rn", "Space", "V", "V_inverse", "compose", "compound", "ellipse", "from_frame",
-    "gate",
-    "inv_observe", "inv_scan", "inverse", "mahalanobis", "merge", "move", "observe", "rotation", "scan",
-    "sigma_probability", "sigma_table", "to_frame", "wrap",
+    "POINT2", "POINT3", "SE2", "SE3", "Rn", "Space", "V", "V_inverse", "compose", "compound", "directions", "ellipse",
+    "frames3d", "from_frame", "gate", "inv_observe", "inv_scan", "inverse", "mahalanobis", "merge", "move", "observe",
+    "rotation", "rotations", "scan", "sigma_probability", "sigma_table", "to_frame", "wrap",
 ]  # fmt: skip

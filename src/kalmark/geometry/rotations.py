@@ -165,7 +165,7 @@ def to_euler(q: Array) -> tuple[Array, Array]:
     """Return (roll, pitch, yaw), rad, of a unit quaternion, pitch within +-pi/2; and E_q (3, 3).
 
     Through the half sum and half difference of roll and yaw, so that the rotation is kept to the last digit near
-    pitch = +-pi/2 too.  There only one of the two is defined: roll is 0, and E_q, which has no limit, grows unbounded.
+    pitch = +-pi/2 too.  There only one of the two is defined: roll is 0, and E_q grows without bound.
     """
     x, y, z, w = q[0], q[1], q[2], q[3]
     above, below = math.hypot(x - z, w + y), math.hypot(x + z, w - y)  # sqrt(1 +- sin pitch)

@@ -19,7 +19,6 @@ from kalmark.compiled import compiled
 from kalmark.geometry import frames3d
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
-from kalmark.geometry.rotations import exp, left_jacobian
 from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.parameters import check_parameters
 
@@ -59,17 +58,6 @@ def ackermann(r: Array, u: Array, dt: float, wheelbase: float, offset: float) ->
     VW_u = np.array([[slip, v_s], [slip * tan / wheelbase, (v_s * tan + v * tan_s) / wheelbase]])
     r2, R_r, R_vw = arc(r, v, w, dt)
     return r2, R_r, R_vw @ VW_u
-
-
-@compiled
-def increment3d(r: Array, u: Array) -> tuple[Array, Array, Array]:
-    """Move r (7,) by u = (translation, rotation vector) in its own frame; R_u (6, 6)."""
-    step = np.empty(7)
-    step[:3], step[3:] = u[:3], exp(u[3:])
-    r2, R_r, R_s = frames3d.compose(r, step)
-    R_u = R_s.copy()
-    R_u[3:, 3:] = R_s[3:, 3:].copy() @ left_jacobian(u[3:])
-    return r2, R_r, R_u
 
 
 class Planar:
@@ -148,7 +136,7 @@ class Odometry3D:
 
     def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
         """Return the moved pose (7,), R_r (6, 6), R_u (6, 6)."""
-        return increment3d(r, u)
+        return frames3d.move(r, u)
 
     def control_noise(self, u: Array) -> Array:
         """Return N (6, 6) of one increment."""

@@ -19,6 +19,7 @@ from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.models import landmarks, sensors
 from kalmark.models.landmarks import seen_from
+from kalmark.models.landmarks3d import chained
 from kalmark.models.protocols import FullSensor, Landmark, Sensor
 from kalmark.models.sensors import POSITION_FIX, expect, expect3d
 
@@ -101,21 +102,6 @@ def linearize_built_in(view: tuple[int, Array], r: Array, l: Array) -> tuple[Arr
         v, V_T, V_l = frames3d.to_frame_many(T, l)
         e, E_v = expect3d(code, v)
     return e, turned(chained(E_v, V_T), T_r), chained(E_v, V_l)
-
-
-@compiled
-def chained(A: Array, B: Array) -> Array:
-    """Return A @ B (K, m, n) of A (K, m, d) and B (K, d, n)."""
-    k, m, d = A.shape
-    n = B.shape[2]
-    C = np.zeros((k, m, n))
-    for i in range(k):
-        for a in range(m):
-            for b in range(d):
-                A_ab = A[i, a, b]
-                for c in range(n):
-                    C[i, a, c] += A_ab * B[i, b, c]
-    return C
 
 
 @compiled

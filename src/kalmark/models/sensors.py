@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from kalmark.compiled import compiled
 from kalmark.errors import EventError
+from kalmark.geometry.directions import inv_spherical_many, spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.models.parameters import check_parameters
 
@@ -46,21 +47,12 @@ def expect(code: int, v: Array) -> tuple[Array, Array]:
 @compiled
 def expect3d(code: int, v: Array) -> tuple[Array, Array]:
     """Return the measurements (K, 3) that the built-in spatial sensor `code` makes of v (K, 3), and E_v (K, 3, 3)."""
-    k = len(v)
-    e, E_v = v.copy(), np.zeros((k, 3, 3))
-    for i in range(k):
-        if code == 11:
-            E_v[i] = np.eye(3)
-            continue
-        x, y, z = v[i, 0], v[i, 1], v[i, 2]
-        flat2 = x * x + y * y
-        flat, r2 = math.sqrt(flat2), flat2 + z * z
-        r = math.sqrt(r2)
-        e[i, 0], e[i, 1], e[i, 2] = r, math.atan2(y, x), math.atan2(z, flat)
-        E_v[i, 0, 0], E_v[i, 0, 1], E_v[i, 0, 2] = x / r, y / r, z / r
-        E_v[i, 1, 0], E_v[i, 1, 1] = -y / flat2, x / flat2
-        E_v[i, 2, 0], E_v[i, 2, 1], E_v[i, 2, 2] = -x * z / (r2 * flat), -y * z / (r2 * flat), flat / r2
-    return e, E_v
+    if code == 10:
+        return spherical_many(v)
+    E_v = np.zeros((len(v), 3, 3))
+    for i in range(len(v)):
+        E_v[i] = np.eye(3)
+    return v.copy(), E_v
 
 
 @lru_cache(maxsize=256)
@@ -294,11 +286,7 @@ class RangeBearing3D(Spatial):
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return points v (K, 3) and V_y (K, 3, 3)."""
-        r, (ca, sa), (ce, se) = y[:, 0], *((np.cos(a), np.sin(a)) for a in (y[:, 1], y[:, 2]))
-        ray = np.stack([ce * ca, ce * sa, se], axis=1)
-        V_a = np.stack([-r * ce * sa, r * ce * ca, 0 * r], axis=1)
-        V_e = np.stack([-r * se * ca, -r * se * sa, r * ce], axis=1)
-        return r[:, None] * ray, np.stack([ray, V_a, V_e], axis=2)
+        return inv_spherical_many(np.ascontiguousarray(y))
 
     def check(self, y: Array) -> None:
         """Refuse negative ranges."""

@@ -1,0 +1,264 @@
+"""Cameras: pixels of what lies at v = (x, y, z) in the optical frame (x right, y down, z forward), and rays back.
+
+Pin-hole intrinsics are k = (fx, fy, cx, cy) in pixels.  Lens distortion is radial on the plane z = 1,
+x_d = x (1 + d1 r^2 + d2 r^4 + ...), of any order; its correction c has the same form.  The omnidirectional camera is
+Scaramuzza's (2006): polynomials between the angle and the radius in the image, and an affine matrix of the pixels.
+Projections do not depend on the length of v, so that v may be the ray to a landmark of unknown depth.  [TB] `pinHole`,
+`invPinHole`, `omniCam`, `invOmniCam`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.errors import ModelError
+from kalmark.geometry.directions import unit_many
+
+Array = npt.NDArray[np.float64]
+
+
+@compiled
+def radial_many(x: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Scale x (K, 2) by 1 + d1 r^2 + d2 r^4 + ...: xd, XD_x (K, 2, 2), XD_d (K, 2, n).  [TB] `distort`, `undistort`."""
+    k, n = len(x), len(d)
+    xd, XD_x, XD_d = np.empty((k, 2)), np.empty((k, 2, 2)), np.empty((k, 2, n))
+    for i in range(k):
+        r2 = x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1]
+        scale, rate, power = 1.0, 0.0, 1.0  # rate: d scale / d r^2
+        for j in range(n):
+            rate += (j + 1) * d[j] * power
+            power *= r2
+            scale += d[j] * power
+            for a in range(2):
+                XD_d[i, a, j] = x[i, a] * power
+        for a in range(2):
+            xd[i, a] = scale * x[i, a]
+            for b in range(2):
+                XD_x[i, a, b] = 2 * rate * x[i, a] * x[i, b] + (scale if a == b else 0.0)
+    return xd, XD_x, XD_d
+
+
+@compiled
+def plane_many(v: Array) -> tuple[Array, Array]:
+    """Project v (K, 3) on the plane z = 1: x (K, 2) and X_v (K, 2, 3)."""
+    k = len(v)
+    x, X_v = np.empty((k, 2)), np.zeros((k, 2, 3))
+    for i in range(k):
+        for a in range(2):
+            x[i, a] = v[i, a] / v[i, 2]
+            X_v[i, a, a], X_v[i, a, 2] = 1.0 / v[i, 2], -x[i, a] / v[i, 2]
+    return x, X_v
+
+
+@compiled
+def project_pinhole(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
+    """Return the pixels e (K, 2) of v (K, 3), and E_v (K, 2, 3); meaningful where z > 0."""
+    x, X_v = plane_many(v)
+    xd, XD_x, _ = radial_many(x, d)
+    e, E_v = np.empty((len(v), 2)), np.empty((len(v), 2, 3))
+    for i in range(len(v)):
+        for a in range(2):
+            e[i, a] = k[2 + a] + k[a] * xd[i, a]
+            for b in range(3):
+                E_v[i, a, b] = k[a] * (XD_x[i, a, 0] * X_v[i, 0, b] + XD_x[i, a, 1] * X_v[i, 1, b])
+    return e, E_v
+
+
+@compiled
+def calibrate_pinhole(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
+    """Return the Jacobians E_k (K, 2, 4) and E_d (K, 2, n) of `project_pinhole` in its intrinsics and distortion."""
+    xd, _, XD_d = radial_many(plane_many(v)[0], d)
+    E_k, E_d = np.zeros((len(v), 2, 4)), np.empty((len(v), 2, len(d)))
+    for i in range(len(v)):
+        for a in range(2):
+            E_k[i, a, a], E_k[i, a, 2 + a] = xd[i, a], 1.0
+            for j in range(len(d)):
+                E_d[i, a, j] = k[a] * XD_d[i, a, j]
+    return E_k, E_d
+
+
+@compiled
+def back_project_pinhole(y: Array, k: Array, c: Array) -> tuple[Array, Array]:
+    """Return the viewing rays m (K, 3), unit vectors, of pixels y (K, 2), M_y (K, 3, 2); c: `fit_correction`."""
+    xd = np.empty((len(y), 2))
+    for i in range(len(y)):
+        for a in range(2):
+            xd[i, a] = (y[i, a] - k[2 + a]) / k[a]
+    x, X_xd, _ = radial_many(xd, c)
+    v = np.ones((len(y), 3))
+    v[:, :2] = x
+    m, M_v = unit_many(v)
+    M_y = np.empty((len(y), 3, 2))
+    for i in range(len(y)):
+        for a in range(3):
+            for b in range(2):
+                M_y[i, a, b] = (M_v[i, a, 0] * X_xd[i, 0, b] + M_v[i, a, 1] * X_xd[i, 1, b]) / k[b]
+    return m, M_y
+
+
+def valid_radius(d: Any) -> float:
+    """Return the radius on the plane z = 1 up to which the distortion d grows; beyond it the image folds over."""
+    d = np.asarray(d, dtype=np.float64)
+    rates = np.concatenate([[1.0], (2 * np.arange(len(d)) + 3) * d])  # d r_d / d r, in powers of r^2
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros(rates, "b"))
+    turns = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return math.sqrt(turns.min()) if len(turns) else math.inf
+
+
+def fit_correction(d: Any, k: Any, size: Any, tolerance_px: float = 0.005, radius: float | None = None) -> Array:
+    """Fit the shortest correction c that undoes the distortion d within `tolerance_px` over an image (width, height).
+
+    Least squares of pixels at Chebyshev nodes of r_d^2 from the centre to the farthest corner, or to `radius` on the
+    plane z = 1.  Raise ModelError where that is more than the distortion can reach, or if 20 coefficients do not
+    suffice, as where the lens almost folds the image: then `radius` says how much of the image is to be used.
+    """
+    d, k, size = (np.asarray(a, dtype=np.float64) for a in (d, k, size))
+    if not d.any():
+        return np.zeros(0)
+    reach = np.maximum(k[2:], size - k[2:]) / k[:2]
+    rd = (radius or math.hypot(*reach)) * np.sqrt(0.5 - 0.5 * np.cos(np.pi * np.arange(201) / 200))[1:]
+    r = _undistorted(rd, d)
+    n_d = np.arange(1, len(d) + 1)
+    pixels = (1 + r[:, None] ** (2 * n_d) @ ((2 * n_d + 1) * d)) * k[:2].max()  # d pixel / d r
+    for n in range(1, 21):
+        powers = (rd[:, None] / rd[-1]) ** (2 * np.arange(1, n + 1))
+        c = np.linalg.lstsq((pixels * rd)[:, None] * powers, pixels * (r - rd), rcond=None)[0]
+        if np.abs(pixels * (rd + rd * (powers @ c) - r)).max() < tolerance_px:
+            return c / rd[-1] ** (2 * np.arange(1, n + 1))
+    raise ModelError(f"distortion {d.tolist()}: no correction of 20 coefficients within {tolerance_px} px")
+
+
+def _undistorted(rd: Array, d: Array) -> Array:
+    """Return the radii that the distortion d carries to rd (ascending), by bisection below the valid radius."""
+    powers = np.arange(1, len(d) + 1)
+
+    def distorted(r: Array) -> Array:
+        return r * (1 + (r[:, None] ** (2 * powers)) @ d)
+
+    top = min(valid_radius(d), 100 * rd[-1])
+    low, high = np.zeros_like(rd), np.full_like(rd, top)
+    if distorted(high[:1])[0] < rd[-1]:
+        raise ModelError(
+            f"distortion {d.tolist()}: reaches radius {distorted(high[:1])[0]:.4g}, image has {rd[-1]:.4g}"
+        )
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        below = distorted(middle) < rd
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return 0.5 * (low + high)
+
+
+@compiled
+def polynomial(a: Array, x: float) -> tuple[float, float]:
+    """Return a0 + a1 x + a2 x^2 + ... and its derivative."""
+    value, rate = 0.0, 0.0
+    for j in range(len(a) - 1, -1, -1):
+        rate = rate * x + value
+        value = value * x + a[j]
+    return value, rate
+
+
+@compiled
+def project_omni(v: Array, k: Array, a: Array) -> tuple[Array, Array]:
+    """Return the pixels e (K, 2) of v (K, 3), and E_v (K, 2, 3), of an omnidirectional camera.
+
+    k = (cx, cy, c, d, e), the centre and the affine matrix [[1, e], [d, c]] in (u, v); a: the radius in the image as a
+    polynomial of the angle above the image plane, atan2(z, hypot(x, y)).  On the axis itself the pixel is the centre.
+    """
+    e, E_v = np.empty((len(v), 2)), np.empty((len(v), 2, 3))
+    for i in range(len(v)):
+        x, y, z = v[i, 0], v[i, 1], v[i, 2]
+        flat2 = x * x + y * y
+        flat, r2 = math.sqrt(flat2), flat2 + z * z
+        radius, rate = polynomial(a, math.atan2(z, flat))
+        if flat > 1e-12 * abs(z):
+            cos, sin, scale = x / flat, y / flat, radius / flat
+        else:
+            cos, sin, scale, radius = 1.0, 0.0, -rate / z, 0.0
+        along = -rate * z / r2  # d radius / d flat
+        p, q = radius * cos, radius * sin
+        P_x, P_y, Q_y = along * cos * cos + scale * sin * sin, (along - scale) * cos * sin, along * sin * sin
+        Q_y += scale * cos * cos
+        P_z, Q_z = rate * flat / r2 * cos, rate * flat / r2 * sin
+        e[i, 0], e[i, 1] = k[0] + p + k[4] * q, k[1] + k[3] * p + k[2] * q
+        E_v[i, 0, 0], E_v[i, 0, 1], E_v[i, 0, 2] = P_x + k[4] * P_y, P_y + k[4] * Q_y, P_z + k[4] * Q_z
+        E_v[i, 1, 0], E_v[i, 1, 1] = k[3] * P_x + k[2] * P_y, k[3] * P_y + k[2] * Q_y
+        E_v[i, 1, 2] = k[3] * P_z + k[2] * Q_z
+    return e, E_v
+
+
+@compiled
+def back_project_omni(y: Array, k: Array, b: Array) -> tuple[Array, Array]:
+    """Return the viewing rays m (K, 3), unit vectors, of pixels y (K, 2), and M_y (K, 3, 2).
+
+    k as in `project_omni`; b: the height z as a polynomial of the radius in the image, the ray being (p, q, z).
+    """
+    v, V_y = np.empty((len(y), 3)), np.zeros((len(y), 3, 2))
+    det = k[2] - k[3] * k[4]
+    for i in range(len(y)):
+        du, dv = y[i, 0] - k[0], y[i, 1] - k[1]
+        p, q = (k[2] * du - k[4] * dv) / det, (dv - k[3] * du) / det
+        radius = math.sqrt(p * p + q * q)
+        v[i, 0], v[i, 1] = p, q
+        v[i, 2], rate = polynomial(b, radius)
+        V_y[i, 0, 0], V_y[i, 0, 1], V_y[i, 1, 0], V_y[i, 1, 1] = k[2] / det, -k[4] / det, -k[3] / det, 1.0 / det
+        if radius > 0.0:
+            for j in range(2):
+                V_y[i, 2, j] = rate * (p * V_y[i, 0, j] + q * V_y[i, 1, j]) / radius
+    m, M_v = unit_many(v)
+    M_y = np.empty((len(y), 3, 2))
+    for i in range(len(y)):
+        M_y[i] = M_v[i] @ V_y[i]
+    return m, M_y
+
+
+@compiled
+def project_stereo(v: Array, k: Array, baseline_m: float) -> tuple[Array, Array]:
+    """Return the pixels e (K, 4) = (u, v of the left, u, v of the right camera) of v (K, 3), and E_v (K, 4, 3).
+
+    A rectified pair: v is in the left camera's frame, the right one is at (baseline, 0, 0) in it.  A sensor without
+    the right image's v takes the first three rows.
+    """
+    e, E_v = np.empty((len(v), 4)), np.zeros((len(v), 4, 3))
+    for i in range(len(v)):
+        z = v[i, 2]
+        for a in range(4):
+            b = a % 2
+            x = v[i, b] - (baseline_m if a == 2 else 0.0)
+            e[i, a] = k[2 + b] + k[b] * x / z
+            E_v[i, a, b], E_v[i, a, 2] = k[b] / z, -k[b] * x / (z * z)
+    return e, E_v
+
+
+@compiled
+def back_project_stereo(y: Array, k: Array, baseline_m: float) -> tuple[Array, Array]:
+    """Return the points v (K, 3) seen at y (K, 4) or, without the right image's v, (K, 3); and V_y (K, 3, 4 or 3).
+
+    Depth is fx baseline / disparity, height the mean of both images.
+    """
+    k4 = y.shape[1] == 4
+    v, V_y = np.empty((len(y), 3)), np.zeros((len(y), 3, y.shape[1]))
+    for i in range(len(y)):
+        disparity = y[i, 0] - y[i, 2]
+        z = k[0] * baseline_m / disparity
+        x = (y[i, 0] - k[2]) / k[0]
+        h = ((0.5 * (y[i, 1] + y[i, 3]) if k4 else y[i, 1]) - k[3]) / k[1]
+        v[i, 0], v[i, 1], v[i, 2] = z * x, z * h, z
+        for a, t in ((0, x), (1, h), (2, 1.0)):
+            V_y[i, a, 0], V_y[i, a, 2] = -t * z / disparity, t * z / disparity
+        V_y[i, 0, 0] += z / k[0]
+        V_y[i, 1, 1] = z / k[1]
+        if k4:
+            V_y[i, 1, 1] = V_y[i, 1, 3] = 0.5 * z / k[1]
+    return v, V_y
+
+
+def in_image(e: Array, v: Array, size: Any) -> npt.NDArray[np.bool_]:
+    """Return which pixels e (K, 2 or 4) lie in an image (width, height), borders included, with v (K, 3) in front."""
+    inside = (e >= 0) & (e <= np.tile(np.asarray(size, dtype=np.float64), e.shape[1] // 2))
+    return np.logical_and(inside.all(axis=1), v[:, 2] > 0)

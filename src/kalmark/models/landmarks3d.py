@@ -1,0 +1,235 @@
+"""Point landmarks of space, and how they look from a pose T = (x, y, z, qx, qy, qz, qw).  [TB] 4.3; Sola 2012.
+
+===================  ====================================  ====================
+type                 state l                               the point
+===================  ====================================  ====================
+Euclidean            p (3)                                 p
+inverse depth        anchor (3), azimuth, elevation, rho   anchor + m / rho
+anchored             anchor (3), m (3), rho                anchor + m / rho
+homogeneous          h (3), rho                            h / rho
+===================  ====================================  ====================
+
+The last three are for sensors that see no depth.  What such a sensor sees of them is v = rho (point - position of T) in
+its frame: the ray to the point, regular for points at infinity, rho = 0, too.  `..._from_view` takes a ray of any
+length and an inverse distance rho, the prior of what the ray lacks.  A sensor that measures ranges wants the Euclidean
+point, `..._to_point`.  The anchored point is called homogeneous as well; its m is a unit vector when it is made,
+free later.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.geometry.directions import direction_many, spherical_many, unit_many
+from kalmark.geometry.frames3d import from_frame_many, to_frame_many, turned_rates
+from kalmark.geometry.rotations import matrix, skew
+
+Array = npt.NDArray[np.float64]
+
+point_seen_from = to_frame_many
+point_from_view = from_frame_many
+
+
+@compiled
+def anchored_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the rays v (K, 3) to anchored points l (K, 7), V_T (K, 3, 6) and V_l (K, 3, 7)."""
+    Q = matrix(T[3:]).T.copy()
+    k = len(l)
+    v, V_T, V_l = np.empty((k, 3)), np.empty((k, 3, 6)), np.empty((k, 3, 7))
+    for i in range(k):
+        rho = l[i, 6]
+        base = l[i, :3] - T[:3]
+        ray = l[i, 3:6] + rho * base
+        V_T[i, :, 3:] = turned_rates(Q, ray)
+        for j in range(3):
+            v[i, j] = Q[j, 0] * ray[0] + Q[j, 1] * ray[1] + Q[j, 2] * ray[2]
+            V_l[i, j, 6] = Q[j, 0] * base[0] + Q[j, 1] * base[1] + Q[j, 2] * base[2]
+            for a in range(3):
+                V_T[i, j, a], V_l[i, j, a], V_l[i, j, 3 + a] = -rho * Q[j, a], rho * Q[j, a], Q[j, a]
+    return v, V_T, V_l
+
+
+@compiled
+def inverse_depth_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the rays v (K, 3) to inverse-depth points l (K, 6), V_T (K, 3, 6) and V_l (K, 3, 6)."""
+    h, H_l = inverse_depth_to_anchored(l)
+    v, V_T, V_h = anchored_seen_from(T, h)
+    return v, V_T, chained(V_h, H_l)
+
+
+@compiled
+def homogeneous_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the rays v (K, 3) to homogeneous points l (K, 4), V_T (K, 3, 6) and V_l (K, 3, 4)."""
+    Q = matrix(T[3:]).T.copy()
+    k = len(l)
+    v, V_T, V_l = np.empty((k, 3)), np.empty((k, 3, 6)), np.empty((k, 3, 4))
+    for i in range(k):
+        rho = l[i, 3]
+        ray = l[i, :3] - rho * T[:3]
+        V_T[i, :, 3:] = turned_rates(Q, ray)
+        for j in range(3):
+            v[i, j] = Q[j, 0] * ray[0] + Q[j, 1] * ray[1] + Q[j, 2] * ray[2]
+            V_l[i, j, 3] = -(Q[j, 0] * T[0] + Q[j, 1] * T[1] + Q[j, 2] * T[2])
+            for a in range(3):
+                V_T[i, j, a], V_l[i, j, a] = -rho * Q[j, a], Q[j, a]
+    return v, V_T, V_l
+
+
+@compiled
+def chained(A: Array, B: Array) -> Array:
+    """Return the products (K, a, c) of K matrices (K, a, b) and (K, b, c)."""
+    C = np.zeros((len(A), A.shape[1], B.shape[2]))
+    for i in range(len(A)):
+        for a in range(A.shape[1]):
+            for b in range(A.shape[2]):
+                for c in range(B.shape[2]):
+                    C[i, a, c] += A[i, a, b] * B[i, b, c]
+    return C
+
+
+@compiled
+def world_rays(T: Array, ray: Array) -> tuple[Array, Array, Array]:
+    """Return the world's unit vectors m (K, 3) along rays (K, 3) of T, M_theta (K, 3, 3) and M_ray (K, 3, 3)."""
+    Q = matrix(T[3:])
+    w = ray @ Q.T
+    m, M_w = unit_many(w)
+    M_theta, M_ray = np.empty((len(ray), 3, 3)), np.empty((len(ray), 3, 3))
+    for i in range(len(ray)):
+        M_theta[i] = -skew(m[i])
+        M_ray[i] = M_w[i] @ Q
+    return m, M_theta, M_ray
+
+
+@compiled
+def anchored_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Array, Array, Array]:
+    """Return anchored points l (K, 7) on rays (K, 3) of T at inverse distances rho (K,), anchored at T.
+
+    With L_T (K, 7, 6), L_ray (K, 7, 3) and L_rho (K, 7, 1).
+    """
+    k = len(ray)
+    m, M_theta, M_ray = world_rays(T, ray)
+    l, L_T, L_ray, L_rho = np.empty((k, 7)), np.zeros((k, 7, 6)), np.zeros((k, 7, 3)), np.zeros((k, 7, 1))
+    for i in range(k):
+        l[i, :3], l[i, 3:6], l[i, 6] = T[:3], m[i], rho[i]
+        for a in range(3):
+            L_T[i, a, a] = 1.0
+        L_T[i, 3:6, 3:], L_ray[i, 3:6] = M_theta[i], M_ray[i]
+        L_rho[i, 6, 0] = 1.0
+    return l, L_T, L_ray, L_rho
+
+
+@compiled
+def inverse_depth_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Array, Array, Array]:
+    """Return inverse-depth points l (K, 6) on rays (K, 3) of T at inverse distances rho (K,), anchored at T.
+
+    With L_T (K, 6, 6), L_ray (K, 6, 3) and L_rho (K, 6, 1).
+    """
+    h, H_T, H_ray, H_rho = anchored_from_view(T, ray, rho)
+    l, L_h = anchored_to_inverse_depth(h)
+    return l, chained(L_h, H_T), chained(L_h, H_ray), chained(L_h, H_rho)
+
+
+@compiled
+def homogeneous_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Array, Array, Array]:
+    """Return homogeneous points l (K, 4) on rays (K, 3) of T at inverse distances rho (K,) from T.
+
+    With L_T (K, 4, 6), L_ray (K, 4, 3) and L_rho (K, 4, 1).
+    """
+    k = len(ray)
+    m, M_theta, M_ray = world_rays(T, ray)
+    l, L_T, L_ray, L_rho = np.empty((k, 4)), np.zeros((k, 4, 6)), np.zeros((k, 4, 3)), np.zeros((k, 4, 1))
+    for i in range(k):
+        l[i, 3], L_rho[i, 3, 0] = rho[i], 1.0
+        for a in range(3):
+            l[i, a] = m[i, a] + rho[i] * T[a]
+            L_T[i, a, a], L_rho[i, a, 0] = rho[i], T[a]
+        L_T[i, :3, 3:], L_ray[i, :3] = M_theta[i], M_ray[i]
+    return l, L_T, L_ray, L_rho
+
+
+@compiled
+def inverse_depth_to_anchored(l: Array) -> tuple[Array, Array]:
+    """Return the anchored points h (K, 7) of inverse-depth points l (K, 6), and H_l (K, 7, 6)."""
+    m, M_a = direction_many(l[:, 3:5])
+    h, H_l = np.empty((len(l), 7)), np.zeros((len(l), 7, 6))
+    h[:, :3], h[:, 3:6], h[:, 6] = l[:, :3], m, l[:, 5]
+    H_l[:, 3:6, 3:5] = M_a
+    for a in range(3):
+        H_l[:, a, a] = 1.0
+    H_l[:, 6, 5] = 1.0
+    return h, H_l
+
+
+@compiled
+def anchored_to_inverse_depth(h: Array) -> tuple[Array, Array]:
+    """Return the inverse-depth points l (K, 6) of anchored points h (K, 7), and L_h (K, 6, 7): rho / |m| is kept."""
+    y, Y_m = spherical_many(h[:, 3:6])
+    l, L_h = np.empty((len(h), 6)), np.zeros((len(h), 6, 7))
+    for i in range(len(h)):
+        l[i, :3], l[i, 3:5], l[i, 5] = h[i, :3], y[i, 1:], h[i, 6] / y[i, 0]
+        for a in range(3):
+            L_h[i, a, a] = 1.0
+            L_h[i, 3, 3 + a], L_h[i, 4, 3 + a] = Y_m[i, 1, a], Y_m[i, 2, a]
+            L_h[i, 5, 3 + a] = -l[i, 5] / y[i, 0] * Y_m[i, 0, a]
+        L_h[i, 5, 6] = 1.0 / y[i, 0]
+    return l, L_h
+
+
+@compiled
+def anchored_to_point(l: Array) -> tuple[Array, Array]:
+    """Return the Euclidean points p (K, 3) of anchored points l (K, 7), and P_l (K, 3, 7)."""
+    p, P_l = np.empty((len(l), 3)), np.zeros((len(l), 3, 7))
+    for i in range(len(l)):
+        for a in range(3):
+            p[i, a] = l[i, a] + l[i, 3 + a] / l[i, 6]
+            P_l[i, a, a], P_l[i, a, 3 + a] = 1.0, 1.0 / l[i, 6]
+            P_l[i, a, 6] = -l[i, 3 + a] / (l[i, 6] * l[i, 6])
+    return p, P_l
+
+
+@compiled
+def inverse_depth_to_point(l: Array) -> tuple[Array, Array]:
+    """Return the Euclidean points p (K, 3) of inverse-depth points l (K, 6), and P_l (K, 3, 6)."""
+    h, H_l = inverse_depth_to_anchored(l)
+    p, P_h = anchored_to_point(h)
+    return p, chained(P_h, H_l)
+
+
+@compiled
+def homogeneous_to_point(l: Array) -> tuple[Array, Array]:
+    """Return the Euclidean points p (K, 3) of homogeneous points l (K, 4), and P_l (K, 3, 4)."""
+    p, P_l = np.empty((len(l), 3)), np.zeros((len(l), 3, 4))
+    for i in range(len(l)):
+        for a in range(3):
+            p[i, a] = l[i, a] / l[i, 3]
+            P_l[i, a, a], P_l[i, a, 3] = 1.0 / l[i, 3], -p[i, a] / l[i, 3]
+    return p, P_l
+
+
+@compiled
+def anchored_linearity(T: Array, l: Array, sigma_rho: Array) -> Array:
+    """Return the linearity indices (K,) of anchored points l (K, 7) seen from T, sigma_rho (K,) the sigmas of rho.
+
+    4 (sigma_depth / distance) |cos alpha|, alpha between the rays from the anchor and from T: a point may become
+    Euclidean where it is below 0.1.  Civera, Davison and Montiel 2008; [TB] `ahmLinearTest`.
+    """
+    index = np.empty(len(l))
+    for i in range(len(l)):
+        m, rho = l[i, 3:6], l[i, 6]
+        h = l[i, :3] + m / rho - T[:3]
+        h2 = h[0] * h[0] + h[1] * h[1] + h[2] * h[2]
+        length = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+        sigma_depth = length * sigma_rho[i] / (rho * rho)
+        cos = abs(m[0] * h[0] + m[1] * h[1] + m[2] * h[2]) / (length * math.sqrt(h2))
+        index[i] = 4 * sigma_depth / math.sqrt(h2) * cos
+    return index
+
+
+@compiled
+def inverse_depth_linearity(T: Array, l: Array, sigma_rho: Array) -> Array:
+    """Return the linearity indices (K,) of inverse-depth points l (K, 6), as `anchored_linearity` does."""
+    return anchored_linearity(T, inverse_depth_to_anchored(l)[0], sigma_rho)
