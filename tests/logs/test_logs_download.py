@@ -253,7 +253,8 @@ def test_hashes_are_those_of_the_real_files(data: object) -> None:
 def test_the_real_datasets_are_found_on_disk_without_the_network(data: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KALMARK_DATA_URL", "http://127.0.0.1:9")
     for name in ("dlr", "mrclam", "mrclam/MRCLAM_Dataset9", "victoria_park"):
-        assert fetch(name) == data(name)  # type: ignore[operator]
+        folder = data(name)  # type: ignore[operator]
+        assert fetch(name) == folder
 
 
 def test_the_list_of_datasets_is_plain_json() -> None:
