@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -39,7 +40,9 @@ def check_model(model: Any, rng: np.random.Generator) -> list[Finding]:
     """
     for method, check in (("move", _motion), ("expect", _sensor), ("seen_from", _landmark)):
         if hasattr(model, method):
-            return check(model, rng)
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)
+                return check(model, rng)
     raise ModelError(f"{type(model).__name__}: expected a model with one of the methods move, expect and seen_from")
 
 
@@ -72,25 +75,62 @@ def _sensor(model: Any, rng: np.random.Generator) -> list[Finding]:
     if len(angular) != m:
         raise ModelError(f"angular has {len(angular)} entries for {m} columns, expected one each")
     worst = _Worst()
-    y = np.where(angular, rng.uniform(-3, 3, (DRAWS, m)), rng.uniform(0.5, 10, (DRAWS, m)))
-    d = 2
-    if hasattr(model, "invert"):
-        v, V_y = model.invert(y)
-        d = v.shape[1] if v.ndim == 2 else 2
-        _shape("invert", "v", v, (DRAWS, d))
-        _shape("invert", "V_y", V_y, (DRAWS, d, m))
-        _batch(worst, "V_y", lambda x: model.invert(x)[0], V_y, y, "y")
-        worst.add("expect(invert(y)) = y", _wrapped(model.expect(v)[0] - y, angular), np.zeros((DRAWS, m)), "all draws")
-    v = rng.normal(0, 1, (DRAWS, d)) * 10.0 ** rng.uniform(-1, 1, (DRAWS, 1))
+    d = _size_of_view(model, rng)
+    v = _views(rng, d)
     e, E_v = model.expect(v)
     _shape("expect", "e", e, (DRAWS, m))
     _shape("expect", "E_v", E_v, (DRAWS, m, d))
     _batch(worst, "E_v", lambda x: model.expect(x)[0], E_v, v, "v", tuple(angular.tolist()))
+    y = e
+    if hasattr(model, "invert"):
+        y = _inside(model.invert, e)
+        back, V_y = model.invert(y)
+        _shape("invert", "v", back, (len(y), d))
+        _shape("invert", "V_y", V_y, (len(y), d, m))
+        _batch(worst, "V_y", lambda x: model.invert(x)[0], V_y, y, "y")
+        again = _wrapped(model.expect(back)[0] - y, angular)
+        worst.add("expect(invert(y)) = y", again, np.zeros_like(y), "all draws")
     R = model.noise(y)
-    _shape("noise", "R", R, (DRAWS, m, m))
+    _shape("noise", "R", R, (len(y), m, m))
     for one, at in zip(R, y, strict=True):
         worst.covariance("noise", one, m, f"y = {_show(at)}")
     return worst.findings()
+
+
+def _views(rng: np.random.Generator, d: int) -> Array:
+    return rng.normal(0, 1, (DRAWS, d)) * 10.0 ** rng.uniform(-1, 1, (DRAWS, 1))
+
+
+def _size_of_view(model: Any, rng: np.random.Generator) -> int:
+    """Return how many numbers a view has, 2 or 3: what the sensor takes and, if it can, gives back."""
+    taken = []
+    for d in (2, 3):
+        try:
+            e, E_v = model.expect(_views(rng, d))
+            if np.shape(E_v) == (*np.shape(e), d) and np.shape(e)[1] == len(model.columns):
+                taken.append(d)
+                if not hasattr(model, "invert") or np.shape(model.invert(e)[0]) == (DRAWS, d):
+                    return d
+        except Exception:  # this only tries; what is wrong shows when the model is called in earnest
+            continue
+    return taken[0] if taken else 2
+
+
+def _inside(invert: Callable[[Array], tuple[Array, Array]], y: Array) -> Array:
+    """Return the measurements that can be inverted all around, too; all of them if there are none.
+
+    On the border of what a sensor can measure (a sine of 1) the differences would leave it.
+    """
+    around = 1e-3 * np.vstack([np.eye(y.shape[1]), -np.eye(y.shape[1])])
+    kept = [one for one in y if not _finite(invert, one[None]) or _finite(invert, one + around * (1 + np.abs(one)))]
+    return np.array(kept) if kept else y
+
+
+def _finite(invert: Callable[[Array], tuple[Array, Array]], y: Array) -> bool:
+    try:
+        return bool(np.isfinite(invert(y)[0]).all())
+    except (ValueError, ArithmeticError):
+        return False
 
 
 def _landmark(model: Any, rng: np.random.Generator) -> list[Finding]:
