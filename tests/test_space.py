@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -185,3 +186,37 @@ def test_a_fix_in_space_and_a_saved_map(tmp_path: Any) -> None:
 def test_a_mixture_of_plane_and_space_is_refused(make: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
         make()
+
+
+@dataclass(frozen=True)
+class Drone:
+    """A body rate held until the next control, with a diffusion along its own x."""
+
+    space: Space = SE3
+    columns: tuple[str, ...] = ("v_mps", "w_radps")
+    held: bool = True
+
+    def move(self, r: np.ndarray, u: np.ndarray, dt_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        pick = np.zeros((6, 2))
+        pick[0, 0] = pick[5, 1] = dt_s
+        moved, R_r, R_u = km.geometry.frames3d.move(r, pick @ u)
+        return moved, R_r, R_u @ pick
+
+    def control_noise(self, u: np.ndarray) -> np.ndarray:
+        return np.diag([0.1, 0.0]) ** 2
+
+    def diffusion(self, u: np.ndarray, dt_s: float) -> np.ndarray:
+        return np.diag([0.04, 0, 0, 0, 0, 0]) * dt_s
+
+
+def test_a_users_held_control_in_space_is_split_by_scans_and_diffuses_along_the_body() -> None:
+    up = np.concatenate([np.zeros(3), exp(np.array([0, -np.pi / 2, 0]))])  # x looks up
+    whole, split = (km.Slam([km.Robot("d", Drone(), up, {"l": km.Mount(SENSORS[1])})]) for _ in range(2))
+    for slam, times in ((whole, []), (split, [0.3, 0.8])):
+        slam.process(km.Control(0, "d", (1.0, 0.0)))
+        for t in times:
+            slam.process(km.Scan(t, "d", "l", np.zeros((0, 3))))
+        slam.process(km.Control(1, "d", (0.0, 0.0)))
+    np.testing.assert_allclose(whole.mean("d")[:3], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(split.covariance("d"), whole.covariance("d"), atol=1e-15)
+    np.testing.assert_allclose(np.diag(whole.covariance("d"))[:3], [0, 0, 0.04 + 0.1**2], atol=1e-12)

@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.filter.estimators import Estimator, Invariant
 from kalmark.filter.kernels import all_finite
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry.angles import rotation
+from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
@@ -184,13 +186,12 @@ class Slam:
             error = self._errors[name] = self.map.add(Rn(len(u)), np.zeros(len(u)), part.N)
         if error is not None:  # the control's error is a block of the map, common to all parts of its interval
             index = np.concatenate([index, self.map.index(error)])
-            F = np.block([[F, R_u], [np.zeros((len(u), len(r))), np.eye(len(u))]])
+            F = np.block([[F, R_u], [np.zeros((len(u), len(F))), np.eye(len(u))]])
             Q = np.zeros((len(index), len(index)))
         D = motion.diffusion(part.u, part.dt_s)
         if D is not None:
-            G = np.eye(3)
-            G[:2, :2] = rotation(moved[2])
-            Q[:3, :3] += G @ D @ G.T
+            G = _body_axes(moved)
+            Q[: len(G), : len(G)] += G @ D @ G.T
         self.map.predict(index, F, Q)
         self.map.set_predicted(slot, moved)
 
@@ -368,6 +369,14 @@ class Slam:
         from kalmark.config import slam_from_config
 
         return slam_from_config(path)
+
+
+def _body_axes(pose: Array) -> Array:
+    """Return what turns a pose error from the robot's frame into the world's: (3, 3) in the plane, (6, 6) in space."""
+    if len(pose) == 3:
+        return block_diag(rotation(pose[2]), np.eye(1))
+    Q = matrix(pose[3:7])
+    return block_diag(Q, Q)
 
 
 def _when(event: Event) -> str:
