@@ -406,3 +406,30 @@ def test_an_interrupt_is_one_line(kalmark: Kalmark, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(kalmark.cli.run, "run_log", interrupt)
     assert main(["run", "native"]) == 130
+
+
+def test_run_prints_what_to_look_at_twice_after_the_table(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
+    scans = (log / "scans.csv").read_text().splitlines()
+    nameless = [scans[0], *(",".join([*line.split(",")[:3], "", *line.split(",")[4:]]) for line in scans[1:])]
+    (log / "scans.csv").write_text("\n".join(nameless) + "\n")
+    done = kalmark("run", "native", "--log", log)
+    assert done.status == 0
+    line = "60 observations have no id and were ignored; try --set association.type=nearest"
+    assert f"warning: {line}" in done.out.splitlines()
+    assert line in json.loads((tmp_path / "out" / "native" / "summary.json").read_text())["warnings"]
+
+
+def test_a_filter_that_stops_leaves_its_folder_and_status_2(
+    kalmark: Kalmark, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from kalmark.errors import DivergedError
+    from kalmark.slam.slam import Slam
+
+    def refuse(slam: Slam, event: object) -> None:
+        raise DivergedError("the innovation is absurd")
+
+    monkeypatch.setattr(Slam, "process", refuse)
+    done = kalmark("run", "native", "--log", log)
+    assert done.status == 2
+    assert "warning: the filter stopped: the innovation is absurd" in done.out.splitlines()
+    assert (tmp_path / "out" / "native" / "summary.json").is_file()

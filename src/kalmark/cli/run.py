@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -62,12 +61,14 @@ def run(
         result.save(out)
     finish(result, out, f"{Path(config).stem} on {result.log.name}")
     if summary.get("stopped"):
-        sys.stderr.write(f"kalmark: the filter stopped: {summary['stopped']}\n")
+        raise typer.Exit(2)
 
 
 def finish(result: Run, out: Path, title: str) -> None:
-    """Print a run's figures, what was left out, and where the run folder is."""
+    """Print a run's figures, what to look at twice, what was left out, and where the run folder is."""
     print_summary(title, result.summary)
+    for line in result.summary.get("warnings", ()):
+        typer.echo(f"warning: {line}")
     if result.skipped:
         typer.echo(f"{len(result.skipped)} left out:")
         for line in result.skipped[:SHOWN]:

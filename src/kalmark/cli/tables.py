@@ -15,6 +15,9 @@ TOTALS: tuple[tuple[str, str, str], ...] = (
     ("tentative", "  tentative", ""),
     ("landmarks", "landmarks in the map", ""),
     ("nis_per_dof", "NIS per degree of freedom", ""),
+    ("fixes", "position fixes", ""),
+    ("fixes_rejected", "  rejected by the gate", ""),
+    ("fix_nis_per_dof", "  NIS per degree of freedom", ""),
     ("landmark_rmse_m", "landmark RMSE, aligned", "m"),
     ("landmark_rmse_raw_m", "landmark RMSE, raw", "m"),
     ("fix_median_m", "distance to position fixes, median", "m"),
@@ -29,7 +32,7 @@ ROBOT: tuple[tuple[str, str, str], ...] = (
     ("heading_rmse_deg", "heading RMSE", "deg"),
     ("pose_nees", "pose NEES (3 is consistent)", ""),
 )
-_SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected"}
+_SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:

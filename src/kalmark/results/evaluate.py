@@ -11,6 +11,7 @@ from kalmark.results.consistency import diverged, nees, nis, pose_error
 from kalmark.results.history import Array, History, Ints
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.truth import Fixes, Truth
+from kalmark.results.warnings import fix_nis_per_dof, warnings
 from kalmark.slam.report import OUTCOMES
 
 if TYPE_CHECKING:
@@ -39,18 +40,22 @@ def evaluate(run: Run) -> dict[str, Any]:
         "landmarks": len(run.landmarks),
         "skipped": len(run.skipped),
         "wall_s": run.wall_s,
-        "step_us_median": _quantile(history.step_us, 0.5),
-        "step_us_p99": _quantile(history.step_us, 0.99),
+        "step_us_median": _quantile(history.step_us[1:], 0.5),
+        "step_us_p99": _quantile(history.step_us[1:], 0.99),
         "nis_per_dof": nis_per_dof(history),
         "diverged": bool(run.stopped) or any(figures.get("diverged", False) for figures in robots.values()),
     }
+    if run.fixes:
+        summary["fix_nis_per_dof"] = fix_nis_per_dof(history.inputs.fixes)
     if run.stopped:
         summary["stopped"] = run.stopped
     summary["robots"] = robots
     summary |= landmark_figures(run.landmarks, run.truth)
     if run.truth.fixes and not np.isfinite(run.truth.poses).any():
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
-    return none_for_nan(summary)
+    summary = none_for_nan(summary)
+    summary["warnings"] = warnings(run, summary)
+    return summary
 
 
 def robot_figures(run: Run, name: str) -> dict[str, Any]:

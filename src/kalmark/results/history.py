@@ -6,12 +6,13 @@ A *step* is one scan and the controls before it.  Plain arrays, saved as ``histo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.results.inputs import Inputs
 from kalmark.slam.events import Id
 
 Array = npt.NDArray[np.float64]
@@ -66,6 +67,7 @@ class History:
     Z: Array
     maps: tuple[MapSnapshot, ...] = ()
     starts: tuple[Start, ...] = ()
+    inputs: Inputs = field(default_factory=Inputs)
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -78,18 +80,22 @@ class History:
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
         named |= {key: getattr(self, key) for key in _EXTRA}
         d = max((m.means.shape[1] for m in self.maps), default=2)
-        return named | {
-            "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
-            "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
-            "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
-            "map_landmark": texts([i for m in self.maps for i in m.ids]),
-            "map_mean": np.concatenate([m.means for m in self.maps] or [np.empty((0, d))]),
-            "map_covariance": np.concatenate([m.covariances for m in self.maps] or [np.empty((0, d, d))]),
-            "start_robot": texts([s.robot for s in self.starts]),
-            "start_mean": np.array([s.mean for s in self.starts]),
-            "start_covariance": np.array([s.covariance for s in self.starts]),
-            "start_t_ns": np.array([s.t_ns for s in self.starts], dtype=np.int64),
-        }
+        return (
+            named
+            | self.inputs.arrays()
+            | {
+                "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
+                "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
+                "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
+                "map_landmark": texts([i for m in self.maps for i in m.ids]),
+                "map_mean": np.concatenate([m.means for m in self.maps] or [np.empty((0, d))]),
+                "map_covariance": np.concatenate([m.covariances for m in self.maps] or [np.empty((0, d, d))]),
+                "start_robot": texts([s.robot for s in self.starts]),
+                "start_mean": np.array([s.mean for s in self.starts]),
+                "start_covariance": np.array([s.covariance for s in self.starts]),
+                "start_t_ns": np.array([s.t_ns for s in self.starts], dtype=np.int64),
+            }
+        )
 
     @classmethod
     def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> History:
@@ -112,7 +118,7 @@ class History:
                 *(named["start_" + key] for key in ("robot", "mean", "covariance", "t_ns")), strict=True
             )
         )
-        return cls(**{key: named[key] for key in keys}, maps=maps, starts=starts)
+        return cls(**{key: named[key] for key in keys}, maps=maps, starts=starts, inputs=Inputs.from_arrays(named))
 
 
 _EXTRA = ("t_ns", "step_us", "step", "sensor", "index", "id", "outcome", "d2", "reason")

@@ -14,6 +14,7 @@ from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
 from kalmark.results.describe import describe
 from kalmark.results.history import Array, History, MapSnapshot, Start, padded, texts
+from kalmark.results.inputs import Controlled, Inputs, UsedFix
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
 from kalmark.results.run import LogReference, Run
@@ -81,9 +82,8 @@ class _Recorder:
     snapshot_at: npt.NDArray[np.float64]
     anchored: bool = False
     starts: tuple[Start, ...] = ()
-    controls: int = 0
-    fixes: int = 0
-    fixes_rejected: int = 0
+    controls: dict[str, Controlled] = field(default_factory=dict)
+    fixes: list[UsedFix] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     stopped: str = ""
     reports: list[Report] = field(default_factory=list)
@@ -102,10 +102,12 @@ class _Recorder:
         finally:
             self._spent_ns += time.perf_counter_ns() - start
         if type(event) is not Scan:
-            self.controls += type(event) is Control
-            if type(event) is Fix:
-                self.fixes += 1
-                self.fixes_rejected += any(o.outcome == "rejected" for o in report.observations)
+            if type(event) is Control:
+                before = self.controls.get(event.robot) or Controlled(0, event.t_ns, event.t_ns)
+                self.controls[event.robot] = Controlled(before.number + 1, before.first_ns, event.t_ns)
+            elif type(event) is Fix:
+                used = all(o.outcome == "associated" for o in report.observations)
+                self.fixes.append(UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0]))
             return
         self.step_ns.append(self._spent_ns)
         self._spent_ns = 0
@@ -132,9 +134,9 @@ class _Recorder:
             truth=Truth.of(log, history, self.anchored),
             log=LogReference.of(log, tuple(self.slam.robots)),
             coordinates=self.slam.estimator.coordinates,
-            controls=self.controls,
-            fixes=self.fixes,
-            fixes_rejected=self.fixes_rejected,
+            controls=sum(c.number for c in self.controls.values()),
+            fixes=len(self.fixes),
+            fixes_rejected=sum(not fix.used for fix in self.fixes),
             wall_s=wall_s,
             skipped=[*getattr(log, "skipped", ()), *self.skipped],
             stopped=self.stopped,
@@ -173,4 +175,5 @@ class _Recorder:
             Z=padded([r.Z for r in steps], counts, width, matrices=True),
             maps=tuple(self.maps),
             starts=self.starts,
+            inputs=Inputs(self.controls, tuple(self.fixes)),
         )

@@ -38,8 +38,8 @@ def report_html(run: Run) -> str:
         figures="".join(f"<span>{html.escape(figure)}</span>" for figure in figures),
         robots=robot_table(run.summary),
         summary=_table([(key, show(value)) for key, value in _flat(run.summary)]),
-        reasons=_table(reasons(run), ("outcome", "reason", "observations"))
-        or "<p>No observation came with a reason.</p>",
+        warnings="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("warnings", ())),
+        reasons=_table(reasons(run), ("outcome", "reason", "observations")),
         skipped=_skipped(run),
         config=html.escape(config_yaml(run.config)),
         plotly=_plotly(),
@@ -72,7 +72,7 @@ def show(value: Any) -> str:
 def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
-        if key == "robots" and not prefix:
+        if key in ("robots", "warnings") and not prefix:
             continue
         out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
     return out
@@ -113,13 +113,13 @@ _TEMPLATE = """<!DOCTYPE html>
 <style>{style}</style>
 </head>
 <body>
-<header><h1>{title}</h1><p class="figures">{figures}</p></header>
+<header><h1>{title}</h1><p class="figures">{figures}</p><ul class="warnings">{warnings}</ul></header>
 <main>
 <section><h2>Map <small>3-sigma ellipses; drag the slider through time</small></h2>
 <div id="map"></div>
 <div class="slider"><button id="play">Play</button><input id="time" type="range" min="0" value="0" step="1">
 <output id="now"></output></div></section>
-<section id="against-truth"><h2>Errors inside their 3-sigma bands <select id="robot"></select></h2>
+<section id="against-truth"><h2>Errors and their 3-sigma bands <select id="robot"></select></h2>
 <div id="errors"></div>
 <h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
 <section><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>

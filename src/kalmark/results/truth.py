@@ -32,7 +32,7 @@ class Truth:
 
     `offset` (3,) is the pose of the truth's frame in the map's.  It is zero when the robots started at the truth (or
     the map is `anchored`: tied to the world otherwise, by known landmarks or fixes); else it is what brings the first
-    robot's true start to its start.
+    robot's true start to its start.  `robots` are those whose truth the log has.
     """
 
     poses: Array
@@ -40,6 +40,7 @@ class Truth:
     fixes: dict[str, Fixes] = field(default_factory=dict)
     offset: Array = field(default_factory=lambda: np.zeros(3))
     anchored: bool = False
+    robots: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, log: Any, history: History, anchored: bool = False) -> Truth:
@@ -55,7 +56,7 @@ class Truth:
             for robot, track in (getattr(log, "gps", None) or {}).items()
         }
         offset = np.zeros(3) if anchored else _offset(trajectories, history.starts)
-        return cls(poses, dict(getattr(log, "landmarks", None) or {}), fixes, offset, anchored)
+        return cls(poses, dict(getattr(log, "landmarks", None) or {}), fixes, offset, anchored, tuple(trajectories))
 
     def __bool__(self) -> bool:
         return bool(self.landmarks) or bool(np.isfinite(self.poses).any())
@@ -86,6 +87,7 @@ class Truth:
             "truth": self.poses,
             "truth_offset": self.offset,
             "truth_anchored": np.array(self.anchored),
+            "truth_robot": texts(list(self.robots)),
             "truth_landmark": texts(list(self.landmarks)),
             "truth_landmark_mean": np.array(list(self.landmarks.values()), dtype=np.float64),
             "fix_robot": texts(robots),
@@ -109,7 +111,8 @@ class Truth:
                 named["fix_robot"], named["fix_size"], ends, named["fix_antenna"], strict=True
             )
         }
-        return cls(named["truth"], landmarks, fixes, named["truth_offset"], bool(named["truth_anchored"]))
+        robots = tuple(named["truth_robot"].tolist()) if "truth_robot" in named else ()
+        return cls(named["truth"], landmarks, fixes, named["truth_offset"], bool(named["truth_anchored"]), robots)
 
 
 def _offset(trajectories: Mapping[str, Any], starts: tuple[Start, ...]) -> Array:

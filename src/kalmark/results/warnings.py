@@ -1,0 +1,144 @@
+"""What is worth a second look before a run's figures are believed, one line each."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from kalmark.results.inputs import UsedFix
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+NO_ID = "no id in the log"  # the reason that association by identity gives
+POSE_NEES = 9.0  # 3 is consistent; at most 3 % of consistent runs are above: those whose error never changes
+NIS_HIGH, NIS_LOW = 3.0, 0.1  # per degree of freedom
+FIX_NIS_HIGH = 5.0
+FIRST_FIX = float(chi2.ppf(0.9999, 2))
+FEW_FIXES = 5  # fewer say little of the noise
+
+
+def warnings(run: Run, summary: Mapping[str, Any]) -> list[str]:
+    """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
+    parts = (_lost, _observations, _robots, _truth, _fixes, _noise)
+    return [line for part in parts for line in part(run, summary)]
+
+
+def _lost(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    if run.stopped:
+        yield f"the filter stopped: {run.stopped}"
+    lost = [name for name, figures in summary["robots"].items() if figures.get("diverged")]
+    if lost:
+        names = ", ".join(lost)
+        yield f"DIVERGED: the error of {names} exceeds 10 of its own sigmas and 5 % of the path; do not use this map"
+
+
+def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    history, total = run.history, int(summary["observations"])
+    for outcome in ("ignored", "rejected"):
+        mine = history.outcome == outcome
+        if 2 * int(mine.sum()) <= total:
+            continue
+        reason, count = Counter(history.reason[mine].tolist()).most_common(1)[0]
+        if reason == NO_ID:
+            yield f"{count} observations have no id and were ignored; try --set association.type=nearest"
+        else:
+            yield f"{int(mine.sum())} of {total} observations were {outcome}, most often: {reason or 'no reason given'}"
+    if not total:
+        yield "no observation was made: there is nothing to map"
+    elif not summary["landmarks"]:
+        yield "no landmark was mapped"
+    bearings = history.y[:, 1] if history.y.shape[1] > 1 else np.empty(0)
+    turns = np.abs(bearings[np.isfinite(bearings) & _has_bearing(run)]) > 2 * np.pi
+    if turns.any():
+        yield f"{int(turns.sum())} bearings are beyond 2 pi rad: are they in degrees?"
+
+
+def _has_bearing(run: Run) -> Any:
+    """Tell of each observation whether its second column is a bearing, by the type of its sensor."""
+    robots: Mapping[str, Any] = run.config.get("robots") or {}
+    kinds = {
+        (robot, name): str((sensor or {}).get("type", ""))
+        for robot, given in robots.items()
+        for name, sensor in ((given or {}).get("sensors") or {}).items()
+    }
+    pairs = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
+    found = [kinds.get(pair, kinds.get(("each", pair[1]), "")).startswith("range_bearing") for pair in pairs]
+    return np.array(found, dtype=np.bool_)
+
+
+def _robots(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    history = run.history
+    for name in history.robots:
+        scans = history.t_ns[history.robot == name]
+        controls = history.inputs.controls.get(name)
+        if len(scans) and controls is None:
+            yield f"robot {name} has {_count(len(scans), 'scan')} but no controls: it is taken to stand still"
+        elif len(scans) > 1 and controls is not None and controls.number > 1:
+            shared = min(int(scans[-1]), controls.last_ns) - max(int(scans[0]), controls.first_ns)
+            share = max(shared, 0) / max(int(scans[-1] - scans[0]), 1)
+            if share < 0.5:
+                yield f"controls of robot {name} cover {share:.0%} of the time of its scans: are both in seconds?"
+
+
+def _truth(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    true, mine = set(run.truth.robots), run.history.robots
+    for name in run.truth.robots:
+        if name not in mine:
+            yield f"the log has truth for {name}, which is not in this run (robots: {', '.join(mine)})"
+    for name in mine:
+        if true and name not in true:
+            yield f"the log has no truth for robot {name}, but for {', '.join(sorted(true))}"
+        elif name in true and "ate_m" not in summary["robots"].get(name, {}) and (run.history.robot == name).any():
+            yield f"the truth of robot {name} covers none of its scans: are both in seconds?"
+
+
+def _fixes(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    fixes = run.history.inputs.fixes
+    starts = {start.robot: start for start in run.history.starts}
+    for name in dict.fromkeys(fix.robot for fix in fixes):
+        first = next(fix for fix in fixes if fix.robot == name)
+        if name in starts and _d2(first) > FIRST_FIX:
+            sigma = float(np.sqrt(max(np.trace(starts[name].covariance[:2, :2]) / 2, 0.0)))
+            yield (
+                f"the first fix of {name} is {np.linalg.norm(first.z):.3g} m from where its start puts it, "
+                f"which the configuration says is known to {sigma:.3g} m: set robots.{name}.start"
+            )
+    value = summary.get("fix_nis_per_dof")
+    if value is not None and value > FIX_NIS_HIGH and summary["fixes"] >= FEW_FIXES:
+        yield f"NIS per degree of freedom of the fixes is {value:.3g} where 1 is consistent: is their noise too small?"
+    if 2 * summary["fixes_rejected"] > summary["fixes"]:
+        yield f"{summary['fixes_rejected']} of {_count(summary['fixes'], 'fix', 'fixes')} were rejected by the gate"
+
+
+def fix_nis_per_dof(fixes: tuple[UsedFix, ...]) -> float:
+    """Return the sum of the normalised innovations squared of the fixes used over their dimensions, NaN without any."""
+    values = [_d2(fix) for fix in fixes if fix.used]
+    return sum(values) / (2 * len(values)) if values else float("nan")
+
+
+def _d2(fix: UsedFix) -> float:
+    return float(fix.z @ np.linalg.solve(fix.Z, fix.z))
+
+
+def _noise(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    for name, figures in summary["robots"].items():
+        value = figures.get("pose_nees")
+        if value is not None and value > POSE_NEES:
+            whose = f" of {name}" if len(summary["robots"]) > 1 else ""
+            yield (
+                f"pose NEES{whose} {value:.3g} where 3 is consistent: the noise in the configuration is not what this "
+                "log has (correlated or biased errors?)"
+            )
+    value = summary["nis_per_dof"]
+    if value is not None and not NIS_LOW <= value <= NIS_HIGH and summary["associated"] >= 50:
+        size = "small" if value > NIS_HIGH else "large"
+        yield f"NIS per degree of freedom {value:.2g} where 1 is consistent: the noise configured is too {size}"
+
+
+def _count(number: int, one: str, many: str = "") -> str:
+    return f"{number} {one if number == 1 else many or one + 's'}"

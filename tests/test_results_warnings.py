@@ -1,0 +1,161 @@
+"""What a run warns of, and that a good run warns of nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kalmark.errors import DivergedError
+from kalmark.logs.log import Log
+from kalmark.results.record import record
+from kalmark.results.report import report_html
+from kalmark.results.run import load_run
+from kalmark.slam.events import Control, Event, Fix, Scan
+from results_world import STEP_NS, circle, slam_for
+
+
+def warned(log: Log, events: list[Event] | None = None, **options: Any) -> list[str]:
+    log = log if events is None else replace(log, events=events)
+    lines: list[str] = record(slam_for(log, **options), log, progress=False).evaluate()["warnings"]
+    return lines
+
+
+def only(lines: list[str]) -> str:
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def scan(event: Scan, **changes: Any) -> Scan:
+    given = {"t_ns": event.t_ns, "robot": event.robot, "sensor": event.sensor, "y": event.y, "ids": event.ids}
+    return Scan(**(given | changes))
+
+
+@pytest.mark.parametrize(
+    "log",
+    [circle(steps=60), circle(robots=("a", "b"), steps=30), circle(truth=False, gps=True)],
+    ids=["one robot", "two robots", "position fixes to score with"],
+)
+def test_a_good_run_warns_of_nothing(log: Log) -> None:
+    assert warned(log) == []
+
+
+def test_observations_without_ids_are_said_to_be_ignored_and_what_helps() -> None:
+    log = circle(steps=20)
+    lines = warned(log, [scan(e, ids=None) if isinstance(e, Scan) else e for e in log])
+    count = sum(len(e.y) for e in log if isinstance(e, Scan))
+    assert f"{count} observations have no id and were ignored; try --set association.type=nearest" in lines
+    assert "no landmark was mapped" in lines
+
+
+def test_a_log_in_which_nothing_was_seen_is_said_to_have_nothing_to_map() -> None:
+    assert only(warned(circle(steps=10, landmarks=0))).startswith("no observation was made")
+
+
+def test_a_robot_that_is_never_controlled_is_named() -> None:
+    log = circle(robots=("a", "b"), steps=10)
+    lines = warned(log, [e for e in log if not (isinstance(e, Control) and e.robot == "b")])
+    assert "robot b has 10 scans but no controls: it is taken to stand still" in lines
+
+
+def test_controls_in_other_units_of_time_than_the_scans_are_noticed() -> None:
+    log = circle(steps=40)
+    controls = [Control(t_ns=e.t_ns // 1000, robot=e.robot, u=e.u) for e in log if isinstance(e, Control)]
+    lines = warned(log, [*controls, *(e for e in log if isinstance(e, Scan))])
+    assert any("controls of robot rover cover 0% of the time of its scans" in line for line in lines)
+
+
+def test_bearings_in_degrees_are_noticed() -> None:
+    log = circle(steps=20)
+    events: list[Event] = [scan(e, y=e.y * [1.0, 180 / np.pi]) if isinstance(e, Scan) else e for e in log]
+    assert any("bearings are beyond 2 pi rad: are they in degrees?" in line for line in warned(log, events))
+
+
+def test_truth_that_fits_no_robot_and_robots_without_truth_are_named() -> None:
+    log = circle(robots=("a", "b"), steps=10)
+    truth = {"a": log.truth["a"], "c": log.truth["b"]}
+    lines = warned(replace(log, truth=truth))
+    assert lines == [
+        "the log has truth for c, which is not in this run (robots: a, b)",
+        "the log has no truth for robot b, but for a, c",
+    ]
+
+
+def fixed(log: Log, shift: tuple[float, float], sigma_m: float = 0.1, seed: int = 3) -> list[Event]:
+    """Return the events of a log with a fix at every fifth step, all shifted."""
+    rng, path = np.random.default_rng(seed), log.truth["rover"]
+    fixes = [
+        Fix(t_ns=t, robot="rover", y=pose[:2] + shift + sigma_m * rng.normal(size=2), cov=sigma_m**2 * np.eye(2))
+        for t, pose in zip(path.t_ns[5::5].tolist(), path.poses[5::5], strict=True)
+    ]
+    return sorted([*log, *fixes], key=lambda e: (e.t_ns, isinstance(e, Scan) + 2 * isinstance(e, Fix)))
+
+
+def test_good_fixes_are_counted_with_their_nis_and_bring_no_warning() -> None:
+    log = circle(steps=100)
+    log = replace(log, events=fixed(log, (0.0, 0.0)))
+    summary = record(slam_for(log), log, progress=False).evaluate()
+    assert summary["fixes"] == 20
+    assert 0.3 < summary["fix_nis_per_dof"] < 2.0
+    assert summary["warnings"] == []
+
+
+def test_a_first_fix_far_from_the_start_says_which_setting_to_change() -> None:
+    log = circle(steps=50)
+    lines = warned(log, fixed(log, (11.0, 2.0)))
+    (line,) = (line for line in lines if "first fix" in line)
+    assert "of rover is 11." in line
+    assert "known to 0 m: set robots.rover.start" in line
+
+
+def test_noise_that_is_not_the_log_s_is_noticed() -> None:
+    log = circle(steps=100)
+    rng = np.random.default_rng(5)
+    events: list[Event] = [
+        scan(e, y=e.y + [0.3, 0.1] * rng.normal(size=e.y.shape)) if isinstance(e, Scan) else e for e in log
+    ]
+    lines = warned(log, events)
+    assert any(line.startswith("pose NEES ") and "where 3 is consistent" in line for line in lines)
+    assert any(line.endswith("the noise configured is too small") for line in lines)
+
+
+def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    log = circle(steps=20)
+    slam = slam_for(log)
+    process = slam.process
+
+    def refuse(event: Event) -> object:
+        if event.t_ns >= 10 * STEP_NS:
+            raise DivergedError("the innovation is <absurd>")
+        return process(event)
+
+    monkeypatch.setattr(slam, "process", refuse)
+    run = record(slam, log, progress=False)
+    assert run.evaluate()["warnings"][0] == "the filter stopped: the innovation is <absurd>"
+    page = report_html(run)
+    assert '<ul class="warnings"><li>the filter stopped: the innovation is &lt;absurd&gt;</li>' in page
+    run.save(tmp_path)
+    assert load_run(tmp_path).evaluate()["warnings"] == run.summary["warnings"]
+
+
+def test_warnings_and_fixes_outlive_saving(tmp_path: Path) -> None:
+    log = circle(steps=50)
+    log = replace(log, events=fixed(log, (11.0, 2.0)))
+    run = record(slam_for(log), log, progress=False)
+    run.save(tmp_path)
+    loaded = load_run(tmp_path)
+    assert run.summary["warnings"]
+    assert loaded.evaluate() == run.evaluate()
+    assert len(loaded.history.inputs.fixes) == 10
+
+
+def test_a_diverged_run_is_not_to_be_used() -> None:
+    log = circle(steps=100)
+    turned = [Control(t_ns=e.t_ns, robot=e.robot, u=-e.u) if isinstance(e, Control) else e for e in log]
+    blind = [scan(e, y=(), ids=None) if isinstance(e, Scan) else e for e in turned]
+    assert any(line.startswith("DIVERGED: the error of rover") for line in warned(log, blind))
