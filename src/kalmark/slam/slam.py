@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.filter.estimators import Estimator, Invariant
@@ -374,9 +373,12 @@ class Slam:
 def _body_axes(pose: Array) -> Array:
     """Return what turns a pose error from the robot's frame into the world's: (3, 3) in the plane, (6, 6) in space."""
     if len(pose) == 3:
-        return block_diag(rotation(pose[2]), np.eye(1))
-    Q = matrix(pose[3:7])
-    return block_diag(Q, Q)
+        G = np.eye(3)
+        G[:2, :2] = rotation(pose[2])
+        return G
+    G = np.zeros((6, 6))
+    G[:3, :3] = G[3:, 3:] = matrix(pose[3:7])
+    return G
 
 
 def _when(event: Event) -> str:
