@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,12 +16,13 @@ from kalmark.errors import KalmarkError
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
 ]
+COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; it can take half a minute\n"
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that `kalmark run` wrote.")]
 
 
 @contextmanager
 def computing() -> Iterator[None]:
-    """Say so if the inner loops are yet to be compiled, and keep BLAS to one thread.
+    """Say so when inner loops are compiled, and keep BLAS to one thread.
 
     The matrices of a scan are small: with more threads, they only wait for each other.
     """
@@ -32,12 +34,34 @@ def computing() -> Iterator[None]:
         yield
 
 
+@cache
 def announce_compilation() -> None:
-    """Say on stderr that the first run of this version will take longer."""
+    """From now on say on stderr, once, that an inner loop is being compiled; one loaded from the cache is not."""
+    from numba.core import event
+
+    class Announcer(event.Listener):  # type: ignore[misc, unused-ignore]
+        def on_start(self, event: Any) -> None:
+            if event.data["dispatcher"].py_func.__module__.startswith("kalmark."):
+                say_compiling()
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    event.register("numba:compile", Announcer())
+
+
+def announce_compilation_elsewhere() -> None:
+    """Say on stderr that other processes will compile the inner loops, as far as can be known: nothing is there yet."""
     from kalmark.compiled import cache_folder
 
     if not Path(cache_folder()).exists():
-        sys.stderr.write("kalmark: compiling its inner loops, this once; it takes about half a minute\n")
+        say_compiling()
+
+
+@cache
+def say_compiling() -> None:
+    """Say on stderr that this takes longer than it will the next time; once in a process."""
+    sys.stderr.write(COMPILING)
 
 
 def writable(folder: Path) -> Path:
