@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from pathlib import Path
 
+import numba
 import pytest
 
+from kalmark.cli.options import COMPILING, announce_compilation, say_compiling
+from kalmark.config import load_config
+from kalmark.simulate import load_world
 from test_cli import Kalmark, kalmark  # noqa: F401 - `kalmark` is a fixture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -24,3 +30,49 @@ def test_a_check_finds_a_wrong_inverse_without_a_warning(kalmark: Kalmark, tmp_p
     done = kalmark("check", "wrong.py:sonar")
     assert done.status == 2
     assert "expect(invert(y)) = y differs by" in done.err
+
+
+def test_compiling_is_announced_once_and_what_is_compiled_already_is_not(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def own(x: float) -> float:
+        return x + 1
+
+    def others(x: float) -> float:
+        return x + 2
+
+    own.__module__ = "kalmark.own"
+    kernel = numba.njit(own)
+    announce_compilation()
+    say_compiling.cache_clear()
+    numba.njit(others)(1.0)
+    assert capsys.readouterr().err == ""
+    kernel(1.0)
+    assert capsys.readouterr().err == COMPILING
+    kernel(1.0)
+    kernel(1)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("world", ["two_robots", "loop_b2"])
+def test_what_simulate_leaves_runs_with_the_command_it_prints(
+    kalmark: Kalmark,  # noqa: F811
+    tmp_path: Path,
+    world: str,
+) -> None:
+    done = kalmark("simulate", world, "--out", "a log", "--seed", "2", "--set", "steps=40")
+    assert done.status == 0
+    command = shlex.split(done.out.splitlines()[-1])
+    assert command == ["kalmark", "run", "a log/config.yaml"]
+    assert kalmark(*command[1:]).status == 0
+    config = load_config(tmp_path / "a log" / "config.yaml")
+    fitting = load_world(world).config()
+    assert (config.robots, config.association, config.estimator) == (
+        fitting.robots,
+        fitting.association,
+        fitting.estimator,
+    )
+    assert (config.log.path, config.seed) == (".", 2)
+    summary = json.loads((tmp_path / "out" / "config" / "summary.json").read_text())
+    assert summary["landmarks"] > 0
+    assert set(summary["robots"]) == set(fitting.robots)

@@ -1,8 +1,8 @@
-"""`kalmark simulate`: a world in, a native log with truth out."""
+"""`kalmark simulate`: a world in; a native log with truth, and the configuration that fits it, out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,14 +11,7 @@ import typer
 from kalmark.cli.options import Overrides, writable
 
 if TYPE_CHECKING:
-    from kalmark.logs.log import Log
-
-
-def simulate_log(world_path: str | Path, seed: int, overrides: Sequence[str] = ()) -> Log:
-    """Return one log of a world."""
-    from kalmark import simulate as sim
-
-    return sim.simulate(sim.load_world(world_path, overrides), seed)
+    from kalmark.simulate import World
 
 
 def simulate(
@@ -27,10 +20,24 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 1,
     overrides: Overrides = None,
 ) -> None:
-    """Simulate a world and write a native log with its truth."""
+    """Simulate a world and write a native log with its truth, and the configuration of the filter that fits it."""
+    from kalmark import simulate as sim
     from kalmark.logs import write_native
 
     writable(out)
-    log = simulate_log(world, seed, overrides or ())
+    loaded = sim.load_world(world, overrides or ())
+    log = sim.simulate(loaded, seed)
     write_native(log, out)
-    typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}")
+    (out / "config.yaml").write_text(fitting_config(loaded, seed), encoding="utf-8")
+    typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}; map them with")
+    typer.echo(f"kalmark run {shlex.quote(str(out / 'config.yaml'))}")
+
+
+def fitting_config(world: World, seed: int) -> str:
+    """Return the text of a configuration of the filter that fits a world, for a log in its own folder."""
+    from kalmark.config import config_dict
+    from kalmark.results.files import config_yaml
+
+    config = world.config()
+    log = config.log.model_copy(update={"path": ".", "format": "native"})
+    return config_yaml(config_dict(config.model_copy(update={"log": log, "seed": seed})))
