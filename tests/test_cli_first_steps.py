@@ -10,7 +10,7 @@ import numba
 import pytest
 
 from kalmark.cli.options import COMPILING, announce_compilation, say_compiling
-from kalmark.config import load_config
+from kalmark.config import load_config, shipped_configs
 from kalmark.simulate import load_world
 from test_cli import Kalmark, kalmark  # noqa: F401 - `kalmark` is a fixture
 
@@ -76,3 +76,14 @@ def test_what_simulate_leaves_runs_with_the_command_it_prints(
     summary = json.loads((tmp_path / "out" / "config" / "summary.json").read_text())
     assert summary["landmarks"] > 0
     assert set(summary["robots"]) == set(fitting.robots)
+
+
+def test_config_prints_a_shipped_configuration_to_start_from(kalmark: Kalmark, tmp_path: Path) -> None:  # noqa: F811
+    done = kalmark("config", "native")
+    assert (done.status, done.err) == (0, "")
+    (tmp_path / "mine.yaml").write_text(done.out)
+    assert load_config(tmp_path / "mine.yaml").model_dump() == load_config("native").model_dump()
+    assert done.out == shipped_configs()["native"].read_text()
+    refused = kalmark("config", "nativ")
+    assert (refused.status, refused.out) == (2, "")
+    assert refused.err.endswith("did you mean native?\n")

@@ -11,6 +11,7 @@ import typer
 from kalmark.cli.campaign import campaign
 from kalmark.cli.check import check
 from kalmark.cli.coming import COMING, coming
+from kalmark.cli.config import config
 from kalmark.cli.convert import convert
 from kalmark.cli.data import data
 from kalmark.cli.demo import demo
@@ -31,7 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (demo, run, simulate, evaluate, report, campaign, convert, check):
+for verb in (demo, run, simulate, evaluate, report, campaign, config, convert, check):
     app.command()(verb)
 app.add_typer(data, name="data")
 for name, what in COMING.items():
