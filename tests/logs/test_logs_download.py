@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import requests
+from urllib3.exceptions import MaxRetryError, NewConnectionError, ReadTimeoutError
 
 from kalmark.errors import DataError, LogError
 from kalmark.logs import cache_folder, download, fetch, find_data, list_data
@@ -126,9 +128,27 @@ def test_a_download_that_breaks_off_leaves_nothing(
 
 def test_a_server_that_is_not_there_is_one_clear_line(mirror: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KALMARK_DATA_URL", "http://127.0.0.1:9")
-    with pytest.raises(DataError, match=r"toy/two/c\.csv: cannot be fetched") as refused:
+    with pytest.raises(DataError) as refused:
         fetch("toy/two")
-    assert "\n" not in str(refused.value)
+    assert str(refused.value) == (
+        "cannot reach 127.0.0.1:9 (connection refused); "
+        "set KALMARK_DATA to a folder that has it or KALMARK_DATA_URL to a mirror"
+    )
+
+
+def test_a_name_that_is_not_resolved_and_a_server_that_is_silent_are_told_in_a_few_words() -> None:
+    lost = requests.ConnectionError(MaxRetryError(None, "/", NewConnectionError(None, "Failed to resolve")))  # type: ignore[arg-type]
+    lost.args[0].reason.__cause__ = OSError(-2, "Name not known")
+    assert download.innermost(lost) == "name not known"
+    assert download.innermost(requests.ReadTimeout(ReadTimeoutError(None, "/", "Read timed out."))) == (  # type: ignore[arg-type]
+        "no answer in time"
+    )
+
+
+def test_a_log_not_found_says_how_to_name_a_folder_that_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("KALMARK_DATA", raising=False)
+    with pytest.raises(LogError, match="`kalmark data fetch dlr` downloads it; KALMARK_DATA can name a folder"):
+        find_data("dlr/nowhere")
 
 
 def test_progress_counts_the_bytes_of_the_whole_dataset(mirror: Server) -> None:

@@ -21,8 +21,9 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import platformdirs
 
@@ -30,6 +31,7 @@ from kalmark.errors import DataError, LogError
 from kalmark.logs.source import nearest
 
 ORIGIN = "https://raw.githubusercontent.com/{repo}/{commit}/{path}"
+ELSEWHERE = "set KALMARK_DATA to a folder that has it or KALMARK_DATA_URL to a mirror"
 Progress = Callable[[str, int, int], None]
 """Called with a file's name, the bytes that are there and the bytes there will be, of the whole dataset."""
 
@@ -142,11 +144,29 @@ def retrieve(file: DataFile, folder: Path, transfer: Transfer) -> None:
     try:
         place = folder / file.file
         pooch.retrieve(where, f"sha256:{file.sha256}", fname=place.name, path=place.parent, downloader=checked)
+    except (requests.ConnectionError, requests.Timeout) as error:
+        raise DataError(f"cannot reach {urlsplit(where).netloc} ({innermost(error)}); {ELSEWHERE}") from None
     except (requests.RequestException, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{file.file}: cannot be fetched ({reason}), expected it at {where}") from None
     finally:
         logger.setLevel(level)
+
+
+def innermost(error: BaseException) -> str:
+    """Return in a few words what is at the bottom of an error of the network."""
+    seen = [error]
+    while True:
+        last = seen[-1]
+        arguments = [a for a in (getattr(last, "reason", None), *last.args) if isinstance(a, BaseException)]
+        below = [e for e in (*arguments, last.__cause__, last.__context__) if e is not None and e not in seen]
+        if not below:
+            break
+        seen.append(below[0])
+    if any("timeout" in type(e).__name__.lower() for e in seen):
+        return "no answer in time"
+    words = getattr(last, "strerror", None) or str(last) or type(last).__name__
+    return shorten(words[0].lower() + words[1:], 80, placeholder=" ...")
 
 
 def url_of(file: DataFile) -> str:
@@ -232,9 +252,11 @@ def find_data(path: Path | str, base: Path | str | None = None) -> Path:
     for place in places:
         if place.exists():
             return place
-    looked = ", ".join(str(place.absolute()) for place in places)
+    looked = " or ".join(str(place.absolute()) for place in places)
     known = [
         dataset.name for dataset in list_data() if f"{path.as_posix()}/".startswith(f"{dataset.name.split('/')[0]}/")
     ]
     hint = f"; `kalmark data fetch {known[0]}` downloads it" if known else ""
-    raise LogError(f"log {str(path)!r} not found, expected it at {' or '.join(looked.split(', '))}{hint}")
+    if not os.environ.get("KALMARK_DATA"):
+        hint += "; KALMARK_DATA can name a folder that has it"
+    raise LogError(f"log {str(path)!r} not found, expected it at {looked}{hint}")
