@@ -293,17 +293,24 @@ def test_a_robot_or_sensor_without_configuration_is_refused(kalmark: Kalmark, lo
     )
     config.write_text("log: {path: log}\nrobots:\n  each: {sensors: {radar: {type: range_bearing}}}\n")
     message = refused(kalmark("run", config))
-    assert "sensor is 'lidar', expected one of ['radar']" in message
-    assert "t=0" in message
+    assert message == (
+        f"{log}: rover has scans of the sensor 'lidar', expected one of radar; add robots.each.sensors.lidar"
+    )
     assert not (tmp_path / "out").exists()
 
 
 def test_a_motion_that_does_not_fit_the_controls_is_refused(kalmark: Kalmark, log: Path) -> None:
     message = refused(kalmark("run", "native", "--log", log, "--set", "robots.each.motion.type=odometry_2d"))
-    assert message.startswith(
-        "--set robots.each.motion.type=odometry_2d: robots.each.motion.type: got odometry_2d, which "
+    assert message == (
+        f"{log}: the controls of rover have the columns v_mps, w_radps, expected dx_m, dy_m, dtheta_rad of its motion "
+        "odometry_2d; try --set robots.each.motion.type=unicycle"
     )
-    assert message.endswith("takes dx_m, dy_m, dtheta_rad, expected the log's controls v_mps, w_radps")
+    controls = (log / "controls.csv").read_text()
+    (log / "controls.csv").write_text(controls.replace("v_mps", "v", 1))
+    message = refused(kalmark("run", "native", "--log", log))
+    assert message == (
+        f"{log}: the controls of rover have the columns w_radps, v, expected v_mps, w_radps of its motion unicycle"
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from kalmark.cli.options import COMPILING, announce_compilation, say_compiling
 from kalmark.config import load_config, shipped_configs
 from kalmark.simulate import load_world
-from test_cli import Kalmark, kalmark  # noqa: F401 - `kalmark` is a fixture
+from test_cli import Kalmark, kalmark, write_log  # noqa: F401 - `kalmark` is a fixture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -87,3 +87,13 @@ def test_config_prints_a_shipped_configuration_to_start_from(kalmark: Kalmark, t
     refused = kalmark("config", "nativ")
     assert (refused.status, refused.out) == (2, "")
     assert refused.err.endswith("did you mean native?\n")
+
+
+def test_a_truth_of_other_columns_is_told_both_poses(kalmark: Kalmark, tmp_path: Path) -> None:  # noqa: F811
+    log = write_log(tmp_path / "log")
+    truth = (log / "truth.csv").read_text()
+    (log / "truth.csv").write_text(truth.replace("theta_rad", "theta", 1))
+    assert kalmark("run", "native", "--log", "log").err == (
+        "kalmark: log/truth.csv:1: columns x_m, y_m, theta, expected either x_m, y_m, theta_rad or "
+        "x_m, y_m, z_m, qx, qy, qz, qw; did you mean 'theta_rad'?\n"
+    ).replace("log/", f"{log}/")

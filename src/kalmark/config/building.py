@@ -13,13 +13,14 @@ from kalmark.config.locate import check_format, find_log
 from kalmark.config.models import Landmark, Motion, MountConfig, Sensor
 from kalmark.config.reading import did_you_mean, load_config
 from kalmark.config.schema import Config, RobotConfig, StartConfig
-from kalmark.errors import ModelError
+from kalmark.errors import LogError, ModelError
 from kalmark.filter import estimators
 from kalmark.logs import open_log
 from kalmark.logs.log import Log
 from kalmark.logs.start import true_start
 from kalmark.models import landmarks, motion, sensors
 from kalmark.slam import association
+from kalmark.slam.events import Scan
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 
@@ -42,6 +43,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "invariant": estimators.Invariant,
     "fej": estimators.Fej,
 }
+MOTIONS = ("unicycle", "odometry_2d", "ackermann")
 _MOUNTED = {"mount", "landmark", "association", "detector"}
 
 
@@ -103,12 +105,27 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     robot, path = config.robots[key], ("robots", key)
     moves = _build(config, (*path, "motion"), robot.motion)
     start, cov = _start(robot, name, log, moves.held)
-    columns = None if log is None else log.control_columns.get(name)
-    if columns is not None and tuple(columns) != moves.columns:
-        what = f"takes {', '.join(moves.columns)}, expected the log's controls {', '.join(columns)}"
-        raise config.error((*path, "motion", "type"), f"got {robot.motion.type}, which {what}")
+    if log is not None:
+        _refuse_misfit(config, key, name, moves.columns, log)
     mounts = {s: _mount(config, (*path, "sensors", s), sensor) for s, sensor in robot.sensors.items()}
     return Robot(name, moves, start=start, sensors=mounts, cov=cov)
+
+
+def _refuse_misfit(config: Config, key: str, name: str, columns: tuple[str, ...], log: Log) -> None:
+    """Refuse controls that the motion does not take and, unless bad input is skipped, sensors not configured."""
+    robot, given = config.robots[key], tuple(log.control_columns.get(name, columns))
+    if given != columns:
+        fitting = [motion for motion in MOTIONS if CLASSES[motion]().columns == given]
+        hint = f"; try --set robots.{key}.motion.type={fitting[0]}" if fitting else ""
+        what = f"the controls of {name} have the columns {', '.join(given)}"
+        raise LogError(f"{log.path}: {what}, expected {', '.join(columns)} of its motion {robot.motion.type}{hint}")
+    if config.log.on_error == "skip":
+        return
+    for event in log.events:
+        if isinstance(event, Scan) and event.robot == name and event.sensor not in robot.sensors:
+            known = f"one of {', '.join(robot.sensors)}" if robot.sensors else "none, as none is configured"
+            what = f"{name} has scans of the sensor {event.sensor!r}, expected {known}"
+            raise LogError(f"{log.path}: {what}; add robots.{key}.sensors.{event.sensor}")
 
 
 def _names(config: Config, log: Log | None) -> list[str]:

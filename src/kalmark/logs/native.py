@@ -24,7 +24,7 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.logs.log import Array, Log, PositionTrack, Trajectory
-from kalmark.logs.source import Format, Request, folder_of
+from kalmark.logs.source import Format, Request, folder_of, nearest
 from kalmark.logs.table import Row, Table, read_table
 from kalmark.logs.text import landmark_id, seconds
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, order
@@ -159,9 +159,12 @@ def read_fixes(path: Path, request: Request) -> list[Event]:
 
 def read_truth(path: Path, request: Request) -> dict[str, Trajectory]:
     """Return the true trajectory of each robot in `truth.csv`."""
-    table = read_table(path, ("t_s", "robot"), allowed=(*POSE2, *POSE3))
+    table = read_table(path, ("t_s", "robot"))
     if set(table.value_columns) not in (set(POSE2), set(POSE3)):
-        raise LogError(f"{path}:1: columns {', '.join(table.value_columns)}, expected {pose_columns()}")
+        odd = next((name for name in table.value_columns if name not in (*POSE2, *POSE3)), None)
+        hint = nearest(odd, (*POSE2, *POSE3)) if odd else ""
+        given = ", ".join(table.value_columns) or "of a pose: none"
+        raise LogError(f"{path}:1: columns {given}, expected {pose_columns()}{hint}")
     columns = POSE2 if "theta_rad" in table.value_columns else POSE3
     paths: dict[str, tuple[list[int], list[list[float]]]] = {}
     for row in timed(table, request, strictly=True):
@@ -179,7 +182,7 @@ def read_truth(path: Path, request: Request) -> dict[str, Trajectory]:
 
 def pose_columns() -> str:
     """Say which columns a true pose may have."""
-    return f"{', '.join(POSE2)} or {', '.join(POSE3)}"
+    return f"either {', '.join(POSE2)} or {', '.join(POSE3)}"
 
 
 def read_landmarks(path: Path, request: Request) -> dict[Id, Array]:
