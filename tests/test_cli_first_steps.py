@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 from kalmark.cli.options import COMPILING, announce_compilation, say_compiling
 from kalmark.config import load_config, shipped_configs
+from kalmark.logs import list_data
 from kalmark.simulate import load_world
 from test_cli import Kalmark, kalmark, write_log  # noqa: F401 - `kalmark` is a fixture
 
@@ -97,3 +99,15 @@ def test_a_truth_of_other_columns_is_told_both_poses(kalmark: Kalmark, tmp_path:
         "kalmark: log/truth.csv:1: columns x_m, y_m, theta, expected either x_m, y_m, theta_rad or "
         "x_m, y_m, z_m, qx, qy, qz, qw; did you mean 'theta_rad'?\n"
     ).replace("log/", f"{log}/")
+
+
+def test_names_of_datasets_are_whole_in_a_narrow_terminal(
+    kalmark: Kalmark,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    done = kalmark("data", "list")
+    assert max(len(line) for line in re.sub(r"\x1b\[[0-9;]*m", "", done.out).splitlines()) == 80
+    for dataset in list_data():
+        assert dataset.name in done.out

@@ -56,15 +56,18 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:
-    """Print rows of text; `align` has one of < and > for each column.  A header appears if any column has a name."""
+    """Print rows of text; `align` has one of < and > for each column.  A header appears if any column has a name.
+
+    A narrow terminal folds all columns but the first, which holds names.
+    """
     from rich import box
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     table = Table(box=box.SIMPLE, show_header=any(columns))
-    for column, side in zip(columns, align, strict=True):
-        table.add_column(Text(column), justify="right" if side == ">" else "left", overflow="fold")
+    for n, (column, side) in enumerate(zip(columns, align, strict=True)):
+        table.add_column(Text(column), justify="right" if side == ">" else "left", overflow="fold", no_wrap=n == 0)
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     console = Console()
