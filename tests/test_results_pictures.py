@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from kalmark.results.record import record
 from kalmark.results.report import report_html, show
 from kalmark.results.run import Run
 from kalmark.results.series import POINTS, reasons, series
-from kalmark.slam.events import Control, Scan
+from kalmark.results.words import count, figure
+from kalmark.slam.events import Control, Fix, Scan
 from results_world import circle, slam_for
 
 
@@ -165,3 +167,38 @@ def test_the_headline_names_the_key_figures(run: Run) -> None:
     assert any(figure.startswith("position ") for figure in figures)
     assert show(None) != show(0.0) == "0"
     assert show(1234567.0) == "1.235e+06"
+
+
+def test_the_map_shows_whole_ellipses_but_a_huge_one_does_not_blow_it_up(run: Run) -> None:
+    means, covariances = run.landmarks.positions()
+    contours = np.concatenate(list(ellipses(means, covariances)))
+    (axes,) = draw_map(run).axes
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    assert left < contours[:, 0].min() < contours[:, 0].max() < right
+    assert bottom < contours[:, 1].min() < contours[:, 1].max() < top
+    huge = replace(run.landmarks, covariances=[1e6 * np.eye(2), *run.landmarks.covariances[1:]])
+    (axes,) = draw_map(replace(run, landmarks=huge)).axes
+    assert axes.get_xlim()[1] - axes.get_xlim()[0] < 2 * (right - left)
+
+
+def test_fixes_that_the_filter_used_are_drawn_where_they_were_measured() -> None:
+    log = circle(steps=10)
+    fix = Fix(t_ns=log.events[-1].t_ns, robot="rover", y=(1.0, 0.1), cov=np.eye(2))
+    run = record(slam_for(log), [*log.events, fix], progress=False)
+    assert Picture.of(run).used["rover"].tolist() == [[1.0, 0.1]]
+    assert page_data(report_html(run))["usedFixes"] == {"rover": {"x": [1.0], "y": [0.1]}}
+    assert "fixes used" in [text.get_text() for text in draw_map(run).legends[0].get_texts()]
+
+
+def test_figures_in_words_are_without_powers_of_ten_and_in_the_right_number() -> None:
+    assert [figure(110.4, 2), figure(1234.5), figure(0.01234), figure(float("nan"))] == ["110", "1230", "0.0123", "nan"]
+    assert [count(1, "scan"), count(0, "scan"), count(2, "fix", "fixes")] == ["1 scan", "0 scans", "2 fixes"]
+    title, parts = headline(recorded(circle(steps=1)))
+    assert title == "circle · invariant"
+    assert "1 scan" in parts
+
+
+def test_the_first_step_does_not_count_for_the_time_a_step_takes(run: Run) -> None:
+    slow = replace(run.history, step_us=np.array([1e9, *[5.0] * (len(run.history.t_ns) - 1)]))
+    summary = replace(run, history=slow, summary={}).evaluate()
+    assert (summary["step_us_median"], summary["step_us_p99"]) == (5.0, 5.0)

@@ -71,7 +71,7 @@ def test_controls_in_other_units_of_time_than_the_scans_are_noticed() -> None:
 def test_bearings_in_degrees_are_noticed() -> None:
     log = circle(steps=20)
     events: list[Event] = [scan(e, y=e.y * [1.0, 180 / np.pi]) if isinstance(e, Scan) else e for e in log]
-    assert any("bearings are beyond 2 pi rad: are they in degrees?" in line for line in warned(log, events))
+    assert any("bearings beyond 2 pi rad: are they in degrees?" in line for line in warned(log, events))
 
 
 def test_truth_that_fits_no_robot_and_robots_without_truth_are_named() -> None:
@@ -119,7 +119,7 @@ def test_noise_that_is_not_the_log_s_is_noticed() -> None:
     ]
     lines = warned(log, events)
     assert any(line.startswith("pose NEES ") and "where 3 is consistent" in line for line in lines)
-    assert any(line.endswith("the noise configured is too small") for line in lines)
+    assert any(line.endswith("the noise is set too small") for line in lines)
 
 
 def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(

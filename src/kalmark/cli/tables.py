@@ -15,7 +15,7 @@ TOTALS: tuple[tuple[str, str, str], ...] = (
     ("tentative", "  tentative", ""),
     ("landmarks", "landmarks in the map", ""),
     ("nis_per_dof", "NIS per degree of freedom", ""),
-    ("fixes", "position fixes", ""),
+    ("fixes", "fixes given to the filter", ""),
     ("fixes_rejected", "  rejected by the gate", ""),
     ("fix_nis_per_dof", "  NIS per degree of freedom", ""),
     ("landmark_rmse_m", "landmark RMSE, aligned", "m"),

@@ -10,6 +10,7 @@ import numpy as np
 from kalmark.results.align import Rigid, rigid, rigid_robust
 from kalmark.results.evaluate import antenna_path
 from kalmark.results.history import Array
+from kalmark.results.words import count, figure
 from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
@@ -18,17 +19,21 @@ if TYPE_CHECKING:
 COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b0457a", "#6b6f2a")
 TRUTH_COLOUR = "#8b929c"
 LANDMARK_COLOUR = "#d2691e"
+FIX_COLOUR = "#7a3fa0"
 INK = "#2b2f36"
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """By robot: estimated poses (N, 3), true positions (N, 2; NaN: unknown), fixes (N, 2).  True landmarks (2,)."""
+    """By robot: estimated poses (N, 3), true positions (N, 2; NaN: unknown), fixes (N, 2) to score with
+    and those `used` by the filter.  True landmarks (2,).
+    """
 
     paths: dict[str, Array]
     truth: dict[str, Array]
     fixes: dict[str, Array]
     landmarks: dict[Id, Array]
+    used: dict[str, Array]
 
     @classmethod
     def of(cls, run: Run) -> Picture:
@@ -44,11 +49,18 @@ class Picture:
                 truth[robot] = to_map(poses[:, :2])
             elif robot in run.truth.fixes:
                 fixes[robot] = _fixes_in_map(run, robot)
-        return cls(paths, truth, fixes, {i: to_map(l[:2]) for i, l in run.truth.landmarks.items()})
+        landmarks = {i: to_map(l[:2]) for i, l in run.truth.landmarks.items()}
+        return cls(paths, truth, fixes, landmarks, _used_fixes(run))
 
     def colour(self, robot: str) -> str:
         """Return the robot's colour."""
         return COLOURS[list(self.paths).index(robot) % len(COLOURS)]
+
+
+def _used_fixes(run: Run) -> dict[str, Array]:
+    """Return the fixes (N, 2) of each robot that the filter used; they are in the frame of the map."""
+    used = [fix for fix in run.history.inputs.fixes if fix.used]
+    return {name: np.array([fix.y for fix in used if fix.robot == name]) for name in sorted({f.robot for f in used})}
 
 
 def _truth_to_map(run: Run) -> Rigid:
@@ -75,17 +87,18 @@ def headline(run: Run) -> tuple[str, list[str]]:
     summary = run.summary or run.evaluate()
     name = run.log.name or "run"
     title = f"{name} · {run.estimator}" if run.estimator else name
-    parts = [f"{summary['landmarks']} landmarks", f"{summary['scans']} scans"]
+    parts = [count(summary["landmarks"], "landmark"), count(summary["scans"], "scan")]
     errors = [figures for figures in summary["robots"].values() if figures.get("ate_m") is not None]
     if errors:
-        parts.append(f"position {_mean(errors, 'ate_raw_m'):.3g} m ({_mean(errors, 'ate_m'):.3g} m aligned)")
-        parts.append(f"heading {_mean(errors, 'heading_rmse_deg'):.2g}°")
+        parts.append(f"position {figure(_mean(errors, 'ate_raw_m'))} m ({figure(_mean(errors, 'ate_m'))} m aligned)")
+        parts.append(f"heading {figure(_mean(errors, 'heading_rmse_deg'), 2)}°")
     if summary.get("landmark_rmse_m") is not None:
-        parts.append(f"landmarks {summary['landmark_rmse_raw_m']:.3g} m ({summary['landmark_rmse_m']:.3g} m aligned)")
+        raw, aligned = figure(summary["landmark_rmse_raw_m"]), figure(summary["landmark_rmse_m"])
+        parts.append(f"landmarks {raw} m ({aligned} m aligned)")
     if summary.get("fix_median_m") is not None:
         parts.append(f"fixes: median {summary['fix_median_m']:.2f} m, {summary['fix_within_10m']:.1%} within 10 m")
     if any(figures.get("pose_nees") is not None for figures in errors):
-        parts.append(f"pose NEES {_mean(errors, 'pose_nees'):.3g}")
+        parts.append(f"pose NEES {figure(_mean(errors, 'pose_nees'))}")
     if summary["nis_per_dof"] is not None:
         parts.append(f"NIS/dof {summary['nis_per_dof']:.2f}")
     if summary["diverged"]:

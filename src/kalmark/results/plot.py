@@ -14,12 +14,13 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from kalmark.results.history import Array
-from kalmark.results.picture import INK, LANDMARK_COLOUR, TRUTH_COLOUR, Picture, ellipses, headline
+from kalmark.results.picture import FIX_COLOUR, INK, LANDMARK_COLOUR, TRUTH_COLOUR, Picture, ellipses, headline
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
 
 LONG = 3000  # a path of more steps than this is drawn thinner
+REACH = 0.2  # an ellipse widens the picture by at most this part of it
 CROWD = 100  # with more landmarks than this, everything about them is drawn thinner
 
 
@@ -34,7 +35,7 @@ def draw_map(run: Run) -> Figure:
     """Return the figure of a run's map: axes in metres, in the frame of the map."""
     picture = Picture.of(run)
     means, covariances = run.landmarks.positions()
-    low, high = _extent(picture, means)
+    low, high = _extent(picture, means, covariances)
     figure = Figure(figsize=_size(high - low), layout=ConstrainedLayoutEngine(h_pad=0.09), facecolor="white")
     axes = figure.subplots()
     _style(axes)
@@ -84,14 +85,23 @@ def _style(axes: Axes) -> None:
         side.set_color("#c4c8cf")
 
 
-def _extent(picture: Picture, landmarks: Array) -> tuple[Array, Array]:
-    """Return the corners of what is to be seen; ellipses and stray fixes may reach out of it."""
-    parts = [landmarks, *(path[:, :2] for path in picture.paths.values()), *picture.truth.values()]
+def _extent(picture: Picture, landmarks: Array, covariances: Array) -> tuple[Array, Array]:
+    """Return the corners of what is to be seen; huge ellipses and stray fixes may reach out of it."""
+    parts = [
+        landmarks,
+        *(path[:, :2] for path in picture.paths.values()),
+        *picture.truth.values(),
+        *picture.used.values(),
+    ]
     points = np.concatenate([*parts, np.array(list(picture.landmarks.values())).reshape(-1, 2)])
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         return np.array([-1.0, -1.0]), np.array([1.0, 1.0])
     low, high = points.min(axis=0), points.max(axis=0)
+    if len(landmarks):
+        reach = 3.0 * np.sqrt(np.maximum(np.einsum("kii->ki", covariances), 0.0))
+        reach = np.minimum(reach, max(REACH * (high - low).max(), 0.5))
+        low, high = np.minimum(low, (landmarks - reach).min(axis=0)), np.maximum(high, (landmarks + reach).max(axis=0))
     middle, half = (low + high) / 2, (high - low) / 2
     half = np.maximum(half * 1.06, max(0.15 * half.max(), 0.5))
     return middle - half, middle + half
@@ -107,6 +117,8 @@ def _size(span: Array) -> tuple[float, float]:
 def _draw_truth(axes: Axes, picture: Picture, crowded: bool) -> None:
     for fixes in picture.fixes.values():
         axes.plot(fixes[:, 0], fixes[:, 1], ".", color=TRUTH_COLOUR, markersize=1.8, zorder=1)
+    for fixes in picture.used.values():
+        axes.plot(fixes[:, 0], fixes[:, 1], "x", color=FIX_COLOUR, markersize=3.5, markeredgewidth=0.7, zorder=3)
     for path in picture.truth.values():
         axes.plot(path[:, 0], path[:, 1], "-", color=TRUTH_COLOUR, linewidth=2.2, alpha=0.6, zorder=2)
     if picture.landmarks:
@@ -155,6 +167,8 @@ def _legend(picture: Picture, landmarks: int) -> list[Line2D]:
         handles.append(
             Line2D([], [], color=TRUTH_COLOUR, marker=".", linestyle="", label="position fixes (aligned, not used)")
         )
+    if picture.used:
+        handles.append(Line2D([], [], color=FIX_COLOUR, marker="x", markersize=5, linestyle="", label="fixes used"))
     if picture.landmarks:
         handles.append(Line2D([], [], color=INK, marker="+", linestyle="", label="true landmarks"))
     if landmarks:

@@ -122,8 +122,8 @@ _TEMPLATE = """<!DOCTYPE html>
 <section id="against-truth"><h2>Errors and their 3-sigma bands <select id="robot"></select></h2>
 <div id="errors"></div>
 <h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
-<section><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>
-<section><h2>Association</h2><div id="outcomes"></div>{reasons}</section>
+<section id="nis-section"><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>
+<section id="association"><h2>Association</h2><div id="outcomes"></div>{reasons}</section>
 <section><h2>Figures</h2>{robots}{summary}{skipped}</section>
 <section><h2>Configuration</h2><pre>{config}</pre></section>
 </main>

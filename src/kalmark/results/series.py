@@ -29,6 +29,7 @@ def series(run: Run) -> dict[str, Any]:
         "robots": [_robot(run, picture, robot, t) for robot in picture.paths],
         "trueLandmarks": _points(picture.landmarks),
         "fixes": {robot: xy(points[_thin(len(points))]) for robot, points in picture.fixes.items()},
+        "usedFixes": {robot: xy(points[_thin(len(points))]) for robot, points in picture.used.items()},
         "maps": [_map(m, float(t[m.step])) for m in run.history.maps],
         "nis": _nis(run, t),
         "neesBounds": anees_interval(3),

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from kalmark.results.inputs import UsedFix
+from kalmark.results.words import count, figure
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -43,9 +44,9 @@ def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
         mine = history.outcome == outcome
         if 2 * int(mine.sum()) <= total:
             continue
-        reason, count = Counter(history.reason[mine].tolist()).most_common(1)[0]
+        reason, number = Counter(history.reason[mine].tolist()).most_common(1)[0]
         if reason == NO_ID:
-            yield f"{count} observations have no id and were ignored; try --set association.type=nearest"
+            yield f"{number} observations have no id and were ignored; try --set association.type=nearest"
         else:
             yield f"{int(mine.sum())} of {total} observations were {outcome}, most often: {reason or 'no reason given'}"
     if not total:
@@ -55,7 +56,7 @@ def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
     bearings = history.y[:, 1] if history.y.shape[1] > 1 else np.empty(0)
     turns = np.abs(bearings[np.isfinite(bearings) & _has_bearing(run)]) > 2 * np.pi
     if turns.any():
-        yield f"{int(turns.sum())} bearings are beyond 2 pi rad: are they in degrees?"
+        yield f"{int(turns.sum())} bearings beyond 2 pi rad: are they in degrees?"
 
 
 def _has_bearing(run: Run) -> Any:
@@ -77,7 +78,7 @@ def _robots(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
         scans = history.t_ns[history.robot == name]
         controls = history.inputs.controls.get(name)
         if len(scans) and controls is None:
-            yield f"robot {name} has {_count(len(scans), 'scan')} but no controls: it is taken to stand still"
+            yield f"robot {name} has {count(len(scans), 'scan')} but no controls: it is taken to stand still"
         elif len(scans) > 1 and controls is not None and controls.number > 1:
             shared = min(int(scans[-1]), controls.last_ns) - max(int(scans[0]), controls.first_ns)
             share = max(shared, 0) / max(int(scans[-1] - scans[0]), 1)
@@ -103,16 +104,17 @@ def _fixes(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
     for name in dict.fromkeys(fix.robot for fix in fixes):
         first = next(fix for fix in fixes if fix.robot == name)
         if name in starts and _d2(first) > FIRST_FIX:
+            far = float(np.linalg.norm(first.z))
             sigma = float(np.sqrt(max(np.trace(starts[name].covariance[:2, :2]) / 2, 0.0)))
             yield (
-                f"the first fix of {name} is {np.linalg.norm(first.z):.3g} m from where its start puts it, "
-                f"which the configuration says is known to {sigma:.3g} m: set robots.{name}.start"
+                f"the first fix of {name} is {figure(far)} m from where its start puts it, "
+                f"which the configuration says is known to {figure(sigma)} m: set robots.{name}.start"
             )
     value = summary.get("fix_nis_per_dof")
     if value is not None and value > FIX_NIS_HIGH and summary["fixes"] >= FEW_FIXES:
-        yield f"NIS per degree of freedom of the fixes is {value:.3g} where 1 is consistent: is their noise too small?"
+        yield f"NIS per degree of freedom of the fixes is {figure(value)} where 1 is consistent: too small a noise?"
     if 2 * summary["fixes_rejected"] > summary["fixes"]:
-        yield f"{summary['fixes_rejected']} of {_count(summary['fixes'], 'fix', 'fixes')} were rejected by the gate"
+        yield f"{summary['fixes_rejected']} of {count(summary['fixes'], 'fix', 'fixes')} were rejected by the gate"
 
 
 def fix_nis_per_dof(fixes: tuple[UsedFix, ...]) -> float:
@@ -131,14 +133,10 @@ def _noise(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
         if value is not None and value > POSE_NEES:
             whose = f" of {name}" if len(summary["robots"]) > 1 else ""
             yield (
-                f"pose NEES{whose} {value:.3g} where 3 is consistent: the noise in the configuration is not what this "
-                "log has (correlated or biased errors?)"
+                f"pose NEES{whose} {figure(value)} where 3 is consistent: the noise in the configuration is not what "
+                "this log has (correlated or biased errors?)"
             )
     value = summary["nis_per_dof"]
     if value is not None and not NIS_LOW <= value <= NIS_HIGH and summary["associated"] >= 50:
         size = "small" if value > NIS_HIGH else "large"
-        yield f"NIS per degree of freedom {value:.2g} where 1 is consistent: the noise configured is too {size}"
-
-
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
+        yield f"NIS per degree of freedom {figure(value, 2)} where 1 is consistent: the noise is set too {size}"

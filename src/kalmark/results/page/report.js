@@ -1,5 +1,5 @@
 "use strict";
-const TRUTH = "rgba(139,146,156,0.6)", LANDMARK = "#d2691e", INK = "#2b2f36", BAND = "rgba(31,95,168,0.13)";
+const TRUTH = "rgba(139,146,156,0.6)", LANDMARK = "#d2691e", FIX = "#7a3fa0", INK = "#2b2f36", BAND = "rgba(31,95,168,0.13)";
 const OUTCOME = {associated: "#4a8f7b", new: "#d2a23c", rejected: "#c8553d", ignored: "#aab0ba",
                  deferred: "#7c86b8", tentative: "#b48ac0"};
 const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d"]};
@@ -9,6 +9,16 @@ const axis = title => ({title: {text: title, standoff: 8}, gridcolor: "#e6e8ec",
 const layout = extra => ({margin: {l: 64, r: 16, t: 10, b: 44}, font: {family: "system-ui, sans-serif", size: 13, color: INK},
                           paper_bgcolor: "white", plot_bgcolor: "white", hovermode: "closest",
                           legend: {orientation: "h", y: -0.12, x: 0}, ...extra});
+
+/* A logarithmic axis around values, with ticks that are plain numbers; at most the upper six decades. */
+function logAxis(title, values) {
+  const logs = values.filter(v => v > 0).map(Math.log10);
+  const top = logs.reduce((a, v) => Math.max(a, v), 0.4);
+  const bottom = Math.max(logs.reduce((a, v) => Math.min(a, v), -0.4), top - 6), pad = 0.04 * (top - bottom);
+  const steps = top - bottom > 2.5 ? [1] : [1, 2, 5], tickvals = [];
+  for (let k = Math.floor(bottom); k <= top; k++) for (const m of steps) tickvals.push(Number(m + "e" + k));
+  return {...axis(title), type: "log", range: [bottom - pad, top + pad], tickvals, ticktext: tickvals.map(v => `${v}`)};
+}
 
 /* The 3-sigma contours of many Gaussians as one broken line. */
 function ellipses(g, from, to, points = 24) {
@@ -31,9 +41,16 @@ function ellipses(g, from, to, points = 24) {
 function extent() {
   const all = {x: [], y: []};
   const last = DATA.maps.length ? [DATA.maps[DATA.maps.length - 1]] : [];
-  for (const g of [...DATA.robots, ...DATA.robots.map(r => r.truth || {x: [], y: []}), DATA.trueLandmarks, ...last])
+  for (const g of [...DATA.robots, ...DATA.robots.map(r => r.truth || {x: [], y: []}), DATA.trueLandmarks, ...Object.values(DATA.usedFixes), ...last])
     for (const k of ["x", "y"]) for (const value of g[k]) if (value !== null) all[k].push(value);
-  const range = values => values.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
+  const span = v => v.reduce(([a, b], w) => [Math.min(a, w), Math.max(b, w)], [Infinity, -Infinity]);
+  const most = Math.max(0.2 * Math.max(...[all.x, all.y].map(span).map(r => r[1] - r[0])), 0.5);
+  for (const g of last)  /* the ellipses too, but a huge one widens the picture only so far */
+    for (const [k, p] of [["x", "pxx"], ["y", "pyy"]])
+      g[k].forEach((value, i) => {
+        const reach = Math.min(3 * Math.sqrt(Math.max(g[p][i], 0)), most);
+        all[k].push(value - reach, value + reach);
+      });
   let [x, y] = [range(all.x), range(all.y)].map(r => r[0] > r[1] ? [-1, 1] : r);
   const pad = 0.05 * Math.max(x[1] - x[0], y[1] - y[0], 1);
   return [x, y].map(r => [r[0] - pad, r[1] + pad]);
@@ -54,6 +71,9 @@ function still() {
   for (const [robot, f] of Object.entries(DATA.fixes))
     traces.push({...f, mode: "markers", marker: {color: TRUTH, size: 3}, name: "position fixes (aligned, not used)",
                  hoverinfo: "skip"});
+  Object.values(DATA.usedFixes).forEach((f, i) =>
+    traces.push({...f, mode: "markers", marker: {color: FIX, size: 5, symbol: "x-thin", line: {color: FIX, width: 1}},
+                 name: "fixes used", legendgroup: "fixes", showlegend: i === 0, hoverinfo: "skip"}));
   DATA.robots.filter(r => r.truth).forEach((r, i) =>
     traces.push({...r.truth, mode: "lines", line: {color: TRUTH, width: 3}, name: "true path", legendgroup: "truth",
                  showlegend: i === 0, hoverinfo: "skip"}));
@@ -137,7 +157,7 @@ function drawErrors(robot) {
     {x: robot.t, y: robot.nees, mode: "lines", line: {color: robot.colour, width: 1.1},
      hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
     {x: ends, y: [3, 3], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
-    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: {...axis("NEES"), type: "log", dtick: 1}}), CONFIG);
+    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: logAxis("NEES", [...robot.nees, low, high])}), CONFIG);
 }
 
 function bounds(t, low, high) {
@@ -154,7 +174,7 @@ function drawNis() {
     {x: nis.t, y: nis.value, mode: "lines", line: {color: "#1f5fa8", width: 1.1},
      hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
     {x: [nis.t[0], nis.t[nis.t.length - 1]], y: [1, 1], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
-    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: {...axis("NIS / dof"), type: "log", dtick: 1}}), CONFIG);
+    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: logAxis("NIS / dof", [...nis.value, ...nis.low, ...nis.high])}), CONFIG);
 }
 
 function drawOutcomes() {
@@ -173,5 +193,5 @@ if (judged.length) {
   el("robot").addEventListener("change", () => drawErrors(judged[+el("robot").value]));
   drawErrors(judged[0]);
 } else el("against-truth").remove();
-drawNis();
-drawOutcomes();
+if (DATA.nis.t.length) drawNis(); else el("nis-section").remove();
+if (Object.keys(DATA.outcomes.counts).length) drawOutcomes(); else el("association").remove();
