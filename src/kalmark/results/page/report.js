@@ -41,7 +41,8 @@ function ellipses(g, from, to, points = 24) {
 function extent() {
   const all = {x: [], y: []};
   const last = DATA.maps.length ? [DATA.maps[DATA.maps.length - 1]] : [];
-  for (const g of [...DATA.robots, ...DATA.robots.map(r => r.truth || {x: [], y: []}), DATA.trueLandmarks, ...Object.values(DATA.usedFixes), ...last])
+  for (const g of [...DATA.robots, ...DATA.robots.map(r => r.truth || {x: [], y: []}), DATA.trueLandmarks,
+                   ...Object.values(DATA.usedFixes), ...last])
     for (const k of ["x", "y"]) for (const value of g[k]) if (value !== null) all[k].push(value);
   const span = v => v.reduce(([a, b], w) => [Math.min(a, w), Math.max(b, w)], [Infinity, -Infinity]);
   const most = Math.max(0.2 * Math.max(...[all.x, all.y].map(span).map(r => r[1] - r[0])), 0.5);
@@ -51,7 +52,7 @@ function extent() {
         const reach = Math.min(3 * Math.sqrt(Math.max(g[p][i], 0)), most);
         all[k].push(value - reach, value + reach);
       });
-  let [x, y] = [range(all.x), range(all.y)].map(r => r[0] > r[1] ? [-1, 1] : r);
+  let [x, y] = [span(all.x), span(all.y)].map(r => r[0] > r[1] ? [-1, 1] : r);
   const pad = 0.05 * Math.max(x[1] - x[0], y[1] - y[0], 1);
   return [x, y].map(r => [r[0] - pad, r[1] + pad]);
 }
