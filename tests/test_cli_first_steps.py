@@ -67,6 +67,7 @@ def test_what_simulate_leaves_runs_with_the_command_it_prints(
     command = shlex.split(done.out.splitlines()[-1])
     assert command == ["kalmark", "run", "a log/config.yaml"]
     assert kalmark(*command[1:]).status == 0
+    assert kalmark(*command[1:], "--set", "estimator.type=ekf", "--out", "ekf").status == 0
     config = load_config(tmp_path / "a log" / "config.yaml")
     fitting = load_world(world).config()
     assert (config.robots, config.association, config.estimator) == (

@@ -40,4 +40,6 @@ def fitting_config(world: World, seed: int) -> str:
 
     config = world.config()
     log = config.log.model_copy(update={"path": ".", "format": "native"})
-    return config_yaml(config_dict(config.model_copy(update={"log": log, "seed": seed})))
+    values = config_dict(config.model_copy(update={"log": log, "seed": seed}))
+    chosen = config.estimator.model_dump(exclude_defaults=True)  # so that --set estimator.type=ekf is enough
+    return config_yaml(values | {"estimator": {"type": config.estimator.type, **chosen}})
