@@ -217,3 +217,19 @@ def test_a_name_that_means_nothing_is_told_the_nearest(tmp_path: Path) -> None:
         resolve_config("mrclm")
     with pytest.raises(ConfigError, match="got a folder, expected a configuration"):
         resolve_config(tmp_path)
+
+
+def test_another_type_replaces_its_section(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(
+        "estimator: {type: invariant, iterations: 3}\n"
+        "robots: {each: {motion: {type: unicycle, sigma_v_mps: 0.2}, sensors: {s: {type: range, sigma_range_m: 1.0,"
+        " mount: {x_m: 0.5}}}}}\n"
+    )
+    overrides = ["estimator.type=ekf", "robots.each.motion.type=odometry_2d", "robots.each.sensors.s.type=bearing"]
+    config = load_config(path, overrides)
+    assert config.estimator.type == "ekf"
+    each = config.robots["each"]
+    assert each.motion.type == "odometry_2d"
+    assert each.sensors["s"].type == "bearing"
+    assert each.sensors["s"].mount.x_m == 0.5

@@ -119,7 +119,7 @@ def _item(node: CommentedMap | CommentedSeq, key: Any, path: tuple[str, ...], tr
 
 
 def _override(tree: Tree, override: str) -> None:
-    """Lay one `a.b=value` over the tree; the value is YAML."""
+    """Lay one `a.b=value` over the tree; the value is YAML.  Another `type` replaces its section, but for a mount."""
     where = f"--set {override}"
     dotted, equals, text = override.partition("=")
     path = tuple(part.strip() for part in dotted.split("."))
@@ -133,7 +133,11 @@ def _override(tree: Tree, override: str) -> None:
         if not isinstance(node, dict):
             raise ConfigError(f"{where}: {'.'.join(path[:depth])}: got {show(node)}, expected a mapping of keys")
     overlay = Tree()
-    node[path[-1]] = _plain(_parse(text, where), (), overlay, where)
+    value = _plain(_parse(text, where), (), overlay, where)
+    if path[-1] == "type" and node.get("type", value) != value:  # another type has other keys; a mount stays
+        for key in [key for key in node if key != "mount"]:
+            del node[key]
+    node[path[-1]] = value
     for table in (tree.places, tree.keys):
         for below in [p for p in table if p[: len(path)] == path]:
             del table[below]
