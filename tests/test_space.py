@@ -220,3 +220,34 @@ def test_a_users_held_control_in_space_is_split_by_scans_and_diffuses_along_the_
     np.testing.assert_allclose(whole.mean("d")[:3], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(split.covariance("d"), whole.covariance("d"), atol=1e-15)
     np.testing.assert_allclose(np.diag(whole.covariance("d"))[:3], [0, 0, 0.04 + 0.1**2], atol=1e-12)
+
+
+def planar(**arguments: Any) -> km.Robot:
+    return km.Robot("p", km.motion.Unicycle(), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: km.Slam([robot(), planar()]), "robot 'p' is of the plane, expected one of the space"),
+        (lambda: km.Slam([planar(), robot()]), "robot 'r' is of the space, expected one of the plane"),
+        (lambda: km.Slam([planar(sensors={"l": km.Mount(SENSORS[0])})]), "RangeBearing3D is of the space"),
+        (
+            lambda: km.Slam([km.Robot("r", km.motion.Odometry3D(), sensors={"l": km.Mount(km.sensors.Bearing())})]),
+            "Bearing is of the plane",
+        ),
+        (
+            lambda: km.Slam(
+                [planar(sensors={"l": km.Mount(km.sensors.RangeBearingSignature(), landmark=km.landmarks.Point3D())})]
+            ),
+            "point3 is of the space",
+        ),
+        (
+            lambda: km.Slam([planar()]).add_landmark(1, (0, 0, 0), landmark=km.landmarks.Point3D()),
+            "point3 is of the space",
+        ),
+    ],
+)
+def test_what_lives_in_the_plane_is_kept_out_of_space(make: Any, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        make()

@@ -17,7 +17,7 @@ from numba.extending import register_jitable
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import Index, cholesky_inverse, columns, downdate, submatrix, transport
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.spaces import Table, generator, retract
+from kalmark.geometry.spaces import HEADING, VECTOR, VECTOR3, Table, generator, retract
 from kalmark.models.observe import linearize
 
 Array = npt.NDArray[np.float64]
@@ -29,7 +29,7 @@ Scan = tuple[int, Index, int, Array, Array, Flags, float]  # robot, slots, d, y,
 @compiled
 def pose_sizes(blocks: Table, atoms: Table, robot: int) -> tuple[int, int, int]:
     """Return the numbers of a robot's pose, its degrees of freedom, and the axes it turns about: its last rows."""
-    return (3, 3, 1) if atoms[blocks[robot, 4] + 1, 0] == 2 else (7, 6, 3)
+    return (3, 3, 1) if atoms[blocks[robot, 4] + 1, 0] == HEADING else (7, 6, 3)
 
 
 @compiled
@@ -52,7 +52,7 @@ def observed_block(
                 kind = atoms[a, 0]
                 table[count, 0] = kind
                 table[count, 1], table[count, 2] = x_to + atoms[a, 1] - x_at, p_to + rows
-                rows += 3 if kind >= 4 else (2 if kind == 1 else 1)
+                rows += 3 if kind >= VECTOR3 else (2 if kind == VECTOR else 1)
                 count += 1
         for j in range(rows):
             index[p_to + j] = p_at + j

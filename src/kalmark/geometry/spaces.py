@@ -54,17 +54,17 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
     V = left_jacobian(turn) if len(turn) == 3 else np.eye(3)
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
-        if kind == 1:
+        if kind == VECTOR:
             x[at] += p * d[k] - q * d[k + 1]
             x[at + 1] += q * d[k] + p * d[k + 1]
-        elif kind == 0:
+        elif kind == SCALAR:
             x[at] += d[k]
-        elif kind in (2, 3):
+        elif kind in (HEADING, ANGLE):
             x[at] = wrap(x[at] + d[k])
-        elif kind == 4:
+        elif kind == VECTOR3:
             for j in range(3):
                 x[at + j] += V[j, 0] * d[k] + V[j, 1] * d[k + 1] + V[j, 2] * d[k + 2]
-        elif kind == 5:
+        elif kind == ROTATION:
             own = exp(d[k : k + 3] - whole)
             x[at : at + 4] = multiply(exp(whole), multiply(own, x[at : at + 4]))
 
@@ -75,15 +75,15 @@ def generator(atoms: Table, x: Array, size: int, axes: int) -> Array:
     g = np.zeros((size, axes))
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
-        if kind == 1:
+        if kind == VECTOR:
             g[k, 0], g[k + 1, 0] = -x[at + 1], x[at]
-        elif kind == 2:
+        elif kind == HEADING:
             g[k, 0] = 1.0
-        elif kind == 4:
+        elif kind == VECTOR3:
             g[k, 1], g[k, 2] = x[at + 2], -x[at + 1]
             g[k + 1, 0], g[k + 1, 2] = -x[at + 2], x[at]
             g[k + 2, 0], g[k + 2, 1] = x[at + 1], -x[at]
-        elif kind == 5:
+        elif kind == ROTATION:
             for j in range(3):
                 g[k + j, j] = 1.0
     return g
@@ -142,6 +142,13 @@ class Space:
     def axes(self) -> int:
         """Axes the world can turn about: 1 in the plane, 3 in space."""
         return 3 if VECTOR3 in self.kinds or ROTATION in self.kinds else 1
+
+    @cached_property
+    def world(self) -> str:
+        """Where it lives: "plane", "space", or "" for plain numbers, which fit either."""
+        if any(kind in (VECTOR3, ROTATION) for kind in self.kinds):
+            return "space"
+        return "plane" if any(kind in (VECTOR, HEADING) for kind in self.kinds) else ""
 
     def rotated(self, x: Array, phi: Any) -> Array:
         """Return x after rotating the world by phi (rad; in space a rotation vector) about its origin."""

@@ -91,13 +91,13 @@ def linearize_built_in(view: tuple[int, Array], r: Array, l: Array) -> tuple[Arr
     code, mount = view
     if len(r) == 3:
         T, T_r, _ = compose(r, mount)
-        if code == 6:  # an absolute position fix looks at no landmark
+        if code == POSITION_FIX:  # an absolute position fix looks at no landmark
             return T[:2].copy().reshape(1, 2), T_r[:2].copy().reshape(1, 2, 3), np.zeros((1, 2, l.shape[1]))
         v, V_T, V_l = seen_from(T, l)
         e, E_v = expect(code, v)
     else:
         T, T_r, _ = frames3d.compose(r, mount)
-        if code == 6:
+        if code == POSITION_FIX:
             return T[:3].copy().reshape(1, 3), T_r[:3].copy().reshape(1, 3, 6), np.zeros((1, 3, l.shape[1]))
         v, V_T, V_l = frames3d.to_frame_many(T, l)
         e, E_v = expect3d(code, v)

@@ -26,20 +26,20 @@ RANGE_BEARING_3D, POSITION_3D = 10, 11
 def expect(code: int, v: Array) -> tuple[Array, Array]:
     """Return the measurements (K, m) that the built-in sensor `code` makes of v (K, d), and E_v (K, m, d)."""
     k, d = v.shape
-    if code == 4:
+    if code == POSITION:
         E_v = np.zeros((k, 2, d))
         E_v[:, 0, 0] = 1.0
         E_v[:, 1, 1] = 1.0
         return v[:, :2].copy(), E_v
     y, Y_p = scan_many(v)
-    first, last = (1, 2) if code == 2 else (0, 1 if code == 3 else 2)
-    m = last - first + (1 if code == 5 else 0)
+    first, last = (1, 2) if code == BEARING else (0, 1 if code == RANGE else 2)
+    m = last - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
     e, E_v = np.empty((k, m)), np.zeros((k, m, d))
     for i in range(k):
         for j in range(first, last):
             e[i, j - first] = y[i, j]
             E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
-        if code == 5:
+        if code == RANGE_BEARING_SIGNATURE:
             e[i, 2], E_v[i, 2, 2] = v[i, 2], 1.0
     return e, E_v
 
@@ -47,7 +47,7 @@ def expect(code: int, v: Array) -> tuple[Array, Array]:
 @compiled
 def expect3d(code: int, v: Array) -> tuple[Array, Array]:
     """Return the measurements (K, 3) that the built-in spatial sensor `code` makes of v (K, 3), and E_v (K, 3, 3)."""
-    if code == 10:
+    if code == RANGE_BEARING_3D:
         return spherical_many(v)
     E_v = np.zeros((len(v), 3, 3))
     for i in range(len(v)):
@@ -74,6 +74,7 @@ def refuse_negative_ranges(y: Array) -> None:
 class Planar:
     """What the planar sensors share: limits of sight, built-in expectation."""
 
+    world: ClassVar[str] = "plane"
     code: ClassVar[int]
     range_min_m: float
     range_max_m: float
@@ -245,6 +246,7 @@ class RangeBearingSignature(Planar):
 class Spatial:
     """What the spatial sensors share: limits of sight, built-in expectation."""
 
+    world: ClassVar[str] = "space"
     code: ClassVar[int]
     range_min_m: float
     range_max_m: float

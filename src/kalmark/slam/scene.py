@@ -38,6 +38,8 @@ class View:
         self.sensor = mount.sensor
         self.at: Array = np.array(mount.at)  # writable, like all else: numba compiles per kind of array
         self.landmark: Landmark = mount.landmark or landmarks or _natural(mount)
+        slam.refuse_other_world(type(self.sensor).__name__, getattr(self.sensor, "world", ""))
+        slam.refuse_other_world(self.landmark.kind, self.landmark.space.world)
         self.look = view_of(self.sensor, self.landmark, self.at)
         self.d = self.landmark.space.size
         self.angular = np.array(self.sensor.angular, dtype=np.bool_)

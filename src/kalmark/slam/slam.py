@@ -79,6 +79,7 @@ class Slam:
         if robot.name in self.robots:
             raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
         self.robots[robot.name] = robot
+        self.refuse_other_world(f"robot {robot.name!r}", robot.motion.space.world)
         self._slots[robot.name] = self.map.add(robot.motion.space, robot.start, robot.cov)
         self._drives[robot.name] = Drive(robot.motion)
         for name, mount in robot.sensors.items():
@@ -306,6 +307,12 @@ class Slam:
             observations=[self._seen.get(i, 0) for i in ids],
         )
 
+    def refuse_other_world(self, what: str, world: str) -> None:
+        """Refuse what lives in the plane among robots that move in space, and the other way round."""
+        here = next(iter(self.robots.values())).motion.space.world
+        if world and world != here:
+            raise ModelError(f"{what} is of the {world}, expected one of the {here}, where the first robot moves")
+
     def landmark_ids(self, landmark: Landmark) -> list[Id]:
         """Return the ids of the landmarks of one type."""
         return [i for i, kind in self._kinds.items() if kind.kind == landmark.kind]
@@ -314,6 +321,7 @@ class Slam:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
         name = checked_id(name, "landmark")
         kind = landmark or next((v.landmark for v in self._views.values()), Point2D())
+        self.refuse_other_world(kind.kind, kind.space.world)
         if name in self._slots:
             raise MapError(f"landmark {name!r} is in the map already, expected a new id")
         try:
