@@ -19,12 +19,13 @@ from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM
 from kalmark.logs.native import NATIVE
 from kalmark.logs.source import Format, Request, choice, nearest, quantity
+from kalmark.logs.starry_night import STARRY_NIGHT
 from kalmark.logs.text import raising
 from kalmark.logs.victoria_park import VICTORIA_PARK
 from kalmark.slam.events import Event, Scan
 
 FORMATS: dict[str, Format] = {
-    entry.name: entry for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG)
+    entry.name: entry for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT)
 }
 
 
@@ -112,7 +113,15 @@ def keep_robots(log: Log, request: Request) -> Log:
         gps={robot: value for robot, value in log.gps.items() if robot in request.robots},
         control_columns={key: value for key, value in log.control_columns.items() if key in request.robots},
         sensor_columns={key: value for key, value in log.sensor_columns.items() if key[0] in request.robots},
+        describes=described(log.describes, (*request.robots, "each")),
     )
+
+
+def described(rig: dict[str, Any], robots: Sequence[str]) -> dict[str, Any]:
+    """Return what a log describes of these robots."""
+    if "robots" not in rig:
+        return rig
+    return rig | {"robots": {name: robot for name, robot in rig["robots"].items() if name in robots}}
 
 
 def without(event: Event, others: set[str], left_out: Counter[str]) -> Event | None:

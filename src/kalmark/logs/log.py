@@ -110,9 +110,12 @@ class PositionTrack:
 class Log:
     """Hold one log: `events` sorted by `kalmark.slam.events.order`, and what is known to score them against.
 
-    `truth` and `gps` are by robot, `landmarks` are true positions (2,) or (3,) m by id (all {} where unknown);
-    `skipped` has one line for each thing left out; `control_columns` (by robot) and `sensor_columns` (by robot and
-    sensor) name what the numbers of a control and an observation are.
+    `truth` and `gps` are by robot, `landmarks` are by id: true positions (2,) or (3,) m, both ends of a line (6,) or
+    the pose of a tag (7,) (all {} where unknown).  `skipped` has one line for each thing left out; `control_columns`
+    (by robot) and `sensor_columns` (by robot and sensor) name what the numbers of a control and an observation are.
+    `describes` is what the source itself says of the rig, its calibration, mounts, noise and start, in the shape of
+    a configuration, which may overrule it.  `reference` has figures of other programs on this log, by program, named
+    as in ``summary.json``.
     """
 
     name: str
@@ -126,6 +129,8 @@ class Log:
     skipped: list[str] = field(default_factory=list)
     control_columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+    describes: dict[str, Any] = field(default_factory=dict)
+    reference: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self.events)
