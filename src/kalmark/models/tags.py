@@ -1,0 +1,223 @@
+"""Square tags, landmarks of six degrees of freedom: l = (x, y, z, qx, qy, qz, qw), the tag's frame in the map.
+
+The tag lies in the plane z = 0 of its frame, with its corners at (-s, -s), (s, -s), (s, s), (-s, s), s half its size.
+What a sensor sees of it is v, the tag's frame in its own; errors of l are those of frames in the map, errors of v
+(position, rotation vector) are in the sensor's frame.  A camera sees the four corners, y = (u1, v1, ..., u4, v4).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.geometry.frames3d import compose, minus, plus, turned_rates
+from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inverse, matrix, multiply, skew
+from kalmark.models.lenses import back_project, project
+
+Array = npt.NDArray[np.float64]
+
+ITERATIONS = 50
+SAME = 1e-4  # distance (tag sizes) and angle (rad) below which two solutions are one
+
+
+@compiled
+def corners(size: float) -> Array:
+    """Return the corners (4, 3) of a tag in its frame."""
+    s = 0.5 * size
+    return np.array([[-s, -s, 0.0], [s, -s, 0.0], [s, s, 0.0], [-s, s, 0.0]])
+
+
+@compiled
+def tag_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Express tags l (K, 7) in the frame T (7,): v (K, 7), V_T (K, 6, 6), V_l (K, 6, 6)."""
+    Q = matrix(T[3:]).T.copy()
+    k = len(l)
+    v, V_T, V_l = np.empty((k, 7)), np.zeros((k, 6, 6)), np.zeros((k, 6, 6))
+    for i in range(k):
+        d = l[i, :3] - T[:3]
+        v[i, :3] = Q @ d
+        v[i, 3:] = multiply(conjugate(T[3:]), l[i, 3:])
+        V_T[i, :3, :3] = -Q
+        V_T[i, :3, 3:] = turned_rates(Q, d)
+        V_T[i, 3:, 3:] = -Q
+        V_l[i, :3, :3] = Q
+        V_l[i, 3:, 3:] = Q
+    return v, V_T, V_l
+
+
+@compiled
+def tag_from_view(T: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Return the tags l (K, 7) that are at v (K, 7) in the frame T (7,), L_T (K, 6, 6), L_v (K, 6, 6)."""
+    k = len(v)
+    l, L_T, L_v = np.empty((k, 7)), np.empty((k, 6, 6)), np.empty((k, 6, 6))
+    for i in range(k):
+        l[i], L_T[i], L_v[i] = compose(T, v[i])
+    return l, L_T, L_v
+
+
+@compiled
+def project_corners(lens: int, v: Array, size: Array, par: Array) -> tuple[Array, Array]:
+    """Return the pixels e (K, 8) of the corners of tags at v (K, 7), of sizes (K,) in m, and E_v (K, 8, 6)."""
+    k = len(v)
+    p, arm = np.empty((4 * k, 3)), np.empty((4 * k, 3))
+    for i in range(k):
+        arm[4 * i : 4 * i + 4] = corners(size[i]) @ matrix(v[i, 3:]).T.copy()
+        p[4 * i : 4 * i + 4] = v[i, :3] + arm[4 * i : 4 * i + 4]
+    pixels, E_p = project(lens, p, par)
+    e, E_v = np.empty((k, 8)), np.empty((k, 8, 6))
+    for i in range(k):
+        for c in range(4):
+            j, rows = 4 * i + c, slice(2 * c, 2 * c + 2)
+            e[i, rows] = pixels[j]
+            E_v[i, rows, :3] = E_p[j]
+            E_v[i, rows, 3:] = -(E_p[j] @ skew(arm[j]))
+    return e, E_v
+
+
+@compiled
+def pose_residual(y: Array, v: Array) -> tuple[Array, Array]:
+    """Return the innovations z (K, 6) = y - v of measured poses y (K, 7), and E_v (K, 6, 6) = -dz/dv."""
+    z, E_v = np.empty((len(v), 6)), np.zeros((len(v), 6, 6))
+    for i in range(len(v)):
+        z[i] = minus(y[i], v[i])
+        E_v[i, :3, :3] = np.eye(3)
+        E_v[i, 3:, 3:] = left_jacobian_inverse(-z[i, 3:])  # Log(Q Exp(-d)): the right Jacobian
+    return z, E_v
+
+
+@compiled
+def tag_from_corners(lens: int, y: Array, size: Array, par: Array) -> tuple[Array, Array, Array, Array]:
+    """Find the tags whose corners are seen at y (K, 8): v (K, 7), V_y (K, 6, 8), RMS (K,) px, ambiguity (K,).
+
+    v minimises the sum of squared pixels.  From afar a tag looks the same when it is mirrored along the line of sight,
+    so that there are two minima: both are sought, by Levenberg's method from the homography of the corners and from its
+    mirror image, and the lower one is kept.  The ambiguity is the ratio of both RMS: 1, no telling which; 0, only one.
+    V_y = (E'E)^-1 E' of Gauss-Newton, so that V_y N V_y' is the covariance for noise N of the pixels.  The RMS is of
+    the distances of the corners.  All is NaN where the four pixels are no convex quadrangle of rays ahead.
+    """
+    k = len(y)
+    v, V_y, rms, ambiguity = np.empty((k, 7)), np.empty((k, 6, 8)), np.empty(k), np.empty(k)
+    for i in range(k):
+        first, second = from_homography(back_project(lens, y[i].copy().reshape((4, 2)), par)[0], size[i])
+        a, E_a, cost_a = refined(lens, y[i], size[i], first, par)
+        b, E_b, cost_b = refined(lens, y[i], size[i], second, par)
+        if cost_b < cost_a or math.isnan(cost_a):
+            a, b, E_a, E_b, cost_a, cost_b = b, a, E_b, E_a, cost_b, cost_a
+        v[i], rms[i] = a, math.sqrt(0.25 * cost_a)
+        apart = minus(a, b)
+        same = np.abs(apart[:3]).max() < SAME * size[i] and np.abs(apart[3:]).max() < SAME
+        ambiguity[i] = 0.0 if same or math.isnan(cost_b) else math.sqrt(cost_a / cost_b)
+        V_y[i] = np.nan
+        if not math.isnan(cost_a):
+            V_y[i] = np.linalg.solve(E_a.T @ E_a, E_a.T)
+        else:
+            ambiguity[i] = np.nan
+    return v, V_y, rms, ambiguity
+
+
+def tag_pose(lens: int, y: Array, size: float, par: Array, sigma_px: float) -> tuple[Array, Array, float, float]:
+    """Find one tag from its corners y (8,): pose (7,) in the camera, covariance (6, 6), RMS px, ambiguity.
+
+    See `tag_from_corners`; the covariance is that of independent pixels.
+    """
+    rows = np.ascontiguousarray(y, dtype=np.float64).reshape(1, 8)
+    v, V_y, rms, ambiguity = tag_from_corners(lens, rows, np.array([float(size)]), par)
+    return v[0], sigma_px**2 * V_y[0] @ V_y[0].T, float(rms[0]), float(ambiguity[0])
+
+
+@compiled
+def refined(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple[Array, Array, float]:
+    """Minimise |y - e(v)|^2 from a start (7,) by Levenberg's method: v (7,), E_v (8, 6), the least sum; or NaN."""
+    v, sizes, damping = start.copy().reshape((1, 7)), np.array([size]), 1e-3
+    e, E_v = project_corners(lens, v, sizes, par)
+    cost = np.sum((y - e[0]) ** 2)
+    for _ in range(ITERATIONS if math.isfinite(cost) else 0):
+        E = E_v[0]
+        A = E.T @ E
+        for j in range(6):
+            A[j, j] *= 1.0 + damping
+        step = np.linalg.solve(A, E.T @ (y - e[0]))
+        new = plus(v[0], step).reshape((1, 7))
+        e_new, E_new = project_corners(lens, new, sizes, par)
+        cost_new = np.sum((y - e_new[0]) ** 2)
+        small = np.abs(step[:3]).max() < 1e-13 * np.abs(v[0, :3]).max() and np.abs(step[3:]).max() < 1e-13
+        if cost_new <= cost:
+            v, e, E_v, cost, damping = new, e_new, E_new, cost_new, 0.1 * damping
+        else:
+            damping = max(10.0 * damping, 1e-9)
+        if small or damping > 1e9:
+            break
+    return v[0], E_v[0], cost if math.isfinite(cost) else np.nan
+
+
+@compiled
+def from_homography(m: Array, size: float) -> tuple[Array, Array]:
+    """Return both poses (7,) of a tag whose corners are on the rays m (4, 3): the homography's, and its mirror image.
+
+    The second is the first, mirrored in the plane through the tag's centre across the line of sight, and in its own
+    plane.  NaN unless the rays are a convex quadrangle, less than 87 degrees from their mean.
+    """
+    nothing = np.full(7, np.nan)
+    W = _looking_along(m)
+    x = np.empty((4, 2))
+    for i in range(4):
+        r = W @ m[i].copy()
+        if not r[2] > 0.05:
+            return nothing, nothing
+        x[i] = r[:2] / r[2]
+    if not _is_convex(x):
+        return nothing, nothing
+    A, b, at = np.zeros((8, 8)), x.copy().reshape(8), corners(2.0)
+    for i in range(4):
+        for a in range(2):
+            row = 2 * i + a
+            A[row, 3 * a], A[row, 3 * a + 1], A[row, 3 * a + 2] = at[i, 0], at[i, 1], 1.0
+            A[row, 6], A[row, 7] = -x[i, a] * at[i, 0], -x[i, a] * at[i, 1]
+    h = np.linalg.solve(A, b)
+    H = W.T.copy() @ np.array([[h[0], h[1], h[2]], [h[3], h[4], h[5]], [h[6], h[7], 1.0]])
+    a0, a1 = math.sqrt(np.sum(H[:, 0] ** 2)), math.sqrt(np.sum(H[:, 1] ** 2))
+    p, q = H[:, 0] / a0 + H[:, 1] / a1, H[:, 0] / a0 - H[:, 1] / a1  # at right angles, whatever H is
+    p, q = p / math.sqrt(2 * np.sum(p * p)), q / math.sqrt(2 * np.sum(q * q))
+    Q = np.empty((3, 3))
+    Q[:, 0], Q[:, 1] = p + q, p - q
+    Q[:, 2] = np.array(
+        [
+            Q[1, 0] * Q[2, 1] - Q[2, 0] * Q[1, 1],
+            Q[2, 0] * Q[0, 1] - Q[0, 0] * Q[2, 1],
+            Q[0, 0] * Q[1, 1] - Q[1, 0] * Q[0, 1],
+        ]
+    )
+    sight = H[:, 2] / math.sqrt(np.sum(H[:, 2] ** 2))
+    mirror = np.eye(3) - 2.0 * sight.reshape((3, 1)) * sight
+    first, second = np.empty(7), np.empty(7)
+    first[:3] = second[:3] = H[:, 2] * size / (a0 + a1)
+    first[3:], second[3:] = from_matrix(Q), from_matrix(mirror @ Q @ np.diag(np.array([1.0, 1.0, -1.0])))
+    return first, second
+
+
+@compiled
+def _looking_along(m: Array) -> Array:
+    """Return a rotation matrix whose third row is the mean of rays m (4, 3)."""
+    z = m[0] + m[1] + m[2] + m[3]
+    z = z / math.sqrt(np.sum(z * z))
+    i = np.argmin(np.abs(z))
+    x = -z[i] * z
+    x[i] += 1.0
+    x = x / math.sqrt(np.sum(x * x))
+    W = np.empty((3, 3))
+    W[0], W[1], W[2] = x, skew(z) @ x, z
+    return W
+
+
+@compiled
+def _is_convex(x: Array) -> bool:
+    """Return whether x (4, 2), in this order, go round a convex quadrangle."""
+    left = 0
+    for i in range(4):
+        a, b = x[(i + 1) % 4] - x[i], x[(i + 2) % 4] - x[(i + 1) % 4]
+        turn = (a[0] * b[1] - a[1] * b[0]) / math.sqrt(np.sum(a * a) * np.sum(b * b))
+        left += 1 if turn > 1e-9 else (-1 if turn < -1e-9 else 0)
+    return abs(left) == 4
