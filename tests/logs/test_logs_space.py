@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import shutil
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
@@ -15,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from kalmark.errors import LogError
 from kalmark.logs import Log, open_log
+from kalmark.models.cameras import project_omni, project_pinhole
 from kalmark.slam.events import Control, Scan
 
 Data = Callable[[str], Path]
@@ -124,3 +127,131 @@ def test_starry_night_with_an_array_of_another_size_is_refused(data: Data, tmp_p
 
 def test_a_log_describes_only_the_robots_that_were_asked_for(data: Data) -> None:
     assert list(open_log(data("starry_night"), robots="robot", to_s=1).describes["robots"]) == ["robot"]
+
+
+RECORDINGS = {  # frames, position RMSE m, mean NEES and its median: those of the toolbox itself
+    "a_idpPnt_odo": (150, 0.0365, 6.5, 6.5),
+    "a_idpPnt_odo_small": (150, 0.0405, 7.8, 7.5),
+    "a3_hmgPnt_odo": (60, 0.0217, 25.7, 23.1),
+    "b2_idpPnt_constVel_small": (100, 0.0950, 5.3, 4.4),
+    "c_idpLin_small": (50, 0.0113, 7.6, 5.4),
+    "c_plkLin_small": (50, 0.0117, 7.6, 5.4),
+    "c_hmgLin_small": (50, 0.0117, 7.9, 5.4),
+    "e_omni_ahmPnt": (60, 0.0371, 7.6, 7.1),
+    "g_outliers_small": (80, 0.0411, 6.7, 6.5),
+}
+
+
+def recording(oracle: Data, name: str) -> Log:
+    return opened(oracle(f"{name}.json.gz"))
+
+
+def pixels(p: np.ndarray, s: dict[str, Any]) -> np.ndarray:
+    """Return the pixels (K, 2) of points (K, 3) in the frame of a camera that a log describes."""
+    if s["type"] == "omnidirectional":
+        k = np.array([s["cx_px"], s["cy_px"], s["c"], s["d"], s["e"]])
+        return project_omni(p, k, np.array(s["projection"]))[0]
+    k = np.array([s["fx_px"], s["fy_px"], s["cx_px"], s["cy_px"]])
+    return project_pinhole(p, k, np.array(s.get("distortion", [])))[0]
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_recording_has_the_toolbox_s_own_figures(name: str, oracle: Data) -> None:
+    frames, rmse, nees, median = RECORDINGS[name]
+    log = recording(oracle, name)
+    assert (log.name, log.format, log.robots) == (name, "slamtb", ("robot1",))
+    assert [scan.t_ns for scan in scans(log, "camera1")] == [k * 100_000_000 for k in range(1, frames + 1)]
+    assert len(controls(log)) == frames + (
+        log.describes["robots"]["robot1"]["motion"]["type"] == "constant_velocity_3d"
+    )
+    figures = log.reference["slamtb"]
+    assert figures["ate_raw_m"] == pytest.approx(rmse, abs=5e-5)
+    assert (figures["pose_nees"], figures["pose_nees_median"]) == pytest.approx((nees, median), abs=0.051)
+    assert len(log.truth["robot1"]) == frames + 1 and log.skipped == []
+
+
+@pytest.mark.parametrize("name", [name for name in RECORDINGS if "outliers" not in name and "Lin" not in name])
+def test_a_recording_s_points_are_seen_where_the_truth_puts_them(name: str, oracle: Data) -> None:
+    log = recording(oracle, name)
+    sensor = log.describes["robots"]["robot1"]["sensors"]["camera1"]
+    errors = []
+    for scan in scans(log):
+        points = np.array([log.landmarks[i] for i in scan.ids])
+        errors.append(scan.y - pixels(in_sensor(points, log.truth["robot1"].at(scan.t_ns), sensor["mount"]), sensor))
+    error = np.concatenate(errors)
+    assert abs(error.mean(axis=0)).max() < 0.1
+    np.testing.assert_allclose(error.std(axis=0), sensor["sigma_px"], rtol=0.06)
+
+
+@pytest.mark.parametrize("name", [name for name in RECORDINGS if "Lin" in name])
+def test_a_recording_s_segments_lie_on_the_true_lines(name: str, oracle: Data) -> None:
+    log = recording(oracle, name)
+    sensor = log.describes["robots"]["robot1"]["sensors"]["camera1"]
+    errors = []
+    for scan in scans(log):
+        pose = log.truth["robot1"].at(scan.t_ns)
+        for id_, y in zip(scan.ids, scan.y, strict=True):
+            a, b = in_sensor(log.landmarks[id_].reshape(2, 3), pose, sensor["mount"])
+            k = np.array([[sensor["fx_px"], 0, sensor["cx_px"]], [0, sensor["fy_px"], sensor["cy_px"]], [0, 0, 1]])
+            line = np.cross(k @ a, k @ b)
+            errors += [(line @ [*end, 1]) / np.linalg.norm(line[:2]) for end in (y[:2], y[2:])]
+    assert abs(np.mean(errors)) < 0.1
+    assert np.std(errors) == pytest.approx(sensor["sigma_px"], rel=0.06)
+    assert all(len(ends) == 6 for ends in log.landmarks.values())
+
+
+def test_a_recording_s_controls_lead_along_the_truth(oracle: Data) -> None:
+    log = recording(oracle, "a_idpPnt_odo")
+    path, motion = log.truth["robot1"].poses, log.describes["robots"]["robot1"]["motion"]
+    turns = Rotation.from_quat(path[:, 3:])
+    moved = turns[:-1].inv().apply(np.diff(path[:, :3], axis=0))
+    turned = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    error = np.array([control.u for control in controls(log)]) - np.hstack([moved, turned])
+    given = [motion[f"sigma_{axis}_m"] for axis in "xyz"] + 3 * [motion["sigma_rotation_rad"]]
+    np.testing.assert_allclose(error.std(axis=0), given, rtol=0.25)
+    assert abs(error.mean(axis=0) / given).max() < 0.3
+
+
+def test_a_constant_velocity_starts_at_0_with_a_control_that_does_nothing(oracle: Data) -> None:
+    log = recording(oracle, "b2_idpPnt_constVel_small")
+    first, start = controls(log)[0], log.describes["robots"]["robot1"]["start"]
+    assert first.t_ns == 0 and not first.u.any() and not first.cov.any()
+    assert start["vx_mps"] == 0.8 and start["wz_radps"] == pytest.approx(np.radians(9))
+    after = log.truth["robot1"].at(100_000_000)
+    np.testing.assert_allclose(after[:3], [0.08, -5, 0], atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(after[3:]).as_rotvec(), [0, 0, np.radians(0.9)], atol=1e-12)
+
+
+def test_a_recording_follows_the_toolbox_s_landmarks_gate_and_attention(oracle: Data) -> None:
+    rig = recording(oracle, "a_idpPnt_odo").describes
+    camera = rig["robots"]["robot1"]["sensors"]["camera1"]
+    assert rig["landmarks"] == {"type": "inverse_depth", "prior_rho_per_m": 0.01, "sigma_rho_per_m": 0.5}
+    assert rig["association"]["gate"] == pytest.approx(0.98889, abs=1e-5) and rig["map"] == {"reparametrize": 0.1}
+    assert camera["distortion"] == [-0.3, 0.1] and camera["mount"]["roll_deg"] == -90 == camera["mount"]["yaw_deg"]
+    attention = camera["attention"]
+    assert (attention["updates"], attention["first_starts"], attention["starts"]) == (10, 5, 1)
+    assert attention["margin_px"] == 25.6 and attention["delete"]
+    kinds = {name: recording(oracle, name).describes["landmarks"]["type"] for name in RECORDINGS}
+    assert kinds["a3_hmgPnt_odo"] == "homogeneous" and kinds["e_omni_ahmPnt"] == "anchored_homogeneous"
+    assert [kinds[f"c_{k}Lin_small"] for k in ("idp", "plk", "hmg")] == [
+        "inverse_depth_line", "pluecker_line", "homogeneous_line"
+    ]  # fmt: skip
+
+
+def test_a_recording_that_is_cut_or_lacks_something_is_refused(oracle: Data, tmp_path: Path) -> None:
+    whole = oracle("c_plkLin_small.json.gz").read_bytes()
+    cut = tmp_path / "cut.json.gz"
+    cut.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(LogError, match=r"cut\.json\.gz: cannot be read .*, expected a whole recording"):
+        open_log(cut)
+    cut.write_bytes(gzip.compress(b'{"cfg":{"Robot":[],"Sensor":[]},"frames":[]}'))
+    with pytest.raises(LogError, match=r"cut\.json\.gz: no 'Opt' in it"):
+        open_log(cut)
+    with pytest.raises(LogError, match="no known log format"):
+        open_log(oracle("functions.json.gz"))
+
+
+def test_a_recording_without_its_numbers_has_no_truth(oracle: Data, tmp_path: Path) -> None:
+    shutil.copy(oracle("c_plkLin_small.json.gz"), tmp_path)
+    log = open_log(tmp_path / "c_plkLin_small.json.gz")
+    assert log.truth == {} and log.reference == {} and len(scans(log)) == 50

@@ -18,6 +18,7 @@ from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM
 from kalmark.logs.native import NATIVE
+from kalmark.logs.slamtb import SLAMTB
 from kalmark.logs.source import Format, Request, choice, nearest, quantity
 from kalmark.logs.starry_night import STARRY_NIGHT
 from kalmark.logs.text import raising
@@ -25,7 +26,8 @@ from kalmark.logs.victoria_park import VICTORIA_PARK
 from kalmark.slam.events import Event, Scan
 
 FORMATS: dict[str, Format] = {
-    entry.name: entry for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT)
+    entry.name: entry
+    for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB)
 }
 
 

@@ -24,7 +24,7 @@ def vector_frame(position: Any, vector: Any) -> Array:
 
 def placed(pose: Array) -> dict[str, float]:
     """Return a frame (7,) as a configuration gives mounts and starts: x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg."""
-    angles = np.degrees(rotations.to_euler(np.array(pose[3:], dtype=np.float64))[0])
+    angles = np.degrees(rotations.to_euler(np.array(pose[3:], dtype=np.float64))[0]).round(12) + 0.0  # no -0
     names = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
     return dict(zip(names, [*map(float, pose[:3]), *map(float, angles)], strict=True))
 
