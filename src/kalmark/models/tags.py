@@ -143,12 +143,13 @@ def refined(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple
         new = plus(v[0], step).reshape((1, 7))
         e_new, E_new = project_corners(lens, new, sizes, par)
         cost_new = np.sum((y - e_new[0]) ** 2)
-        small = np.abs(step[:3]).max() < 1e-13 * np.abs(v[0, :3]).max() and np.abs(step[3:]).max() < 1e-13
-        if cost_new <= cost:
+        change = max(np.abs(step[:3]).max() / np.abs(v[0, :3]).max(), np.abs(step[3:]).max())
+        lower = cost_new < cost
+        if lower:
             v, e, E_v, cost, damping = new, e_new, E_new, cost_new, 0.1 * damping
         else:
             damping = max(10.0 * damping, 1e-9)
-        if small or damping > 1e9:
+        if change < (1e-13 if lower else 1e-7) or damping > 1e9:  # below 1e-7 the cost cannot tell any more
             break
     return v[0], E_v[0], cost if math.isfinite(cost) else np.nan
 
