@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.geometry.rotations import from_matrix, multiply
+
 Array = npt.NDArray[np.float64]
 
 
@@ -28,12 +30,21 @@ class Rigid(NamedTuple):
         """The rotation angle of a 2-D alignment, in radians."""
         return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
 
+    @property
+    def quaternion(self) -> Array:
+        """The rotation of a 3-D alignment as a unit quaternion xyzw."""
+        return from_matrix(np.ascontiguousarray(self.rotation))
+
     def inverse(self) -> Rigid:
         """Return the alignment that undoes this one."""
         return Rigid(self.rotation.T, -self.rotation.T @ self.shift)
 
     def poses(self, poses: Array) -> Array:
-        """Return 2-D poses (N, 3) = (x, y, theta) rotated and shifted."""
+        """Return poses (N, 3) = (x, y, theta) or (N, 7) = (x, y, z, qx, qy, qz, qw) rotated and shifted."""
+        if poses.shape[1] == 7:
+            turn = self.quaternion
+            turned = np.array([multiply(turn, q) for q in np.ascontiguousarray(poses[:, 3:])])
+            return np.column_stack([self(poses[:, :3]), turned.reshape(-1, 4)])
         return np.column_stack([self(poses[:, :2]), poses[:, 2] + self.angle])
 
 

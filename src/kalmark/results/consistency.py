@@ -1,6 +1,8 @@
 """Does an estimate err as much as it says?  NEES in the estimator's coordinates, NIS, and their chi-square bounds.
 
-Bar-Shalom, Li, Kirubarajan 2001, section 5.4; Bailey et al. 2006 for the use in SLAM.  Points, poses: 2-D.
+Bar-Shalom, Li, Kirubarajan 2001, section 5.4; Bailey et al. 2006 for the use in SLAM.  In the plane poses are
+(x, y, theta) and the error of a heading is a number; in space poses are (x, y, z, qx, qy, qz, qw), and the error of an
+orientation is the rotation vector in the world's frame that turns the estimate into the truth.
 """
 
 from __future__ import annotations
@@ -29,22 +31,55 @@ def left_jacobian_inverse(a: Any) -> Array:
     return np.stack([np.stack([diagonal, half], -1), np.stack([-half, diagonal], -1)], -2)
 
 
-def point_error(mean: Array, truth: Array, dtheta: Any, coordinates: str) -> Array:
-    """Return the error (..., 2) of points in the estimator's coordinates, "world" or "log".
+def turned_back(turn: Array, d: Array) -> Array:
+    """Return V(turn)^-1 d (..., 3) for rotation vectors (..., 3), V the left Jacobian of SO(3), angles up to pi."""
+    half = 0.5 * np.linalg.norm(turn, axis=-1, keepdims=True)
+    small = half < 1e-2
+    safe = np.where(small, 1.0, half)
+    series = 1 / 12 + half**2 * (1 / 180 + half**2 / 1890)
+    q = np.where(small, series, (1.0 - safe / np.tan(safe)) / (4.0 * safe**2))
+    once = np.cross(turn, d)
+    return d - 0.5 * once + q * np.cross(turn, once)
 
-    World: d = truth - mean.  Log: V(dtheta)^-1 d with the heading error of the (observing) robot.
+
+def rotation_error(mean: Array, truth: Array) -> Array:
+    """Return Log(Q_truth Q_mean') (..., 3), at most pi long, for unit quaternions (..., 4)."""
+    mean, truth = np.asarray(mean, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    v, w, v2, w2 = truth[..., :3], truth[..., 3:], -mean[..., :3], mean[..., 3:]
+    vector = w * v2 + w2 * v + np.cross(v, v2)
+    scalar = w * w2 - np.sum(v * v2, axis=-1, keepdims=True)
+    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
+    return np.where(scalar < 0.0, -scale, scale) * vector
+
+
+def point_error(mean: Array, truth: Array, dtheta: Any, coordinates: str) -> Array:
+    """Return the error (..., 2 or 3) of points in the estimator's coordinates, "world" or "log".
+
+    World: d = truth - mean.  Log: V(dtheta)^-1 d with the heading error (...), in space the rotation error (..., 3),
+    of the (observing) robot.
     """
     d = np.asarray(truth, dtype=np.float64) - np.asarray(mean, dtype=np.float64)
     if coordinates == "world":
         return d
     if coordinates != "log":
         raise ValueError(f"coordinates is {coordinates!r}, expected 'world' or 'log'")
+    if d.shape[-1] == 3:
+        return turned_back(np.asarray(dtheta, dtype=np.float64), d)
     return np.einsum("...ij,...j->...i", left_jacobian_inverse(dtheta), d)
 
 
 def pose_error(mean: Array, truth: Array, coordinates: str = "world") -> Array:
-    """Return the error (..., 3) of poses (x, y, theta), the heading's wrapped, in "world" or "log" coordinates."""
+    """Return the errors (..., 3 or 6) of poses (..., 3 or 7): position, then orientation, in "world" or "log".
+
+    In log coordinates the estimate's retraction by the error is the truth: the orientation turned by Exp(d_theta), the
+    position moved by V(d_theta) d_p.
+    """
     mean, truth = np.asarray(mean, dtype=np.float64), np.asarray(truth, dtype=np.float64)
+    if mean.shape[-1] == 7:
+        turn = rotation_error(mean[..., 3:], truth[..., 3:])
+        return np.concatenate([point_error(mean[..., :3], truth[..., :3], turn, coordinates), turn], axis=-1)
     dtheta = np.asarray(wrap(truth[..., 2] - mean[..., 2]))
     position = point_error(mean[..., :2], truth[..., :2], dtheta, coordinates)
     return np.concatenate([position, dtheta[..., None]], axis=-1)
@@ -88,7 +123,7 @@ def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tu
 def diverged(d: Array, P: Array, error_m: Array, path_m: float) -> bool:
     """Tell whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
 
-    `d` (N, 2) is the position error in the estimator's coordinates, `P` (N, 2, 2) its covariance, `error_m` (N,) its
+    `d` (N, 2 or 3) is the position error in the estimator's coordinates, `P` its covariance, `error_m` (N,) its
     length in metres.  Sigmas are counted as the Mahalanobis distance.
     """
     far = np.sqrt(nees(d, P)) > DIVERGED_SIGMAS

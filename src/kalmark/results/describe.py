@@ -8,16 +8,39 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.geometry.rotations import to_euler
+
 TYPES = {
     "Unicycle": "unicycle",
     "Odometry2D": "odometry_2d",
     "Ackermann": "ackermann",
+    "Odometry3D": "odometry_3d",
+    "Velocity3D": "velocity_3d",
+    "ConstantVelocity3D": "constant_velocity_3d",
     "RangeBearing": "range_bearing",
     "Bearing": "bearing",
     "Range": "range",
     "Position2D": "position",
     "RangeBearingSignature": "range_bearing_signature",
+    "RangeBearing3D": "range_bearing_3d",
+    "Position3D": "position_3d",
+    "PinHole": "pinhole",
+    "Omnidirectional": "omnidirectional",
+    "Stereo": "stereo",
+    "Segments": "segments",
+    "TagPose": "tag_pose",
+    "TagCorners": "tag_corners",
     "Point2D": "point",
+    "Point3D": "point",
+    "InverseDepth3D": "inverse_depth",
+    "AnchoredHomogeneous": "anchored_homogeneous",
+    "Homogeneous": "homogeneous",
+    "Tag": "tag",
+    "PlueckerLine": "pluecker_line",
+    "AnchoredPlueckerLine": "anchored_pluecker_line",
+    "InverseDepthLine": "inverse_depth_line",
+    "AnchoredHomogeneousLine": "anchored_homogeneous_line",
+    "HomogeneousLine": "homogeneous_line",
     "PointSignature2D": "point_signature",
     "ByIdentity": "identity",
     "NearestNeighbour": "nearest",
@@ -71,18 +94,49 @@ def describe(slam: Any, log: Any = None) -> dict[str, Any]:
 
 def _robot(robot: Any) -> dict[str, Any]:
     out: dict[str, Any] = {"motion": model(robot.motion)}
-    start = [float(value) for value in robot.start]
-    if len(start) == 3:
-        out["start"] = dict(zip(("x_m", "y_m", "theta_rad"), start, strict=True))
-        if robot.cov is not None:
-            variance = np.diagonal(np.asarray(robot.cov, dtype=np.float64)).tolist()
-            out["start"] |= {"sigma_xy_m": math.sqrt(variance[0]), "sigma_theta_rad": math.sqrt(variance[2])}
+    out["start"] = _start(robot)
     out["sensors"] = {}
     for name, mount in robot.sensors.items():
         sensor = model(mount.sensor)
-        if any(mount.at):
-            sensor["mount"] = dict(zip(("x_m", "y_m", "theta_rad"), plain(mount.at), strict=False))
-        if mount.landmark is not None:
-            sensor["landmark"] = model(mount.landmark)
+        at = _pose(mount.at)
+        if any(at.values()):
+            sensor["mount"] = at
+        for part in ("landmark", "association", "detector"):
+            if getattr(mount, part, None) is not None:
+                sensor[part] = model(getattr(mount, part))
+        if getattr(mount, "attention", None) is not None:
+            sensor["attention"] = {key: value for key, value in model(mount.attention).items() if key != "type"}
+        if getattr(mount, "cov", None) is not None:
+            sensor["mount"] = at | _sigmas(mount.cov)
         out["sensors"][name] = sensor
     return out
+
+
+def _start(robot: Any) -> dict[str, float]:
+    out = _pose(robot.start)
+    out |= dict(
+        zip(("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"), plain(robot.start)[7:], strict=False)
+    )
+    return out if robot.cov is None else out | _sigmas(robot.cov)
+
+
+def _pose(pose: Any) -> dict[str, float]:
+    """Return a pose as configuration files have it: (x, y, theta), in space (x, y, z, roll, pitch, yaw)."""
+    pose = [float(value) for value in pose]
+    if len(pose) == 3:
+        return dict(zip(("x_m", "y_m", "theta_rad"), pose, strict=True))
+    roll, pitch, yaw = np.degrees(to_euler(np.array(pose[3:7]))[0]).tolist()
+    return dict(zip(("x_m", "y_m", "z_m"), pose[:3], strict=True)) | {
+        "roll_deg": roll,
+        "pitch_deg": pitch,
+        "yaw_deg": yaw,
+    }
+
+
+def _sigmas(cov: Any) -> dict[str, float]:
+    """Return the sigmas of a covariance as configuration files have them, one for all axes."""
+    sigma = np.sqrt(np.diagonal(np.asarray(cov, dtype=np.float64))).tolist()
+    if len(sigma) == 3:
+        return {"sigma_xy_m": sigma[0], "sigma_theta_rad": sigma[2]}
+    out = {"sigma_position_m": sigma[0], "sigma_rotation_deg": math.degrees(sigma[3])}
+    return out if len(sigma) == 6 else out | {"sigma_v_mps": sigma[6], "sigma_w_radps": sigma[9]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,8 @@ from kalmark.results.align import identity, rigid, rigid_robust, rmse
 from kalmark.results.consistency import diverged, nees, nis, pose_error
 from kalmark.results.history import Array, History, Ints
 from kalmark.results.landmarks import MapLandmarks
-from kalmark.results.truth import Fixes, Truth
+from kalmark.results.shapes import EUCLIDEAN, LINE
+from kalmark.results.truth import Fixes, Truth, fitted
 from kalmark.results.warnings import fix_nis_per_dof, warnings
 from kalmark.slam.report import OUTCOMES
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0
+SETTLED = 0.01  # of the map's extent: the sigma below which a point that is not Euclidean yet is compared
 
 
 def evaluate(run: Run) -> dict[str, Any]:
@@ -51,6 +54,7 @@ def evaluate(run: Run) -> dict[str, Any]:
         summary["stopped"] = run.stopped
     summary["robots"] = robots
     summary |= landmark_figures(run.landmarks, run.truth)
+    summary |= run.reference
     if run.truth.fixes and not np.isfinite(run.truth.poses).any():
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
     summary = none_for_nan(summary)
@@ -61,7 +65,7 @@ def evaluate(run: Run) -> dict[str, Any]:
 def robot_figures(run: Run, name: str) -> dict[str, Any]:
     """Return the figures of one robot: against its truth if there is one, else against position fixes."""
     mine = run.history.robot == name
-    mean, P = run.history.mean[mine], run.history.covariance[mine]
+    mean, P = run.history.poses[mine], run.history.pose_covariances[mine]
     truth = run.truth.poses_in_map()[mine]
     figures: dict[str, Any] = {"scans": int(mine.sum())}
     known = np.isfinite(truth).all(axis=1)
@@ -73,46 +77,65 @@ def robot_figures(run: Run, name: str) -> dict[str, Any]:
 
 
 def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world") -> dict[str, Any]:
-    """Return errors and NEES of a path (N, 3) with covariances (N, 3, 3) against true poses (N, 3) in one frame."""
+    """Return errors and NEES of a path (N, 3) with covariances (N, 3, 3) against true poses (N, 3) in one frame.
+
+    In space poses are (N, 7) and covariances (N, 6, 6).
+    """
+    d = 3 if mean.shape[1] == 7 else 2
     world = pose_error(mean, truth, "world")
     own = pose_error(mean, truth, coordinates)
-    path_m = float(np.linalg.norm(np.diff(truth[:, :2], axis=0), axis=1).sum())
-    error_m = np.linalg.norm(world[:, :2], axis=1)
+    path_m = float(np.linalg.norm(np.diff(truth[:, :d], axis=0), axis=1).sum())
+    error_m = np.linalg.norm(world[:, :d], axis=1)
     values, values_world = nees(own, P), nees(world, P)
     return {
-        "ate_m": rmse(rigid(mean[:, :2], truth[:, :2])(mean[:, :2]) - truth[:, :2]),
-        "ate_raw_m": rmse(world[:, :2]),
-        "heading_rmse_deg": float(np.degrees(rmse(world[:, 2:]))),
+        "ate_m": rmse(rigid(mean[:, :d], truth[:, :d])(mean[:, :d]) - truth[:, :d]),
+        "ate_raw_m": rmse(world[:, :d]),
+        "heading_rmse_deg": float(np.degrees(rmse(world[:, d:]))),
         "pose_nees": _mean(values),
         "pose_nees_world": _mean(values_world),
         "path_m": path_m,
-        "diverged": diverged(own[:, :2], P[:, :2, :2], error_m, path_m),
+        "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, path_m),
     }
 
 
 def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
-    """Return the landmark errors, raw and after their own rigid alignment, over the ids that map and truth share."""
+    """Return the landmark errors, raw and after their own rigid alignment, over the ids that map and truth share.
+
+    Points that are not Euclidean yet count if they are known to a hundredth of the extent of the true map: the depth of
+    the others is still open.
+    """
     true = {str(i): l for i, l in truth.landmarks_in_map().items()}
     if not true:
         return {}
-    pairs = [
-        (mean[:2], true[str(i)][:2])
-        for i, kind, mean in zip(landmarks.ids, landmarks.kinds, landmarks.means, strict=True)
-        if str(i) in true and kind.startswith("point")
+    means, covariances = landmarks.positions()
+    d = means.shape[1]
+    extent = float(np.linalg.norm(np.ptp([l[:d] for l in true.values()], axis=0)))
+    rows = [
+        k
+        for k, (i, kind, place) in enumerate(zip(landmarks.ids, landmarks.kinds, landmarks.means, strict=True))
+        if str(i) in true
+        and LINE not in (len(place), len(true[str(i)]))
+        and (kind in EUCLIDEAN or _sigma(covariances[k]) < SETTLED * extent)
     ]
-    estimate, position = (np.array([pair[k] for pair in pairs]).reshape(-1, 2) for k in (0, 1))
-    enough = len(pairs) >= 2
+    estimate = means[rows]
+    position = np.array([true[str(landmarks.ids[k])][:d] for k in rows]).reshape(-1, d)
+    enough = len(rows) >= d
     return {
         "landmark_rmse_m": rmse(rigid(estimate, position)(estimate) - position) if enough else float("nan"),
         "landmark_rmse_raw_m": rmse(estimate - position),
-        "landmarks_compared": len(pairs),
+        "landmarks_compared": len(rows),
     }
 
 
+def _sigma(P: Array) -> float:
+    """Return the sigma along the worst axis, infinite if P is."""
+    return math.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)) if np.isfinite(P).all() else math.inf
+
+
 def path_at(history: History, robot: str, t_ns: Ints, max_gap_s: float = FIX_GAP_S) -> Array:
-    """Return poses (N, 3) of a robot's estimated path interpolated at times, NaN outside it and across long gaps."""
+    """Return planar poses (N, 3) of a robot's path interpolated at times, NaN outside it and across long gaps."""
     mine = history.robot == robot
-    t, mean = history.t_ns[mine], history.mean[mine]
+    t, mean = history.t_ns[mine], fitted(history.poses[mine], 3)
     out = np.full((len(t_ns), 3), np.nan)
     if len(t) < 2:
         return out

@@ -28,7 +28,7 @@ def tum(history: History, robot: str) -> str:
     """Return a robot's path after each of its scans as TUM lines: t x y z qx qy qz qw."""
     mine = history.robot == robot
     lines = ["# t_s x_m y_m z_m qx qy qz qw"]
-    for t_ns, pose in zip(history.t_ns[mine].tolist(), history.mean[mine].tolist(), strict=True):
+    for t_ns, pose in zip(history.t_ns[mine].tolist(), history.poses[mine].tolist(), strict=True):
         x, y, z, *q = pose if len(pose) == 7 else _lifted(*pose[:3])
         lines.append(f"{seconds(t_ns)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
     return "\n".join(lines) + "\n"

@@ -30,22 +30,42 @@ class Start(NamedTuple):
 
 
 class MapSnapshot(NamedTuple):
-    """The landmarks of the map after step `step`: ids, positions (K, d) and their covariances (K, d, d)."""
+    """The landmarks of the map after step `step`: ids, places (K, n) and their covariances (K, q, q), kinds.
+
+    In the plane places are positions.  In space they are positions, endpoints of lines or poses of tags, padded with
+    NaN (see `kalmark.results.shapes`).
+    """
 
     step: int
     t_ns: int
     ids: tuple[Id, ...]
     means: Array
     covariances: Array
+    kinds: tuple[str, ...] = ()
+
+
+class Camera(NamedTuple):
+    """A camera of a robot: its mount (7,), the image's width and height in pixels, and what its rows of y are.
+
+    `corners` (4, 3) are the rays to the image's corners with z = 1, for drawing.
+    """
+
+    robot: str
+    sensor: str
+    mount: Array
+    size: tuple[float, float]
+    columns: tuple[str, ...]
+    corners: Array
 
 
 @dataclass(frozen=True, eq=False)
 class History:
     """A run's steps (S of them) and observations (O of them).
 
-    Steps: time, robot, its mean (S, p) and covariance (S, q, q) after the scan, and the wall time in microseconds.
-    Observations: `step` is the row of the step, `id` and `landmark` are texts ("" for none), `d2` is NaN where there
-    is none; `y`, `e`, `z` (O, m) and `Z` (O, m, m) are padded with NaN where sensors differ in size.
+    Steps: time, robot, its mean (S, n) and covariance (S, q, q) after the scan, and the wall time in microseconds.
+    Observations: `step` is the row of the step, `id` and `landmark` are texts ("" for none), `kind` is that of the
+    landmark after the scan, `d2` is NaN where there is none; measured `y` and expected `e` (O, m), innovation `z`
+    (O, p) and its covariance `Z` (O, p, p).  All are padded with NaN where robots or sensors differ in size.
     """
 
     t_ns: Ints
@@ -68,6 +88,24 @@ class History:
     maps: tuple[MapSnapshot, ...] = ()
     starts: tuple[Start, ...] = ()
     inputs: Inputs = field(default_factory=Inputs)
+    kind: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    cameras: tuple[Camera, ...] = ()
+
+    @property
+    def in_space(self) -> bool:
+        """Whether the robots move in space."""
+        return self.mean.shape[1] > 3
+
+    @property
+    def poses(self) -> Array:
+        """The poses after each scan, (S, 3) in the plane and (S, 7) in space."""
+        return self.mean[:, : 7 if self.in_space else 3]
+
+    @property
+    def pose_covariances(self) -> Array:
+        """The covariances of the poses, (S, 3, 3) or (S, 6, 6)."""
+        q = 6 if self.in_space else 3
+        return self.covariance[:, :q, :q]
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -78,50 +116,96 @@ class History:
         """Return everything as named arrays, those of the contract (t in seconds) first."""
         named = {"t": self.t_ns * 1e-9} | {key: getattr(self, key) for key in ("robot", "mean", "covariance")}
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
-        named |= {key: getattr(self, key) for key in _EXTRA}
-        d = max((m.means.shape[1] for m in self.maps), default=2)
+        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind")}
         return (
-            named
-            | self.inputs.arrays()
-            | {
-                "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
-                "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
-                "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
-                "map_landmark": texts([i for m in self.maps for i in m.ids]),
-                "map_mean": np.concatenate([m.means for m in self.maps] or [np.empty((0, d))]),
-                "map_covariance": np.concatenate([m.covariances for m in self.maps] or [np.empty((0, d, d))]),
-                "start_robot": texts([s.robot for s in self.starts]),
-                "start_mean": np.array([s.mean for s in self.starts]),
-                "start_covariance": np.array([s.covariance for s in self.starts]),
-                "start_t_ns": np.array([s.t_ns for s in self.starts], dtype=np.int64),
-            }
+            named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._camera_arrays()
         )
+
+    def _camera_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        return {
+            "camera": texts([f"{c.robot}\n{c.sensor}\n{','.join(c.columns)}" for c in self.cameras]),
+            "camera_mount": np.array([c.mount for c in self.cameras]).reshape(-1, 7),
+            "camera_size": np.array([c.size for c in self.cameras], dtype=np.float64).reshape(-1, 2),
+            "camera_corners": np.array([c.corners for c in self.cameras]).reshape(-1, 4, 3),
+        }
 
     @classmethod
     def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> History:
         """Return the history that `arrays` gave."""
         keys = ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)
-        ends = np.cumsum(named["map_size"])
-        maps = tuple(
-            MapSnapshot(
-                int(named["map_step"][i]),
-                int(named["map_t_ns"][i]),
-                tuple(as_id(text) for text in named["map_landmark"][end - size : end].tolist()),
-                named["map_mean"][end - size : end],
-                named["map_covariance"][end - size : end],
-            )
-            for i, (end, size) in enumerate(zip(ends, named["map_size"], strict=True))
-        )
         starts = tuple(
-            Start(str(robot), mean, covariance, int(t_ns))
+            Start(str(robot), mean[~np.isnan(mean)], _cut(covariance), int(t_ns))
             for robot, mean, covariance, t_ns in zip(
                 *(named["start_" + key] for key in ("robot", "mean", "covariance", "t_ns")), strict=True
             )
         )
-        return cls(**{key: named[key] for key in keys}, maps=maps, starts=starts, inputs=Inputs.from_arrays(named))
+        kind = named.get("kind", np.full(len(named["landmark"]), "", dtype=np.str_))
+        maps, inputs, cameras = _maps(named), Inputs.from_arrays(named), _cameras(named)
+        columns = {key: named[key] for key in keys}
+        return cls(**columns, maps=maps, starts=starts, inputs=inputs, kind=kind, cameras=cameras)
 
 
-_EXTRA = ("t_ns", "step_us", "step", "sensor", "index", "id", "outcome", "d2", "reason")
+def _map_arrays(maps: tuple[MapSnapshot, ...]) -> dict[str, npt.NDArray[Any]]:
+    blocks = [m.covariances for m in maps]
+    width = max((block.shape[1] for block in blocks), default=2)
+    return {
+        "map_step": np.array([m.step for m in maps], dtype=np.int64),
+        "map_t_ns": np.array([m.t_ns for m in maps], dtype=np.int64),
+        "map_size": np.array([len(m.ids) for m in maps], dtype=np.int64),
+        "map_landmark": texts([i for m in maps for i in m.ids]),
+        "map_kind": texts([kind for m in maps for kind in m.kinds]),
+        "map_mean": padded_rows([mean for m in maps for mean in m.means]),
+        "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
+    }
+
+
+def _maps(named: Mapping[str, npt.NDArray[Any]]) -> tuple[MapSnapshot, ...]:
+    ends = np.cumsum(named["map_size"])
+    kinds = named.get("map_kind", np.empty(0, dtype=np.str_))
+    return tuple(
+        MapSnapshot(
+            int(named["map_step"][i]),
+            int(named["map_t_ns"][i]),
+            tuple(as_id(text) for text in named["map_landmark"][end - size : end].tolist()),
+            named["map_mean"][end - size : end],
+            named["map_covariance"][end - size : end],
+            tuple(kinds[end - size : end].tolist()),
+        )
+        for i, (end, size) in enumerate(zip(ends, named["map_size"], strict=True))
+    )
+
+
+def _start_arrays(starts: tuple[Start, ...]) -> dict[str, npt.NDArray[Any]]:
+    return {
+        "start_robot": texts([s.robot for s in starts]),
+        "start_mean": padded_rows([s.mean for s in starts]),
+        "start_covariance": padded_squares([s.covariance for s in starts]),
+        "start_t_ns": np.array([s.t_ns for s in starts], dtype=np.int64),
+    }
+
+
+def _cameras(named: Mapping[str, npt.NDArray[Any]]) -> tuple[Camera, ...]:
+    if "camera" not in named:
+        return ()
+    rows = zip(*(named[key] for key in ("camera", "camera_mount", "camera_size", "camera_corners")), strict=True)
+    cameras = []
+    for text, mount, (width, height), corners in rows:
+        robot, sensor, columns = str(text).split("\n")
+        cameras.append(Camera(robot, sensor, mount, (float(width), float(height)), tuple(columns.split(",")), corners))
+    return tuple(cameras)
+
+
+_EXTRA = (
+    "t_ns",
+    "step_us",
+    "step",
+    "sensor",
+    "index",
+    "id",
+    "outcome",
+    "d2",
+    "reason",
+)  # and kind, which runs saved by the first version lack
 
 
 def texts(values: list[Any]) -> Texts:
@@ -147,3 +231,23 @@ def padded(blocks: list[Array], counts: list[int], width: int, matrices: bool = 
             out[(slice(at, at + count), *(slice(m) for m in block.shape[1:]))] = block
         at += count
     return out
+
+
+def padded_rows(rows: list[Array]) -> Array:
+    """Stack rows of several lengths, padded with NaN."""
+    out = np.full((len(rows), max((len(row) for row in rows), default=2)), np.nan)
+    for k, row in enumerate(rows):
+        out[k, : len(row)] = row
+    return out
+
+
+def padded_squares(matrices: list[Array]) -> Array:
+    """Stack square matrices of several sizes, padded with NaN."""
+    width = max((len(P) for P in matrices), default=2)
+    return padded([P[None] for P in matrices], [1] * len(matrices), width, matrices=True)
+
+
+def _cut(P: Array) -> Array:
+    """Return a square matrix without the NaN it was padded with."""
+    n = int((~np.isnan(np.diagonal(P))).sum())
+    return P[:n, :n]

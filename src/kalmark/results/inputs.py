@@ -21,7 +21,10 @@ class Controlled(NamedTuple):
 
 
 class UsedFix(NamedTuple):
-    """A fix that the filter was given: y (2,), innovation z (2,) and its covariance Z (2, 2); `used`: not rejected."""
+    """A fix that the filter was given: y (d,), innovation z (d,) and its covariance Z (d, d), d = 2 or 3.
+
+    `used`: not rejected.
+    """
 
     t_ns: int
     robot: str
@@ -40,15 +43,16 @@ class Inputs:
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return everything as named arrays for ``history.npz``."""
+        d = max((len(fix.y) for fix in self.fixes), default=2)
         return {
             "control_robot": np.array(list(self.controls), dtype=np.str_),
             "control_span": np.array(list(self.controls.values()), dtype=np.int64).reshape(-1, 3),
             "used_fix_robot": np.array([fix.robot for fix in self.fixes], dtype=np.str_),
             "used_fix_t_ns": np.array([fix.t_ns for fix in self.fixes], dtype=np.int64),
             "used_fix_used": np.array([fix.used for fix in self.fixes], dtype=np.bool_),
-            "used_fix_y": np.array([fix.y for fix in self.fixes], dtype=np.float64).reshape(-1, 2),
-            "used_fix_z": np.array([fix.z for fix in self.fixes], dtype=np.float64).reshape(-1, 2),
-            "used_fix_Z": np.array([fix.Z for fix in self.fixes], dtype=np.float64).reshape(-1, 2, 2),
+            "used_fix_y": np.array([fix.y for fix in self.fixes], dtype=np.float64).reshape(-1, d),
+            "used_fix_z": np.array([fix.z for fix in self.fixes], dtype=np.float64).reshape(-1, d),
+            "used_fix_Z": np.array([fix.Z for fix in self.fixes], dtype=np.float64).reshape(-1, d, d),
         }
 
     @classmethod

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
@@ -13,68 +14,93 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import RunError
-from kalmark.results.history import as_id
+from kalmark.results.history import as_id, padded_rows, padded_squares
+from kalmark.results.shapes import LINE, POINT, TAG, place
 from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
-    from kalmark.slam.report import LandmarkTable
+    from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
 
-_AXES = {"point_signature": ("x_m", "y_m", "signature")}
+_PLANE = {"point_signature": ("x_m", "y_m", "signature")}
 _POINT = ("x_m", "y_m", "z_m")
+_LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
+_TAG = (*_POINT, "qx", "qy", "qz", "qw")
+_SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
+_ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
 
 
 @dataclass(frozen=True)
 class MapLandmarks:
-    """The landmarks of a map: ids, kinds, means, covariances and how often each was observed."""
+    """The landmarks of a map: ids, kinds, places with covariances and how often each was observed.
+
+    The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
+    in the map is: see `kalmark.results.shapes`.
+    """
 
     ids: list[Id]
     kinds: list[str]
     means: list[Array]
     covariances: list[Array]
     observations: list[int]
+    in_space: bool = False
 
     def __len__(self) -> int:
         return len(self.ids)
 
     @classmethod
-    def of(cls, table: LandmarkTable) -> MapLandmarks:
-        """Return a copy of the table that `slam.landmarks()` gives."""
+    def of(cls, slam: Slam) -> MapLandmarks:
+        """Return the places of the landmarks of a filter's map."""
+        table = slam.landmarks()
+        models = (slam._kinds[i] for i in table.ids)
+        places = [place(*each) for each in zip(models, table.means, table.covariances, strict=True)]
         return cls(
             list(table.ids),
             list(table.kinds),
-            [np.array(mean, dtype=np.float64) for mean in table.means],
-            [np.array(cov, dtype=np.float64) for cov in table.covariances],
+            [mean for mean, _ in places],
+            [cov for _, cov in places],
             [int(count) for count in table.observations],
+            any(robot.motion.space.world == "space" for robot in slam.robots.values()),
         )
 
     def positions(self) -> tuple[Array, Array]:
-        """Return the positions in the plane (K, 2) and their covariances (K, 2, 2)."""
-        means = np.array([mean[:2] for mean in self.means]).reshape(-1, 2)
-        return means, np.array([cov[:2, :2] for cov in self.covariances]).reshape(-1, 2, 2)
+        """Return the positions (K, d) and their covariances (K, d, d), of lines their first endpoints."""
+        d = 3 if self.in_space else 2
+        means = np.array([mean[:d] for mean in self.means]).reshape(-1, d)
+        return means, np.array([cov[:d, :d] for cov in self.covariances]).reshape(-1, d, d)
+
+    def places(self) -> tuple[Array, Array]:
+        """Return the places (K, n) and covariances (K, q, q), padded with NaN; in the plane the positions alone."""
+        if not self.in_space:
+            return self.positions()
+        return padded_rows(self.means), padded_squares(self.covariances)
 
     def to_csv(self) -> str:
         """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations."""
-        axes = [_axes(kind, len(mean)) for kind, mean in zip(self.kinds, self.means, strict=True)]
-        columns = list(dict.fromkeys(name for names in axes for name in names)) or ["x_m", "y_m"]
-        pairs = list(combinations_with_replacement(columns, 2))
+        axes = [self._axes(kind, len(mean)) for kind, mean in zip(self.kinds, self.means, strict=True)]
+        columns = list(dict.fromkeys(name for names in axes for name in names))
+        columns = columns or list(_POINT if self.in_space else _POINT[:2])
+        pairs = _pairs({_errors(names) for names in axes} or {_errors(columns)})
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations"])
         for i, names in enumerate(axes):
-            at = {name: j for j, name in enumerate(names)}
+            at, row = ({name: j for j, name in enumerate(of)} for of in (names, _errors(names)))
             mean = [repr(float(self.means[i][at[name]])) if name in at else "" for name in columns]
-            cov = [repr(float(self.covariances[i][at[a], at[b]])) if a in at and b in at else "" for a, b in pairs]
+            cov = [repr(float(self.covariances[i][row[a], row[b]])) if {a, b} <= row.keys() else "" for a, b in pairs]
             writer.writerow([self.ids[i], self.kinds[i], *mean, *cov, self.observations[i]])
         return out.getvalue()
+
+    def _axes(self, kind: str, n: int) -> tuple[str, ...]:
+        return _SPACE.get(n, _POINT) if self.in_space else _PLANE.get(kind, _POINT)[:n]
 
     @classmethod
     def read(cls, path: Path) -> MapLandmarks:
         """Read a ``landmarks.csv``.  Raises RunError naming file and line."""
-        table = cls([], [], [], [], [])
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
+            table = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ()))
             for number, row in enumerate(rows, start=2):
                 try:
                     table._append(row)
@@ -83,9 +109,10 @@ class MapLandmarks:
         return table
 
     def _append(self, row: dict[str, str]) -> None:
-        names = [name for name in (*_POINT, "signature") if row.get(name)]
-        cov = np.empty((len(names), len(names)))
-        for (i, a), (j, b) in combinations_with_replacement(enumerate(names), 2):
+        names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
+        errors = _errors(names)
+        cov = np.empty((len(errors), len(errors)))
+        for (i, a), (j, b) in combinations_with_replacement(enumerate(errors), 2):
             cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
         self.ids.append(as_id(row["id"]))
         self.kinds.append(row["kind"])
@@ -94,9 +121,17 @@ class MapLandmarks:
         self.observations.append(int(row["observations"]))
 
 
-def _axes(kind: str, d: int) -> tuple[str, ...]:
-    return _AXES.get(kind, _POINT)[:d]
+def _pairs(errors: set[tuple[str, ...]]) -> list[tuple[str, str]]:
+    """Return the pairs of error components that some landmark has the covariance of, in the order of their columns."""
+    used = {pair for names in errors for pair in combinations_with_replacement(names, 2)}
+    return [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
+
+
+def _errors(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the components of the error of what has these columns: a quaternion's is a rotation."""
+    turn = ("rx_rad", "ry_rad", "rz_rad") if "qw" in names else ()
+    return (*(name for name in names if not name.startswith("q")), *turn)
 
 
 def _cov_name(a: str, b: str) -> str:
-    return f"cov_{a[0]}{b[0]}"
+    return "cov_" + "".join(name[0] if name == "signature" else name.partition("_")[0] for name in (a, b))

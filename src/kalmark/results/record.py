@@ -12,14 +12,15 @@ import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
-from kalmark.results.describe import describe
+from kalmark.results.cameras import cameras
+from kalmark.results.describe import describe, plain
 from kalmark.results.history import Array, History, MapSnapshot, Start, padded, texts
 from kalmark.results.inputs import Controlled, Inputs, UsedFix
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
 from kalmark.results.run import LogReference, Run
 from kalmark.results.truth import Truth
-from kalmark.slam.events import Control, Event, Fix, Scan
+from kalmark.slam.events import Control, Event, Fix, Id, Scan
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
@@ -91,6 +92,7 @@ class _Recorder:
     means: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
     step_ns: list[int] = field(default_factory=list)
+    kinds: list[str] = field(default_factory=list)
     maps: list[MapSnapshot] = field(default_factory=list)
     _spent_ns: int = 0
 
@@ -115,12 +117,18 @@ class _Recorder:
         self.reports.append(report)
         self.means.append(self.slam.mean(event.robot))
         self.covariances.append(self.slam.covariance(event.robot))
+        self.kinds += [self._kind(o.landmark) for o in report.observations]
         if len(self.maps) < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[len(self.maps)]:
             self.maps.append(self._snapshot())
 
+    def _kind(self, name: Id | None) -> str:
+        model = self.slam._kinds.get(name) if name is not None else None
+        return "" if model is None else model.kind
+
     def _snapshot(self) -> MapSnapshot:
-        landmarks = MapLandmarks.of(self.slam.landmarks())
-        return MapSnapshot(len(self.reports) - 1, self.reports[-1].t_ns, tuple(landmarks.ids), *landmarks.positions())
+        landmarks = MapLandmarks.of(self.slam)
+        ids, kinds = tuple(landmarks.ids), tuple(landmarks.kinds)
+        return MapSnapshot(len(self.reports) - 1, self.reports[-1].t_ns, ids, *landmarks.places(), kinds)
 
     def run(self, log: Any, config: Mapping[str, Any] | None, wall_s: float) -> Run:
         """Return the run made of what was gathered."""
@@ -130,7 +138,7 @@ class _Recorder:
         return Run(
             history=history,
             config=dict(config) if config is not None else describe(self.slam, log),
-            landmarks=MapLandmarks.of(self.slam.landmarks()),
+            landmarks=MapLandmarks.of(self.slam),
             truth=Truth.of(log, history, self.anchored),
             log=LogReference.of(log, tuple(self.slam.robots)),
             coordinates=self.slam.estimator.coordinates,
@@ -142,6 +150,7 @@ class _Recorder:
             stopped=self.stopped,
             slam=self.slam,
             source=log,
+            reference=plain(getattr(log, "reference", None) or {}),
         )
 
     def _history(self) -> History:
@@ -152,14 +161,14 @@ class _Recorder:
             for o in report.observations
         ]
         counts = [len(report.observations) for report in steps]
-        width = max((report.y.shape[1] for report in steps if report.observations), default=2)
-        p = len(self.means[0]) if steps else 3
-        q = len(self.covariances[0]) if steps else 3
+        widths = [max((getattr(r, key).shape[1] for r in steps if r.observations), default=2) for key in "yz"]
+        spaces = [robot.motion.space for robot in self.slam.robots.values()]
+        n, q = max(space.size for space in spaces), max(space.dof for space in spaces)
         return History(
             t_ns=np.array([r.t_ns for r in steps], dtype=np.int64),
             robot=texts([r.robot for r in steps]),
-            mean=np.array(self.means, dtype=np.float64).reshape(-1, p),
-            covariance=np.array(self.covariances, dtype=np.float64).reshape(-1, q, q),
+            mean=padded([m[None] for m in self.means], [1] * len(steps), n),
+            covariance=padded([P[None] for P in self.covariances], [1] * len(steps), q, matrices=True),
             step_us=np.array(self.step_ns, dtype=np.float64) * 1e-3,
             step=np.array([s for s, _, _ in seen], dtype=np.int64),
             sensor=texts([scan.sensor for _, scan, _ in seen]),
@@ -169,11 +178,13 @@ class _Recorder:
             landmark=texts([o.landmark for _, _, o in seen]),
             d2=np.array([np.nan if o.d2 is None else o.d2 for _, _, o in seen], dtype=np.float64),
             reason=texts([o.reason for _, _, o in seen]),
-            y=padded([r.y for r in steps], counts, width),
-            e=padded([r.e for r in steps], counts, width),
-            z=padded([r.z for r in steps], counts, width),
-            Z=padded([r.Z for r in steps], counts, width, matrices=True),
+            y=padded([r.y for r in steps], counts, widths[0]),
+            e=padded([r.e for r in steps], counts, widths[0]),
+            z=padded([r.z for r in steps], counts, widths[1]),
+            Z=padded([r.Z for r in steps], counts, widths[1], matrices=True),
             maps=tuple(self.maps),
             starts=self.starts,
             inputs=Inputs(self.controls, tuple(self.fixes)),
+            kind=texts(list(self.kinds)),
+            cameras=cameras(self.slam),
         )

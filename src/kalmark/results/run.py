@@ -54,7 +54,8 @@ class Run:
     """One log through one filter: the history, the final map, the truth to judge them by, the configuration.
 
     `summary` is what `evaluate` last returned.  `slam`, the filter after the last event, and `source`, the log itself,
-    are None in a run that was loaded; `final_slam` reads the filter from ``map.kmk``.
+    are None in a run that was loaded; `final_slam` reads the filter from ``map.kmk``.  `reference` holds what others
+    made of the same log, figures by their name, which the summary repeats.
     """
 
     history: History
@@ -73,6 +74,7 @@ class Run:
     source: Any = None
     folder: Path | None = None
     summary: dict[str, Any] = field(default_factory=dict)
+    reference: dict[str, Any] = field(default_factory=dict)
 
     @property
     def estimator(self) -> str:
@@ -164,6 +166,7 @@ class Run:
                 stopped=summary.get("stopped", ""),
                 folder=folder,
                 summary=summary,
+                reference={name: summary[name] for name in named.get("reference", np.empty(0)).tolist()},
             )
         except (KeyError, ValueError, OSError) as error:
             raise RunError(f"{folder}: not a run that this version reads: {error}") from None
@@ -172,6 +175,7 @@ class Run:
         skipped = np.array(self.skipped, dtype=np.str_)
         with path.open("wb") as file:
             arrays: dict[str, Any] = {**self.history.arrays(), **self.truth.arrays(), "skipped": skipped}
+            arrays["reference"] = np.array(list(self.reference), dtype=np.str_)
             np.savez_compressed(file, **arrays)
 
     def _save_map(self, folder: Path) -> None:

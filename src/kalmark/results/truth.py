@@ -10,10 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.results.align import Rigid
-from kalmark.results.history import Array, History, Start, as_id, texts
+from kalmark.results.consistency import pose_error
+from kalmark.results.history import Array, History, Start, as_id, padded_rows, texts
+from kalmark.results.shapes import LINE, TAG
 from kalmark.slam.events import Id
 
+ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 SAME_FRAME_M, SAME_FRAME_RAD, SAME_FRAME_SIGMAS = 0.05, 0.02, 4.0
 
 
@@ -28,17 +32,18 @@ class Fixes:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """True poses (S, 3) at the steps of a run, NaN where unknown, in the frame of the truth.
+    """True poses (S, 3) or, in space, (S, 7) at the steps of a run, NaN where unknown, in the frame of the truth.
 
-    `offset` (3,) is the pose of the truth's frame in the map's.  It is zero when the robots started at the truth (or
-    the map is `anchored`: tied to the world otherwise, by known landmarks or fixes); else it is what brings the first
-    robot's true start to its start.  `robots` are those whose truth the log has.
+    `landmarks` are true places: positions (2,) or (3,), endpoints of a line (6,), the pose of a tag (7,). `offset`
+    is the pose of the truth's frame in the map's. It is the origin when the robots started at the truth (or the map
+    is `anchored`: tied to the world otherwise, by known landmarks or fixes); else it is what brings the first
+    robot's true start to its start. `robots` are those whose truth the log has.
     """
 
     poses: Array
     landmarks: dict[Id, Array] = field(default_factory=dict)
     fixes: dict[str, Fixes] = field(default_factory=dict)
-    offset: Array = field(default_factory=lambda: np.zeros(3))
+    offset: Array = field(default_factory=lambda: ORIGIN[3])
     anchored: bool = False
     robots: tuple[str, ...] = ()
 
@@ -46,17 +51,21 @@ class Truth:
     def of(cls, log: Any, history: History, anchored: bool = False) -> Truth:
         """Return the truth of a log at the steps of a history; a log without truth, or a list of events, gives none."""
         trajectories = getattr(log, "truth", None) or {}
-        poses = np.full((len(history.t_ns), 3), np.nan)
+        size = 7 if history.in_space else 3
+        poses = np.full((len(history.t_ns), size), np.nan)
         for robot, trajectory in trajectories.items():
             mine = history.robot == robot
             if mine.any():
-                poses[mine] = trajectory.at(history.t_ns[mine])[:, :3]
+                poses[mine] = fitted(trajectory.at(history.t_ns[mine]), size)
         fixes = {
             robot: Fixes(track.t_ns, np.asarray(track.xy), np.asarray(track.antenna))
             for robot, track in (getattr(log, "gps", None) or {}).items()
         }
-        offset = np.zeros(3) if anchored else _offset(trajectories, history.starts)
-        return cls(poses, dict(getattr(log, "landmarks", None) or {}), fixes, offset, anchored, tuple(trajectories))
+        offset = ORIGIN[size] if anchored else _offset(trajectories, history.starts, size)
+        landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in (getattr(log, "landmarks", None) or {}).items()}
+        if size == 7:
+            landmarks = {i: np.append(l, 0.0) if len(l) == 2 else l for i, l in landmarks.items()}
+        return cls(poses, landmarks, fixes, offset, anchored, tuple(trajectories))
 
     def __bool__(self) -> bool:
         return bool(self.landmarks) or bool(np.isfinite(self.poses).any())
@@ -64,21 +73,19 @@ class Truth:
     @property
     def frame(self) -> str:
         """Whether the map is in the frame of the truth ("truth") or in that of the first robot's start ("start")."""
-        return "start" if self.offset.any() else "truth"
+        return "truth" if np.array_equal(self.offset, ORIGIN[len(self.offset)]) else "start"
 
     def to_map(self) -> Rigid:
         """Return what takes positions from the truth's frame to the map's."""
-        c, s = np.cos(self.offset[2]), np.sin(self.offset[2])
-        return Rigid(np.array([[c, -s], [s, c]]), self.offset[:2])
+        return as_rigid(self.offset)
 
     def poses_in_map(self) -> Array:
-        """Return the true poses (S, 3) in the frame of the map."""
+        """Return the true poses (S, 3 or 7) in the frame of the map."""
         return self.to_map().poses(self.poses)
 
     def landmarks_in_map(self) -> dict[Id, Array]:
         """Return the true landmarks in the frame of the map."""
-        to_map = self.to_map()
-        return {i: np.append(to_map(l[:2]), l[2:]) for i, l in self.landmarks.items()}
+        return moved(self.to_map(), self.landmarks)
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Return everything as named arrays for ``history.npz``."""
@@ -89,7 +96,7 @@ class Truth:
             "truth_anchored": np.array(self.anchored),
             "truth_robot": texts(list(self.robots)),
             "truth_landmark": texts(list(self.landmarks)),
-            "truth_landmark_mean": np.array(list(self.landmarks.values()), dtype=np.float64),
+            "truth_landmark_mean": padded_rows(list(self.landmarks.values())),
             "fix_robot": texts(robots),
             "fix_size": np.array([len(self.fixes[r].t_ns) for r in robots], dtype=np.int64),
             "fix_t_ns": np.concatenate([self.fixes[r].t_ns for r in robots] or [np.empty(0, dtype=np.int64)]),
@@ -101,7 +108,7 @@ class Truth:
     def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> Truth:
         """Return the truth that `arrays` gave."""
         landmarks = {
-            as_id(text): mean
+            as_id(text): mean[~np.isnan(mean)]
             for text, mean in zip(named["truth_landmark"].tolist(), named["truth_landmark_mean"], strict=True)
         }
         ends = np.cumsum(named["fix_size"])
@@ -115,20 +122,60 @@ class Truth:
         return cls(named["truth"], landmarks, fixes, named["truth_offset"], bool(named["truth_anchored"]), robots)
 
 
-def _offset(trajectories: Mapping[str, Any], starts: tuple[Start, ...]) -> Array:
-    """Return the pose of the truth's frame in the map's: zero if the first robot with truth started there."""
+def fitted(poses: Array, size: int) -> Array:
+    """Return poses (N, 3) or (N, 7) as poses of the plane (size 3: seen from above) or of space (size 7: at z = 0)."""
+    if poses.shape[1] == size:
+        return poses
+    if size == 3:
+        return np.column_stack([poses[:, :2], yaw(poses[:, 3:])])
+    flat, half = np.zeros(len(poses)), poses[:, 2] / 2
+    return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
+
+
+def yaw(q: Array) -> Array:
+    """Return the headings (N,) of orientations (N, 4): where their x points as seen from above."""
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+
+
+def as_rigid(pose: Array) -> Rigid:
+    """Return the transform from the frame that a pose (3,) or (7,) is, to the frame that it is given in."""
+    if len(pose) == 7:
+        return Rigid(matrix(np.ascontiguousarray(pose[3:])), pose[:3])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return Rigid(np.array([[c, -s], [s, c]]), pose[:2])
+
+
+def moved(rigid: Rigid, landmarks: Mapping[Id, Array]) -> dict[Id, Array]:
+    """Return landmarks rotated and shifted: positions (attributes are kept), in space endpoints (6,) and poses (7,)."""
+    d = len(rigid.shift)
+    out = {}
+    for i, l in landmarks.items():
+        if d == 3 and len(l) == LINE:
+            out[i] = rigid(l.reshape(2, 3)).ravel()
+        else:
+            out[i] = rigid.poses(l[None])[0] if d == 3 and len(l) == TAG else np.append(rigid(l[:d]), l[d:])
+    return out
+
+
+def _offset(trajectories: Mapping[str, Any], starts: tuple[Start, ...], size: int) -> Array:
+    """Return the pose of the truth's frame in the map's: the origin if the first robot with truth started there."""
     for start in starts:
         if start.robot not in trajectories:
             continue
-        true = trajectories[start.robot].at(np.array([start.t_ns]))[0][:3]
+        true = fitted(trajectories[start.robot].at(np.array([start.t_ns])), size)[0]
         if not np.isfinite(true).all():
             continue
-        d = np.append(true[:2] - start.mean[:2], wrap(true[2] - start.mean[2]))
-        sigma = np.sqrt(np.maximum(np.diagonal(start.covariance)[:3], 0.0))
-        slack = np.array([SAME_FRAME_M, SAME_FRAME_M, SAME_FRAME_RAD])
+        n = 2 if size == 3 else 3
+        d = pose_error(start.mean[:size], true)
+        sigma = np.sqrt(np.maximum(np.diagonal(start.covariance)[: len(d)], 0.0))
+        slack = np.repeat([SAME_FRAME_M, SAME_FRAME_RAD], [n, len(d) - n])
         if (np.abs(d) <= SAME_FRAME_SIGMAS * sigma + slack).all():
-            return np.zeros(3)
-        angle = -d[2]
-        c, s = np.cos(angle), np.sin(angle)
-        return np.append(start.mean[:2] - np.array([[c, -s], [s, c]]) @ true[:2], wrap(angle))
-    return np.zeros(3)
+            break
+        here, there = as_rigid(start.mean[:size]), as_rigid(true)
+        turn = here.rotation @ there.rotation.T
+        shift = here.shift - turn @ there.shift
+        if size == 3:
+            return np.append(shift, wrap(start.mean[2] - true[2]))
+        return np.concatenate([shift, from_matrix(np.ascontiguousarray(turn))])
+    return ORIGIN[size]

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import chi2
 
 from kalmark.results.inputs import UsedFix
@@ -16,10 +17,12 @@ if TYPE_CHECKING:
     from kalmark.results.run import Run
 
 NO_ID = "no id in the log"  # the reason that association by identity gives
-POSE_NEES = 9.0  # 3 is consistent; at most 3 % of consistent runs are above: those whose error never changes
+POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; at most 3 % of consistent runs are above: constant errors
 NIS_HIGH, NIS_LOW = 3.0, 0.1  # per degree of freedom
 FIX_NIS_HIGH = 5.0
-FIRST_FIX = float(chi2.ppf(0.9999, 2))
+FIRST_FIX = {d: float(chi2.ppf(0.9999, d)) for d in (2, 3)}
+BEARINGS = ("range_bearing", "range_bearing_3d")
+MARGIN = 0.1  # of an image, by which its measurements may lie outside it
 FEW_FIXES = 5  # fewer say little of the noise
 
 
@@ -53,14 +56,34 @@ def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
         yield "no observation was made: there is nothing to map"
     elif not summary["landmarks"]:
         yield "no landmark was mapped"
-    bearings = history.y[:, 1] if history.y.shape[1] > 1 else np.empty(0)
-    turns = np.abs(bearings[np.isfinite(bearings) & _has_bearing(run)]) > 2 * np.pi
+    angles = history.y[_has_bearing(run)][:, 1:]
+    turns = (np.abs(angles) > 2 * np.pi).any(axis=1)  # NaN, where a sensor has less numbers, is not
     if turns.any():
         yield f"{int(turns.sum())} bearings beyond 2 pi rad: are they in degrees?"
+    yield from _images(run)
 
 
-def _has_bearing(run: Run) -> Any:
-    """Tell of each observation whether its second column is a bearing, by the type of its sensor."""
+def _images(run: Run) -> Iterator[str]:
+    """Tell of cameras whose measurements lie outside their images."""
+    history = run.history
+    robots = history.robot[history.step]
+    for camera in history.cameras:
+        mine = (robots == camera.robot) & (history.sensor == camera.sensor)
+        outside = np.zeros(int(mine.sum()), dtype=np.bool_)
+        for k, name in enumerate(camera.columns):
+            if name.endswith("_px"):
+                limit = camera.size[0 if name.startswith("u") else 1]
+                outside |= (history.y[mine, k] < -MARGIN * limit) | (history.y[mine, k] > (1 + MARGIN) * limit)
+        if outside.any():
+            width, height = (f"{size:g}" for size in camera.size)
+            yield (
+                f"{int(outside.sum())} of {count(len(outside), 'measurement')} of camera {camera.sensor} lie outside "
+                f"its image of {width} x {height} pixels: set width_px and height_px"
+            )
+
+
+def _has_bearing(run: Run) -> npt.NDArray[np.bool_]:
+    """Tell of each observation whether all but its first column are bearings, by the type of its sensor."""
     robots: Mapping[str, Any] = run.config.get("robots") or {}
     kinds = {
         (robot, name): str((sensor or {}).get("type", ""))
@@ -68,7 +91,7 @@ def _has_bearing(run: Run) -> Any:
         for name, sensor in ((given or {}).get("sensors") or {}).items()
     }
     pairs = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
-    found = [kinds.get(pair, kinds.get(("each", pair[1]), "")).startswith("range_bearing") for pair in pairs]
+    found = [kinds.get(pair, kinds.get(("each", pair[1]), "")) in BEARINGS for pair in pairs]
     return np.array(found, dtype=np.bool_)
 
 
@@ -103,9 +126,10 @@ def _fixes(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
     starts = {start.robot: start for start in run.history.starts}
     for name in dict.fromkeys(fix.robot for fix in fixes):
         first = next(fix for fix in fixes if fix.robot == name)
-        if name in starts and _d2(first) > FIRST_FIX:
+        if name in starts and _d2(first) > FIRST_FIX[len(first.z)]:
             far = float(np.linalg.norm(first.z))
-            sigma = float(np.sqrt(max(np.trace(starts[name].covariance[:2, :2]) / 2, 0.0)))
+            d = len(first.z)
+            sigma = float(np.sqrt(max(np.trace(starts[name].covariance[:d, :d]) / d, 0.0)))
             yield (
                 f"the first fix of {name} is {figure(far)} m from where its start puts it, "
                 f"which the configuration says is known to {figure(sigma)} m: set robots.{name}.start"
@@ -119,8 +143,8 @@ def _fixes(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
 
 def fix_nis_per_dof(fixes: tuple[UsedFix, ...]) -> float:
     """Return the sum of the normalised innovations squared of the fixes used over their dimensions, NaN without any."""
-    values = [_d2(fix) for fix in fixes if fix.used]
-    return sum(values) / (2 * len(values)) if values else float("nan")
+    used = [fix for fix in fixes if fix.used]
+    return sum(_d2(fix) for fix in used) / sum(len(fix.z) for fix in used) if used else float("nan")
 
 
 def _d2(fix: UsedFix) -> float:
@@ -128,13 +152,14 @@ def _d2(fix: UsedFix) -> float:
 
 
 def _noise(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    dof = 6 if run.history.in_space else 3
     for name, figures in summary["robots"].items():
         value = figures.get("pose_nees")
-        if value is not None and value > POSE_NEES:
+        if value is not None and value > POSE_NEES[dof]:
             whose = f" of {name}" if len(summary["robots"]) > 1 else ""
             yield (
-                f"pose NEES{whose} {figure(value)} where 3 is consistent: the noise in the configuration is not what "
-                "this log has (correlated or biased errors?)"
+                f"pose NEES{whose} {figure(value)} where {dof} is consistent: the noise in the configuration is not "
+                "what this log has (correlated or biased errors?)"
             )
     value = summary["nis_per_dof"]
     if value is not None and not NIS_LOW <= value <= NIS_HIGH and summary["associated"] >= 50:

@@ -1,0 +1,53 @@
+"""The cameras of a run: where they sit on their robots and what their images are, to draw them and in them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.errors import MapError
+from kalmark.results.history import Array, Camera
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
+
+HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has no focal length
+
+
+def cameras(slam: Slam) -> tuple[Camera, ...]:
+    """Return the sensors of a filter that measure pixels of an image of known size; mounts in the map as estimated."""
+    return tuple(
+        Camera(
+            robot.name,
+            name,
+            _mount(slam, robot.name, name, mount.at),
+            _size(mount.sensor),
+            columns,
+            _corners(mount.sensor),
+        )
+        for robot in slam.robots.values()
+        for name, mount in robot.sensors.items()
+        if (columns := tuple(mount.sensor.columns))[0].endswith("_px") and hasattr(mount.sensor, "width_px")
+    )
+
+
+def _mount(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
+    try:
+        return np.array(slam.mean(f"{robot}.{sensor}"), dtype=np.float64)
+    except MapError:
+        return np.array(at, dtype=np.float64)
+
+
+def _size(sensor: Any) -> tuple[float, float]:
+    return float(sensor.width_px), float(sensor.height_px)
+
+
+def _corners(sensor: Any) -> Array:
+    """Return the rays (4, 3), z = 1, to the corners of the image of a camera without distortion."""
+    width, height = _size(sensor)
+    u, v = np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height])
+    if not hasattr(sensor, "fx_px"):
+        across, down = u / width - 0.5, v / height - 0.5
+        return np.column_stack([2 * HALF_VIEW * across, 2 * HALF_VIEW * down * height / width, np.ones(4)])
+    return np.column_stack([(u - sensor.cx_px) / sensor.fx_px, (v - sensor.cy_px) / sensor.fy_px, np.ones(4)])

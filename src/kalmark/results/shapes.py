@@ -1,0 +1,85 @@
+"""The places that landmarks are at: Euclidean points, the endpoints of lines, the poses of tags, with covariances.
+
+A place is a row of numbers, and its covariance that of its error:
+
+==========  ==============================  ==========================  =====
+kind        place                           error                       sizes
+==========  ==============================  ==========================  =====
+point       x y z                           x y z                       3, 3
+line        both endpoints, x y z x2 y2 z2  the same                    6, 6
+tag         x y z qx qy qz qw               x y z, rotation vector      7, 6
+==========  ==============================  ==========================  =====
+
+Whatever else a landmark is in the map (inverse depth, homogeneous, Pluecker), its model says where that is: `to_point`
+or `to_endpoints` gives the place (K, n) of states (K, m) and its Jacobian (K, n, dof).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+POINT, LINE, TAG = 3, 6, 7
+EUCLIDEAN = ("", "point", "point3", "point_signature", "tag")
+
+
+def place(model: Any, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the place and covariance of one landmark's state; a model that does not say is its own place."""
+    convert = getattr(model, "to_point", None) or getattr(model, "to_endpoints", None)
+    if convert is None:
+        return np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        p, P_l = convert(np.array(mean, dtype=np.float64).reshape(1, -1))
+        covariance = P_l[0] @ covariance @ P_l[0].T
+    at_infinity = ~np.isfinite(p[0])
+    return np.where(at_infinity, np.inf, p[0]), np.where(np.isfinite(covariance), covariance, np.inf)
+
+
+class Points(NamedTuple):
+    """Gaussian points in space to draw: which landmark each belongs to (K,), positions (K, 3), covariances."""
+
+    row: Ints
+    means: Array
+    covariances: Array
+
+
+class Shapes(NamedTuple):
+    """What is to be drawn of a map: `points` (of lines both endpoints), `lines` (L, 2, 3) and `tags` (T, 7).
+
+    `line_rows` and `tag_rows` are their rows in the map.
+    """
+
+    points: Points
+    lines: Array
+    tags: Array
+    line_rows: Ints
+    tag_rows: Ints
+
+
+def shapes(means: Array, covariances: Array) -> Shapes:
+    """Sort the places (K, n) of landmarks in space, padded with NaN, and covariances (K, q, q), by what they are."""
+    size = (~np.isnan(means)).sum(axis=1)
+    lines, tags = np.flatnonzero(size == LINE), np.flatnonzero(size == TAG)
+    row = np.concatenate([np.arange(len(means)), lines])
+    ends = means[lines]
+    return Shapes(
+        Points(
+            row,
+            np.concatenate([means[:, :3].reshape(-1, 3), ends[:, 3:6].reshape(-1, 3)]),
+            np.concatenate([covariances[:, :3, :3].reshape(-1, 3, 3), covariances[lines, 3:6, 3:6].reshape(-1, 3, 3)]),
+        ),
+        ends[:, :6].reshape(-1, 2, 3),
+        means[tags][:, :7].reshape(-1, 7),
+        lines,
+        tags,
+    )
+
+
+def euclidean(kinds: Any) -> npt.NDArray[np.bool_]:
+    """Tell of each kind whether its state is Euclidean: what is not (inverse depth, say) is not yet well known."""
+    return np.isin(np.asarray(kinds, dtype=np.str_), EUCLIDEAN)
