@@ -10,8 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from kalmark.config import load_config
-from kalmark.config.building import build_slam, open_config_log
+from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.results.batch import solve_batch
 from kalmark.results.record import record
 

@@ -12,8 +12,7 @@ import pytest
 
 import kalmark as km
 from batch_dense import Link, Sight, link, optimum
-from kalmark.config import load_config
-from kalmark.config.building import build_slam, open_config_log
+from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
 from kalmark.geometry import V, wrap
 from kalmark.geometry.frames import compose

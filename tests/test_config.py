@@ -88,9 +88,9 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ("robots.each.motion.sigma_v_mps='1'", "robots.each.motion.sigma_v_mps: got '1', expected a number"),
         (
             "robots.each.motion.type=unicicle",
-            "got 'unicicle', expected one of unicycle, odometry_2d, ackermann; did",
+            "got 'unicicle', expected one of unicycle, odometry_2d, ackermann, odome",
         ),
-        ("robots.each.motion.type=odometry_3d", "got 'odometry_3d', which is not available yet, expected one of unic"),
+        ("robots.each.motion.type=inertial", "got 'inertial', which is not available yet, expected one of unic"),
         ("robots.each.motion=3", "robots.each.motion: got 3, expected a mapping with a type: one of unicycle, od"),
         ("robots.each.start.x_m=.inf", "robots.each.start.x_m: got inf, expected a finite number"),
         (
@@ -233,3 +233,48 @@ def test_another_type_replaces_its_section(tmp_path: Path) -> None:
     assert each.motion.type == "odometry_2d"
     assert each.sensors["s"].type == "bearing"
     assert each.sensors["s"].mount.x_m == 0.5
+
+
+SPACE = """\
+robots:
+  each:
+    motion: {type: odometry_3d, sigma_z_m: 0.02}
+    start: {x_m: 1, y_m: 2, z_m: 3, roll_deg: 10, pitch_deg: 20, yaw_deg: 30, sigma_rotation_deg: 1}
+    sensors:
+      radar:
+        type: range_bearing_3d
+        mount: {z_m: 0.6, yaw_deg: 90}
+"""
+
+
+def test_a_robot_of_space_has_the_keys_of_space(tmp_path: Path) -> None:
+    path = tmp_path / "space.yaml"
+    path.write_text(SPACE)
+    robot = load_config(path).robots["each"]
+    assert (robot.motion.type, robot.motion.sigma_z_m) == ("odometry_3d", 0.02)
+    assert robot.start is not None
+    assert (robot.start.z_m, robot.start.yaw_deg, robot.start.sigma_rotation_deg) == (3, 30, 1)
+    assert (robot.sensors["radar"].mount.z_m, robot.sensors["radar"].mount.roll_deg) == (0.6, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "replacement", "where", "what"),
+    [
+        (SPACE, 4, "    start: {theta_rad: 1}", "4:13", "start.theta_rad: got a key of the plane for a rob"),
+        (SPACE, 8, "        mount: {theta_rad: 1}", "8:17", "mount.theta_rad: got a key of the plan"),
+        (SPACE, 8, "        mount: {yaw_rad: 1}", "8:17", "got an unknown key (value 1), expected one"),
+        (SPACE, 7, "        type: range_bearing", "7:15", "a sensor of the plane on a robot of space,"),
+        (SPACE, 4, "    start: {vx_mps: 1}", "4:21", "start.vx_mps: got 1, expected 0: odometry_3d has no vel"),
+        (GOOD, 5, "    start: {z_m: 1}", "5:13", "start.z_m: got a key of space for a robot of the plane (value 1)"),
+        (GOOD, 10, "        mount: {yaw_deg: 1}", "10:17", "yaw_deg: got a key of space for a robot of the plane"),
+        (GOOD, 8, "        type: position_3d", "8:15", "got 'position_3d', a sensor of space on a robot of the p"),
+    ],
+)
+def test_what_is_of_the_other_world_is_refused_by_its_place(
+    tmp_path: Path, text: str, line: int, replacement: str, where: str, what: str
+) -> None:
+    lines = text.splitlines()
+    lines[line - 1] = replacement
+    message = refusal_of("\n".join(lines) + "\n", tmp_path)
+    assert message.startswith(f"{where}: ")
+    assert what in message

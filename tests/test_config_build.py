@@ -12,8 +12,9 @@ from pydantic import create_model
 
 import kalmark as km
 from kalmark.config import Config, build_slam, config_dict, load_config, open_config_log, slam_from_config
-from kalmark.config.building import CLASSES
-from kalmark.config.models import Association, Landmark, Motion, Sensor
+from kalmark.config.classes import CLASSES, MOUNTED
+from kalmark.config.landmarks import Association, Landmark
+from kalmark.config.models import Motion, Sensor
 from kalmark.config.reading import validate
 from kalmark.config.schema import Estimator
 from kalmark.config.sections import types
@@ -46,8 +47,7 @@ def test_keys_and_defaults_are_those_of_the_models(choice: Any) -> None:
     for name in types(choice):
         section = validate(Tree(values={"section": {"type": name}}), holder).section  # type: ignore[attr-defined]
         parameters = {f.name: f.default for f in dataclasses.fields(CLASSES[name]) if f.init}  # type: ignore[arg-type]
-        of_the_mount = {"type", "mount", "landmark", "association", "detector"}
-        assert section.model_dump(exclude=of_the_mount) == parameters, name
+        assert section.model_dump(exclude={"type", *MOUNTED}) == parameters, name
 
 
 def test_a_robot_without_a_start_starts_at_the_truth_exactly(tmp_path: Path) -> None:

@@ -38,8 +38,7 @@ def run_log(
     from kalmark.results.record import record
 
     override = [] if on_error is None else [f"log.on_error={on_error}"]
-    config = cfg.in_force(cfg.load_config(config_path, [*overrides, *override]), log_path)
-    log = cfg.open_config_log(config)
+    config, log = cfg.open_run(config_path, log_path, [*overrides, *override])
     slam = cfg.build_slam(config, log)
     return record(slam, log, progress=progress, on_error=config.log.on_error, config=cfg.config_dict(config))
 

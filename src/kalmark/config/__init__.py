@@ -1,6 +1,7 @@
 """Configuration: which log, which robots and sensors, which filter, with every default in one frozen model."""
 
-from kalmark.config.building import build_slam, config_dict, in_force, open_config_log, slam_from_config
+from kalmark.config.building import build_slam, config_dict, slam_from_config
+from kalmark.config.opening import in_force, open_config_log, open_run
 from kalmark.config.reading import load_config, resolve_config, shipped_configs
 from kalmark.config.schema import Config
 
@@ -11,6 +12,7 @@ __all__ = [
     "in_force",
     "load_config",
     "open_config_log",
+    "open_run",
     "resolve_config",
     "shipped_configs",
     "slam_from_config",

@@ -7,22 +7,27 @@ import inspect
 import math
 import sys
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from itertools import pairwise
-from typing import Any, get_args
+from typing import Any
 
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from kalmark.config import models, schema
-from kalmark.config.sections import LATER
+from kalmark.config import landmarks, models, mounting, schema
+from kalmark.config.sections import LATER, Section, members
 
 UNITS = {
+    "_mps_per_sqrt_s": "m/s/sqrt(s)",
+    "_radps_per_sqrt_s": "rad/s/sqrt(s)",
     "_m_per_sqrt_s": "m/sqrt(s)",
     "_rad_per_sqrt_s": "rad/sqrt(s)",
+    "_per_m": "1/m",
     "_mps": "m/s",
     "_radps": "rad/s",
     "_rad": "rad",
+    "_deg": "deg",
+    "_px": "px",
     "_m": "m",
     "_s": "s",
     "r_max": "m",
@@ -51,9 +56,16 @@ association: {{type: identity}}
 estimator: {{type: invariant}}
 ```
 
-Lengths are metres, angles radians, times seconds.  A control's noise is either the error of the control held over its
-interval (`sigma_v_mps`: the displacement's error is sigma times the duration) or a random walk (`..._per_sqrt_s`),
-which acts while the robot is told to move.  A gate is the probability with which a right observation is let through:
+A log may describe its own rig: a recording its camera, a data set its calibration and the noise of its sensors.  Then
+a key that is left out, in any section here, has the log's value, and a section may hold single keys without its `type`;
+another `type` than the log's drops what the log says of that section, but for a mount.  `each` here stands for the
+robots that have no entry of their own.
+
+Lengths are metres, angles radians (degrees in keys that end in `_deg`), times seconds.  Robots move in the plane or in
+space, as their `motion` says, all robots of a log in the same; mounts and starts have other keys in each.  A control's
+noise is either the error of the control held over its interval (`sigma_v_mps`: the displacement's error is sigma times
+the duration) or a random walk (`..._per_sqrt_s`), which acts while the robot is told to move.  A gate is the
+probability with which a right observation is let through:
 0.9973 is the 3 sigma of one dimension; `default` is the estimator's own (`ekf`: squared distance below 9; the others:
 no gate).
 """
@@ -64,12 +76,16 @@ def page() -> str:
     names = ", ".join(f"`{name}`" for name in _shipped())
     parts = [HEAD.format(names=names), _section("The file", schema.Config)]
     parts += [_section("`log`", schema.LogConfig), _section("`robots.NAME`", schema.RobotConfig)]
-    parts += [_section("`robots.NAME.start`", schema.StartConfig)]
+    parts += [_section("`robots.NAME.start`, in the plane", mounting.StartConfig)]
+    parts += [_section("`robots.NAME.start`, in space", mounting.SpaceStartConfig)]
     parts += [_choice("`robots.NAME.motion`", models.Motion, "motion")]
-    parts += [_choice("`robots.NAME.sensors.SENSOR`", models.Sensor, "sensor")]
-    parts += [_section("`robots.NAME.sensors.SENSOR.mount`", models.MountConfig)]
-    parts += [_choice("`landmarks`, and `landmark` of a sensor", models.Landmark, "landmark")]
-    parts += [_choice("`association`", models.Association, "association")]
+    parts += [_section("`robots.NAME.sensors.SENSOR`", mounting.Mounted)]
+    parts += [_choice("`robots.NAME.sensors.SENSOR`, in the plane", models.PlaneSensor, None, mounting.PlaneMounted)]
+    parts += [_choice("`robots.NAME.sensors.SENSOR`, in space", models.SpaceSensor, "sensor", mounting.SpaceMounted)]
+    parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in the plane", mounting.MountConfig)]
+    parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in space", mounting.SpaceMountConfig)]
+    parts += [_choice("`landmarks`, and `landmark` of a sensor", landmarks.Landmark, "landmark")]
+    parts += [_choice("`association`, also of a sensor", landmarks.Association, "association")]
     parts += [_choice("`estimator`", schema.Estimator, "estimator")]
     parts += [_section("`map`", schema.MapConfig) + _later("map")]
     return "\n".join(parts)
@@ -85,13 +101,13 @@ def _section(title: str, model: type[BaseModel]) -> str:
     return f"## {title}\n\n{inspect.getdoc(model)}\n\n{_table(model)}\n"
 
 
-def _choice(title: str, union: Any, kind: str) -> str:
-    members = [get_args(member) for member in get_args(get_args(union)[0])]
+def _choice(title: str, choice: Any, kind: str | None, common: type[BaseModel] = Section) -> str:
+    """Return the sections of a choice; keys that all have by inheritance from `common` are left out."""
     parts = [f"## {title}\n"]
-    for model, tag in members:
-        table = _table(model)
-        parts.append(f"**`type: {tag.tag}`**  {inspect.getdoc(model)}\n" + (f"\n{table}\n" if table else ""))
-    return "\n".join(parts) + _later(kind)
+    for name, model in members(choice).items():
+        table = _table(model, without=set(common.model_fields))
+        parts.append(f"**`type: {name}`**  {inspect.getdoc(model)}\n" + (f"\n{table}\n" if table else ""))
+    return "\n".join(parts) + (_later(kind) if kind else "")
 
 
 def _later(kind: str) -> str:
@@ -99,11 +115,11 @@ def _later(kind: str) -> str:
     return f"\nNot available yet: {names}.\n" if names else ""
 
 
-def _table(model: type[BaseModel]) -> str:
+def _table(model: type[BaseModel], without: Collection[str] = ()) -> str:
     rows = [
         f"| `{name}` | {_default(field)} | {_unit(name)} | {text} |"
         for name, field, text in ((n, f, _texts(model).get(n, "")) for n, f in model.model_fields.items())
-        if text
+        if text and name not in without
     ]
     return "\n".join(["| key | default | unit | meaning |", "|---|---|---|---|", *rows]) if rows else ""
 

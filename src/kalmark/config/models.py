@@ -1,13 +1,15 @@
-"""Configuration of motion, sensors and landmarks: the fields of `kalmark.models`, by the same names."""
+"""Configuration of motion and sensors: the fields of `kalmark.models`, by the same names; those of the plane here."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Tag
 
-from kalmark.config.sections import Gate, Limit, NotNegative, Number, Positive, Probability, Reserved, Section, type_or
+from kalmark.config.models3d import SpaceMotions, SpaceSensors
+from kalmark.config.mounting import PlaneMounted
+from kalmark.config.sections import Limit, NotNegative, Positive, Section, type_or, types
 
 
 class _Diffusion(Section):
@@ -55,76 +57,16 @@ class AckermannMotion(_Diffusion):
     """Error of the steering angle held over its interval."""
 
 
-Motion = Annotated[
+PlaneMotions = (
     Annotated[UnicycleMotion, Tag("unicycle")]
     | Annotated[Odometry2DMotion, Tag("odometry_2d")]
-    | Annotated[AckermannMotion, Tag("ackermann")],
-    Discriminator(type_or()),
-]
+    | Annotated[AckermannMotion, Tag("ackermann")]
+)
+Motion = Annotated[PlaneMotions | SpaceMotions, Discriminator(type_or())]
+_IN_SPACE = set(types(Motion)).difference(types(Annotated[PlaneMotions, None]))
 
 
-class IdentityAssociation(Section):
-    """Trust the ids of the log."""
-
-    type: Literal["identity"] = "identity"
-    gate: Gate = "default"
-    """Refuse observations outside this probability; or off, or default."""
-
-
-class NearestAssociation(Section):
-    """The nearest landmark by Mahalanobis distance, inside its gate."""
-
-    type: Literal["nearest"] = "nearest"
-    gate: Probability = 0.99
-    """Pair an observation with a landmark inside this probability."""
-    new_gate: Probability = 0.99999
-    """Beyond this probability from every landmark it is a new one; in between it is left alone."""
-
-
-Association = Annotated[
-    Annotated[IdentityAssociation, Tag("identity")] | Annotated[NearestAssociation, Tag("nearest")],
-    Discriminator(type_or("identity")),
-]
-
-
-class PointLandmark(Section):
-    """A Euclidean point."""
-
-    type: Literal["point"] = "point"
-
-
-class PointSignatureLandmark(Section):
-    """A Euclidean point with a signature (x, y, s)."""
-
-    type: Literal["point_signature"] = "point_signature"
-
-
-Landmark = Annotated[
-    Annotated[PointLandmark, Tag("point")] | Annotated[PointSignatureLandmark, Tag("point_signature")],
-    Discriminator(type_or("point")),
-]
-
-
-class MountConfig(Section):
-    """Where a sensor sits, in the robot's frame."""
-
-    x_m: Number = 0.0
-    """Forward of the robot's origin."""
-    y_m: Number = 0.0
-    """To the left of the robot's origin."""
-    theta_rad: Number = 0.0
-    """Turned to the left."""
-
-
-class _Sensor(Section):
-    mount: MountConfig = MountConfig()
-    """Where the sensor sits on the robot."""
-    landmark: Landmark | None = None
-    """Landmark type of this sensor; `landmarks` if absent."""
-    association: Reserved = None
-    """Reserved: an association of this sensor's own."""
-    detector: Reserved = None
-    """Reserved: how landmarks are found in raw data."""
+class _Sensor(PlaneMounted):
     range_min_m: NotNegative = 0.0
     """Nearest landmark the sensor sees."""
     range_max_m: Limit = math.inf
@@ -182,11 +124,20 @@ class PositionSensor(_Sensor):
     """Noise, to the left."""
 
 
-Sensor = Annotated[
+PlaneSensors = (
     Annotated[RangeBearingSensor, Tag("range_bearing")]
     | Annotated[BearingSensor, Tag("bearing")]
     | Annotated[RangeSensor, Tag("range")]
     | Annotated[PositionSensor, Tag("position")]
-    | Annotated[RangeBearingSignatureSensor, Tag("range_bearing_signature")],
-    Discriminator(type_or()),
-]
+    | Annotated[RangeBearingSignatureSensor, Tag("range_bearing_signature")]
+)
+PlaneSensor = Annotated[PlaneSensors, Discriminator(type_or())]
+SpaceSensor = Annotated[SpaceSensors, Discriminator(type_or())]
+Sensor = Annotated[PlaneSensors | SpaceSensors, Discriminator(type_or())]
+
+
+def world_of(robot: Any) -> str:
+    """Return where a robot (a section, or the mapping it is made from) moves by its motion: "(plane)" or "(space)"."""
+    motion = robot.get("motion") if isinstance(robot, dict) else getattr(robot, "motion", None)
+    kind = motion.get("type") if isinstance(motion, dict) else getattr(motion, "type", None)
+    return "(space)" if isinstance(kind, str) and kind in _IN_SPACE else "(plane)"

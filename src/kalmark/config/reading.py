@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from kalmark.config.models import Association, Landmark, Motion, Sensor
+from kalmark.config.landmarks import Association, Landmark
+from kalmark.config.models import Motion, PlaneSensor, Sensor, SpaceSensor
 from kalmark.config.schema import Config, Estimator
 from kalmark.config.sections import LATER, types
 from kalmark.config.tree import Tree, read_tree, show
@@ -49,7 +50,11 @@ def load_config(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Conf
     Raises ConfigError: ``file:line:column: key.path: got value, expected what``.
     """
     path = resolve_config(path_or_name)
-    tree = read_tree(path, overrides)
+    return config_of(read_tree(path, overrides), path)
+
+
+def config_of(tree: Tree, path: Path | None) -> Config:
+    """Return the configuration that a tree read from the file `path` is.  Raises ConfigError."""
     config = validate(tree, Config)
     config._file = path
     config._where.update(tree.places)
@@ -92,7 +97,10 @@ def validate(tree: Tree, model: type[Model]) -> Model:
         return model.model_validate(tree.values)
     except ValidationError as error:
         order = {path: n for n, path in enumerate(tree.keys)}
-        errors = [(_path(e["loc"], tree.values), e) for e in error.errors(include_url=False)]
+        errors = [
+            ((*_path(e["loc"], tree.values), *e.get("ctx", {}).get("below", ())), e)
+            for e in error.errors(include_url=False)
+        ]
         raise _one_error(*min(errors, key=lambda e: order.get(e[0], 0)), tree) from None
 
 
@@ -109,7 +117,8 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
         key, keys = str(context["key"]), context["keys"]
         path = (*path, key)
         value = _at(tree.values, path)
-        message = f"got an unknown key (value {show(value)}), expected {_one_of(keys)}{did_you_mean(key, keys)}"
+        near = did_you_mean(key, keys)
+        message = f"got {context['what']} (value {show(value)}), expected {_one_of(keys)}{near}"
         return ConfigError(f"{tree.place(path, of_key=True)}: {'.'.join(path)}: {message}")
     value = _at(tree.values, path)
     if kind == "union_tag_invalid":
@@ -152,8 +161,12 @@ def _expected(kind: str, context: dict[str, Any], message: str) -> str:
 
 
 def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
-    if path[-1] == "type" and got in LATER.get(_kind(path[:-1]), ()):
+    kind = _kind(path[:-1])
+    if path[-1] == "type" and got in LATER.get(kind, ()):
         return f"got {show(got)}, which is not available yet, expected {_one_of(words)}"
+    for here, there, choice in (("space", "the plane", PlaneSensor), ("the plane", "space", SpaceSensor)):
+        if kind == "sensor" and path[-1] == "type" and got in types(choice):
+            return f"got {show(got)}, a sensor of {there} on a robot of {here}, expected {_one_of(words)}"
     return f"got {show(got)}, expected {_one_of(words)}{did_you_mean(str(got), words)}"
 
 
@@ -161,7 +174,7 @@ def _kind(path: tuple[str, ...]) -> str:
     """Return what is chosen at `path`: motion, sensor, landmark, association, estimator or map."""
     if len(path) > 1 and path[-2] == "sensors":
         return "sensor"
-    return "landmark" if path[-1] == "landmarks" else path[-1]
+    return "landmark" if path[-1:] == ("landmarks",) else path[-1] if path else ""
 
 
 def _quoted(words: str) -> list[str]:

@@ -5,18 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, PrivateAttr, Tag
+from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
-from kalmark.config.models import (
-    Association,
-    IdentityAssociation,
-    Landmark,
-    Motion,
-    PointLandmark,
-    Sensor,
-    UnicycleMotion,
-)
-from kalmark.config.sections import NotNegative, Number, Positive, RobotName, Section, type_or
+from kalmark.config.landmarks import Association, IdentityAssociation, Landmark
+from kalmark.config.models import Motion, PlaneSensor, SpaceSensor, UnicycleMotion, world_of
+from kalmark.config.mounting import VELOCITY, SpaceStartConfig, StartConfig
+from kalmark.config.sections import Number, Positive, RobotName, Section, expected, type_or
 from kalmark.errors import ConfigError
 
 
@@ -54,30 +48,40 @@ class LogConfig(Section):
         return self.model_dump(exclude=common, exclude_none=True)
 
 
-class StartConfig(Section):
-    """Where a robot starts, and how surely."""
-
-    x_m: Number = 0.0
-    """Position."""
-    y_m: Number = 0.0
-    """Position."""
-    theta_rad: Number = 0.0
-    """Heading."""
-    sigma_xy_m: NotNegative = 0.0
-    """Standard deviation of each coordinate."""
-    sigma_theta_rad: NotNegative = 0.0
-    """Standard deviation of the heading."""
-
-
-class RobotConfig(Section):
-    """One robot: how it moves, where it starts, what it carries."""
-
+class _AnyRobot(Section):
     motion: Motion = UnicycleMotion()
     """Motion model."""
+
+
+class RobotConfig(_AnyRobot):
+    """One robot: how it moves, where it starts, what it carries.  Its motion decides: in the plane or in space."""
+
     start: StartConfig | None = None
     """Start; if absent, the log's truth, or else the origin."""
-    sensors: dict[str, Sensor] = Field(default_factory=dict)
+    sensors: dict[str, PlaneSensor] = Field(default_factory=dict)
     """Sensors by the log's name of each."""
+
+
+class SpaceRobotConfig(_AnyRobot):
+    """One robot of space."""
+
+    start: SpaceStartConfig | None = None
+    """Start; if absent, the log's truth, or else the origin."""
+    sensors: dict[str, SpaceSensor] = Field(default_factory=dict)
+    """Sensors by the log's name of each."""
+
+    @model_validator(mode="after")
+    def _start_fits(self) -> SpaceRobotConfig:
+        if self.start is not None and self.motion.type not in ("constant_velocity_3d",):
+            for key in VELOCITY:
+                if getattr(self.start, key) != 0:
+                    raise expected(f"0: {self.motion.type} has no velocity in its state", "start", key)
+        return self
+
+
+AnyRobot = Annotated[
+    Annotated[RobotConfig, Tag("(plane)")] | Annotated[SpaceRobotConfig, Tag("(space)")], Discriminator(world_of)
+]
 
 
 class EkfEstimator(Section):
@@ -115,7 +119,7 @@ class MapConfig(Section):
     """`dense` keeps the full covariance; `auto` chooses."""
 
 
-def _each() -> dict[str, RobotConfig]:
+def _each() -> dict[str, AnyRobot]:
     return {"each": RobotConfig()}
 
 
@@ -128,10 +132,10 @@ class Config(Section):
     """Seed of the simulation the log came from."""
     log: LogConfig = LogConfig()
     """The log."""
-    robots: dict[str, RobotConfig] = Field(default_factory=_each)
+    robots: dict[str, AnyRobot] = Field(default_factory=_each)
     """Robots by name; `each` stands for every robot not named."""
-    landmarks: Landmark = PointLandmark()
-    """Landmark type."""
+    landmarks: Landmark | None = None
+    """Landmark type; what fits each sensor if absent."""
     association: Association = IdentityAssociation()
     """Which landmark was that."""
     estimator: Estimator = InvariantEstimator()

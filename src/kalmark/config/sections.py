@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, model_validator
 from pydantic_core import PydanticCustomError
@@ -17,9 +17,9 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 
 # What the contract names and later versions bring: refused by name, not as a spelling mistake.
 LATER: dict[str, tuple[str, ...]] = {
-    "motion": ("odometry_3d", "constant_velocity_3d", "inertial"),
-    "sensor": ("range_bearing_3d", "pinhole", "omnidirectional", "stereo", "tag_pose", "position_fix"),
-    "landmark": ("inverse_depth", "homogeneous", "anchored_homogeneous", "polar", "tag", "pluecker"),
+    "motion": ("velocity_3d", "constant_velocity_3d", "inertial"),
+    "sensor": ("pinhole", "omnidirectional", "stereo", "segments", "tag_pose", "tag_corners", "position_fix"),
+    "landmark": ("inverse_depth", "anchored_homogeneous", "homogeneous", "tag", "pluecker_line", "polar"),
     "association": ("global", "jcbb", "clique", "sample", "jpda", "auto"),
     "estimator": (),
     "map": ("postponed",),
@@ -27,9 +27,13 @@ LATER: dict[str, tuple[str, ...]] = {
 
 
 class Section(BaseModel):
-    """A frozen mapping of keys, each with its default; unknown keys and loosely typed values are refused."""
+    """A frozen mapping of keys, each with its default; unknown keys and loosely typed values are refused.
+
+    `elsewhere` says of keys that another section of this kind has what they are here.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    elsewhere: ClassVar[dict[str, str]] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -37,13 +41,15 @@ class Section(BaseModel):
         if isinstance(value, dict):
             for key in value:
                 if key not in cls.model_fields:
-                    raise PydanticCustomError("unknown_key", "unknown key", {"key": key, "keys": [*cls.model_fields]})
+                    what = cls.elsewhere.get(key, "an unknown key")
+                    told = {"key": key, "what": what, "keys": [*cls.model_fields]}
+                    raise PydanticCustomError("unknown_key", "unknown key", told)
         return value
 
 
-def expected(what: str) -> PydanticCustomError:
-    """Return the error of a value that should have been `what`."""
-    return PydanticCustomError("expected", "{what}", {"what": what})
+def expected(what: str, *below: str) -> PydanticCustomError:
+    """Return the error of a value that should have been `what`; `below` leads from the section to that value."""
+    return PydanticCustomError("expected", "{what}", {"what": what, "below": below})
 
 
 def type_or(default: str | None = None) -> Callable[[Any], str | None]:
@@ -58,10 +64,15 @@ def type_or(default: str | None = None) -> Callable[[Any], str | None]:
     return discriminate
 
 
+def members(choice: Any) -> dict[str, Any]:
+    """Return the sections of a choice, an annotated union of tagged sections, by type name."""
+    pairs = (get_args(member) for member in get_args(get_args(choice)[0]))
+    return {tag.tag: section for section, tag in pairs}
+
+
 def types(choice: Any) -> list[str]:
-    """Return the type names of a choice: an annotated union of tagged sections."""
-    union = get_args(choice)[0]
-    return [get_args(member)[1].tag for member in get_args(union)]
+    """Return the type names of a choice."""
+    return [*members(choice)]
 
 
 def _gate(value: Any) -> float | str:

@@ -150,7 +150,7 @@ def _replaced(given: Input, initial: Batch) -> State:
 
 def _log_of(run: Run) -> Iterable[Event]:
     """Read again the log a run was made from, as its configuration says."""
-    from kalmark.config.building import open_config_log
+    from kalmark.config.opening import open_config_log
     from kalmark.config.schema import Config
 
     if run.log.path is None:

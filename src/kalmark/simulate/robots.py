@@ -17,8 +17,7 @@ import numpy.typing as npt
 from numpy.random import Generator, SeedSequence
 from scipy.spatial import cKDTree
 
-from kalmark.config.building import CLASSES
-from kalmark.config.sections import Section
+from kalmark.config.classes import model_of
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
 from kalmark.logs.log import Log, Trajectory
@@ -100,17 +99,11 @@ def landmarks_of(world: World, rng: Generator) -> Landmarks:
 def sim_robot(name: str, robot: SimulatedRobot, dt_s: float, area: Array, rng: Generator) -> SimRobot:
     """Put a robot at its start, drawn from the start's Gaussian if it has sigmas."""
     start = robot.start
-    motion = model(robot.motion)
+    motion = model_of(robot.motion)
     sigma = np.array([start.sigma_xy_m, start.sigma_xy_m, start.sigma_theta_rad])
     pose = np.array([start.x_m, start.y_m, start.theta_rad]) + sigma * rng.standard_normal(3)
-    mounted = {key: (model(s), mount(s)) for key, s in robot.sensors.items()}
+    mounted = {key: (model_of(s), mount(s)) for key, s in robot.sensors.items()}
     return SimRobot(name, motion, pose, robot.route.driver(motion, dt_s, area, rng), mounted)
-
-
-def model(section: Section) -> Any:
-    """Return the model that a section of the world describes."""
-    keys = section.model_dump(exclude={"mount", "landmark", "association", "detector"})
-    return CLASSES[keys.pop("type")](**keys)
 
 
 def mount(section: Any) -> Array:

@@ -12,9 +12,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 from ruamel.yaml import YAML
 
+from kalmark.config.merging import merged
 from kalmark.config.models import Motion, RangeBearingSignatureSensor, Sensor
+from kalmark.config.mounting import StartConfig
 from kalmark.config.reading import resolve_name, validate
-from kalmark.config.schema import Config, StartConfig
+from kalmark.config.schema import Config
 from kalmark.config.sections import Positive, Section, expected
 from kalmark.config.tree import Tree, read_tree
 from kalmark.simulate.layouts import Layout
@@ -122,16 +124,6 @@ class World(Section):
             written: dict[tuple[str, ...], str] = getattr(self._tree, source, {})
             table |= {path[1:]: place for path, place in written.items() if path[:1] == ("filter",)}
         return tree
-
-
-def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Return `below` with `above` laid over it: mappings key by key, another `type` replacing a whole section."""
-    other = "type" in above and above["type"] != below.get("type", above["type"])
-    result = {} if other else dict(below)
-    for key, value in above.items():
-        old = result.get(key)
-        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-    return result
 
 
 def shipped_worlds() -> dict[str, Path]:

@@ -1,0 +1,78 @@
+"""Which class a section of a configuration describes, and the numbers of its poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.config.mounting import MountConfig, SpaceMountConfig, SpaceStartConfig, StartConfig
+from kalmark.config.sections import Section
+from kalmark.filter import estimators
+from kalmark.geometry.rotations import from_euler
+from kalmark.models import landmarks, motion, sensors
+from kalmark.slam import association
+
+Array = npt.NDArray[np.float64]
+
+CLASSES: dict[str, Callable[..., Any]] = {
+    "unicycle": motion.Unicycle,
+    "odometry_2d": motion.Odometry2D,
+    "ackermann": motion.Ackermann,
+    "odometry_3d": motion.Odometry3D,
+    "range_bearing": sensors.RangeBearing,
+    "bearing": sensors.Bearing,
+    "range": sensors.Range,
+    "position": sensors.Position2D,
+    "range_bearing_signature": sensors.RangeBearingSignature,
+    "range_bearing_3d": sensors.RangeBearing3D,
+    "position_3d": sensors.Position3D,
+    "point": landmarks.Point2D,
+    "point_signature": landmarks.PointSignature2D,
+    "identity": association.ByIdentity,
+    "nearest": association.NearestNeighbour,
+    "ekf": estimators.Ekf,
+    "invariant": estimators.Invariant,
+    "fej": estimators.Fej,
+}
+IN_SPACE: dict[str, Callable[..., Any]] = {"point": landmarks.Point3D}
+MOUNTED = frozenset({"mount", "landmark", "association", "attention", "detector"})
+
+
+def model_of(section: Section, world: str = "plane") -> Any:
+    """Return the model that a section describes, of the plane or of space where its type leaves that open.
+
+    Raises ModelError if the model refuses its parameters.
+    """
+    keys = section.model_dump(exclude=set(MOUNTED))
+    kind = keys.pop("type")
+    return (IN_SPACE.get(kind, CLASSES[kind]) if world == "space" else CLASSES[kind])(**keys)
+
+
+def pose_of(section: MountConfig | SpaceMountConfig | StartConfig | SpaceStartConfig) -> Array:
+    """Return the pose that a mount or a start describes: (3,) in the plane, (7,) in space."""
+    if isinstance(section, MountConfig | StartConfig):
+        return np.array([section.x_m, section.y_m, section.theta_rad])
+    q, _ = from_euler(np.radians([section.roll_deg, section.pitch_deg, section.yaw_deg]))
+    return np.array([section.x_m, section.y_m, section.z_m, *q])
+
+
+def velocity_of(section: SpaceStartConfig) -> Array:
+    """Return the velocity in the world and the body rate (6,) at a start."""
+    s = section
+    return np.array([s.vx_mps, s.vy_mps, s.vz_mps, s.wx_radps, s.wy_radps, s.wz_radps])
+
+
+def covariance_of(section: MountConfig | SpaceMountConfig | StartConfig | SpaceStartConfig, dof: int) -> Array | None:
+    """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly."""
+    if isinstance(section, MountConfig):
+        return None
+    if isinstance(section, StartConfig):
+        sigmas = [section.sigma_xy_m, section.sigma_xy_m, section.sigma_theta_rad]
+    else:
+        sigmas = [*3 * [section.sigma_position_m], *3 * [float(np.radians(section.sigma_rotation_deg))]]
+    if isinstance(section, SpaceStartConfig):
+        sigmas += [*3 * [section.sigma_v_mps], *3 * [section.sigma_w_radps]]
+    return np.diag(np.square(sigmas[:dof])) if any(sigmas[:dof]) else None
