@@ -1,0 +1,312 @@
+"""Line landmarks of space, and how they look from a pose T = (x, y, z, qx, qy, qz, qw).  [TB] 4.3; Sola et al. 2012.
+
+=========================  =========================================  ==================================
+kind                       state l                                    the line
+=========================  =========================================  ==================================
+pluecker                   n (3), v (3)                               n = p x v for each of its points p
+anchored_pluecker          anchor (3), n (3), v (3)                   n = (p - anchor) x v
+inverse_depth_line         anchor (3), (azimuth, elevation, rho) x 2  through two inverse-depth points
+anchored_homogeneous_line  anchor (3), (m (3), rho) x 2               through two anchored points
+homogeneous_line           (h (3), rho) x 2                           through two homogeneous points
+=========================  =========================================  ==================================
+
+What a camera sees of a line is v: the normal, in its frame, of the plane through the optical centre and the line.  The
+length of v has no meaning; a line through the optical centre has v = 0, and no image.  `..._from_view` takes the
+viewing rays (K, 6) of two points of the line, of any length, and a prior of what they lack: of each end the inverse
+distance rho (K, 2), or of Pluecker lines beta (K, 2), the direction of the line in a basis of that plane, as long as
+the line's inverse distance.  Intrinsics are k = (fx, fy, cx, cy) in pixels, without lens distortion.  Where
+lines end: `segments`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.geometry.directions import unit_many
+from kalmark.geometry.frames3d import turned_rates
+from kalmark.geometry.rotations import matrix, skew
+from kalmark.models.landmarks3d import (
+    anchored_from_view,
+    anchored_seen_from,
+    chained,
+    homogeneous_from_view,
+    homogeneous_seen_from,
+    inverse_depth_from_view,
+    inverse_depth_seen_from,
+)
+
+Array = npt.NDArray[np.float64]
+View = tuple[Array, Array, Array]
+New = tuple[Array, Array, Array, Array]
+
+
+@compiled
+def crossed(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Return the cross products n = a x b of K pairs of vectors (K, 3), N_a (K, 3, 3) and N_b (K, 3, 3)."""
+    n, N_a, N_b = np.empty((len(a), 3)), np.empty((len(a), 3, 3)), np.empty((len(a), 3, 3))
+    for i in range(len(a)):
+        N_a[i], N_b[i] = -skew(b[i]), skew(a[i])
+        for j in range(3):
+            n[i, j] = N_b[i, j, 0] * b[i, 0] + N_b[i, j, 1] * b[i, 1] + N_b[i, j, 2] * b[i, 2]
+    return n, N_a, N_b
+
+
+@compiled
+def anchored_pluecker_seen_from(T: Array, l: Array) -> View:
+    """Return the normals v (K, 3) of anchored Pluecker lines l (K, 9), V_T (K, 3, 6) and V_l (K, 3, 9)."""
+    Q = matrix(T[3:]).T.copy()
+    k = len(l)
+    v, V_T, V_l = np.empty((k, 3)), np.empty((k, 3, 6)), np.empty((k, 3, 9))
+    for i in range(k):
+        n, N_base, N_v = crossed(l[i : i + 1, :3] - T[:3], l[i : i + 1, 6:])
+        n[0] += l[i, 3:6]
+        v[i] = Q @ n[0]
+        V_l[i, :, :3], V_l[i, :, 3:6], V_l[i, :, 6:] = Q @ N_base[0], Q, Q @ N_v[0]
+        V_T[i, :, :3], V_T[i, :, 3:] = -V_l[i, :, :3], turned_rates(Q, n[0])
+    return v, V_T, V_l
+
+
+@compiled
+def pluecker_seen_from(T: Array, l: Array) -> View:
+    """Return the normals v (K, 3) of Pluecker lines l (K, 6), V_T (K, 3, 6) and V_l (K, 3, 6): Q' (n - t x v)."""
+    v, V_T, V_l = anchored_pluecker_seen_from(T, np.hstack((np.zeros((len(l), 3)), l)))
+    return v, V_T, V_l[:, :, 3:].copy()
+
+
+@compiled
+def ends(l: Array, shared: int) -> tuple[Array, Array]:
+    """Return the states of both ends of lines l (K, n), whose first `shared` numbers, the anchor, are those of both."""
+    own = (l.shape[1] - shared) // 2
+    return l[:, : shared + own].copy(), np.hstack((l[:, :shared], l[:, shared + own :]))
+
+
+@compiled
+def joined(A: Array, B: Array, shared: int) -> Array:
+    """Return the Jacobians (K, a, n) in the state of lines from those in both ends' states; the inverse of `ends`."""
+    size = A.shape[2]
+    J = np.zeros((len(A), A.shape[1], 2 * size - shared))
+    J[:, :, :size] = A
+    J[:, :, size:] = B[:, :, shared:]
+    J[:, :, :shared] += B[:, :, :shared]
+    return J
+
+
+@compiled
+def crossed_views(a: View, b: View, shared: int) -> View:
+    """Return what is seen of lines through two points that are seen as a and b."""
+    v, V_a, V_b = crossed(a[0], b[0])
+    return v, chained(V_a, a[1]) + chained(V_b, b[1]), joined(chained(V_a, a[2]), chained(V_b, b[2]), shared)
+
+
+@compiled
+def inverse_depth_line_seen_from(T: Array, l: Array) -> View:
+    """Return the normals v (K, 3) of inverse-depth lines l (K, 9), V_T (K, 3, 6) and V_l (K, 3, 9)."""
+    a, b = ends(l, 3)
+    return crossed_views(inverse_depth_seen_from(T, a), inverse_depth_seen_from(T, b), 3)
+
+
+@compiled
+def anchored_homogeneous_line_seen_from(T: Array, l: Array) -> View:
+    """Return the normals v (K, 3) of anchored homogeneous lines l (K, 11), V_T (K, 3, 6) and V_l (K, 3, 11)."""
+    a, b = ends(l, 3)
+    return crossed_views(anchored_seen_from(T, a), anchored_seen_from(T, b), 3)
+
+
+@compiled
+def homogeneous_line_seen_from(T: Array, l: Array) -> View:
+    """Return the normals v (K, 3) of homogeneous lines l (K, 8), V_T (K, 3, 6) and V_l (K, 3, 8)."""
+    a, b = ends(l, 0)
+    return crossed_views(homogeneous_seen_from(T, a), homogeneous_seen_from(T, b), 0)
+
+
+@compiled
+def in_plane(n: Array, beta: Array) -> tuple[Array, Array, Array]:
+    """Return the vectors v = E(n) beta (K, 3) in the planes of unit normals n (K, 3), V_n (K, 3, 3), V_beta (K, 3, 2).
+
+    E(n) has two unit columns: the first, (n_y, -n_x, 0), lies in the image plane too, the second is n x the first.
+    For n along the optical axis, of lines seen 90 degrees off it, there is no first: all is NaN.
+    """
+    k = len(n)
+    v, V_n, V_beta = np.empty((k, 3)), np.empty((k, 3, 3)), np.empty((k, 3, 2))
+    for i in range(k):
+        flat = math.sqrt(n[i, 0] * n[i, 0] + n[i, 1] * n[i, 1])
+        a, b, z = n[i, 0] / flat, n[i, 1] / flat, n[i, 2]
+        p, q = beta[i, 0], beta[i, 1]
+        V_beta[i, 0], V_beta[i, 1], V_beta[i, 2] = (b, z * a), (-a, z * b), (0.0, -flat)
+        v[i, 0], v[i, 1], v[i, 2] = b * p + z * a * q, -a * p + z * b * q, -flat * q
+        turn_x, turn_y = (z * b * q - a * p) / flat, (-z * a * q - b * p) / flat  # as (a, b) turns by 1 / flat
+        V_n[i, 0] = (b * turn_x, -a * turn_x, a * q)
+        V_n[i, 1] = (b * turn_y, -a * turn_y, b * q)
+        V_n[i, 2] = (-a * q, -b * q, 0.0)
+    return v, V_n, V_beta
+
+
+@compiled
+def anchored_pluecker_from_view(T: Array, rays: Array, beta: Array) -> New:
+    """Return anchored Pluecker lines l (K, 9) seen on `rays` (K, 6) of T, anchored at T, |n| = 1 and v = E(n) beta.
+
+    With L_T (K, 9, 6), L_rays (K, 9, 6) and L_beta (K, 9, 2).  They are at the distance 1 / |beta|.  [TB]
+    `retroProjPlkLin`.
+    """
+    Q = matrix(T[3:])
+    normal, N_a, N_b = crossed(rays[:, :3].copy(), rays[:, 3:].copy())
+    n, N_normal = unit_many(normal)
+    v, V_n, V_beta = in_plane(n, beta)
+    k = len(rays)
+    l, L_T, L_rays, L_beta = np.empty((k, 9)), np.zeros((k, 9, 6)), np.zeros((k, 9, 6)), np.zeros((k, 9, 2))
+    for i in range(k):
+        l[i, :3], l[i, 3:6], l[i, 6:] = T[:3], Q @ n[i], Q @ v[i]
+        for j in range(3):
+            L_T[i, j, j] = 1.0
+        L_T[i, 3:6, 3:], L_T[i, 6:, 3:] = -skew(l[i, 3:6]), -skew(l[i, 6:])
+        turned = Q @ N_normal[i]
+        L_rays[i, 3:6, :3], L_rays[i, 3:6, 3:] = turned @ N_a[i], turned @ N_b[i]
+        turned = Q @ V_n[i] @ N_normal[i]
+        L_rays[i, 6:, :3], L_rays[i, 6:, 3:] = turned @ N_a[i], turned @ N_b[i]
+        L_beta[i, 6:] = Q @ V_beta[i]
+    return l, L_T, L_rays, L_beta
+
+
+@compiled
+def anchored_pluecker_to_pluecker(l: Array) -> tuple[Array, Array]:
+    """Return the Pluecker lines h (K, 6) of anchored ones l (K, 9), and H_l (K, 6, 9).  [TB] `unanchorPlucker`."""
+    h, H_l = np.empty((len(l), 6)), np.zeros((len(l), 6, 9))
+    n, N_anchor, N_v = crossed(l[:, :3].copy(), l[:, 6:].copy())
+    for i in range(len(l)):
+        h[i, :3], h[i, 3:] = l[i, 3:6] + n[i], l[i, 6:]
+        H_l[i, :3, :3], H_l[i, :3, 6:] = N_anchor[i], N_v[i]
+        for j in range(6):
+            H_l[i, j, 3 + j] = 1.0
+    return h, H_l
+
+
+@compiled
+def pluecker_from_view(T: Array, rays: Array, beta: Array) -> New:
+    """Return Pluecker lines l (K, 6) seen on `rays` (K, 6) of T with v = E(n) beta, as `anchored_pluecker_from_view`.
+
+    With L_T (K, 6, 6), L_rays (K, 6, 6) and L_beta (K, 6, 2).
+    """
+    h, H_T, H_rays, H_beta = anchored_pluecker_from_view(T, rays, beta)
+    l, L_h = anchored_pluecker_to_pluecker(h)
+    return l, chained(L_h, H_T), chained(L_h, H_rays), chained(L_h, H_beta)
+
+
+@compiled
+def first_end(rays: Array, rho: Array) -> tuple[Array, Array]:
+    """Return the rays (K, 3) and inverse distances (K,) of the first ends."""
+    return rays[:, :3].copy(), rho[:, 0].copy()
+
+
+@compiled
+def second_end(rays: Array, rho: Array) -> tuple[Array, Array]:
+    """Return the rays (K, 3) and inverse distances (K,) of the second ends."""
+    return rays[:, 3:].copy(), rho[:, 1].copy()
+
+
+@compiled
+def stacked_views(a: New, b: New, shared: int) -> New:
+    """Return new lines through the new points a and b, which share their first numbers."""
+    k, size = a[0].shape
+    n = 2 * size - shared
+    l, L_T, L_rays, L_rho = np.empty((k, n)), np.empty((k, n, 6)), np.zeros((k, n, 6)), np.zeros((k, n, 2))
+    l[:, :size], l[:, size:] = a[0], b[0][:, shared:]
+    L_T[:, :size], L_T[:, size:] = a[1], b[1][:, shared:]
+    L_rays[:, :size, :3], L_rays[:, size:, 3:] = a[2], b[2][:, shared:]
+    L_rho[:, :size, :1], L_rho[:, size:, 1:] = a[3], b[3][:, shared:]
+    return l, L_T, L_rays, L_rho
+
+
+@compiled
+def inverse_depth_line_from_view(T: Array, rays: Array, rho: Array) -> New:
+    """Return inverse-depth lines l (K, 9) through the ends on `rays` (K, 6) of T at rho (K, 2), anchored at T.
+
+    With L_T (K, 9, 6), L_rays (K, 9, 6) and L_rho (K, 9, 2).
+    """
+    a, b = first_end(rays, rho), second_end(rays, rho)
+    return stacked_views(inverse_depth_from_view(T, a[0], a[1]), inverse_depth_from_view(T, b[0], b[1]), 3)
+
+
+@compiled
+def anchored_homogeneous_line_from_view(T: Array, rays: Array, rho: Array) -> New:
+    """Return anchored homogeneous lines l (K, 11) through the ends on `rays` (K, 6) of T at rho (K, 2), anchored at T.
+
+    With L_T (K, 11, 6), L_rays (K, 11, 6) and L_rho (K, 11, 2).
+    """
+    a, b = first_end(rays, rho), second_end(rays, rho)
+    return stacked_views(anchored_from_view(T, a[0], a[1]), anchored_from_view(T, b[0], b[1]), 3)
+
+
+@compiled
+def homogeneous_line_from_view(T: Array, rays: Array, rho: Array) -> New:
+    """Return homogeneous lines l (K, 8) through the ends on `rays` (K, 6) of T at inverse distances rho (K, 2) from T.
+
+    With L_T (K, 8, 6), L_rays (K, 8, 6) and L_rho (K, 8, 2).
+    """
+    a, b = first_end(rays, rho), second_end(rays, rho)
+    return stacked_views(homogeneous_from_view(T, a[0], a[1]), homogeneous_from_view(T, b[0], b[1]), 0)
+
+
+@compiled
+def image_lines(v: Array, k: Array) -> tuple[Array, Array]:
+    """Return the image lines h (K, 3) of normals v (K, 3), and H_v (K, 3, 3).
+
+    h (x, y, 1) is the signed distance in pixels of a pixel (x, y).  Lines at infinity, v along the optical axis, and
+    lines through the optical centre have none: NaN.
+    """
+    h, H_v = np.empty((len(v), 3)), np.empty((len(v), 3, 3))
+    for i in range(len(v)):
+        a, b = v[i, 0] / k[0], v[i, 1] / k[1]
+        length = math.sqrt(a * a + b * b)
+        h[i, 0], h[i, 1], h[i, 2] = a / length, b / length, (v[i, 2] - k[2] * a - k[3] * b) / length
+        for j in range(3):  # d h = d (a, b, c) / length - h (h_x d a + h_y d b) / length
+            H_v[i, j, 0], H_v[i, j, 1], H_v[i, j, 2] = -h[i, j] * h[i, 0], -h[i, j] * h[i, 1], 0.0
+        for j in range(2):
+            H_v[i, j, j] += 1.0
+            H_v[i, 2, j] -= k[2 + j]
+        H_v[i, 2, 2] = 1.0
+        for j in range(3):
+            H_v[i, j, 0] /= length * k[0]
+            H_v[i, j, 1] /= length * k[1]
+            H_v[i, j, 2] /= length
+    return h, H_v
+
+
+@compiled
+def segment_innovation(v: Array, y: Array, k: Array) -> tuple[Array, Array, Array]:
+    """Compare measured endpoints y (K, 4) = (u1, v1, u2, v2) with the expected lines of normals v (K, 3).
+
+    Returns e (K, 4), the feet of the measured endpoints on the expected lines; z (K, 2), minus their signed distances
+    in pixels; and E_v (K, 2, 3), with z = E_v dv to first order if v + dv is the true normal.  [TB] `ortDst`.
+    """
+    h, H_v = image_lines(v, k)
+    e, z, E_v = np.empty((len(v), 4)), np.empty((len(v), 2)), np.empty((len(v), 2, 3))
+    for i in range(len(v)):
+        for end in range(2):
+            x, y_end = y[i, 2 * end], y[i, 2 * end + 1]
+            z[i, end] = -(h[i, 0] * x + h[i, 1] * y_end + h[i, 2])
+            e[i, 2 * end], e[i, 2 * end + 1] = x + z[i, end] * h[i, 0], y_end + z[i, end] * h[i, 1]
+            for j in range(3):
+                E_v[i, end, j] = x * H_v[i, 0, j] + y_end * H_v[i, 1, j] + H_v[i, 2, j]
+    return e, z, E_v
+
+
+@compiled
+def segment_noise(y: Array, R4: Array) -> Array:
+    """Return the noise R (K, 2, 2) of both endpoints' distances, from that of the pixels R4, (4, 4) or (K, 4, 4).
+
+    Across the measured segments y (K, 4), which need some length, so that it does not depend on the estimate.
+    """
+    pixels = R4.copy().reshape((-1, 4, 4))
+    R = np.empty((len(y), 2, 2))
+    N = np.zeros((2, 4))
+    for i in range(len(y)):
+        a, b = y[i, 3] - y[i, 1], y[i, 0] - y[i, 2]
+        length = math.sqrt(a * a + b * b)
+        N[0, 0] = N[1, 2] = a / length
+        N[0, 1] = N[1, 3] = b / length
+        R[i] = N @ pixels[min(i, len(pixels) - 1)] @ N.T
+    return R
