@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import gzip
 import shutil
-from collections.abc import Callable
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,39 +12,12 @@ import numpy as np
 import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
+from space_logs import Data, controls, in_sensor, opened, scans
 
 from kalmark.errors import LogError
 from kalmark.logs import Log, open_log
 from kalmark.models.cameras import project_omni, project_pinhole
-from kalmark.slam.events import Control, Scan
-
-Data = Callable[[str], Path]
-
-
-@cache
-def opened(path: Path, **options: object) -> Log:
-    """Open a log once for all tests here, which only read it."""
-    return open_log(path, **options)
-
-
-def controls(log: Log) -> list[Control]:
-    return [event for event in log if isinstance(event, Control)]
-
-
-def scans(log: Log, sensor: str | None = None) -> list[Scan]:
-    return [event for event in log if isinstance(event, Scan) and sensor in (None, event.sensor)]
-
-
-def pose_of(section: dict[str, Any]) -> tuple[Rotation, np.ndarray]:
-    """Return rotation and position of a mount or start as configurations give them."""
-    angles = [section[name] for name in ("yaw_deg", "pitch_deg", "roll_deg")]
-    return Rotation.from_euler("ZYX", angles, degrees=True), np.array([section[n] for n in ("x_m", "y_m", "z_m")])
-
-
-def in_sensor(points: np.ndarray, pose: np.ndarray, mount: dict[str, Any]) -> np.ndarray:
-    """Return world points (K, 3) in the frame of a sensor mounted on a robot at this pose (7,)."""
-    turn, place = pose_of(mount)
-    return turn.inv().apply(Rotation.from_quat(pose[3:]).inv().apply(points - pose[:3]) - place)
+from kalmark.slam.events import Control
 
 
 def stereo(p: np.ndarray, s: dict[str, Any]) -> np.ndarray:

@@ -21,13 +21,14 @@ from kalmark.logs.native import NATIVE
 from kalmark.logs.slamtb import SLAMTB
 from kalmark.logs.source import Format, Request, choice, nearest, quantity
 from kalmark.logs.starry_night import STARRY_NIGHT
+from kalmark.logs.tagslam import TAGSLAM
 from kalmark.logs.text import raising
 from kalmark.logs.victoria_park import VICTORIA_PARK
 from kalmark.slam.events import Event, Scan
 
 FORMATS: dict[str, Format] = {
     entry.name: entry
-    for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB)
+    for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB, TAGSLAM)
 }
 
 
