@@ -150,7 +150,7 @@ def _step(
     A[np.diag_indices_from(A)] += _lifted(A.diagonal(), damping)
     try:
         poses: Ints = 6 * np.arange(n)
-        D_inverse: Array = np.linalg.inv(D)
+        D_inverse = np.asarray(np.linalg.inv(D), dtype=np.float64)
         inverse = block_matrix([(poses, poses, D_inverse)], (6 * n, 6 * n))
         L = la.cho_factor(A - (B.T @ inverse @ B).toarray(), lower=True)
         determined = (L[0].diagonal() ** 2 > FLAT * A.diagonal()).all()
