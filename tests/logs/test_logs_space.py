@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
-from space_logs import Data, controls, in_sensor, opened, scans
+from space_logs import Data, controls, in_sensor, opened, pose_of, scans
 
 from kalmark.errors import LogError
 from kalmark.logs import Log, open_log
@@ -226,3 +226,46 @@ def test_a_recording_without_its_numbers_has_no_truth(oracle: Data, tmp_path: Pa
     shutil.copy(oracle("c_plkLin_small.json.gz"), tmp_path)
     log = open_log(tmp_path / "c_plkLin_small.json.gz")
     assert log.truth == {} and log.reference == {} and len(scans(log)) == 50
+
+
+def frame_to_frame(log: Log) -> np.ndarray:
+    """Return how far (u, v) of the left image is off (K, 2) when a point moves from one frame to the next."""
+    sensor = log.describes["robots"]["car"]["sensors"]["stereo"]
+    (turn, place), errors = pose_of(sensor["mount"]), []
+    for control, before, after in zip(controls(log), scans(log), scans(log)[1:], strict=False):
+        shared = sorted(set(before.ids) & set(after.ids))
+        a = before.y[[before.ids.index(i) for i in shared]]
+        b = after.y[[after.ids.index(i) for i in shared]]
+        z = sensor["fx_px"] * sensor["baseline_m"] / (a[:, 0] - a[:, 2])
+        x, y = (a[:, 0] - sensor["cx_px"]) * z / sensor["fx_px"], (a[:, 1] - sensor["cy_px"]) * z / sensor["fy_px"]
+        points, dt = turn.apply(np.column_stack([x, y, z])) + place, after.t_s - before.t_s
+        moved = Rotation.from_rotvec(control.u[3:] * dt).inv().apply(points - control.u[:3] * dt)
+        errors.append(b[:, :2] - stereo(turn.inv().apply(moved - place), sensor)[:, :2])
+    return np.concatenate(errors)
+
+
+def test_kitti_has_its_counts_and_leaves_out_points_behind_infinity(data: Data) -> None:
+    log = opened(data("kitti_stereo_features"))
+    assert (log.format, log.robots, log.truth) == ("kitti_stereo_features", ("car",), {})
+    assert len(controls(log)) == len(scans(log)) == 800
+    assert sum(len(scan.y) for scan in scans(log)) == 58418 - 107
+    assert log.skipped == [f"{log.path}: 107 observations with a disparity below 1 px"]
+    assert min((scan.y[:, 0] - scan.y[:, 2]).min() for scan in scans(log)) >= 1
+    all_of_it = opened(data("kitti_stereo_features/0022.npz"), min_disparity_px=-100)
+    assert sum(len(scan.y) for scan in scans(all_of_it)) == 58418 and all_of_it.skipped == []
+    assert np.median(np.concatenate([abs(s.y[:, 1] - s.y[:, 3]) for s in scans(log)])) == pytest.approx(0.26, abs=0.01)
+    path = sum(np.linalg.norm(c.u[:3]) * (d.t_s - c.t_s) for c, d in pairwise(controls(log)))
+    assert path == pytest.approx(511, abs=2)
+
+
+def test_kitti_s_features_move_as_its_rates_say(data: Data) -> None:
+    mean = np.median(abs(frame_to_frame(opened(data("kitti_stereo_features")))), axis=0)
+    held = np.median(abs(frame_to_frame(opened(data("kitti_stereo_features"), rates="held"))), axis=0)
+    np.testing.assert_allclose(mean, (2.37, 2.28), atol=0.02)
+    assert (mean < 0.75 * held).all()
+
+
+def test_kitti_s_camera_is_ahead_of_and_above_the_inertial_unit(data: Data) -> None:
+    mount = opened(data("kitti_stereo_features")).describes["robots"]["car"]["sensors"]["stereo"]["mount"]
+    assert [round(mount[f"{axis}_m"], 3) for axis in "xyz"] == [1.083, -0.310, 0.730]
+    assert [mount[f"{angle}_deg"] for angle in ("roll", "pitch", "yaw")] == pytest.approx([-90, 0, -90], abs=1)

@@ -14,6 +14,7 @@ from kalmark.errors import LogError
 from kalmark.logs.dlr import DLR
 from kalmark.logs.download import find_data
 from kalmark.logs.freiburg import FREIBURG
+from kalmark.logs.kitti_stereo import KITTI_STEREO
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM
@@ -28,7 +29,18 @@ from kalmark.slam.events import Event, Scan
 
 FORMATS: dict[str, Format] = {
     entry.name: entry
-    for entry in (NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB, TAGSLAM)
+    for entry in (
+        NATIVE,
+        MRCLAM,
+        VICTORIA_PARK,
+        LOST_IN_THE_WOODS,
+        DLR,
+        FREIBURG,
+        STARRY_NIGHT,
+        SLAMTB,
+        TAGSLAM,
+        KITTI_STEREO,
+    )
 }
 
 
