@@ -18,7 +18,8 @@ from kalmark.results.plot import draw_map, save_map
 from kalmark.results.record import record
 from kalmark.results.report import report_html, show
 from kalmark.results.run import Run
-from kalmark.results.series import POINTS, reasons, series
+from kalmark.results.series import reasons, series
+from kalmark.results.thinned import POINTS
 from kalmark.results.words import count, figure
 from kalmark.slam.events import Control, Fix, Scan
 from results_world import circle, slam_for

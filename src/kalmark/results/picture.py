@@ -10,6 +10,7 @@ import numpy as np
 from kalmark.results.align import Rigid, rigid, rigid_robust
 from kalmark.results.evaluate import antenna_path
 from kalmark.results.history import Array
+from kalmark.results.truth import moved
 from kalmark.results.words import count, figure
 from kalmark.slam.events import Id
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from kalmark.results.run import Run
 
 COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b0457a", "#6b6f2a")
+SPACE_COLOURS = ("#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#6b6f2a", "#b0457a")
 TRUTH_COLOUR = "#8b929c"
 LANDMARK_COLOUR = "#d2691e"
 FIX_COLOUR = "#7a3fa0"
@@ -26,7 +28,8 @@ INK = "#2b2f36"
 @dataclass(frozen=True, eq=False)
 class Picture:
     """By robot: estimated poses (N, 3), true positions (N, 2; NaN: unknown), fixes (N, 2) to score with
-    and those `used` by the filter.  True landmarks (2,).
+    and those `used` by the filter.  True landmarks (2,).  In space poses are (N, 7), positions (N, 3), landmarks
+    places.
     """
 
     paths: dict[str, Array]
@@ -39,22 +42,25 @@ class Picture:
     def of(cls, run: Run) -> Picture:
         """Return what to draw of a run."""
         history = run.history
-        to_map = _truth_to_map(run)
+        d = 3 if history.in_space else 2
+        to_map = _truth_to_map(run, d)
         paths, truth, fixes = {}, {}, {}
         for robot in history.robots:
             mine = history.robot == robot
-            paths[robot] = history.mean[mine][:, :3]
+            paths[robot] = history.poses[mine]
             poses = run.truth.poses[mine]
             if np.isfinite(poses).any():
-                truth[robot] = to_map(poses[:, :2])
+                truth[robot] = to_map(poses[:, :d])
             elif robot in run.truth.fixes:
                 fixes[robot] = _fixes_in_map(run, robot)
-        landmarks = {i: to_map(l[:2]) for i, l in run.truth.landmarks.items()}
+        landmarks = {i: l if d == 3 else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()}
         return cls(paths, truth, fixes, landmarks, _used_fixes(run))
 
     def colour(self, robot: str) -> str:
-        """Return the robot's colour."""
-        return COLOURS[list(self.paths).index(robot) % len(COLOURS)]
+        """Return the robot's colour; in space, where landmarks are blue or red, the first robot is green."""
+        in_space = any(path.shape[1] == 7 for path in self.paths.values())
+        colours = SPACE_COLOURS if in_space else COLOURS
+        return colours[list(self.paths).index(robot) % len(colours)]
 
 
 def _used_fixes(run: Run) -> dict[str, Array]:
@@ -63,13 +69,13 @@ def _used_fixes(run: Run) -> dict[str, Array]:
     return {name: np.array([fix.y for fix in used if fix.robot == name]) for name in sorted({f.robot for f in used})}
 
 
-def _truth_to_map(run: Run) -> Rigid:
+def _truth_to_map(run: Run, d: int) -> Rigid:
     """Return what brings the truth into the map: nothing if they share a frame, else the best rigid alignment."""
     truth = run.truth
     if truth.frame == "truth":
         return truth.to_map()
     known = np.isfinite(truth.poses).all(axis=1)
-    return rigid(truth.poses[known][:, :2], run.history.mean[known][:, :2])
+    return rigid(truth.poses[known][:, :d], run.history.mean[known][:, :d])
 
 
 def _fixes_in_map(run: Run, robot: str) -> Array:
@@ -91,7 +97,9 @@ def headline(run: Run) -> tuple[str, list[str]]:
     errors = [figures for figures in summary["robots"].values() if figures.get("ate_m") is not None]
     if errors:
         parts.append(f"position {figure(_mean(errors, 'ate_raw_m'))} m ({figure(_mean(errors, 'ate_m'))} m aligned)")
-        parts.append(f"heading {figure(_mean(errors, 'heading_rmse_deg'), 2)}°")
+        parts.append(
+            f"{'orientation' if run.history.in_space else 'heading'} {figure(_mean(errors, 'heading_rmse_deg'), 2)}°"
+        )
     if summary.get("landmark_rmse_m") is not None:
         raw, aligned = figure(summary["landmark_rmse_raw_m"]), figure(summary["landmark_rmse_m"])
         parts.append(f"landmarks {raw} m ({aligned} m aligned)")

@@ -13,8 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
+from kalmark.results import plot_space
 from kalmark.results.history import Array
 from kalmark.results.picture import FIX_COLOUR, INK, LANDMARK_COLOUR, TRUTH_COLOUR, Picture, ellipses, headline
+from kalmark.results.plot_sensor import draw_sensor
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -31,8 +33,17 @@ def save_map(run: Run, path: str | Path) -> None:
     figure.savefig(path, dpi=130, format="png")
 
 
+def save_sensor(run: Run, robot: str, sensor: str, path: str | Path, step: int | None = None) -> None:
+    """Draw a camera's last scan, or that at a step, and write it as a PNG."""
+    figure = draw_sensor(run, robot, sensor, step)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=110, format="png")
+
+
 def draw_map(run: Run) -> Figure:
-    """Return the figure of a run's map: axes in metres, in the frame of the map."""
+    """Return the figure of a run's map: axes in metres, in the frame of the map; in space a view and a plan."""
+    if run.history.in_space:
+        return plot_space.draw_map(run)
     picture = Picture.of(run)
     means, covariances = run.landmarks.positions()
     low, high = _extent(picture, means, covariances)

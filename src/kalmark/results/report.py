@@ -20,12 +20,18 @@ _ROBOT_COLUMNS = {
     "ate_raw_m": "position RMSE (m)",
     "ate_m": "aligned (m)",
     "heading_rmse_deg": "heading RMSE (deg)",
-    "pose_nees": "pose NEES (ideal 3)",
+    "pose_nees": "pose NEES",
     "pose_nees_world": "in world coordinates",
     "fix_median_m": "fixes: median (m)",
     "fix_rms_10m": "RMS within 10 m (m)",
     "fix_within_10m": "share within 10 m",
     "diverged": "diverged",
+}
+
+
+_HINTS = {
+    False: "3-sigma ellipses; drag the slider through time",
+    True: "3-sigma ellipsoids; drag to turn, scroll to come closer, drag the slider through time",
 }
 
 
@@ -44,7 +50,9 @@ def report_html(run: Run) -> str:
         config=html.escape(config_yaml(run.config)),
         plotly=_plotly(),
         data=json.dumps(series(run), allow_nan=False, separators=(",", ":")).replace("</", "<\\/"),
+        space=_resource("space.js"),
         script=_resource("report.js"),
+        hint=_HINTS[run.history.in_space],
     )
 
 
@@ -115,10 +123,11 @@ _TEMPLATE = """<!DOCTYPE html>
 <body>
 <header><h1>{title}</h1><p class="figures">{figures}</p><ul class="warnings">{warnings}</ul></header>
 <main>
-<section><h2>Map <small>3-sigma ellipses; drag the slider through time</small></h2>
+<section><h2>Map <small>{hint}</small></h2>
 <div id="map"></div>
 <div class="slider"><button id="play">Play</button><input id="time" type="range" min="0" value="0" step="1">
-<output id="now"></output></div></section>
+<output id="now"></output></div>
+<div id="images"></div></section>
 <section id="against-truth"><h2>Errors and their 3-sigma bands <select id="robot"></select></h2>
 <div id="errors"></div>
 <h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
@@ -129,6 +138,7 @@ _TEMPLATE = """<!DOCTYPE html>
 </main>
 <script>{plotly}</script>
 <script>const DATA = {data};</script>
+<script>{space}</script>
 <script>{script}</script>
 </body>
 </html>

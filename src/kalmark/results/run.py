@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from kalmark.errors import RunError
 from kalmark.results.evaluate import evaluate
 from kalmark.results.files import associations_csv, config_yaml, read_yaml, tum
 from kalmark.results.history import History
+from kalmark.results.images import cameras_that_saw
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.truth import Truth
 
@@ -130,12 +132,15 @@ class Run:
         return folder
 
     def report(self, folder: str | Path) -> None:
-        """Write ``map.png`` and ``report.html`` into a folder."""
-        from kalmark.results.plot import save_map  # matplotlib is slow to import
+        """Write ``map.png``, ``report.html`` and a figure of each camera's last scan into a folder."""
+        from kalmark.results.plot import save_map, save_sensor  # matplotlib is slow to import
         from kalmark.results.report import report_html
 
         folder = Path(folder)
         replace_file(folder / "map.png", lambda path: save_map(self, path))
+        for robot, sensor in cameras_that_saw(self.history):
+            name = f"sensor_{file_name(robot)}_{file_name(sensor)}.png"
+            replace_file(folder / name, partial(save_sensor, self, robot, sensor))
         write(folder / "report.html", report_html(self))
 
     @classmethod

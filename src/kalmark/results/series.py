@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from typing import TYPE_CHECKING, Any
@@ -12,12 +11,13 @@ import numpy as np
 from kalmark.results.consistency import anees_interval, nees, nis, pose_error
 from kalmark.results.history import Array, Ints, MapSnapshot
 from kalmark.results.picture import Picture
+from kalmark.results.series_space import space_series
+from kalmark.results.thinned import POINTS, gaussians, significant, thin, xy
 from kalmark.slam.report import OUTCOMES
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
 
-POINTS = 2000
 BINS = 120
 
 
@@ -25,14 +25,21 @@ def series(run: Run) -> dict[str, Any]:
     """Return all that the pictures of a report need; times in seconds since the first step."""
     picture = Picture.of(run)
     t = _since_start(run)
-    return {
+    dof = 6 if run.history.in_space else 3
+    if run.history.in_space:
+        shown = space_series(run, t)
+    else:
+        shown = {
+            "trueLandmarks": _points(picture.landmarks),
+            "fixes": {robot: xy(points[thin(len(points))]) for robot, points in picture.fixes.items()},
+            "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in picture.used.items()},
+            "maps": [_map(m, float(t[m.step])) for m in run.history.maps],
+        }
+    return shown | {
         "robots": [_robot(run, picture, robot, t) for robot in picture.paths],
-        "trueLandmarks": _points(picture.landmarks),
-        "fixes": {robot: xy(points[_thin(len(points))]) for robot, points in picture.fixes.items()},
-        "usedFixes": {robot: xy(points[_thin(len(points))]) for robot, points in picture.used.items()},
-        "maps": [_map(m, float(t[m.step])) for m in run.history.maps],
         "nis": _nis(run, t),
-        "neesBounds": anees_interval(3),
+        "dof": dof,
+        "neesBounds": anees_interval(dof),
         "outcomes": _outcomes(run, t),
     }
 
@@ -49,22 +56,25 @@ def _since_start(run: Run) -> Array:
 
 def _robot(run: Run, picture: Picture, robot: str, t: Array) -> dict[str, Any]:
     rows = np.flatnonzero(run.history.robot == robot)
-    rows = rows[_thin(len(rows))]
-    mean, P = run.history.mean[rows], run.history.covariance[rows]
+    rows = rows[thin(len(rows))]
+    mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
     out: dict[str, Any] = {"name": robot, "colour": picture.colour(robot), "t": significant(t[rows], 7)}
-    out |= gaussians(mean[:, :2], P[:, :2, :2]) | {"theta": significant(mean[:, 2], 5)}
+    d = 3 if run.history.in_space else 2
+    out |= gaussians(mean[:, :d], P[:, :d, :d])
+    out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
     if robot in picture.truth:
         true = picture.truth[robot]
-        out["truth"] = xy(true[_thin(len(true))])
+        out["truth"] = xy(true[thin(len(true))])
         out |= _errors(run, rows)
     return out
 
 
 def _errors(run: Run, rows: Ints) -> dict[str, Any]:
     """Return errors (estimate less truth) and sigmas in m and degrees, and the NEES in the estimator's coordinates."""
-    mean, P = run.history.mean[rows], run.history.covariance[rows]
+    mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
     truth = run.truth.poses_in_map()[rows]
-    scale = np.array([1.0, 1.0, 180.0 / np.pi])
+    metres, turns = (3, 3) if run.history.in_space else (2, 1)
+    scale = np.repeat([1.0, 180.0 / np.pi], [metres, turns])
     error = -pose_error(mean, truth) * scale
     sigma = np.sqrt(np.maximum(np.einsum("nii->ni", P), 0.0)) * scale
     return {
@@ -122,33 +132,3 @@ def reasons(run: Run, most: int = 15) -> list[tuple[str, str, int]]:
 def _points(landmarks: dict[Any, Array]) -> dict[str, Any]:
     points = np.array(list(landmarks.values())).reshape(-1, 2)
     return {"id": [str(i) for i in landmarks], **xy(points)}
-
-
-def xy(points: Array) -> dict[str, Any]:
-    """Return points (N, 2) to a tenth of a millimetre."""
-    return {"x": _rounded(points[:, 0], 4), "y": _rounded(points[:, 1], 4)}
-
-
-def gaussians(means: Array, covariances: Array) -> dict[str, Any]:
-    """Return means (N, 2) and covariances (N, 2, 2) column by column."""
-    return xy(means) | {
-        "pxx": significant(covariances[:, 0, 0]),
-        "pxy": significant(covariances[:, 0, 1]),
-        "pyy": significant(covariances[:, 1, 1]),
-    }
-
-
-def _thin(count: int) -> Ints:
-    """Return at most about 2,000 evenly spread indices, the last one among them."""
-    stride = max(1, -(-count // POINTS))
-    indices = np.arange(0, count, stride)
-    return np.append(indices, count - 1) if count and indices[-1] != count - 1 else indices
-
-
-def _rounded(values: Array, digits: int) -> list[float | None]:
-    return [value if math.isfinite(value) else None for value in np.round(values, digits).tolist()]
-
-
-def significant(values: Array, digits: int = 4) -> list[float | None]:
-    """Return values to so many significant digits, None for NaN and infinity."""
-    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values.tolist()]

@@ -16,6 +16,7 @@ or `to_endpoints` gives the place (K, n) of states (K, m) and its Jacobian (K, n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,14 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 POINT, LINE, TAG = 3, 6, 7
-EUCLIDEAN = ("", "point", "point3", "point_signature", "tag")
+EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
+EUCLIDEAN = (  # kinds whose state is their place; what is not (inverse depth, say) is not well known yet
+    "",
+    "point",
+    "point3",
+    "point_signature",
+    "tag",
+)
 
 
 def place(model: Any, mean: Array, covariance: Array) -> tuple[Array, Array]:
@@ -51,17 +59,16 @@ class Points(NamedTuple):
 class Shapes(NamedTuple):
     """What is to be drawn of a map: `points` (of lines both endpoints), `lines` (L, 2, 3) and `tags` (T, 7).
 
-    `line_rows` and `tag_rows` are their rows in the map.
+    `group` tells of each point whether it is of a Euclidean landmark (0), another (1) or a line (2).
     """
 
     points: Points
     lines: Array
     tags: Array
-    line_rows: Ints
-    tag_rows: Ints
+    group: Ints
 
 
-def shapes(means: Array, covariances: Array) -> Shapes:
+def shapes(means: Array, covariances: Array, kinds: Sequence[str]) -> Shapes:
     """Sort the places (K, n) of landmarks in space, padded with NaN, and covariances (K, q, q), by what they are."""
     size = (~np.isnan(means)).sum(axis=1)
     lines, tags = np.flatnonzero(size == LINE), np.flatnonzero(size == TAG)
@@ -75,11 +82,5 @@ def shapes(means: Array, covariances: Array) -> Shapes:
         ),
         ends[:, :6].reshape(-1, 2, 3),
         means[tags][:, :7].reshape(-1, 7),
-        lines,
-        tags,
+        np.where(np.isin(row, lines), LINES, np.where(np.isin(kinds, EUCLIDEAN), EUCLIDEANS, OTHERS)[row]),
     )
-
-
-def euclidean(kinds: Any) -> npt.NDArray[np.bool_]:
-    """Tell of each kind whether its state is Euclidean: what is not (inverse depth, say) is not yet well known."""
-    return np.isin(np.asarray(kinds, dtype=np.str_), EUCLIDEAN)

@@ -109,18 +109,24 @@ function moving(frame) {
   return traces;
 }
 
-function drawMap() {
-  if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
-  const [x, y] = extent(), background = still(), slider = el("time");
+/* The picture of a map in the plane: a function that draws the map at a position of the slider. */
+function planarMap() {
+  const [x, y] = extent(), background = still();
   const width = el("map").clientWidth || 1080;
   const height = Math.min(820, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 120));
   const page = layout({height, uirevision: "map", xaxis: {...axis("x (m)"), range: x},
                        yaxis: {...axis("y (m)"), range: y, scaleanchor: "x"}, margin: {l: 64, r: 16, t: 32, b: 44},
                        legend: {orientation: "h", y: -48 / (height - 100), yanchor: "top"}});
+  return frame => Plotly.react("map", [...background, ...moving(frame)], page, CONFIG);
+}
+
+function drawMap() {
+  if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
+  const slider = el("time"), draw = DATA.space ? spatialMap() : planarMap();
   const show = () => {
     const map = DATA.maps[+slider.value];
-    el("now").textContent = `${map.t.toFixed(1)} s · ${map.x.length} landmarks`;
-    Plotly.react("map", [...background, ...moving(+slider.value)], page, CONFIG);
+    el("now").textContent = `${map.t.toFixed(1)} s · ${map.count ?? map.x.length} landmarks`;
+    draw(+slider.value);
   };
   slider.max = DATA.maps.length - 1;
   slider.value = slider.max;
@@ -140,24 +146,28 @@ function drawMap() {
 }
 
 function drawErrors(robot) {
-  const names = ["x (m)", "y (m)", "heading (deg)"], traces = [], page = layout({height: 560, showlegend: false});
+  const names = DATA.dof === 3 ? ["x (m)", "y (m)", "heading (deg)"]
+    : ["x (m)", "y (m)", "z (m)", "about x (deg)", "about y (deg)", "about z (deg)"];
+  const traces = [], page = layout({height: 560, showlegend: false}), two = names.length > 3;
   names.forEach((name, i) => {
-    const n = i + 1, at = {xaxis: "x", yaxis: "y" + (i ? n : "")};
+    const n = i + 1, row = i % 3, right = i > 2, at = {xaxis: right ? "x2" : "x", yaxis: "y" + (i ? n : "")};
     const band = robot.sigma[i].map(s => s === null ? null : 3 * s);
     traces.push({x: robot.t, y: band.map(b => b === null ? null : -b), mode: "lines", line: {width: 0}, hoverinfo: "skip", ...at});
     traces.push({x: robot.t, y: band, mode: "lines", line: {width: 0}, fill: "tonexty", fillcolor: BAND, hoverinfo: "skip", ...at});
     traces.push({x: robot.t, y: robot.error[i], mode: "lines", line: {color: robot.colour, width: 1.1},
                  hovertemplate: `%{x:.1f} s: %{y:.4g}<extra>${name}</extra>`, ...at});
-    page["yaxis" + (i ? n : "")] = {...axis(name), domain: [1 - n / 3 + 0.025, 1 - i / 3 - 0.01], zeroline: true, zerolinecolor: "#c4c8cf"};
+    page["yaxis" + (i ? n : "")] = {...axis(name), domain: [1 - (row + 1) / 3 + 0.025, 1 - row / 3 - 0.01], zeroline: true,
+                                    zerolinecolor: "#c4c8cf", anchor: right ? "x2" : "x"};
   });
-  page.xaxis = {...axis("time (s)"), anchor: "y3"};
+  page.xaxis = {...axis("time (s)"), anchor: "y3", domain: [0, two ? 0.46 : 1]};
+  if (two) page.xaxis2 = {...axis("time (s)"), anchor: "y6", domain: [0.54, 1], matches: "x"};
   Plotly.react("errors", traces, page, CONFIG);
   const [low, high] = DATA.neesBounds, ends = [robot.t[0], robot.t[robot.t.length - 1]];
-  el("nees-note").textContent = `3 degrees of freedom; the band holds 95 % of the values of a consistent filter`;
+  el("nees-note").textContent = `${DATA.dof} degrees of freedom; the band holds 95 % of the values of a consistent filter`;
   Plotly.react("nees", [...bounds(ends, [low, low], [high, high]),
     {x: robot.t, y: robot.nees, mode: "lines", line: {color: robot.colour, width: 1.1},
      hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
-    {x: ends, y: [3, 3], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
+    {x: ends, y: [DATA.dof, DATA.dof], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
     layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: logAxis("NEES", [...robot.nees, low, high])}), CONFIG);
 }
 
