@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalmark.campaign.scoring import SERIES, Scores, joint_nees, nees_of_points
+from kalmark.campaign.scoring import SERIES, Scores, joint_nees
 from kalmark.campaign.statistics import Anees, figures
 from kalmark.results.consistency import anees_interval, nees
 
@@ -16,12 +16,13 @@ def scores(rng: np.random.Generator, scale: float = 1.0, joint_dof: float = 7.0,
     """Return independent chi-square draws at each step, times `scale`."""
     dof = {"pose": 3, "heading": 1, "landmarks": 2, "joint": joint_dof}
     shape = (1, STEPS)
-    series = {key: np.abs(rng.standard_normal(shape)) for key in SERIES}
-    for key in SERIES:
-        kind = key.removesuffix("_world")
-        if kind in dof:
-            series[key] = scale * rng.chisquare(dof[kind], shape)
-    series["joint_dof"] = np.full(shape, joint_dof)
+    series = {key: np.full(shape, np.nan) for key in SERIES}
+    for name, n in dof.items():
+        for key in (name, f"{name}_world"):
+            series[key] = scale * rng.chisquare(n, shape)
+        series[f"{name}_dof"] = np.full(shape, float(n))
+    for key in ("position_m", "heading_rad"):
+        series[key] = np.abs(rng.standard_normal(shape))
     return Scores(series, 0.3, 0.4, 5, 20.0, 10, diverged, "")
 
 
@@ -84,11 +85,26 @@ def test_the_joint_nees_is_the_quadratic_form_and_nothing_for_a_singular_covaria
     assert np.isnan(joint_nees(d, np.zeros((6, 6)))).all()
 
 
-def test_the_nees_of_points_is_the_quadratic_form_and_nothing_where_a_covariance_is_singular() -> None:
-    rng = np.random.default_rng(3)
-    A = rng.standard_normal((50, 2, 2))
-    P, d = A @ A.swapaxes(1, 2), rng.standard_normal((50, 2))
-    P[7], P[8] = 0.0, [[1.0, 2.0], [2.0, 4.0]]
-    expected = nees(d, P)
-    assert np.isnan(expected).nonzero()[0].tolist() == [7, 8]
-    assert nees_of_points(d, P) == pytest.approx(expected, rel=1e-6, nan_ok=True)
+def test_the_first_steps_can_be_left_out_of_the_averages() -> None:
+    rng = np.random.default_rng(0)
+    runs = [scores(rng) for _ in range(4)]
+    for s in runs:
+        s.series["pose"][0, :100] = 1e6
+    assert figures(runs)["pose_anees"] > 1e4
+    f = figures(runs, skip=100)
+    assert f["pose_anees"] == pytest.approx(3.0, rel=0.05)
+    assert f["pose_inside"] == pytest.approx(0.95, abs=0.02)
+
+
+def test_mounts_are_judged_by_how_the_runs_end() -> None:
+    rng = np.random.default_rng(0)
+    runs = [scores(rng) for _ in range(3)]
+    for s, nees_at_end, error in zip(runs, (5.0, 30.0, 6.0), (0.001, 0.002, 0.003), strict=True):
+        s.series["mount"][0, [9, 19]] = 100.0, nees_at_end
+        s.series["mount_dof"][0, [9, 19]] = 6.0
+        s.series["mount_m"][0, [9, 19]] = s.series["mount_rad"][0, [9, 19]] = 1.0, error
+    f = figures(runs)
+    assert f["mount_sure"] == 2
+    assert f["mount_m"] == pytest.approx(np.sqrt(14 / 3) * 1e-3)
+    assert f["mount_deg"] == pytest.approx(np.degrees(np.sqrt(14 / 3) * 1e-3))
+    assert "mount_m" not in figures([scores(rng)])

@@ -24,8 +24,6 @@ WITHOUT: dict[str, str] = {
     "toFrameIdp": ANOTHER_WAY,
     "fromFrameAhm": ANOTHER_WAY,
     "fromFrameAPlucker": ANOTHER_WAY,
-    "thickCloister": "simulated worlds of space are not written yet",
-    "house": "simulated worlds of space are not written yet",
 }
 PARTLY: dict[str, str] = {
     "constVel_nojac_exact": "recorded without Jacobians",

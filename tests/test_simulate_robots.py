@@ -13,7 +13,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, scan_many, to_frame_many
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
-from kalmark.simulate.robots import gaussian
+from kalmark.simulate.sights import gaussian
 from kalmark.slam.events import Control, Scan
 
 

@@ -11,11 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from kalmark.config.merging import merged
 from kalmark.errors import ConfigError
 from kalmark.simulate import World, load_world, shipped_worlds, simulate
-from kalmark.simulate.layouts import Cloister, Listed, Loop, RandomField, cloister
+from kalmark.simulate.layouts import Cloister, Loop, RandomField, cloister
+from kalmark.simulate.layouts3d import House, Listed, ListedTag, RandomBox, TagRoom, ThickCloister
 from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control
-from kalmark.simulate.worlds import merged
+from kalmark.simulate.sights import Sensing
+from kalmark.simulate.worlds import SimulatedRobot
 
 SMALL = ["steps=20"]
 PAGE = Path(__file__).parents[1] / "docs" / "worlds.md"
@@ -198,7 +201,8 @@ def test_the_page_about_worlds_names_every_world_key_and_figure() -> None:
     from kalmark.campaign import run_campaign
 
     page = PAGE.read_text(encoding="utf-8")
-    sections = (World, Cloister, Loop, RandomField, Listed, Constant, Waypoints, Wander, Lanes)
+    sections = (World, Cloister, Loop, RandomField, Listed, Constant, Waypoints, Wander, Lanes, Sensing)
+    sections += (ThickCloister, House, RandomBox, TagRoom, ListedTag, SimulatedRobot)
     keys = {key for section in sections for key in section.model_fields} - {"type"}
     assert not [key for key in [*keys, *shipped_worlds()] if f"`{key}`" not in page]
     figures = run_campaign(load_world("cloister", ["steps=2"]), 1, jobs=1).summary()["estimators"]["invariant"]

@@ -12,6 +12,7 @@ from kalmark.geometry import directions, frames3d, rotations
 from kalmark.models import cameras
 from kalmark.models import landmarks3d as lm
 from kalmark.simulate.layouts import cloister
+from kalmark.simulate.layouts3d import house, thick_cloister
 from toolbox import (
     TURNED,
     Case,
@@ -292,6 +293,16 @@ def cloister_walk(i: Case, o: Case) -> list[Pair]:
     return [(cloister(*limits, int(n)).T, o["world"])]
 
 
+def two_storeys(i: Case, o: Case) -> list[Pair]:
+    *limits, n = i["args"]
+    return [(thick_cloister(*limits, int(n)).T, o["world"])]
+
+
+def house_of_segments(i: Case, o: Case) -> list[Pair]:
+    x, y, z = i["args"].tolist()
+    return [(house((x, y, z)).T, o["world"])]
+
+
 COUNTERPARTS: dict[str, Callable[[Case, Case], list[Pair]]] = {
     "fromFrame": from_frame,
     "toFrame": to_frame,
@@ -340,4 +351,6 @@ COUNTERPARTS: dict[str, Callable[[Case, Case], list[Pair]]] = {
     "innovation_pnt": point_innovation,
     "cov2elli": ellipse,
     "cloister": cloister_walk,
+    "thickCloister": two_storeys,
+    "house": house_of_segments,
 }

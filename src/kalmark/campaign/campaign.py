@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 
 from kalmark.campaign.scoring import Scores
-from kalmark.campaign.statistics import Anees, figures
+from kalmark.campaign.statistics import Anees, figures, kinds
 from kalmark.results.evaluate import none_for_nan
 
-_COLUMNS = ("pose", "pose_world", "heading", "landmarks", "landmarks_world", "joint", "joint_world")
+_WORDS = {"joint": "joint state, a dimension", "state": "pose and velocity"}
+_WITH_WORLD = ("pose", "landmarks", "joint")
 
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
     """N runs of a world, each estimator on the same logs: `scores[estimator][run]`, `t_s` the time of each step.
 
-    `description` is the world as it was in force, in YAML.
+    `description` is the world as it was in force, in YAML.  Averages of NEES leave out the first `skip` steps.
     """
 
     world: str
@@ -32,12 +33,24 @@ class Campaign:
     robots: tuple[str, ...]
     t_s: tuple[float, ...]
     scores: dict[str, tuple[Scores, ...]]
+    skip: int = 0
+
+    def ideal(self, name: str) -> float:
+        """Return what the ANEES of a consistent filter would be: its degrees of freedom, 1 for the joint state."""
+        return Anees(name, [score for scores in self.scores.values() for score in scores]).ideal
+
+    def label(self, name: str) -> str:
+        """Return the words for a NEES and, in brackets, what it is for a consistent filter."""
+        words = "orientation" if name == "heading" and self.ideal(name) == 3 else _WORDS.get(name, name)
+        return f"{words} ({self.ideal(name):.3g})"
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of ``summary.json``: a section for each estimator."""
-        estimators = {name: figures(scores) for name, scores in self.scores.items()}
+        estimators = {name: figures(scores, self.skip) for name, scores in self.scores.items()}
         head = {"world": self.world, "seed": self.seed, "runs": self.runs, "steps": len(self.t_s)}
-        return none_for_nan({**head, "map_every": self.map_every, "estimators": estimators})
+        dof = {name: self.ideal(name) for name in self._names()}
+        tail = {"map_every": self.map_every, "skip": self.skip, "dof": dof, "estimators": estimators}
+        return none_for_nan({**head, **tail})
 
     def save(self, folder: str | Path) -> Path:
         """Write ``summary.json``, ``world.yaml``, ``anees.csv`` (a row an estimator, robot and step), ``anees.png``."""
@@ -51,15 +64,19 @@ class Campaign:
         draw(self, folder / "anees.png")
         return folder
 
+    def _names(self) -> list[str]:
+        return kinds([score for scores in self.scores.values() for score in scores])
+
     def _write_steps(self, path: Path) -> None:
-        bands = [f"{name}_{what}" for name in _COLUMNS for what in ("anees", "low", "high")]
+        names = [n + w for n in self._names() for w in (("", "_world") if n in _WITH_WORLD else ("",))]
+        bands = [f"{name}_{what}" for name in names for what in ("anees", "low", "high")]
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(
                 ["estimator", "robot", "step", "t_s", "runs", *bands, "position_rmse_m", "heading_rmse_rad"]
             )
             for estimator, scores in self.scores.items():
-                anees = [Anees(name, scores) for name in _COLUMNS]
+                anees = [Anees(name, scores) for name in names]
                 columns = [column for a in anees for column in (a.mean, a.low, a.high)]
                 columns += [_rms(scores, name) for name in ("position_m", "heading_rad")]
                 for i, robot in enumerate(self.robots):

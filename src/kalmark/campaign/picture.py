@@ -7,18 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kalmark.campaign.statistics import DOF, Anees
+from kalmark.campaign.statistics import Anees, kinds
 from kalmark.results.picture import COLOURS
 
 if TYPE_CHECKING:
     from kalmark.campaign.campaign import Campaign
-
-_ROWS = {
-    "pose": "pose (3)",
-    "heading": "heading (1)",
-    "landmarks": "landmarks (2)",
-    "joint": "joint, per dimension (1)",
-}
 
 
 def draw(campaign: Campaign, path: Path) -> None:
@@ -26,10 +19,12 @@ def draw(campaign: Campaign, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 10), layout="constrained")
+    scores = [s for runs in campaign.scores.values() for s in runs]
+    rows = kinds(scores)
+    figure = Figure(figsize=(9, 2.5 * len(rows)), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(len(_ROWS), 1, sharex=True)
-    for axis, name in zip(axes, _ROWS, strict=True):
+    axes = figure.subplots(len(rows), 1, sharex=True)
+    for axis, name in zip(axes, rows, strict=True):
         _draw_row(axis, campaign, name)
     axes[-1].set_xlabel("time (s)")
     figure.suptitle(f"{campaign.world}: average NEES of {campaign.runs} runs, seed {campaign.seed}")
@@ -41,18 +36,18 @@ def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
 
     t_s = np.array(campaign.t_s)
     for i, (estimator, scores) in enumerate(campaign.scores.items()):
-        anees = Anees(name, scores)
+        anees = Anees(name, scores, campaign.skip)
         value, low, high = (np.nanmean(np.ma.masked_invalid(a), axis=0) for a in (anees.mean, anees.low, anees.high))
         some = ~np.ma.getmaskarray(value)
         label = f"{estimator} ({anees.average:.3g}; {100 * anees.inside:.0f} % inside)"
         if i == 0:
             axis.fill_between(t_s[some], low[some], high[some], color="0.85", linewidth=0, label="95 % band")
         axis.plot(t_s[some], value[some], color=COLOURS[i % len(COLOURS)], linewidth=0.9, label=label)
-    axis.axhline(DOF.get(name, 1), color="0.4", linewidth=0.6)
+    axis.axhline(campaign.ideal(name), color="0.4", linewidth=0.6)
     axis.set_yscale("log")
     axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter(NullFormatter())
-    axis.set_ylabel(_ROWS[name])
+    axis.set_ylabel(campaign.label(name))
     axis.grid(visible=True, which="both", linewidth=0.3)
     axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False, borderpad=0.1)

@@ -26,9 +26,8 @@ from kalmark.config.schema import Config
 from kalmark.config.tree import Tree
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.results.progress import track
-from kalmark.simulate.robots import simulate
+from kalmark.simulate.robots import simulation
 from kalmark.simulate.worlds import World, load_world
-from kalmark.slam.events import Event, Scan
 
 BACKENDS = ("loky", "dask", "ray")
 ESTIMATORS = ("invariant", "ekf", "fej")
@@ -50,12 +49,10 @@ class Plan:
     def run(self, number: int) -> dict[str, Scores]:
         """Simulate run `number` and score every estimator on it."""
         with threadpool_limits(1):
-            told = self.world.model_copy(update={"ids": True})
-            log = simulate(told, np.random.SeedSequence(self.seed, spawn_key=(number,)))
-            events = log.events if self.world.ids else [without_ids(event) for event in log.events]
+            simulated = simulation(self.world, np.random.SeedSequence(self.seed, spawn_key=(number,)))
             steps = self.steps()
             return {
-                name: score(build_slam(config, log), log, events, steps, self.map_every)
+                name: score(build_slam(config, simulated.log), simulated, steps, self.map_every)
                 for name, config in self.configs.items()
             }
 
@@ -69,15 +66,18 @@ def run_campaign(
     backend: str = "loky",
     progress: bool = True,
     map_every: int = 10,
+    skip: int = 0,
 ) -> Campaign:
     """Run a world (or the path or name of one) `runs` times and return the figures of each estimator.
 
     `estimators` are names like "invariant", "ekf" or, with a key of theirs, "invariant:iterations=1"; by default the
     one in the world's `filter`.  `jobs` is the number of processes (default: one a core).  Landmarks and joint state
-    are scored every `map_every` steps.  Raises ConfigError or KalmarkError on anything that cannot be run.
+    are scored every `map_every` steps; averages of NEES leave out the first `skip` steps.  Raises ConfigError or
+    KalmarkError on anything that cannot be run.
     """
     world = world if isinstance(world, World) else load_world(world)
-    for name, value, least in (("runs", runs, 1), ("seed", seed, 0), ("map_every", map_every, 1), ("jobs", jobs, 1)):
+    limits = (("runs", runs, 1), ("seed", seed, 0), ("map_every", map_every, 1), ("jobs", jobs, 1), ("skip", skip, 0))
+    for name, value, least in limits:
         if value is not None and (not isinstance(value, int) or value < least):
             raise KalmarkError(f"campaign: {name} is {value!r}, expected a whole number of at least {least}")
     configs = configs_of(world, estimators)
@@ -92,6 +92,7 @@ def run_campaign(
         robots=tuple(world.robots),
         t_s=tuple(t * 1e-9 for t in plan.steps()),
         scores={name: tuple(result[name] for result in results) for name in configs},
+        skip=skip,
     )
 
 
@@ -155,10 +156,3 @@ def installed(module: str, packages: str) -> Any:
         return import_module(module)
     except ImportError:
         raise KalmarkError(f"campaign: {module} is not installed, expected it: pip install {packages}") from None
-
-
-def without_ids(event: Event) -> Event:
-    """Return an event that does not tell which landmark is which."""
-    if isinstance(event, Scan):
-        return Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor, y=event.y, cov=event.cov)
-    return event

@@ -14,16 +14,17 @@ from kalmark.cli.tables import number, print_table
 if TYPE_CHECKING:
     from kalmark.campaign import Campaign
 
+NEES = ("joint", "pose", "state", "heading", "landmarks", "mount")
 FIGURES = (
     ("diverged", "diverged"),
-    ("joint_anees", "joint state, a dimension (1)"),
-    ("pose_anees", "pose (3)"),
-    ("heading_anees", "heading (1)"),
-    ("landmarks_anees", "landmarks (2)"),
+    *((f"{name}_anees", name) for name in NEES),
     ("pose_inside", "pose in its band, %"),
     ("position_rmse_m", "position RMSE, m"),
     ("heading_rmse_deg", "heading RMSE, deg"),
     ("landmark_rmse_m", "landmark RMSE, m"),
+    ("mount_m", "mount at the end, m"),
+    ("mount_deg", "mount at the end, deg"),
+    ("mount_sure", "mounts within 3 sigma at the end"),
 )
 
 
@@ -45,6 +46,7 @@ def campaign(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the campaign.")] = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes. (default: one a core)")] = None,
     backend: Annotated[Backend, typer.Option(help="Who runs the processes.")] = Backend.LOKY,
+    skip: Annotated[int, typer.Option(min=0, help="Steps at the beginning that no average of NEES counts.")] = 0,
     out: Annotated[Path | None, typer.Option(help="The folder to write. (default: out/campaign-WORLD)")] = None,
     overrides: Overrides = None,
 ) -> None:
@@ -56,7 +58,7 @@ def campaign(
 
     out = writable(out or Path("out") / f"campaign-{Path(world).stem}")
     loaded = load_world(world, overrides or ())
-    result = run_campaign(loaded, runs, estimator, seed=seed, jobs=jobs, backend=backend.value)
+    result = run_campaign(loaded, runs, estimator, seed=seed, jobs=jobs, backend=backend.value, skip=skip)
     result.save(out)
     print_campaign(result)
     typer.echo(f"{out}: summary.json, anees.csv and anees.png")
@@ -66,7 +68,10 @@ def print_campaign(campaign: Campaign) -> None:
     """Print one row a figure, one column an estimator."""
     estimators: dict[str, dict[str, Any]] = campaign.summary()["estimators"]
     rows = [
-        (label, *(number(figures.get(key), "%" if key.endswith("_inside") else "") for figures in estimators.values()))
+        (
+            campaign.label(label) if label in NEES else label,
+            *(number(figures.get(key), "%" if key.endswith("_inside") else "") for figures in estimators.values()),
+        )
         for key, label in FIGURES
         if any(figures.get(key) is not None for figures in estimators.values())
     ]

@@ -1,8 +1,9 @@
 """Move robots through a world and let them measure, with the models the filter uses.  [S] 4.1; [TB] SimRob, SimSen.
 
-The guide disturbs the *estimator's* control and lets the robot move exactly (`noise_on: control`); with
+The guide and the toolbox disturb the *estimator's* control and let the robot move exactly (`noise_on: control`); with
 `noise_on: robot` the robot is disturbed and the log holds what it was told.  Either way the log holds the control
-the estimator is given.  A diffusion always disturbs the robot.
+the estimator is given.  A diffusion always disturbs the robot.  A mount with sigmas truly sits elsewhere: the log's
+rig is the one configured, and where the sensor sits is drawn around it.
 """
 
 from __future__ import annotations
@@ -15,48 +16,82 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from numpy.random import Generator, SeedSequence
-from scipy.spatial import cKDTree
 
-from kalmark.config.classes import model_of
-from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames import compose
+from kalmark.config.building import build_robot
+from kalmark.geometry.angles import rotation
+from kalmark.geometry.rotations import matrix
+from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
-from kalmark.models.landmarks import Point2D
+from kalmark.models.observe import composed
 from kalmark.simulate.routes import Driver
-from kalmark.simulate.worlds import SimulatedRobot, World
+from kalmark.simulate.sights import (
+    POINTS,
+    Sensing,
+    Sighted,
+    Things,
+    centre,
+    chosen,
+    exact,
+    faulty,
+    gaussian,
+    in_frame,
+    looks_for,
+    noisy,
+    things_of,
+)
+from kalmark.simulate.worlds import World
 from kalmark.slam.events import Control, Event, Id, Scan, order
 
 Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
+Key = tuple[int, str, str]
 
-_LOOK = Point2D()
+
+@dataclass
+class SimSensor:
+    """A sensor, where it truly sits, and what is wrong with it."""
+
+    sensor: Any
+    at: Array
+    sensing: Sensing
 
 
 @dataclass
 class SimRobot:
-    """A robot under way: its model, its true pose (3,), and what steers it."""
+    """A robot under way: its model, its true state, what steers it, and what it carries."""
 
     name: str
     motion: Any
-    pose: Array
+    state: Array
     driver: Driver
-    sensors: dict[str, tuple[Any, Array]]
-    poses: list[Array] = field(default_factory=list)
+    sensors: dict[str, SimSensor]
+    states: list[Array] = field(default_factory=list)
+
+    @property
+    def pose(self) -> Array:
+        """The true pose (3,) or (7,)."""
+        return self.state[: 3 if self.motion.space.world == "plane" else 7]
 
 
-@dataclass
-class Landmarks:
-    """The landmarks (M, 2|3), which of them were ever seen, and an index of where they are."""
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated log, and what only the simulator knows.
 
-    points: Array
-    seen: npt.NDArray[np.bool_]
-    tree: Any
+    `states` are the true states (steps + 1, n) of each robot, `mounts` where its sensors truly sit, `origins` (by time,
+    robot and sensor) what each observation of a scan is really of: an id, or None for a false one.
+    """
 
-    def near(self, place: Array, reach_m: float) -> Indices:
-        """Return the landmarks within reach of a place (2,), in order."""
-        if math.isinf(reach_m):
-            return np.arange(len(self.points))
-        return np.array(sorted(self.tree.query_ball_point(place, reach_m)), dtype=np.int64)
+    log: Log
+    states: dict[str, Array]
+    mounts: dict[tuple[str, str], Array]
+    origins: dict[Key, tuple[Id | None, ...]]
+
+
+class Chance:
+    """The sources of chance, each a random stream of its own, all from one seed."""
+
+    def __init__(self, seed: int | SeedSequence | Generator) -> None:
+        streams = np.random.default_rng(seed).spawn(6)
+        self.layout, self.route, self.control, self.sight, self.faults, self.mounts = streams
 
 
 def simulate(world: World, seed: int | SeedSequence | Generator = 0) -> Log:
@@ -64,117 +99,140 @@ def simulate(world: World, seed: int | SeedSequence | Generator = 0) -> Log:
 
     Landmark ids are 1, 2, ... in the world's order.  A scan in which nothing is seen is left out.
     """
-    layout, route, control, sight = np.random.default_rng(seed).spawn(4)
-    landmarks = landmarks_of(world, layout)
-    area = np.array([landmarks.points[:, :2].min(axis=0), landmarks.points[:, :2].max(axis=0)])
-    robots = [sim_robot(name, robot, world.dt_s, area, route) for name, robot in world.robots.items()]
+    return simulation(world, seed).log
+
+
+def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simulation:
+    """Return one simulated run: its log, and what the log does not tell."""
+    chance = Chance(seed)
+    things = scenery_of(world, chance.layout)
+    area = area_of(things)
+    robots = [sim_robot(world, name, area, chance) for name in world.robots]
     times = [round(k * world.dt_s * 1e9) for k in range(world.steps + 1)]
     events: list[Event] = []
-    for before, now in pairwise(times):
+    origins: dict[Key, tuple[Id | None, ...]] = {}
+    for k, (before, now) in enumerate(pairwise(times), 1):
         for robot in robots:
-            u = step(robot, world, control)
+            u = step(robot, world, chance.control)
             events.append(Control(t_ns=before if robot.motion.held else now, robot=robot.name, u=u))
         for robot in robots:
-            events += scans(robot, robots, landmarks, world, now, sight)
-    return Log(
+            for scan, real in scans(robot, robots, things, world, k, now, chance):
+                events.append(scan)
+                origins[now, scan.robot, scan.sensor] = real
+    states = {r.name: np.array([*r.states, r.state]) for r in robots}
+    log = Log(
         name=world.name,
         robots=tuple(world.robots),
         events=sorted(events, key=order),
         format="simulated",
-        truth={r.name: Trajectory(np.array(times), np.array([*r.poses, r.pose])) for r in robots},
-        landmarks={i + 1: point[:2].copy() for i, point in enumerate(landmarks.points)},
+        truth={r.name: Trajectory(np.array(times), states[r.name][:, : len(r.pose)]) for r in robots},
+        landmarks=true_landmarks(things),
         control_columns={r.name: r.motion.columns for r in robots},
-        sensor_columns={(r.name, name): s.columns for r in robots for name, (s, _) in r.sensors.items()},
+        sensor_columns={(r.name, name): s.sensor.columns for r in robots for name, s in r.sensors.items()},
     )
+    return Simulation(log, states, {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}, origins)
 
 
-def landmarks_of(world: World, rng: Generator) -> Landmarks:
-    """Place the world's landmarks, with a signature each if a sensor measures signatures."""
-    points = world.world.place(rng)
+def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
+    """Place what there is to see, points with a signature each if a sensor measures signatures."""
+    scenery = world.world.scenery(rng)
+    things = things_of(scenery, world.dimensions)
     if world.has_signatures:
-        points = np.column_stack([points, rng.uniform(0.0, world.signature_max, len(points))])
-    return Landmarks(points, np.zeros(len(points), dtype=np.bool_), cKDTree(points[:, :2]))
+        points = things[POINTS]
+        signatures = rng.uniform(0.0, world.signature_max, len(points.values))
+        points.values = np.column_stack([points.values, signatures])
+    return things
 
 
-def sim_robot(name: str, robot: SimulatedRobot, dt_s: float, area: Array, rng: Generator) -> SimRobot:
-    """Put a robot at its start, drawn from the start's Gaussian if it has sigmas."""
-    start = robot.start
-    motion = model_of(robot.motion)
-    sigma = np.array([start.sigma_xy_m, start.sigma_xy_m, start.sigma_theta_rad])
-    pose = np.array([start.x_m, start.y_m, start.theta_rad]) + sigma * rng.standard_normal(3)
-    mounted = {key: (model_of(s), mount(s)) for key, s in robot.sensors.items()}
-    return SimRobot(name, motion, pose, robot.route.driver(motion, dt_s, area, rng), mounted)
+def area_of(things: dict[str, Things]) -> Array:
+    """Return the lowest and the highest corner (2, 2|3) of where things are."""
+    centres = np.concatenate([sort.centres() for sort in things.values() if len(sort.values)])
+    return np.array([centres.min(axis=0), centres.max(axis=0)])
 
 
-def mount(section: Any) -> Array:
-    """Return a sensor's place (3,) on the robot."""
-    return np.array([section.mount.x_m, section.mount.y_m, section.mount.theta_rad])
+def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
+    """Return by id the points (2|3,), segments (6,) from end to end and tags (7,)."""
+    points = things[POINTS]
+    rows = {POINTS: points.centres()} | {s: t.values for s, t in things.items() if s != POINTS}
+    return {i: row.copy() for s, t in things.items() for i, row in enumerate(rows[s], t.first)}
+
+
+def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
+    """Put a robot at its start and its sensors on their mounts, drawn around what is configured if that has sigmas."""
+    simulated = world.robots[name]
+    robot = build_robot(world.models(), name)
+    motion, space = robot.motion, robot.motion.space
+    cov = np.zeros((space.dof, space.dof)) if robot.cov is None else robot.cov
+    state = space.plus(np.array(robot.start), gaussian(cov, chance.route))
+    sensors = {}
+    for key, mount in robot.sensors.items():
+        at, cov = np.array(mount.at), getattr(mount, "cov", None)
+        if cov is not None:
+            at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(cov, chance.mounts))
+        sensors[key] = SimSensor(mount.sensor, at, simulated.sensing.get(key, Sensing()))
+    driver = simulated.route.driver(motion, world.dt_s, area, chance.route)
+    return SimRobot(name, motion, state, driver, sensors)
 
 
 def step(robot: SimRobot, world: World, rng: Generator) -> Array:
     """Move a robot by one step and return the control that its estimator is given."""
-    u = robot.driver(robot.pose)
+    u = robot.driver(robot.state)
     disturbed = u + gaussian(robot.motion.control_noise(u), rng)
     told, done = (disturbed, u) if world.noise_on == "control" else (u, disturbed)
-    robot.poses.append(robot.pose)
-    robot.pose, *_ = robot.motion.move(robot.pose, done, world.dt_s)
-    Q = robot.motion.diffusion(done, world.dt_s)
-    if Q is not None:
-        robot.pose, *_ = compose(robot.pose, gaussian(Q, rng))
+    robot.states.append(robot.state)
+    robot.state, *_ = robot.motion.move(robot.state, done, world.dt_s)
+    D = robot.motion.diffusion(done, world.dt_s)
+    if D is not None:
+        robot.state = robot.motion.space.plus(robot.state, body_axes(robot.state, len(D)) @ gaussian(D, rng))
     return told
 
 
+def body_axes(state: Array, size: int) -> Array:
+    """Return what turns errors (size,) from the robot's frame into the world's; a body's rates stay its own."""
+    G = np.eye(size)
+    if len(state) == 3:
+        G[:2, :2] = rotation(state[2])
+        return G
+    Q = matrix(state[3:7].copy())
+    for at in range(0, min(size, 9), 3):
+        G[at : at + 3, at : at + 3] = Q
+    return G
+
+
 def scans(
-    robot: SimRobot, robots: list[SimRobot], landmarks: Landmarks, world: World, t_ns: int, rng: Generator
-) -> list[Event]:
-    """Return the scans of a robot's sensors from its true pose."""
-    events: list[Event] = []
-    others = [r for r in robots if r is not robot] if world.sight_robots else []
-    for name, (sensor, at) in robot.sensors.items():
-        T, *_ = compose(robot.pose, at)
-        seen = visible(sensor, T, landmarks, world, rng)
-        ids: list[Id] = [int(i) + 1 for i in seen] + [r.name for r in others]
-        points = np.concatenate([landmarks.points[seen], *(r.pose[None, :2] for r in others)])
-        v, *_ = _LOOK.seen_from(T, points)
-        keep = sensor.sees(v)
-        y = measure(sensor, v[keep], rng)
-        real = np.flatnonzero((y[:, 0] >= 0) | (sensor.columns[0] != "range_m"))  # noise took the others below zero
-        if len(real):
-            kept = [ids[i] for i in np.flatnonzero(keep)[real]]
-            events.append(Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[real], ids=kept if world.ids else None))
-    return events
+    robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World, k: int, t_ns: int, chance: Chance
+) -> list[tuple[Scan, tuple[Id | None, ...]]]:
+    """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
+    found = []
+    for name, carried in robot.sensors.items():
+        if k % carried.sensing.every:
+            continue
+        sensor, there = carried.sensor, things[looks_for(carried.sensor)]
+        others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
+        sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight)
+        sighted, real = faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
+        y = noisy(sensor, sighted.e, chance.sight)
+        kept = np.flatnonzero((y[:, 0] >= 0) | (sensor.columns[0] != "range_m"))  # the others: noise below zero
+        if len(kept):
+            told = [sighted.ids[i] for i in kept] if world.ids else None
+            scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=told)
+            found.append((scan, tuple(real[i] for i in kept)))
+    return found
 
 
-def visible(sensor: Any, T: Array, landmarks: Landmarks, world: World, rng: Generator) -> Indices:
-    """Return the landmarks that a sensor at pose T reports, in order, and note them as seen."""
-    near = landmarks.near(T[:2], sensor.range_max_m)
-    v, *_ = _LOOK.seen_from(T, landmarks.points[near])
-    inside = sensor.sees(v)
-    near, distance = near[inside], np.hypot(v[inside, 0], v[inside, 1])
-    if world.new_per_step is not None:
-        new = np.flatnonzero(~landmarks.seen[near])
-        kept = np.union1d(np.flatnonzero(landmarks.seen[near]), rng.permutation(new)[: world.new_per_step])
-        near, distance = near[kept], distance[kept]
-    if world.max_per_scan is not None:
-        near = np.sort(near[np.argsort(distance, kind="stable")[: world.max_per_scan]])
-    landmarks.seen[near] = True
-    return near
-
-
-def measure(sensor: Any, v: Array, rng: Generator) -> Array:
-    """Return noisy measurements (K, m) of points v (K, d) in the sensor's frame, angles wrapped."""
-    if len(v) == 0:
-        return np.empty((0, len(sensor.columns)))
-    e, _ = sensor.expect(v)
-    y = e + gaussian(sensor.noise(e), rng)
-    return np.where(sensor.angular, wrap(y), y)
-
-
-def gaussian(cov: Array, rng: Generator) -> Array:
-    """Draw from zero-mean Gaussians with positive semidefinite covariances (..., n, n)."""
-    variances = np.einsum("...ii->...i", cov)
-    if np.count_nonzero(cov) == np.count_nonzero(variances):
-        return np.sqrt(variances) * rng.standard_normal(variances.shape)
-    variances, axes = np.linalg.eigh(cov)
-    draw = np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(variances.shape)
-    return np.einsum("...ij,...j->...i", axes, draw)
+def seen_by(sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator) -> Sighted:
+    """Return what a sensor at T sees, other robots last."""
+    near = things.near(T[: world.dimensions], getattr(sensor, "range_max_m", math.inf))
+    v = things.seen_from(T, near)
+    inside, e = exact(sensor, v, things.sizes[near])
+    near, v, e = near[inside], v[inside], e[inside]
+    distance = np.linalg.norm(centre(things.sort, v, world.dimensions), axis=1)
+    rows = chosen(things, near, distance, world.new_per_step, world.max_per_scan, rng)
+    ids: list[Id] = [int(i) + things.first for i in near[rows]]
+    v, e, sizes = v[rows], e[rows], things.sizes[near[rows]]
+    if others and things.sort == POINTS:
+        w = in_frame(POINTS, T, np.array([pose[: world.dimensions] for pose in others.values()]))
+        inside, f = exact(sensor, w, np.zeros(len(w)))
+        v, e, sizes = np.concatenate([v, w[inside]]), np.concatenate([e, f[inside]]), np.append(sizes, 0 * f[inside, 0])
+        ids += [name for name, seen in zip(others, inside, strict=True) if seen]
+    return Sighted(v, e, sizes, ids)

@@ -14,11 +14,12 @@ from pydantic import Discriminator, Field, Tag
 
 from kalmark.config.sections import Number, Positive, Section, type_or
 from kalmark.geometry.angles import wrap
-from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
+from kalmark.geometry.rotations import left_jacobian, matrix
+from kalmark.models.motion import Ackermann, Odometry2D, Odometry3D, Unicycle
 from kalmark.simulate.layouts import Points, mapping_of
 
 Array = npt.NDArray[np.float64]
-Driver = Callable[[Array], Array]  # true pose -> control of the next step
+Driver = Callable[[Array], Array]  # true state -> control of the next step
 
 
 class Constant(Section):
@@ -29,12 +30,14 @@ class Constant(Section):
     """The control, in the motion model's columns."""
 
     def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
-        """Return what gives the control at each true pose."""
+        """Return what gives the control at each true state."""
         u = np.array(self.u)
-        return lambda pose: u
+        return lambda state: u
 
 
-class _Drive(Section):
+class Drive(Section):
+    """Steering from place to place.  In space a place (x, y) is at the height the robot is at."""
+
     speed_mps: Positive = 1.0
     """Speed along the route."""
     turn_radius_m: Positive = 1.0
@@ -45,37 +48,36 @@ class _Drive(Section):
         raise NotImplementedError
 
     def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
-        """Return what steers from each true pose towards the next place."""
+        """Return what steers from each true state towards the next place."""
         places = self.places(area, rng)
         target = next(places)
-        limit = self.speed_mps / self.turn_radius_m
+        steer = steer_in_space if motion.space.world == "space" else steer_in_plane
 
-        def drive(pose: Array) -> Array:
+        def drive(state: Array) -> Array:
             nonlocal target
             for _ in range(1000):
-                if math.dist(target, pose[:2]) > 2 * self.turn_radius_m:
+                n = min(len(target), 3 if motion.space.world == "space" else 2)
+                if math.dist(target[:n], state[:n]) > 2 * self.turn_radius_m:
                     break
                 target = next(places)
-            error = wrap(math.atan2(target[1] - pose[1], target[0] - pose[0]) - pose[2])
-            w = min(limit, max(-limit, error / dt_s))
-            return control(motion, self.speed_mps, w, dt_s)
+            return steer(motion, state, target, self, dt_s)
 
         return drive
 
 
-class Waypoints(_Drive):
+class Waypoints(Drive):
     """Given places one after the other, round and round."""
 
     type: Literal["waypoints"] = "waypoints"
     points_m: Points
-    """The places (x, y)."""
+    """The places (x, y), in space (x, y, z) too."""
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
         """Yield the places to drive to, without end."""
         yield from cycle(np.array(self.points_m, dtype=np.float64))
 
 
-class Wander(_Drive):
+class Wander(Drive):
     """Random places between the landmarks."""
 
     type: Literal["wander"] = "wander"
@@ -86,7 +88,7 @@ class Wander(_Drive):
             yield rng.uniform(area[0], area[1])
 
 
-class Lanes(_Drive):
+class Lanes(Drive):
     """Lanes up and down between the landmarks, then back: every part of the area is seen."""
 
     type: Literal["lanes"] = "lanes"
@@ -95,7 +97,7 @@ class Lanes(_Drive):
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
         """Yield the places to drive to, without end."""
-        (west, south), (east, north) = area
+        (west, south), (east, north) = area[:, :2]
         lanes = np.linspace(west, east, max(2, math.ceil((east - west) / self.spacing_m) + 1))
         ends = [(x, y) for i, x in enumerate(lanes) for y in ((south, north) if i % 2 == 0 else (north, south))]
         yield from cycle(np.array(ends + ends[-2:0:-1]))
@@ -113,6 +115,13 @@ Route = Annotated[
 ]
 
 
+def steer_in_plane(motion: Any, pose: Array, target: Array, drive: Drive, dt_s: float) -> Array:
+    """Return the control that turns the robot towards a target (2,) as fast as it may."""
+    error = wrap(math.atan2(target[1] - pose[1], target[0] - pose[0]) - pose[2])
+    limit = drive.speed_mps / drive.turn_radius_m
+    return control(motion, drive.speed_mps, min(limit, max(-limit, error / dt_s)), dt_s)
+
+
 def control(motion: Any, v: float, w: float, dt_s: float) -> Array:
     """Return the control of `motion` that drives at v (m/s) and turns at w (rad/s) for `dt_s`."""
     if isinstance(motion, Unicycle):
@@ -124,3 +133,25 @@ def control(motion: Any, v: float, w: float, dt_s: float) -> Array:
     assert isinstance(motion, Ackermann)
     tan = w * motion.wheelbase_m / v
     return np.array([v * (1.0 - tan * motion.encoder_offset_m / motion.wheelbase_m), math.atan(tan)])
+
+
+def steer_in_space(motion: Any, state: Array, target: Array, drive: Drive, dt_s: float) -> Array:
+    """Return the control that turns the nose, the x axis, towards a target (2,) or (3,), and levels the wings."""
+    Q = matrix(state[3:7].copy())
+    ahead = Q.T @ (np.append(target[:2], target[2] if len(target) == 3 else state[2]) - state[:3])
+    up = Q[2]  # the world's, in the robot's frame
+    pitch, yaw = math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1])), math.atan2(ahead[1], ahead[0])
+    error = np.array([-math.atan2(up[1], up[2]), pitch, yaw])
+    w = error / max(dt_s, 0.2)
+    limit = drive.speed_mps / drive.turn_radius_m
+    w *= min(1.0, limit / max(float(np.linalg.norm(w)), 1e-12))
+    return control_in_space(motion, state, np.array([drive.speed_mps, 0.0, 0.0]), w, dt_s)
+
+
+def control_in_space(motion: Any, state: Array, v: Array, w: Array, dt_s: float) -> Array:
+    """Return the control of `motion` that moves at v (m/s) and turns at w (rad/s), robot's frame, for `dt_s`."""
+    if motion.columns == Odometry3D.columns:  # the exact screw
+        return np.concatenate([left_jacobian(w * dt_s) @ v * dt_s, w * dt_s])
+    if len(state) == 7:
+        return np.concatenate([v, w])
+    return np.concatenate([matrix(state[3:7].copy()) @ v - state[7:10], w - state[10:13]])  # impulses

@@ -9,42 +9,81 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+import numpy as np
+from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 from ruamel.yaml import YAML
 
+from kalmark.config.classes import CLASSES
 from kalmark.config.merging import merged
-from kalmark.config.models import Motion, RangeBearingSignatureSensor, Sensor
-from kalmark.config.mounting import StartConfig
+from kalmark.config.models import RangeBearingSignatureSensor, world_of
+from kalmark.config.mounting import SpaceStartConfig, StartConfig
 from kalmark.config.reading import resolve_name, validate
-from kalmark.config.schema import Config
+from kalmark.config.schema import Config, RobotConfig, SpaceRobotConfig
 from kalmark.config.sections import Positive, Section, expected
 from kalmark.config.tree import Tree, read_tree
-from kalmark.simulate.layouts import Layout
-from kalmark.simulate.routes import Constant, Route
+from kalmark.simulate.layouts3d import Layout
+from kalmark.simulate.routes import Constant, Route, Waypoints
+from kalmark.simulate.sights import Sensing
 
 Count = Annotated[int, Field(ge=1)]
 
-_COLUMNS = {"odometry_2d": 3, "unicycle": 2, "ackermann": 2}
+# What a sensor's filter takes for a landmark if `filter` does not say; otherwise a point.
+LANDMARKS = {
+    "range_bearing_signature": "point_signature",
+    "pinhole": "anchored_homogeneous",
+    "omnidirectional": "anchored_homogeneous",
+    "segments": "anchored_homogeneous_line",
+    "tag_pose": "tag",
+    "tag_corners": "tag",
+}
 
 
-class SimulatedRobot(Section):
-    """One robot: how it truly moves and measures, noise included, and where it goes."""
-
-    motion: Motion
-    """Motion model and its noise."""
+class _Underway(Section):
     route: Route
     """Where it is told to go."""
+    sensing: dict[str, Sensing] = Field(default_factory=dict)
+    """By a sensor's name: its rate, and what is wrong with it."""
+
+
+class SimulatedRobot(_Underway, RobotConfig):
+    """One robot of the plane: how it truly moves and measures, noise included, and where it goes."""
+
     start: StartConfig = StartConfig()
     """Start; with sigmas, the true start is drawn around it."""
-    sensors: dict[str, Sensor] = Field(default_factory=dict)
-    """Sensors by name, and their noise."""
 
     @model_validator(mode="after")
-    def _control_fits(self) -> SimulatedRobot:
-        size = _COLUMNS[self.motion.type]
-        if isinstance(self.route, Constant) and len(self.route.u) != size:
-            raise expected(f"a route whose u has the {size} numbers of {self.motion.type}, not {len(self.route.u)}")
+    def _all_fits(self) -> SimulatedRobot:
+        check_robot(self)
         return self
+
+
+class SpaceSimulatedRobot(_Underway, SpaceRobotConfig):
+    """One robot of space.  A mount with sigmas truly sits elsewhere: where it is drawn around what is given."""
+
+    start: SpaceStartConfig = SpaceStartConfig()
+    """Start; with sigmas, the true start is drawn around it."""
+
+    @model_validator(mode="after")
+    def _all_fits(self) -> SpaceSimulatedRobot:
+        check_robot(self)
+        return self
+
+
+AnySimulatedRobot = Annotated[
+    Annotated[SimulatedRobot, Tag("(plane)")] | Annotated[SpaceSimulatedRobot, Tag("(space)")], Discriminator(world_of)
+]
+
+
+def check_robot(robot: SimulatedRobot | SpaceSimulatedRobot) -> None:
+    """Refuse a constant control of another motion, and a rate or faults of a sensor that the robot does not have."""
+    size, route = len(CLASSES[robot.motion.type].columns), robot.route  # type: ignore[attr-defined]
+    if isinstance(route, Constant) and len(route.u) != size:
+        raise expected(f"a route whose u has the {size} numbers of {robot.motion.type}, not {len(route.u)}")
+    if isinstance(route, Waypoints) and isinstance(robot, SimulatedRobot) and len(route.points_m[0]) != 2:
+        raise expected("a route whose points_m are [x, y]: the robot moves in the plane")
+    for name in robot.sensing:
+        if name not in robot.sensors:
+            raise expected(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
 
 
 class World(Section):
@@ -52,7 +91,7 @@ class World(Section):
 
     world: Layout
     """Where the landmarks are."""
-    robots: Annotated[dict[str, SimulatedRobot], Field(min_length=1)]
+    robots: Annotated[dict[str, AnySimulatedRobot], Field(min_length=1)]
     """Robots by name."""
     steps: Count = 1000
     """Steps: one motion and one scan of every sensor each."""
@@ -77,10 +116,19 @@ class World(Section):
     _tree: Tree | None = PrivateAttr(None)
 
     @model_validator(mode="after")
-    def _signatures_fit(self) -> World:
+    def _is_one_world(self) -> World:
         if self.sight_robots and self.has_signatures:
             raise expected("sight_robots false where a sensor measures signatures: robots have none")
+        if len({type(robot) for robot in self.robots.values()}) > 1:
+            raise expected("robots that all move in the plane, or all in space")
+        if self.dimensions == 2 and self.world.scenery(np.random.default_rng(0)).of_space:
+            raise expected("robots of space, or a world of the plane: its landmarks are in space")
         return self
+
+    @property
+    def dimensions(self) -> int:
+        """2 in the plane, 3 in space."""
+        return 3 if isinstance(next(iter(self.robots.values())), SpaceSimulatedRobot) else 2
 
     @property
     def file(self) -> Path | None:
@@ -103,12 +151,29 @@ class World(Section):
 
         Raises ConfigError naming the place of a key in `filter` that a configuration does not have.
         """
-        values: dict[str, Any] = {"robots": {}}
-        for name, robot in self.robots.items():
-            values["robots"][name] = robot.model_dump(exclude={"route"}, exclude_none=True)
+        values = self._values()
         values["association"] = {"type": "identity" if self.ids else "nearest"}
-        values["landmarks"] = {"type": "point_signature" if self.has_signatures else "point"}
         return validate(self._laid_over(values), Config)
+
+    def models(self) -> Config:
+        """Return the configuration of what is simulated, whatever the filter believes."""
+        return validate(Tree(values=self._values()), Config)
+
+    def _values(self) -> dict[str, Any]:
+        values: dict[str, Any] = {"robots": {}}
+        kinds = set()
+        for name, robot in self.robots.items():
+            values["robots"][name] = robot.model_dump(exclude={"route", "sensing"}, exclude_none=True)
+            for key, sensor in robot.sensors.items():
+                kinds.add(kind := LANDMARKS.get(sensor.type, "point"))
+                values["robots"][name]["sensors"][key].setdefault("landmark", {"type": kind})
+        if len(kinds) == 1:  # said once, not of each sensor
+            values["landmarks"] = {"type": kinds.pop()}
+            for name, robot in self.robots.items():
+                for key, sensor in robot.sensors.items():
+                    if sensor.landmark is None:
+                        del values["robots"][name]["sensors"][key]["landmark"]
+        return values
 
     def to_yaml(self) -> str:
         """Return the text of a file that describes this world, every default written out; `load_world` reads it."""

@@ -1,0 +1,117 @@
+"""What the truth says of the blocks of a map: their errors in the estimator's coordinates, and of what part of them.
+
+The error d of an estimate x is what the estimator would have to correct it by: in "log" coordinates its retraction
+(`kalmark.geometry.spaces.retract`) by the error `turn` of the observing robot's orientation gives the truth, in "world"
+coordinates plain plus does.  A landmark is judged by what of it has a truth, whatever its state in the map is:
+
+=======  ====================================================================  ===
+point    its Euclidean position                                                2|3
+line     across itself, where the true ends are: along it, nothing is known    4
+tag      its pose                                                              6
+=======  ====================================================================  ===
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import conjugate, exp, log, multiply
+from kalmark.results.consistency import point_error, pose_error, rotation_error
+
+Array = npt.NDArray[np.float64]
+
+FAR = 3.0  # a point of unknown depth is judged once its depth exceeds so many of its sigmas
+
+
+class Judged(NamedTuple):
+    """A block's error d (f,) in own and in world coordinates, and its Jacobian F (f, dof) in the block's error.
+
+    `place` (k, 2|3) and `truth` (k, 2|3) are the points of it to align maps by.
+    """
+
+    own: Array
+    world: Array
+    F: Array
+    place: Array
+    truth: Array
+
+
+def state_error(mean: Array, truth: Array, turn: Any, coordinates: str) -> Array:
+    """Return the error of a robot's state: pose (3,) or (7,), or pose, velocity and body rate (13,)."""
+    if len(mean) == 3:
+        return np.append(point_error(mean[:2], truth[:2], turn, coordinates), wrap(truth[2] - mean[2]))
+    parts = [point_error(mean[:3], truth[:3], turn, coordinates), orientation_error(mean, truth, turn, coordinates)]
+    if len(mean) == 13:
+        parts += [point_error(mean[7:10], truth[7:10], turn, coordinates), truth[10:] - mean[10:]]
+    return np.concatenate(parts)
+
+
+def orientation_error(mean: Array, truth: Array, turn: Array, coordinates: str) -> Array:
+    """Return the error (3,) of a pose's orientation: after the turn about the observing robot's, what is its own."""
+    if coordinates == "world":
+        return rotation_error(mean[3:7], truth[3:7])
+    back = conjugate(exp(np.ascontiguousarray(turn)))
+    own: Array = log(multiply(back, multiply(truth[3:7].copy(), conjugate(mean[3:7].copy()))))
+    return own + turn
+
+
+def robot_turn(mean: Array, truth: Array) -> Any:
+    """Return the error of a robot's orientation: of its heading, or a rotation vector (3,)."""
+    return wrap(truth[2] - mean[2]) if len(mean) == 3 else rotation_error(mean[3:7], truth[3:7])
+
+
+def robot(mean: Array, truth: Array, turn: Any, coordinates: str, dof: int) -> Judged:
+    """Judge a robot."""
+    own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
+    return Judged(own, world, np.eye(dof), np.empty((0, 0)), np.empty((0, 0)))
+
+
+def mount(mean: Array, truth: Array) -> Judged:
+    """Judge where a sensor sits on its robot: the world's turns leave that as it is."""
+    d = pose_error(mean, truth, "world")
+    return Judged(d, d, np.eye(len(d)), np.empty((0, 0)), np.empty((0, 0)))
+
+
+def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array) -> Judged | None:
+    """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
+    if len(truth) == 6:
+        return line(model, mean, truth, turn, coordinates) if hasattr(model, "endpoints") else None
+    if len(truth) == 7:
+        if len(mean) != 7:
+            return None
+        own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
+        return Judged(own, world, np.eye(6), mean[None, :3], truth[None, :3])
+    point, F = position(model, mean, len(truth))
+    if len(mean) > len(truth) and len(truth) == 3:
+        spread = F @ P @ F.T
+        if not (np.isfinite(spread).all() and FAR**2 * np.linalg.norm(spread, 2) < np.sum((point - eye) ** 2)):
+            return None
+    own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
+    return Judged(own, world, F, point[None], truth[None])
+
+
+def position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
+    """Return the Euclidean position (d,) of a landmark's state, and its Jacobian (d, dof)."""
+    if d == 3 and hasattr(model, "to_point"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            p, P_l = model.to_point(mean[None])
+        return p[0], P_l[0]
+    return mean[:d], np.eye(d, len(mean))
+
+
+def line(model: Any, mean: Array, truth: Array, turn: Array, coordinates: str) -> Judged:
+    """Judge a line by how far it passes, in two directions across it, from the two true ends (6,): four numbers."""
+    l = mean[None]
+    base, _ = model.endpoints(l, np.array([[0.0, 1.0]]))
+    a, along = base[0, 0], base[0, 1] - base[0, 0]
+    ends = truth.reshape(2, 3)
+    t = (ends - a) @ along / (along @ along)
+    q, Q_l = model.endpoints(l, t[None])
+    across = np.linalg.svd(along[None])[2][1:]  # (2, 3): at right angles to the line
+    own, world = (point_error(q[0], ends, turn, c) @ across.T for c in (coordinates, "world"))
+    F = (across @ Q_l[0]).reshape(4, -1)
+    return Judged(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)

@@ -1,0 +1,265 @@
+"""What the sensors of simulated robots see from their true poses, and what they measure of it, right or wrong.
+
+What is seen is judged without noise, and noise is added afterwards: a measurement may so come to lie beyond the border
+of the image, but its noise is that of the sensor everywhere.  ([TB] adds it before and cuts what falls outside.)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numpy.random import Generator
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from kalmark.config.sections import Section
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.spaces import SE3
+from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.simulate.layouts import Scenery
+from kalmark.slam.events import Id
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Indices = npt.NDArray[np.int64]
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Pair = Annotated[tuple[int, int], Field(strict=False)]
+
+POINTS, SEGMENTS, TAGS = "points", "segments", "tags"
+_LOOK = {3: Point2D(), 7: Point3D()}
+_TRIES = 200  # places drawn for a false measurement before it is given up
+
+
+def looks_for(sensor: Any) -> str:
+    """Return what a sensor sees: points, segments or tags."""
+    return {"Segments": SEGMENTS, "TagPose": TAGS, "TagCorners": TAGS}.get(type(sensor).__name__, POINTS)
+
+
+class Sighted(NamedTuple):
+    """What a sensor sees: things v (K, n) in its frame, exact measurements e (K, m), sizes of tags (K,), and ids."""
+
+    v: Array
+    e: Array
+    sizes: Array
+    ids: list[Id]
+
+
+class Sensing(Section):
+    """How a simulated sensor departs from its model: a slower rate, and faults."""
+
+    every: Annotated[int, Field(ge=1)] = 1
+    """A scan at every so manieth step."""
+    dropouts: Share = 0.0
+    """Probability that something seen is not reported."""
+    outliers: Share = 0.0
+    """Probability that a measurement is false: of a place drawn from all that the sensor sees."""
+    swapped: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
+    """Pairs of ids that are taken for each other."""
+    hidden: Annotated[tuple[int, ...], Field(strict=False)] = ()
+    """Ids that are never reported."""
+    faults_from_step: Annotated[int, Field(ge=1)] = 1
+    """All is well before this step."""
+
+    @property
+    def has_faults(self) -> bool:
+        """Whether anything but the rate is unusual."""
+        return bool(self.dropouts or self.outliers or self.swapped or self.hidden)
+
+
+@dataclass
+class Things:
+    """All there is to see of one sort: ids from `first` on, `values` (M, n), and which of it was ever seen."""
+
+    sort: str
+    first: int
+    values: Array
+    sizes: Array
+    seen: Flags = field(init=False)
+    tree: Any = field(init=False)
+    dimensions: int = 2
+
+    def __post_init__(self) -> None:
+        self.seen = np.zeros(len(self.values), dtype=np.bool_)
+        self.tree = cKDTree(self.centres()) if len(self.values) else None
+
+    def extent(self) -> float:
+        """Return the length of the diagonal of all of it, in m, at least 1."""
+        return max(1.0, float(np.linalg.norm(np.ptp(self.centres(), axis=0)))) if len(self.values) else 1.0
+
+    def centres(self) -> Array:
+        """Return where they are (M, 2|3), segments by their middles."""
+        return centre(self.sort, self.values, self.dimensions)
+
+    def near(self, place: Array, reach_m: float) -> Indices:
+        """Return those within reach of a place, in order."""
+        if math.isinf(reach_m) or self.tree is None:
+            return np.arange(len(self.values))
+        return np.array(sorted(self.tree.query_ball_point(place, reach_m)), dtype=np.int64)
+
+    def seen_from(self, T: Array, index: Indices) -> Array:
+        """Return them in the frame T."""
+        return in_frame(self.sort, T, self.values[index])
+
+
+def things_of(scenery: Scenery, dimensions: int) -> dict[str, Things]:
+    """Return what there is to see, by sort; ids are 1, 2, ... over points, then segments, then tags."""
+    points = scenery.points
+    if dimensions == 3 and points.shape[1] == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    values = {POINTS: points, SEGMENTS: scenery.segments, TAGS: scenery.tags}
+    first, things = 1, {}
+    for sort, rows in values.items():
+        sizes = scenery.tag_sizes if sort == TAGS else np.zeros(len(rows))
+        things[sort] = Things(sort, first, rows, sizes, dimensions=dimensions)
+        first += len(rows)
+    return things
+
+
+def centre(sort: str, values: Array, dimensions: int) -> Array:
+    """Return the positions (K, 2|3) of things (K, n)."""
+    return 0.5 * (values[:, :3] + values[:, 3:]) if sort == SEGMENTS else values[:, :dimensions]
+
+
+def in_frame(sort: str, T: Array, values: Array) -> Array:
+    """Return things (K, n) as they are in the frame T: points, both ends of segments, poses of tags."""
+    look: Any = _LOOK[len(T)]
+    if sort == POINTS:
+        v: Array = look.seen_from(T, values)[0]
+        return v
+    if sort == SEGMENTS:
+        return np.column_stack([look.seen_from(T, values[:, at : at + 3])[0] for at in (0, 3)])
+    from kalmark.models.tags import tag_seen_from
+
+    return tag_seen_from(T, np.ascontiguousarray(values))[0]
+
+
+def exact(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
+    """Return which things v (K, n) of the sensor's frame it sees, and what it would measure (K, m) without noise."""
+    sort = looks_for(sensor)
+    if sort == SEGMENTS:
+        from kalmark.models.segments import visible_segment
+
+        k = np.array([sensor.fx_px, sensor.fy_px, sensor.cx_px, sensor.cy_px])
+        size = np.array([sensor.width_px, sensor.height_px], dtype=np.float64)
+        here = np.array([0.0, 0, 0, 0, 0, 0, 1])
+        return visible_segment(here, v[:, :3].copy(), v[:, 3:].copy(), k, size, sensor.min_length_px)
+    if sort == TAGS:
+        return tags_seen(sensor, v, sizes)
+    inside = sensor.sees(v)
+    e = np.full((len(v), len(sensor.columns)), np.nan)
+    if inside.any():
+        e[inside] = sensor.expect(v[inside])[0]
+    return inside, e
+
+
+def noisy(sensor: Any, e: Array, rng: Generator) -> Array:
+    """Return noisy measurements of the exact ones e (K, m), angles wrapped, poses turned."""
+    if len(e) == 0:
+        return np.empty((0, len(sensor.columns)))
+    n = gaussian(sensor.noise(e), rng)
+    if e.shape[1] == 7 and n.shape[1] == 6:
+        return np.array([SE3.plus(pose, d) for pose, d in zip(e, n, strict=True)])
+    y = e.copy()
+    y[:, : n.shape[1]] += n  # a tag's size is known, not measured
+    return np.where(sensor.angular, wrap(y), y) if len(sensor.angular) == y.shape[1] else y
+
+
+def gaussian(cov: Array, rng: Generator) -> Array:
+    """Draw from zero-mean Gaussians with positive semidefinite covariances (..., n, n)."""
+    variances = np.einsum("...ii->...i", cov)
+    if np.count_nonzero(cov) == np.count_nonzero(variances):
+        return np.sqrt(variances) * rng.standard_normal(variances.shape)
+    variances, axes = np.linalg.eigh(cov)
+    draw = np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(variances.shape)
+    return np.einsum("...ij,...j->...i", axes, draw)
+
+
+def chosen(
+    things: Things, near: Indices, distance: Array, new_per_step: int | None, max_per_scan: int | None, rng: Generator
+) -> Indices:
+    """Return which of the visible things, rows of `near`, are reported, in order, and note them as seen."""
+    rows = np.arange(len(near))
+    if new_per_step is not None:
+        new = np.flatnonzero(~things.seen[near])
+        rows = np.union1d(np.flatnonzero(things.seen[near]), rng.permutation(new)[:new_per_step])
+    if max_per_scan is not None:
+        rows = np.sort(rows[np.argsort(distance[rows], kind="stable")[:max_per_scan]])
+    things.seen[near[rows]] = True
+    return rows
+
+
+def faulty(
+    sensor: Any, sighted: Sighted, sensing: Sensing, k: int, things: Things, rng: Generator
+) -> tuple[Sighted, list[Id | None]]:
+    """Return what is reported at step k of what is seen, before noise, and what each observation is really of."""
+    real: list[Id | None] = list(sighted.ids)
+    if k < sensing.faults_from_step or not sensing.has_faults:
+        return sighted, real
+    v, e, sizes, ids = sighted
+    if sensing.outliers:
+        wrong = np.flatnonzero(rng.random(len(ids)) < sensing.outliers)
+        found, y = elsewhere(sensor, v[wrong], sizes[wrong], min(sensor_reach(sensor), things.extent()), rng)
+        e[wrong[found]] = y[found]
+        real = [None if i in wrong[found] else name for i, name in enumerate(real)]
+    kept = rng.random(len(ids)) >= sensing.dropouts
+    swapped: dict[Id, Id] = dict([*sensing.swapped, *((b, a) for a, b in sensing.swapped)])
+    rows = [i for i, name in enumerate(ids) if kept[i] and name not in sensing.hidden]
+    told = [swapped.get(ids[i], ids[i]) for i in rows]
+    return Sighted(v[rows], e[rows], sizes[rows], told), [real[i] for i in rows]
+
+
+def sensor_reach(sensor: Any) -> float:
+    """Return the farthest range of a sensor, inf if it has none."""
+    return float(getattr(sensor, "range_max_m", math.inf))
+
+
+def elsewhere(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generator) -> tuple[Flags, Array]:
+    """Return false measurements (K, m): of the same things at places drawn from the field of view, and which succeeded.
+
+    Places are uniform in the volume that the sensor sees within reach: in an image, uniform over its pixels.
+    """
+    sort, plane = looks_for(sensor), getattr(sensor, "world", "space") == "plane"
+    found, e = np.zeros(len(v), dtype=np.bool_), np.full((len(v), len(sensor.columns)), np.nan)
+    for _ in range(_TRIES):
+        missing = np.flatnonzero(~found)
+        if not len(missing):
+            break
+        places = in_ball(len(missing), 2 if plane else 3, reach_m, rng)
+        moved = v[missing].copy()
+        if sort == SEGMENTS:
+            shift = places - centre(sort, moved, 3)
+            moved += np.column_stack([shift, shift])
+        else:
+            moved[:, : places.shape[1]] = places
+        inside, y = exact(sensor, moved, sizes[missing])
+        found[missing], e[missing[inside]] = inside, y[inside]
+    return found, e
+
+
+def in_ball(count: int, dimensions: int, radius: float, rng: Generator) -> Array:
+    """Return points (count, dimensions) uniform in a ball about the origin."""
+    direction = rng.standard_normal((count, dimensions))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return radius * rng.uniform(0.0, 1.0, (count, 1)) ** (1.0 / dimensions) * direction
+
+
+def tags_seen(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
+    """Return which tags at v (K, 7) a sensor sees: those that face it and that its own limits allow; and e (K, m)."""
+    from kalmark.geometry.rotations import matrix
+
+    axis = np.array([matrix(q)[:, 2] for q in np.ascontiguousarray(v[:, 3:])]).reshape(-1, 3)
+    facing = np.einsum("ki,ki->k", axis, v[:, :3]) > 0
+    if len(sensor.columns) == 7:
+        inside = facing & sensor.sees(v)
+        return inside, v.copy()
+    e = np.full((len(v), 9), np.nan)
+    e[:, 8] = sizes
+    inside = facing & sensor.sees(v)
+    if inside.any():
+        e[inside, :8] = sensor.corners(v[inside], sizes[inside])
+    return inside, e
