@@ -87,6 +87,7 @@ def assert_same_log(a: Log, b: Log) -> None:
     assert a.landmarks.keys() == b.landmarks.keys()
     assert all(np.array_equal(position, b.landmarks[id_]) for id_, position in a.landmarks.items())
     assert a.control_columns == b.control_columns and a.sensor_columns == b.sensor_columns
+    assert a.describes == b.describes
 
 
 def test_a_log_comes_back_to_the_nanosecond_and_to_the_last_bit(tmp_path: Path) -> None:
@@ -104,9 +105,66 @@ def test_poses_in_space_and_landmarks_in_space_come_back(tmp_path: Path) -> None
         robots=("r",),
         events=[Fix(t_ns=1, robot="r", y=(1, 2, 3), cov=np.eye(3) / 3)],
         truth={"r": Trajectory(np.array([1]), np.array([pose]))},
-        landmarks={"a": np.array([1.0, 2.0, 3.0])},
+        landmarks={"a": np.array([1.0, 2.0, 3.0]), 2: np.arange(6.0) / 7, "tag": np.array(pose) / 7},
+        describes={
+            "robots": {"r": {"motion": {"type": "odometry_3d", "sigma_x_m": 1e-5}}},
+            "landmarks": {"type": "tag"},
+        },
     )
     assert_same_log(log, open_log(write_native(log, tmp_path)))
+    text = (tmp_path / "landmarks.csv").read_text().splitlines()
+    assert text[0] == "id,x_m,y_m,z_m,qx,qy,qz,qw,x2_m,y2_m,z2_m"
+    (tmp_path / "landmarks.csv").write_text("\n".join([text[0], "a,1,2,3,,,,,5,,"]))
+    with pytest.raises(
+        LogError, match=r"landmarks\.csv:2: x_m, y_m, z_m, x2_m, expected a point, both ends of a line or"
+    ):
+        open_log(tmp_path)
+
+
+SPACE = {  # robots and sensors of space, each with the columns of its model
+    "odometry": ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad"),
+    "rates": ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"),
+    "impulses": ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps"),
+    "pinhole": ("u_px", "v_px"),
+    "stereo": ("ul_px", "vl_px", "ur_px", "vr_px"),
+    "radar": ("range_m", "azimuth_rad", "elevation_rad"),
+    "depth": ("x_m", "y_m", "z_m"),
+    "segments": ("u1_px", "v1_px", "u2_px", "v2_px"),
+    "corners": ("u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m"),
+    "tags": ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"),
+}
+
+
+def test_robots_and_sensors_of_space_come_back_side_by_side(tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    robots, sensors = list(SPACE)[:3], list(SPACE)[3:]
+    events: list[Event] = [
+        Control(t_ns=1, robot=r, u=random.normal(size=6), cov=np.diag(random.random(6))) for r in robots
+    ]
+    for k, sensor in enumerate(sensors):
+        y = random.random((2, len(SPACE[sensor])))
+        events.append(Scan(t_ns=k, robot="odometry", sensor=sensor, y=y, ids=[k, f"l{k}"]))
+    log = Log(
+        name="many",
+        robots=tuple(robots),
+        events=sorted(events, key=order),
+        control_columns={robot: SPACE[robot] for robot in robots},
+        sensor_columns={("odometry", sensor): SPACE[sensor] for sensor in sensors},
+    )
+    again = open_log(write_native(log, tmp_path))
+    assert_same_log(log, again)
+    scans = (tmp_path / "scans.csv").read_text().splitlines()
+    header, *rows = (line.split(",") for line in scans)
+    swapped = [",".join(reversed(cells)) for cells in (header, *rows)]
+    (tmp_path / "scans.csv").write_text("\n".join(swapped))
+    assert_same_log(log, open_log(tmp_path))
+
+
+def test_a_tag_of_negative_size_is_refused(tmp_path: Path) -> None:
+    row = "0.2,rover,cam,7," + ",".join("12345678") + ",-0.1"
+    native(tmp_path, scans="t_s,robot,sensor,id," + ",".join(SPACE["corners"]) + "\n" + row)
+    with pytest.raises(LogError, match=r"scans\.csv:2: size_m is -0\.1, expected a size of at least 0"):
+        open_log(tmp_path)
 
 
 finite = st.floats(-1e150, 1e150)

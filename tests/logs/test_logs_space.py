@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import shutil
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from space_logs import Data, controls, in_sensor, opened, pose_of, scans
 
 from kalmark.errors import LogError
-from kalmark.logs import Log, open_log
+from kalmark.logs import Log, open_log, write_native
 from kalmark.models.cameras import project_omni, project_pinhole
 from kalmark.slam.events import Control
 
@@ -269,3 +270,21 @@ def test_kitti_s_camera_is_ahead_of_and_above_the_inertial_unit(data: Data) -> N
     mount = opened(data("kitti_stereo_features")).describes["robots"]["car"]["sensors"]["stereo"]["mount"]
     assert [round(mount[f"{axis}_m"], 3) for axis in "xyz"] == [1.083, -0.310, 0.730]
     assert [mount[f"{angle}_deg"] for angle in ("roll", "pitch", "yaw")] == pytest.approx([-90, 0, -90], abs=1)
+
+
+REAL = ["starry_night", "kitti_stereo_features", "tagslam_test/test_13", "tagslam_test/test_22"]
+
+
+@pytest.mark.parametrize("name", [*REAL, "b2_idpPnt_constVel_small.json.gz", "c_hmgLin_small.json.gz"])
+def test_a_log_of_space_is_the_same_when_converted(name: str, data: Data, oracle: Data, tmp_path: Path) -> None:
+    log = opened((oracle if name.endswith(".gz") else data)(name))
+    again = open_log(write_native(log, tmp_path))
+    assert again.describes == log.describes == json.loads(json.dumps(log.describes))
+    assert (again.control_columns, again.sensor_columns) == (log.control_columns, log.sensor_columns)
+    assert len(again) == len(log) and [event.t_ns for event in again] == [event.t_ns for event in log]
+    for a, b in zip(scans(log), scans(again), strict=True):
+        assert (a.sensor, a.ids or ()) == (b.sensor, b.ids or ()) and np.array_equal(a.y, b.y)
+    for c, d in zip(controls(log), controls(again), strict=True):
+        assert np.array_equal(c.u, d.u) and (c.cov is d.cov is None or np.array_equal(c.cov, d.cov))
+    assert all(np.array_equal(log.landmarks[i], again.landmarks[i]) for i in log.landmarks)
+    assert all(np.array_equal(path.poses, again.truth[robot].poses) for robot, path in log.truth.items())

@@ -4,8 +4,9 @@
 `scans.csv`     t_s, robot, sensor, id, the sensors' columns[, own noise]; a sensor leaves the others' columns empty
 `fixes.csv`     t_s, robot, x_m, y_m[, z_m], own noise
 `truth.csv`     t_s, robot, x_m, y_m, theta_rad | x_m, y_m, z_m, qx, qy, qz, qw
-`landmarks.csv` id, x_m, y_m[, z_m]
+`landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags
 `gps.csv`       t_s, robot, x_m, y_m, antenna_x_m, antenna_y_m: fixes that only score a run
+`rig.yaml`      what the log describes of its robots and sensors, in the shape of a configuration
 
 A row of `scans.csv` whose id and values are all empty is a scan that saw nothing.
 
@@ -24,13 +25,18 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.logs.log import Array, Log, PositionTrack, Trajectory
+from kalmark.logs.rig import mapping
 from kalmark.logs.source import Format, Request, folder_of, nearest
 from kalmark.logs.table import Row, Table, read_table
 from kalmark.logs.text import landmark_id, seconds
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, order
 
+RIG = "rig.yaml"
 FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv")
+LANDMARK3 = ("x_m", "y_m", "z_m", "x2_m", "y2_m", "z2_m", "qx", "qy", "qz", "qw")
 POSE2, POSE3 = ("x_m", "y_m", "theta_rad"), ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+LANDMARKS = (LANDMARK3[:2], LANDMARK3[:3], LANDMARK3[:6], POSE3)
+"""The columns of a point of the plane, of one of space, of a line and of a tag, as `Log.landmarks` has them."""
 
 
 def read(path: Path, request: Request) -> Log:
@@ -58,6 +64,7 @@ def read(path: Path, request: Request) -> Log:
         skipped=request.skipped,
         control_columns=control_columns,
         sensor_columns=sensor_columns,
+        describes=mapping(path / RIG) if (path / RIG).is_file() else {},
     )
 
 
@@ -186,19 +193,22 @@ def pose_columns() -> str:
 
 
 def read_landmarks(path: Path, request: Request) -> dict[Id, Array]:
-    """Return the true landmark positions of `landmarks.csv`."""
+    """Return the true landmarks of `landmarks.csv`: positions, both ends of lines (6,), poses of tags (7,)."""
     landmarks: dict[Id, Array] = {}
-    table = read_table(path, ("id", "x_m", "y_m"), allowed=("z_m",))
+    table = read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:])
     for row in table.rows(request):
-        name, position = row.text("id"), row.numbers(table.value_columns, request)
-        if position is None:
+        given = tuple(name for name in table.value_columns if row.text(name) or name in LANDMARK3[:2])
+        name, numbers = row.text("id"), row.numbers(given, request)
+        if numbers is None:
             continue
         if not name:
             row.refuse(request, "id is empty, expected the landmark's id")
         elif landmark_id(name) in landmarks:
             row.refuse(request, f"id {name} is in this file already, expected each landmark once")
+        elif given not in LANDMARKS:
+            row.refuse(request, f"{', '.join(given)}, expected a point, both ends of a line or the pose of a tag")
         else:
-            landmarks[landmark_id(name)] = np.array(position)
+            landmarks[landmark_id(name)] = np.array(numbers)
     return landmarks
 
 

@@ -1,13 +1,18 @@
-"""What the logs of space share: poses from other conventions, and the rig that a log describes."""
+"""What the logs of space share: poses from other conventions, YAML files, and the rig that a log describes."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
+from kalmark.errors import LogError
 from kalmark.geometry import rotations
 from kalmark.logs.log import Array
+from kalmark.logs.text import read_text
 
 
 def frame(position: Any, matrix: Any) -> Array:
@@ -32,3 +37,16 @@ def placed(pose: Array) -> dict[str, float]:
 def named(prefix: str, axes: str, suffix: str, values: Any) -> dict[str, float]:
     """Return one key for each axis: `named("sigma_v", "xyz", "_mps", (1, 2, 3))` has sigma_vx_mps = 1, ..."""
     return {f"{prefix}{axis}{suffix}": float(value) for axis, value in zip(axes, values, strict=True)}
+
+
+def mapping(path: Path) -> dict[str, Any]:
+    """Return the content of a YAML file.  Raises LogError if it is none."""
+    try:
+        content = YAML(typ="safe").load(read_text(path))
+    except YAMLError as error:
+        where = getattr(error, "problem_mark", None)
+        line = where.line + 1 if where is not None else 1
+        raise LogError(f"{path}:{line}: not YAML ({getattr(error, 'problem', error)}), expected a mapping") from None
+    if not isinstance(content, dict):
+        raise LogError(f"{path}:1: holds {type(content).__name__}, expected a mapping")
+    return content

@@ -19,10 +19,16 @@ from kalmark.logs.text import nanoseconds, number, read_text
 
 NAMES = ("t_s", "robot", "sensor", "id")
 CANONICAL = (
-    "v_mps", "w_radps", "steering_rad", "dx_m", "dy_m", "dz_m", "dtheta_rad", "range_m", "bearing_rad", "azimuth_rad",
-    "elevation_rad", "signature", "x_m", "y_m", "z_m", "u_px", "v_px",
+    "v_mps", "w_radps", "vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps", "steering_rad",
+    "dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps",
+    "dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad", "dtheta_rad",
+    "range_m", "bearing_rad", "azimuth_rad", "elevation_rad", "signature",
+    "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "x2_m", "y2_m", "z2_m",
+    "u_px", "v_px", "ul_px", "vl_px", "ur_px", "vr_px",
+    "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
 )  # fmt: skip
 """The order in which known columns make a control or an observation, whatever their order in the file."""
+NOT_NEGATIVE = {"range_m": "range", "size_m": "size"}
 
 _RANK = {name: rank for rank, name in enumerate(CANONICAL)}
 _COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
@@ -128,8 +134,10 @@ class Row:
             except ValueError:
                 self.refuse(request, f"{column} is {self.text(column)!r}, expected a finite number")
                 return None
-            if value < 0 and column == "range_m":
-                self.refuse(request, f"range_m is {self.text(column)}, expected a range of at least 0")
+            if value < 0 and column in NOT_NEGATIVE:
+                self.refuse(
+                    request, f"{column} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0"
+                )
                 return None
             values.append(value)
         return values

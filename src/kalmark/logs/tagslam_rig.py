@@ -6,13 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-
 from kalmark.errors import LogError
 from kalmark.logs.log import Array
-from kalmark.logs.rig import vector_frame
-from kalmark.logs.text import nanoseconds, read_text
+from kalmark.logs.rig import mapping, vector_frame
+from kalmark.logs.text import nanoseconds
 
 LENSES = {"equidistant": "equidistant", "radtan": "radtan", "plumb_bob": "radtan"}
 COEFFICIENTS = {"equidistant": 4, "radtan": 5}
@@ -44,19 +41,6 @@ class Scene:
     def max_hamming(self, tag: int) -> int:
         """Return how many corrected bits a detection of this tag may have."""
         return self.hamming.get(self.body_of.get(tag, self.default_body), MAX_HAMMING)
-
-
-def mapping(path: Path) -> dict[str, Any]:
-    """Return the content of a YAML file.  Raises LogError if it is none."""
-    try:
-        content = YAML(typ="safe").load(read_text(path))
-    except YAMLError as error:
-        where = getattr(error, "problem_mark", None)
-        line = where.line + 1 if where is not None else 1
-        raise LogError(f"{path}:{line}: not YAML ({getattr(error, 'problem', error)}), expected a mapping") from None
-    if not isinstance(content, dict):
-        raise LogError(f"{path}:1: holds {type(content).__name__}, expected a mapping")
-    return content
 
 
 def read_scene(path: Path) -> Scene:

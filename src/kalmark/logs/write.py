@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ruamel.yaml import YAML
 
 from kalmark.errors import LogError
 from kalmark.logs.log import Array, Log
-from kalmark.logs.native import FILES, POSE2, POSE3
+from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
 from kalmark.logs.table import CANONICAL, cov_columns
 from kalmark.logs.text import landmark_id, seconds
 from kalmark.slam.events import Control, Fix, Id, Scan
@@ -44,6 +45,10 @@ def write_native(log: Log, folder: Path | str) -> Path:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(header)
             writer.writerows(rows)
+    (folder / RIG).unlink(missing_ok=True)
+    if log.describes:
+        with (folder / RIG).open("w", encoding="utf-8") as file:
+            YAML(typ="safe", pure=True).dump(log.describes, file)
     return folder
 
 
@@ -115,11 +120,13 @@ def truth_table(log: Log) -> Table:
 
 def landmarks_table(log: Log) -> Table:
     """Return header and rows of landmarks.csv."""
-    sizes = {len(position) for position in log.landmarks.values()}
-    if len(sizes) > 1:
-        raise LogError("landmarks hold positions in the plane and in space, expected one kind")
-    columns = ("x_m", "y_m", "z_m")[: max(sizes, default=2)]
-    return ["id", *columns], [[id_text(id_), *numbers(position)] for id_, position in log.landmarks.items()]
+    of_size = {len(names): names for names in LANDMARKS}
+    sizes = {len(values) for values in log.landmarks.values()}
+    if not sizes <= of_size.keys() or (2 in sizes and len(sizes) > 1):
+        raise LogError(f"landmarks have {', '.join(map(str, sorted(sizes)))} numbers, expected all 2, or 3, 6 and 7")
+    columns = union(of_size[size] for size in sorted(sizes)) or LANDMARKS[0]
+    rows = [[id_text(id_), *place(columns, of_size[len(l)], l)] for id_, l in log.landmarks.items()]
+    return ["id", *columns], rows
 
 
 def gps_table(log: Log) -> Table:
