@@ -108,12 +108,14 @@ class InverseDepth:
 
 
 class Line:
-    """A line by two endpoints."""
+    """A line by two points at the abscissas 1 and 2 of rays from the origin."""
 
     kind = "homogeneous_line"
+    first_ends = (1.0, 2.0)
 
-    def to_endpoints(self, l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return 2.0 * l, np.tile(2.0 * np.eye(6), (len(l), 1, 1))
+    def endpoints(self, l: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        scale = np.repeat(t, 3, axis=1)
+        return (scale * l).reshape(-1, 2, 3), (scale[:, :, None] * np.eye(6)).reshape(-1, 2, 3, 6)
 
 
 def pretended(models: list[Any], means: list[Any], covariances: list[Any]) -> Any:
@@ -126,7 +128,8 @@ def pretended(models: list[Any], means: list[Any], covariances: list[Any]) -> An
         observations=[2] * len(models),
     )
     space = SimpleNamespace(motion=SimpleNamespace(space=SE3))
-    return SimpleNamespace(landmarks=lambda: table, _kinds=dict(enumerate(models)), robots={"r": space})
+    ends = {2: np.array([2.0, 3.0])}
+    return SimpleNamespace(landmarks=lambda: table, _kinds=dict(enumerate(models)), _ends=ends, robots={"r": space})
 
 
 def mixed() -> MapLandmarks:
@@ -145,7 +148,7 @@ def test_every_landmark_has_its_place_in_the_table_and_comes_back_from_it(tmp_pa
     assert "cov_x2rx" not in header
     assert landmarks.means[1].tolist() == [2.0, 2.0, 0.0]
     assert landmarks.covariances[1][0, 0] == pytest.approx(0.04 + 0.01 * 16)
-    assert landmarks.means[2].tolist() == [0, 0, 2, 2, 2, 2]
+    assert landmarks.means[2].tolist() == [0, 0, 2, 3, 3, 3]
     assert not np.isfinite(landmarks.means[4]).any(), "a point at infinity has no place"
     (tmp_path / "landmarks.csv").write_text(text)
     back = MapLandmarks.read(tmp_path / "landmarks.csv")

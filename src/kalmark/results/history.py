@@ -107,6 +107,12 @@ class History:
         q = 6 if self.in_space else 3
         return self.covariance[:, :q, :q]
 
+    def map_at(self, step: int) -> MapSnapshot:
+        """Return the last map that was kept up to a step; before the first there is nothing in it."""
+        d = 3 if self.in_space else 2
+        nothing = MapSnapshot(step, 0, (), np.empty((0, d)), np.empty((0, d, d)))
+        return next((m for m in reversed(self.maps) if m.step <= step), nothing)
+
     @property
     def robots(self) -> tuple[str, ...]:
         """The robots in the order of their starts, then of their first scans."""

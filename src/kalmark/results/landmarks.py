@@ -53,8 +53,9 @@ class MapLandmarks:
     def of(cls, slam: Slam) -> MapLandmarks:
         """Return the places of the landmarks of a filter's map."""
         table = slam.landmarks()
-        models = (slam._kinds[i] for i in table.ids)
-        places = [place(*each) for each in zip(models, table.means, table.covariances, strict=True)]
+        ends = getattr(slam, "_ends", {})
+        rows = zip(table.ids, table.means, table.covariances, strict=True)
+        places = [place(slam._kinds[i], mean, cov, ends.get(i)) for i, mean, cov in rows]
         return cls(
             list(table.ids),
             list(table.kinds),

@@ -44,23 +44,31 @@ def draw_map(run: Run) -> Figure:
     """Return the figure of a run's map: axes in metres, in the frame of the map; in space a view and a plan."""
     if run.history.in_space:
         return plot_space.draw_map(run)
-    picture = Picture.of(run)
-    means, covariances = run.landmarks.positions()
-    low, high = _extent(picture, means, covariances)
+    low, high = extent(run)
     figure = Figure(figsize=_size(high - low), layout=ConstrainedLayoutEngine(h_pad=0.09), facecolor="white")
     axes = figure.subplots()
+    draw_plane(axes, run, low, high)
+    title, figures = headline(run)
+    _head(axes, title, _lines(figures, width=int(12 * figure.get_figwidth())))
+    entries = _legend(Picture.of(run), len(run.landmarks))
+    figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+def draw_plane(axes: Axes, run: Run, low: Array, high: Array, step: int | None = None) -> None:
+    """Draw the map of a run in the plane after a step, by default the last, between two corners (2,)."""
+    picture, history = Picture.of(run), run.history
+    means, covariances = run.landmarks.positions() if step is None else history.map_at(step)[3:5]
+    until = slice(None) if step is None else slice(step + 1)
     _style(axes)
     _draw_truth(axes, picture, crowded=len(means) > CROWD)
     _draw_landmarks(axes, means, covariances)
     for robot in picture.paths:
-        _draw_robot(axes, run, picture, robot)
+        mine = history.robot[until] == robot
+        _draw_robot(axes, picture.colour(robot), history.mean[until][mine], history.covariance[until][mine])
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
-    title, figures = headline(run)
-    _head(axes, title, _lines(figures, width=int(12 * figure.get_figwidth())))
-    figure.legend(handles=_legend(picture, len(means)), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    return figure
 
 
 def _head(axes: Axes, title: str, lines: list[str]) -> None:
@@ -96,8 +104,10 @@ def _style(axes: Axes) -> None:
         side.set_color("#c4c8cf")
 
 
-def _extent(picture: Picture, landmarks: Array, covariances: Array) -> tuple[Array, Array]:
-    """Return the corners of what is to be seen; huge ellipses and stray fixes may reach out of it."""
+def extent(run: Run) -> tuple[Array, Array]:
+    """Return the corners of what is to be seen of a map; huge ellipses and stray fixes may reach out of it."""
+    picture = Picture.of(run)
+    landmarks, covariances = run.landmarks.positions()
     parts = [
         landmarks,
         *(path[:, :2] for path in picture.paths.values()),
@@ -149,8 +159,7 @@ def _draw_landmarks(axes: Axes, means: Array, covariances: Array) -> None:
     axes.plot(means[:, 0], means[:, 1], ".", color=LANDMARK_COLOUR, markersize=1.8 if crowded else 3.5, zorder=5)
 
 
-def _draw_robot(axes: Axes, run: Run, picture: Picture, robot: str) -> None:
-    path, colour = picture.paths[robot], picture.colour(robot)
+def _draw_robot(axes: Axes, colour: str, path: Array, P: Array) -> None:
     if len(path) == 0:
         return
     width = 0.8 if len(path) > LONG else 1.1
@@ -159,8 +168,7 @@ def _draw_robot(axes: Axes, run: Run, picture: Picture, robot: str) -> None:
     heading = np.degrees(path[-1, 2])
     marker = (3, 0, heading - 90.0)
     axes.plot(*path[-1, :2], marker=marker, color=colour, markeredgecolor="white", markersize=11, zorder=8)
-    last = run.history.covariance[run.history.robot == robot][-1:, :2, :2]
-    contour = ellipses(path[-1:, :2], last)[0]
+    contour = ellipses(path[-1:, :2], P[-1:, :2, :2])[0]
     axes.plot(contour[:, 0], contour[:, 1], "-", color=colour, linewidth=0.9, zorder=7)
 
 

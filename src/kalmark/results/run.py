@@ -131,17 +131,19 @@ class Run:
         write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
         return folder
 
-    def report(self, folder: str | Path) -> None:
-        """Write ``map.png``, ``report.html`` and a figure of each camera's last scan into a folder."""
+    def report(self, folder: str | Path) -> list[Path]:
+        """Write ``map.png``, ``report.html`` and each camera's last scan into a folder; return their paths."""
         from kalmark.results.plot import save_map, save_sensor  # matplotlib is slow to import
         from kalmark.results.report import report_html
 
         folder = Path(folder)
         replace_file(folder / "map.png", lambda path: save_map(self, path))
+        written = [folder / "map.png", folder / "report.html"]
         for robot, sensor in cameras_that_saw(self.history):
-            name = f"sensor_{file_name(robot)}_{file_name(sensor)}.png"
-            replace_file(folder / name, partial(save_sensor, self, robot, sensor))
+            written.append(folder / f"sensor_{file_name(robot)}_{file_name(sensor)}.png")
+            replace_file(written[-1], partial(save_sensor, self, robot, sensor))
         write(folder / "report.html", report_html(self))
+        return written
 
     @classmethod
     def load(cls, folder: str | Path) -> Run:

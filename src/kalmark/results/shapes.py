@@ -11,7 +11,8 @@ tag         x y z qx qy qz qw               x y z, rotation vector      7, 6
 ==========  ==============================  ==========================  =====
 
 Whatever else a landmark is in the map (inverse depth, homogeneous, Pluecker), its model says where that is: `to_point`
-or `to_endpoints` gives the place (K, n) of states (K, m) and its Jacobian (K, n, dof).
+gives the points (K, d) of states (K, m) and their Jacobian (K, d, dof), `endpoints` those (K, 2, 3) of lines at the
+abscissas (K, 2) of their ends.
 """
 
 from __future__ import annotations
@@ -36,13 +37,21 @@ EUCLIDEAN = (  # kinds whose state is their place; what is not (inverse depth, s
 )
 
 
-def place(model: Any, mean: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the place and covariance of one landmark's state; a model that does not say is its own place."""
-    convert = getattr(model, "to_point", None) or getattr(model, "to_endpoints", None)
-    if convert is None:
-        return np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
+def place(model: Any, mean: Array, covariance: Array, ends: Array | None = None) -> tuple[Array, Array]:
+    """Return the place and covariance of one landmark's state; `ends` (2,) are the abscissas of a line's ends.
+
+    A model that does not say where it is, is its own place, and so is the pose of a tag.
+    """
+    mean, covariance = np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
+    ends = getattr(model, "first_ends", None) if ends is None else ends
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        p, P_l = convert(np.array(mean, dtype=np.float64).reshape(1, -1))
+        if ends is not None:
+            p, P_l = model.endpoints(mean[None], np.array(ends, dtype=np.float64)[None])
+            p, P_l = p.reshape(1, LINE), P_l.reshape(1, LINE, -1)
+        elif hasattr(model, "to_point") and model.kind != "tag":
+            p, P_l = model.to_point(mean[None])
+        else:
+            return mean, covariance
         covariance = P_l[0] @ covariance @ P_l[0].T
     at_infinity = ~np.isfinite(p[0])
     return np.where(at_infinity, np.inf, p[0]), np.where(np.isfinite(covariance), covariance, np.inf)

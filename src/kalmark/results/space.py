@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kalmark.geometry.rotations import matrix
-from kalmark.results.history import Array, Camera, MapSnapshot
+from kalmark.results.history import Array, Camera
 from kalmark.results.picture import Picture
 from kalmark.results.shapes import EUCLIDEANS, LINE, Shapes, shapes
 from kalmark.slam.events import Id
@@ -50,9 +50,7 @@ class Scene:
             step, (means, covariances) = len(history.t_ns) - 1, run.landmarks.places()
             ids, kinds = tuple(run.landmarks.ids), tuple(run.landmarks.kinds)
         else:
-            then = [m for m in history.maps if m.step <= step][-1:] or history.maps[:1]
-            nothing = MapSnapshot(0, 0, (), np.empty((0, 3)), np.empty((0, 3, 3)))
-            _, _, ids, means, covariances, kinds = then[0] if then else nothing
+            _, _, ids, means, covariances, kinds = history.map_at(step)
         until = {name: int((history.robot[: step + 1] == name).sum()) for name in picture.paths}
         low, high = _box(run, picture)
         return cls(

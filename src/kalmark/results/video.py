@@ -1,0 +1,126 @@
+"""A run as a video: the map as it grew and what cameras saw, MP4 where ffmpeg is installed, else an animated GIF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.animation import FFMpegWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from kalmark.errors import RunError
+from kalmark.results.images import images, steps_of
+from kalmark.results.picture import INK, headline
+from kalmark.results.plot import draw_plane, extent
+from kalmark.results.plot_sensor import draw_image
+from kalmark.results.plot_space import VIEWS, Projection, draw_space, draw_top
+from kalmark.results.progress import track
+from kalmark.results.run import replace_file
+from kalmark.results.space import Scene
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+INCHES, DPI = (12.8, 7.2), 80
+MOST_IMAGES = 3  # beside the map
+
+
+def write_video(
+    run: Run, path: str | Path, fps: float = 10.0, frames: int = 200, orbit_deg: float = 0.0, progress: bool = True
+) -> Path:
+    """Write a run as a video of at most so many frames and return its path.
+
+    The suffix of `path` becomes ``.gif`` if it is ``.mp4`` and ffmpeg is not installed.  In space the view turns by
+    `orbit_deg` in all.  Raises RunError for a run without scans and for other suffixes.
+    """
+    path = Path(path)
+    if path.suffix not in (".mp4", ".gif"):
+        raise RunError(f"{path}: the suffix is {path.suffix!r}, expected .mp4 or .gif")
+    if not (math.isfinite(fps) and fps > 0):
+        raise RunError(f"fps is {fps}, expected a number above 0")
+    if len(run.history.t_ns) == 0:
+        raise RunError(f"{path}: no scan was processed, expected a run with something to show")
+    if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
+        path = path.with_suffix(".gif")
+    count = len(run.history.t_ns)
+    steps = np.unique(np.linspace(0, count - 1, max(1, min(frames, count))).round().astype(int)).tolist()
+    drawn = partial(_frames, run, steps, orbit_deg, progress)
+    replace_file(path, partial(_mp4 if path.suffix == ".mp4" else _gif, drawn(), fps))
+    return path
+
+
+def _mp4(drawn: Iterator[Figure], fps: float, path: Path) -> None:
+    writer: Any = None
+    try:
+        for figure in drawn:
+            if writer is None:
+                writer = FFMpegWriter(fps=fps)  # type: ignore[arg-type]
+                writer.setup(figure, str(path), DPI)
+            writer.grab_frame()
+    finally:
+        if writer is not None:
+            writer.finish()
+
+
+def _gif(drawn: Iterator[Figure], fps: float, path: Path) -> None:
+    pictures = (_picture(figure) for figure in drawn)
+    first = next(pictures)
+    first.save(path, format="GIF", save_all=True, append_images=pictures, duration=max(20, round(1e3 / fps)), loop=0)
+
+
+def _picture(figure: Figure) -> Image.Image:
+    canvas: Any = figure.canvas
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(64)
+
+
+def _frames(run: Run, steps: list[int], orbit_deg: float, progress: bool) -> Iterator[Figure]:
+    """Yield one figure again and again, drawn anew after each of the steps."""
+    figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    first = run.history.t_ns[0]
+    for k, step in enumerate(track(steps, "video", len(steps), show=progress)):
+        figure.clear()
+        turned = orbit_deg * k / max(len(steps) - 1, 1)
+        (_draw_space if run.history.in_space else _draw_plane)(figure, run, step, turned)
+        t = (run.history.t_ns[step] - first) * 1e-9
+        figure.text(0.02, 0.955, headline(run)[0], fontsize=12, fontweight="bold", color=INK)
+        figure.text(0.98, 0.955, f"{t:.1f} s", fontsize=12, ha="right", color=INK)
+        yield figure
+
+
+def _draw_plane(figure: Figure, run: Run, step: int, _turned: float) -> None:
+    draw_plane(figure.add_axes((0.07, 0.09, 0.9, 0.84)), run, *extent(run), step)
+
+
+def _draw_space(figure: Figure, run: Run, step: int, turned: float) -> None:
+    scene = Scene.of(run, step)
+    elevation, azimuth = VIEWS["normal"]
+    projection = Projection.of(scene, (elevation, azimuth + turned))
+    draw_space(figure.add_axes((0.0, 0.02, 0.6, 0.92)), scene, projection)
+    seen = _last_images(run, step)
+    if not seen:
+        draw_top(figure.add_axes((0.65, 0.12, 0.33, 0.76)), scene)
+    height = 0.9 / max(len(seen), 1)
+    for k, (title, image, size) in enumerate(seen):
+        axes = figure.add_axes((0.64, 0.94 - (k + 1) * height + 0.06, 0.35, height - 0.1))
+        draw_image(axes, image, size)
+        axes.set_title(title, fontsize=9, color="#555b66")
+
+
+def _last_images(run: Run, step: int) -> list[tuple[str, Any, tuple[float, float]]]:
+    """Return the images of what each camera saw last up to a step, with titles."""
+    out = []
+    for camera in run.history.cameras:
+        steps = steps_of(run.history, camera)
+        steps = steps[steps <= step]
+        if len(steps):
+            for image in images(run.history, camera, int(steps[-1])):
+                out.append((f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size))
+    return out[:MOST_IMAGES]
