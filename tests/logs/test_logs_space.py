@@ -203,6 +203,8 @@ def test_a_recording_follows_the_toolbox_s_landmarks_gate_and_attention(oracle: 
     attention = camera["attention"]
     assert (attention["updates"], attention["first_starts"], attention["starts"]) == (10, 5, 1)
     assert attention["margin_px"] == 25.6 and attention["delete"]
+    lines = recording(oracle, "c_plkLin_small").describes["landmarks"]
+    assert [lines[f"{name}_beta_{i}"] for name in ("prior", "sigma") for i in (1, 2)] == [0.1, 0, 0.25, 1]
     kinds = {name: recording(oracle, name).describes["landmarks"]["type"] for name in RECORDINGS}
     assert kinds["a3_hmgPnt_odo"] == "homogeneous" and kinds["e_omni_ahmPnt"] == "anchored_homogeneous"
     assert [kinds[f"c_{k}Lin_small"] for k in ("idp", "plk", "hmg")] == [

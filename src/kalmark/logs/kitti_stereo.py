@@ -18,7 +18,7 @@ ROBOT, SENSOR = "car", "stereo"
 NAMES = ("features", "time_stamps", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
 RATES = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
 PIXELS = ("ul_px", "vl_px", "ur_px", "vr_px")
-MOTION = {"type": "velocity_3d", "sigma_v_mps": 0.3, "sigma_w_radps": 0.05}
+SIGMAS = (0.3, 0.3, 0.3, 0.05, 0.05, 0.05)  # of the rates
 IMAGE = {"width_px": 1242, "height_px": 375} | {f"sigma_{name}": 0.5 for name in PIXELS}
 
 
@@ -98,7 +98,11 @@ def car(data: dict[str, Array]) -> dict[str, Any]:
     camera = {"fx_px": K[0, 0], "fy_px": K[1, 1], "cx_px": K[0, 2], "cy_px": K[1, 2], "baseline_m": data["b"]}
     mount = placed(frame(T[:3, 3], T[:3, :3].T))
     section = {name: float(value) for name, value in camera.items()} | IMAGE
-    return {"motion": dict(MOTION), "sensors": {SENSOR: {"type": "stereo", **section, "mount": mount}}}
+    motion = {f"sigma_{name}": sigma for name, sigma in zip(RATES, SIGMAS, strict=True)}
+    return {
+        "motion": {"type": "velocity_3d", **motion},
+        "sensors": {SENSOR: {"type": "stereo", **section, "mount": mount}},
+    }
 
 
 KITTI_STEREO = Format("kitti_stereo_features", "an .npz file with features, time_stamps, ... or its folder", find, read,

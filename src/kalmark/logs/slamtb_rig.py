@@ -44,15 +44,23 @@ def is_lines(cfg: dict[str, Any]) -> bool:
 def described(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
     """Return the configuration with which kalmark repeats a recording, its landmark type included."""
     opt = cfg["Opt"]
-    kind, prior = opt["init"]["initType"], opt["init"]["idpPnt"]
-    landmark: dict[str, Any] = {"type": LANDMARKS[kind]}
-    if kind not in ("eucPnt", *PLUECKER):
-        landmark |= {"prior_rho_per_m": prior["nonObsMean"], "sigma_rho_per_m": prior["nonObsStd"]}
     return {
         "robots": {robot.name: described_robot(cfg, robot) for robot in robots},
-        "landmarks": landmark,
-        "map": {"reparametrize": opt["correct"]["linTestIdp"] if opt["correct"]["reparametrize"] else None},
+        "landmarks": landmark(opt["init"]),
+        "map": {"reparametrize": float(opt["correct"]["linTestIdp"]) if opt["correct"]["reparametrize"] else "off"},
     }
+
+
+def landmark(init: dict[str, Any]) -> dict[str, Any]:
+    """Return the landmark type of a recording, with the prior of what one image does not tell."""
+    kind = init["initType"]
+    prior = init["plkLin" if kind in PLUECKER else "idpPnt"]
+    mean, sigma = numbers(prior["nonObsMean"]), numbers(prior["nonObsStd"])
+    section: dict[str, Any] = {"type": LANDMARKS[kind]}
+    if kind in PLUECKER:
+        names = ("prior_beta_1", "prior_beta_2", "sigma_beta_1", "sigma_beta_2")
+        return section | dict(zip(names, mean + sigma, strict=True))
+    return section if kind == "eucPnt" else section | {"prior_rho_per_m": mean[0], "sigma_rho_per_m": sigma[0]}
 
 
 def described_robot(cfg: dict[str, Any], robot: Part) -> dict[str, Any]:
