@@ -15,11 +15,12 @@ from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import exp, left_jacobian_inverse, log, multiply
 from kalmark.geometry.spaces import retract
 from kalmark.results.consistency import pose_error, rotation_error, turned_back
+from kalmark.results.evaluate import landmark_figures, line_figures
 from kalmark.results.files import tum
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.record import record
 from kalmark.results.run import Run
-from kalmark.results.truth import fitted
+from kalmark.results.truth import ORIGIN, Truth, fitted
 from results_space import START, slam_for, spiral
 
 
@@ -161,3 +162,31 @@ def test_figures_of_others_stand_in_the_summary_under_their_name(run: Run) -> No
     given = record(slam_for(log), log, progress=False)
     assert given.evaluate()["slamtb"] == {"ate_m": 0.25}
     assert "slamtb" not in run.evaluate()
+
+
+def test_lines_are_judged_across_and_only_if_they_are_settled() -> None:
+    P = np.eye(6) * 1e-4
+    P[0, 0] = P[3, 3] = 1e6  # along the line
+    places = [np.array([0.0, 0, 0, 1, 0, 0]), np.array([0.0, 5, 0, 1, 5, 0]), np.array([0.0, 0, 9, 1, 0, 9])]
+    ids: list[Any] = [1, 2, 3]
+    landmarks = MapLandmarks(
+        ids, ["pluecker_line"] * 3, places, [P, P, P + np.diag([0, 4.0, 0, 0, 4, 0])], [2] * 3, True
+    )
+    shifts = {1: np.array([70.0, 0.03, 0.04]), 2: np.zeros(3), 3: np.ones(3)}
+    true = {i: (l.reshape(2, 3) * [9, 1, 1] + shifts[i]).ravel() for i, l in zip(ids, places, strict=True)}
+    truth = Truth(np.empty((0, 7)), true, offset=ORIGIN[7])
+    figures = line_figures(landmarks, truth)
+    assert figures["lines_compared"] == 2
+    assert figures["line_rmse_raw_m"] == pytest.approx(np.sqrt(0.05**2 / 2))
+    assert line_figures(landmarks, Truth(np.empty((0, 7)), offset=ORIGIN[7])) == {}
+
+
+def test_a_point_whose_depth_is_open_is_not_compared() -> None:
+    kinds = ["point3", "inverse_depth", "inverse_depth"]
+    covariances = [np.eye(3), 1e-4 * np.eye(3), np.diag([1e-4, 1e-4, 4.0])]
+    true = {k: np.array([k * 5.0, 0, 0]) for k in range(3)}
+    ids: list[Any] = [0, 1, 2]
+    landmarks = MapLandmarks(ids, kinds, [l + 0.1 for l in true.values()], covariances, [2] * 3, True)
+    figures = landmark_figures(landmarks, Truth(np.empty((0, 7)), true, offset=ORIGIN[7]))
+    assert figures["landmarks_compared"] == 2
+    assert figures["landmark_rmse_raw_m"] == pytest.approx(0.1 * np.sqrt(3))

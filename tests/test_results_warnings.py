@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import results_space
 from kalmark.errors import DivergedError
 from kalmark.logs.log import Log
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import load_run
 from kalmark.slam.events import Control, Event, Fix, Scan
+from results_space import spiral
 from results_world import STEP_NS, circle, slam_for
 
 
@@ -159,3 +161,23 @@ def test_a_diverged_run_is_not_to_be_used() -> None:
     turned = [Control(t_ns=e.t_ns, robot=e.robot, u=-e.u) if isinstance(e, Control) else e for e in log]
     blind = [scan(e, y=(), ids=None) if isinstance(e, Scan) else e for e in turned]
     assert any(line.startswith("DIVERGED: the error of rover") for line in warned(log, blind))
+
+
+def test_what_a_camera_s_attention_leaves_alone_is_no_warning() -> None:
+    log = spiral(steps=10)
+    run = record(results_space.slam_for(log), log, progress=False)
+    count = len(run.history.step)
+    for reason, warns in (("not among the 10 that tell most", False), ("no such landmark", True)):
+        history = replace(run.history, outcome=np.full(count, "ignored"), reason=np.full(count, reason))
+        lines = replace(run, history=history, summary={}).evaluate()["warnings"]
+        assert any("were ignored" in line for line in lines) == warns
+
+
+def test_measurements_outside_the_image_are_noticed() -> None:
+    slam, log = results_space.with_camera(spiral(steps=10))
+    run = record(slam, log, progress=False)
+    assert run.evaluate()["warnings"] == []
+    (camera,) = run.history.cameras
+    history = replace(run.history, cameras=(camera._replace(size=(320.0, 240.0)),))
+    (line,) = replace(run, history=history, summary={}).evaluate()["warnings"]
+    assert line.endswith("of camera eye lie outside its image of 320 x 240 pixels: set width_px and height_px")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.results.history import Array, Camera
+from kalmark.results.history import Array, Camera, Mounted
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
@@ -32,11 +32,23 @@ def cameras(slam: Slam) -> tuple[Camera, ...]:
     )
 
 
-def _mount(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
+def mounts(slam: Slam) -> tuple[Mounted, ...]:
+    """Return the mounts of the sensors that calibrate themselves, as estimated."""
+    names = (f"{robot.name}.{sensor}" for robot in slam.robots.values() for sensor in robot.sensors)
+    return tuple(Mounted(name, slam.mean(name), slam.covariance(name)) for name in names if _in_map(slam, name))
+
+
+def _in_map(slam: Slam, name: str) -> bool:
     try:
-        return np.array(slam.mean(f"{robot}.{sensor}"), dtype=np.float64)
+        slam.slot(name)
     except MapError:
-        return np.array(at, dtype=np.float64)
+        return False
+    return True
+
+
+def _mount(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
+    name = f"{robot}.{sensor}"
+    return np.array(slam.mean(name) if _in_map(slam, name) else at, dtype=np.float64)
 
 
 def _size(sensor: Any) -> tuple[float, float]:

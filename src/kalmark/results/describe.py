@@ -98,7 +98,7 @@ def _robot(robot: Any) -> dict[str, Any]:
     out["sensors"] = {}
     for name, mount in robot.sensors.items():
         sensor = model(mount.sensor)
-        at = _pose(mount.at)
+        at = describe_pose(mount.at)
         if any(at.values()):
             sensor["mount"] = at
         for part in ("landmark", "association", "detector"):
@@ -113,14 +113,14 @@ def _robot(robot: Any) -> dict[str, Any]:
 
 
 def _start(robot: Any) -> dict[str, float]:
-    out = _pose(robot.start)
+    out = describe_pose(robot.start)
     out |= dict(
         zip(("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"), plain(robot.start)[7:], strict=False)
     )
     return out if robot.cov is None else out | _sigmas(robot.cov)
 
 
-def _pose(pose: Any) -> dict[str, float]:
+def describe_pose(pose: Any) -> dict[str, float]:
     """Return a pose as configuration files have it: (x, y, theta), in space (x, y, z, roll, pitch, yaw)."""
     pose = [float(value) for value in pose]
     if len(pose) == 3:

@@ -9,7 +9,8 @@ import numpy as np
 
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
 from kalmark.results.consistency import diverged, nees, nis, pose_error
-from kalmark.results.history import Array, History, Ints
+from kalmark.results.describe import describe_pose
+from kalmark.results.history import Array, History, Ints, Mounted
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.shapes import EUCLIDEAN, LINE
 from kalmark.results.truth import Fixes, Truth, fitted
@@ -53,7 +54,9 @@ def evaluate(run: Run) -> dict[str, Any]:
     if run.stopped:
         summary["stopped"] = run.stopped
     summary["robots"] = robots
-    summary |= landmark_figures(run.landmarks, run.truth)
+    summary |= landmark_figures(run.landmarks, run.truth) | line_figures(run.landmarks, run.truth)
+    if history.mounts:
+        summary["mounts"] = {mount.name: mount_figures(mount) for mount in history.mounts}
     summary |= run.reference
     if run.truth.fixes and not np.isfinite(run.truth.poses).any():
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
@@ -124,6 +127,36 @@ def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
         "landmark_rmse_m": rmse(rigid(estimate, position)(estimate) - position) if enough else float("nan"),
         "landmark_rmse_raw_m": rmse(estimate - position),
         "landmarks_compared": len(rows),
+    }
+
+
+def line_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
+    """Return how far the true ends of lines are from the estimated lines, over those whose place is settled.
+
+    Across the lines: along them nothing is known.  Nothing is aligned.
+    """
+    true = {str(i): l.reshape(2, 3) for i, l in truth.landmarks_in_map().items() if len(l) == LINE}
+    if not true:
+        return {}
+    extent = float(np.linalg.norm(np.ptp(np.concatenate(list(true.values())), axis=0)))
+    errors = []
+    for i, place, P in zip(landmarks.ids, landmarks.means, landmarks.covariances, strict=True):
+        if str(i) not in true or len(place) != LINE or not np.isfinite(P).all():
+            continue
+        along = place[3:] - place[:3]
+        across = np.eye(3) - np.outer(along, along) / np.maximum(along @ along, 1e-300)
+        if max(_sigma(across @ P[k : k + 3, k : k + 3] @ across) for k in (0, 3)) < SETTLED * extent:
+            errors.append((true[str(i)] - place[:3]) @ across)
+    return {"line_rmse_raw_m": rmse(np.reshape(errors, (-1, 3))), "lines_compared": len(errors)}
+
+
+def mount_figures(mount: Mounted) -> dict[str, Any]:
+    """Return where the filter believes a sensor to sit that calibrates itself, and how far that is known."""
+    d = 3 if len(mount.mean) == 7 else 2
+    sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
+    return describe_pose(mount.mean) | {
+        "sigma_position_m": float(sigma[:d].max()),
+        "sigma_rotation_deg": math.degrees(sigma[d:].max()),
     }
 
 

@@ -58,6 +58,14 @@ class Camera(NamedTuple):
     corners: Array
 
 
+class Mounted(NamedTuple):
+    """A sensor that calibrates itself: its name in the map, and its mount (3,) or (7,) with covariance at the end."""
+
+    name: str
+    mean: Array
+    covariance: Array
+
+
 @dataclass(frozen=True, eq=False)
 class History:
     """A run's steps (S of them) and observations (O of them).
@@ -90,6 +98,7 @@ class History:
     inputs: Inputs = field(default_factory=Inputs)
     kind: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
     cameras: tuple[Camera, ...] = ()
+    mounts: tuple[Mounted, ...] = ()
 
     @property
     def in_space(self) -> bool:
@@ -124,15 +133,18 @@ class History:
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
         named |= {key: getattr(self, key) for key in (*_EXTRA, "kind")}
         return (
-            named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._camera_arrays()
+            named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._sensor_arrays()
         )
 
-    def _camera_arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def _sensor_arrays(self) -> dict[str, npt.NDArray[Any]]:
         return {
             "camera": texts([f"{c.robot}\n{c.sensor}\n{','.join(c.columns)}" for c in self.cameras]),
             "camera_mount": np.array([c.mount for c in self.cameras]).reshape(-1, 7),
             "camera_size": np.array([c.size for c in self.cameras], dtype=np.float64).reshape(-1, 2),
             "camera_corners": np.array([c.corners for c in self.cameras]).reshape(-1, 4, 3),
+            "mount": texts([m.name for m in self.mounts]),
+            "mount_mean": padded_rows([m.mean for m in self.mounts]),
+            "mount_covariance": padded_squares([m.covariance for m in self.mounts]),
         }
 
     @classmethod
@@ -147,8 +159,10 @@ class History:
         )
         kind = named.get("kind", np.full(len(named["landmark"]), "", dtype=np.str_))
         maps, inputs, cameras = _maps(named), Inputs.from_arrays(named), _cameras(named)
+        rows = zip(*(named.get(key, ()) for key in ("mount", "mount_mean", "mount_covariance")), strict=True)
+        mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P)) for name, mean, P in rows)
         columns = {key: named[key] for key in keys}
-        return cls(**columns, maps=maps, starts=starts, inputs=inputs, kind=kind, cameras=cameras)
+        return cls(**columns, maps=maps, starts=starts, inputs=inputs, kind=kind, cameras=cameras, mounts=mounts)
 
 
 def _map_arrays(maps: tuple[MapSnapshot, ...]) -> dict[str, npt.NDArray[Any]]:

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from kalmark.results.history import Array
 from kalmark.results.picture import FIX_COLOUR, INK, TRUTH_COLOUR, headline
-from kalmark.results.shapes import LINE
+from kalmark.results.shapes import LINE, LINES
 from kalmark.results.space import EUCLIDEAN_COLOUR, LINE_COLOUR, OTHER_COLOUR, Scene, ellipsoids, joined
 
 if TYPE_CHECKING:
@@ -87,7 +87,8 @@ def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
     floor = ground(scene)
     shadows = [np.column_stack([path[:, :2], np.full(len(path), floor)]) for path in scene.paths.values()]
     if len(scene.ids) <= CROWD:
-        shadows += [np.array([point, [*point[:2], floor]]) for point in scene.shapes.points.means]
+        standing = scene.shapes.points.means[scene.shapes.group != LINES]
+        shadows += [np.array([point, [*point[:2], floor]]) for point in standing]
     _line(axes, projection(scene.inside(joined(shadows))), color=SHADOW, linewidth=0.7, zorder=1)
     for line, style in _strokes(scene):
         _line(axes, projection(scene.inside(line)), **style)
@@ -241,12 +242,24 @@ def legend(scene: Scene) -> list[Line2D]:
     """Return the entries of a scene's legend."""
     several = len(scene.paths) > 1
     out = [Line2D([], [], color=scene.colours[r], label=r if several else "estimated path") for r in scene.paths]
+    sizes = {len(l) for l in scene.true_landmarks.values()}
     if scene.truth:
-        out.append(Line2D([], [], color=TRUTH_COLOUR, linewidth=2.4, alpha=0.6, label="true path"))
+        out.append(
+            Line2D(
+                [],
+                [],
+                color=TRUTH_COLOUR,
+                linewidth=2.4,
+                alpha=0.6,
+                label="true path, true lines" if LINE in sizes else "true path",
+            )
+        )
     if scene.used:
         out.append(Line2D([], [], **_marks("x", FIX_COLOUR, 5, 1), label="fixes used"))
-    if scene.true_landmarks:
+    if sizes - {LINE}:
         out.append(Line2D([], [], **_marks("+", TRUTH_COLOUR, 7, 1), label="true landmarks"))
+    if LINE in sizes and not scene.truth:
+        out.append(Line2D([], [], color=TRUTH_COLOUR, linewidth=2.0, alpha=0.6, label="true lines"))
     for group, (colour, label) in enumerate(GROUPS):
         if (scene.shapes.group == group).any():
             out.append(Line2D([], [], color=colour, marker=".", label=label))

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
-from kalmark.results.cameras import cameras
+from kalmark.results.cameras import cameras, mounts
 from kalmark.results.describe import describe, plain
 from kalmark.results.history import Array, History, MapSnapshot, Start, padded, texts
 from kalmark.results.inputs import Controlled, Inputs, UsedFix
@@ -187,4 +187,5 @@ class _Recorder:
             inputs=Inputs(self.controls, tuple(self.fixes)),
             kind=texts(list(self.kinds)),
             cameras=cameras(self.slam),
+            mounts=mounts(self.slam),
         )
