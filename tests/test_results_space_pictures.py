@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -182,6 +184,60 @@ def test_the_page_has_the_map_and_the_images_of_every_position_of_the_slider(run
     assert len(robot["error"]) == data["dof"] == 6
     assert set(data["maps"][-1]) >= {"x", "y", "z", "pxx", "pyz", "pzz", "group", "lines", "tags"}
     assert len(data["bodies"]["rover"]["x"]) == 11
+
+
+TURNED = """<script>
+const eye = () => document.getElementById("map")._fullLayout.scene._scene.getCamera().eye;
+const mouse = (target, type, x, y, buttons) => target.dispatchEvent(
+  new MouseEvent(type, {clientX: x, clientY: y, buttons, bubbles: true, cancelable: true, view: window}));
+setTimeout(() => {
+  const seen = [eye()], canvas = document.querySelector("#map canvas"), at = canvas.getBoundingClientRect();
+  const x = at.left + 300, y = at.top + 300, slider = document.getElementById("time");
+  let k = 0;
+  mouse(canvas, "mousedown", x, y, 1);
+  const drag = setInterval(() => {
+    if (++k <= 20) { mouse(canvas, "mousemove", x + 8 * k, y + 3 * k, 1); return; }
+    clearInterval(drag);
+    mouse(window, "mouseup", x + 160, y + 60, 0);
+    setTimeout(() => {
+      seen.push(eye());
+      slider.value = 3;
+      slider.dispatchEvent(new Event("input"));
+      setTimeout(() => {
+        seen.push(eye());
+        const image = document.getElementById("image-0-0").layout.title.text;
+        document.title = JSON.stringify({seen, image, now: document.getElementById("now").textContent});
+      }, 1000);
+    }, 1000);
+  }, 30);
+}, 4000);
+</script></body>"""
+
+
+def test_the_page_turns_under_the_mouse_and_stays_turned_when_time_moves_on(run: Run, tmp_path: Path) -> None:
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no chromium to open the page with")
+    (tmp_path / "page.html").write_text(report_html(run).replace("</body>", TURNED))
+    options = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--dump-dom"]
+    command = [
+        chromium,
+        *options,
+        "--window-size=1300,1500",
+        "--virtual-time-budget=15000",
+        f"file://{tmp_path}/page.html",
+    ]
+    page = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False).stdout
+    found = re.search(r"<title>({.*?})</title>", page)
+    if found is None:
+        pytest.skip("this chromium draws nothing in three dimensions")
+    said = json.loads(found[1])
+    before, turned, after = (np.array([eye[axis] for axis in "xyz"]) for eye in said["seen"])
+    assert np.linalg.norm(turned - before) > 0.3
+    np.testing.assert_allclose(after, turned, atol=1e-6)
+    data = page_data(report_html(run))
+    assert said["now"].startswith(f"{data['maps'][3]['t']:.1f} s")
+    assert said["image"].startswith("rover · eye")
 
 
 def test_the_folder_of_a_run_in_space_comes_back_whole(run: Run, tmp_path: Path) -> None:

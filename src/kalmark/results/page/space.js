@@ -111,6 +111,8 @@ function spatialMap() {
     scene: {aspectmode: "data", uirevision: "map", xaxis: side("x (m)", 0), yaxis: side("y (m)", 1), zaxis: side("z (m)", 2),
             camera: {center: {x: 0, y: 0, z: -0.18}, eye: {x: 0.95, y: -1.4, z: 0.9}, up: {x: 0, y: 0, z: 1}}, dragmode: "turntable"}});
   return frame => {
+    const shown = el("map")._fullLayout?.scene?._scene;  /* the slider must not turn the view back */
+    if (shown) page.scene.camera = shown.getCamera();
     Plotly.react("map", [...background, ...spatialMoving(frame)], page, CONFIG);
     DATA.cameras.forEach((camera, i) => drawImages(camera, i, frame));
   };
