@@ -276,14 +276,15 @@ def test_a_line_is_judged_across_itself_where_its_ends_are() -> None:
                 P_l[0, i, :, :3], P_l[0, i, :, 3:] = (1 - t[0, i]) * np.eye(3), t[0, i] * np.eye(3)
             return a + t[:, :, None] * (b - a), P_l
 
-    l = np.array([1.0, 0, 0, 2, 0, 0])  # along x
+    l, P, eye = np.array([1.0, 0, 0, 2, 0, 0]), 1e-4 * np.eye(6), np.array([0.0, 2.0, 0.0])  # along x
     truth = np.array([-3.0, 0.1, 0.2, 4.0, 0.1, -0.2])
-    judged = errors.landmark(Line(), l, np.eye(6), truth, np.zeros(3), "log", np.zeros(3))
+    judged = errors.landmark(Line(), l, P, truth, np.zeros(3), "log", eye)
     assert judged is not None and judged.own.shape == (4,) and judged.F.shape == (4, 6)
     np.testing.assert_allclose(np.linalg.norm(judged.own.reshape(2, 2), axis=1), [math.hypot(0.1, 0.2)] * 2)
     np.testing.assert_allclose(judged.truth - judged.place, [[0, 0.1, 0.2], [0, 0.1, -0.2]], atol=1e-12)
+    assert errors.landmark(Line(), l, 0.1 * np.eye(6), truth, np.zeros(3), "log", eye) is None
     d = np.array([0.0, 0.01, -0.02, 0.0, 0.03, 0.01])
-    moved = errors.landmark(Line(), l + d, np.eye(6), truth, np.zeros(3), "log", np.zeros(3))
+    moved = errors.landmark(Line(), l + d, P, truth, np.zeros(3), "log", eye)
     assert moved is not None
     lengths = [
         np.linalg.norm((judged.own - judged.F @ d).reshape(2, 2), axis=1),

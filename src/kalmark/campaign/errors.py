@@ -79,19 +79,22 @@ def mount(mean: Array, truth: Array) -> Judged:
 def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array) -> Judged | None:
     """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
     if len(truth) == 6:
-        return line(model, mean, truth, turn, coordinates) if hasattr(model, "endpoints") else None
+        return line(model, mean, P, truth, turn, coordinates, eye) if hasattr(model, "endpoints") else None
     if len(truth) == 7:
         if len(mean) != 7:
             return None
         own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
         return Judged(own, world, np.eye(6), mean[None, :3], truth[None, :3])
     point, F = position(model, mean, len(truth))
-    if len(mean) > len(truth) and len(truth) == 3:
-        spread = F @ P @ F.T
-        if not (np.isfinite(spread).all() and FAR**2 * np.linalg.norm(spread, 2) < np.sum((point - eye) ** 2)):
-            return None
+    if len(mean) > len(truth) and len(truth) == 3 and not is_known(point, F @ P @ F.T, eye):
+        return None
     own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
     return Judged(own, world, F, point[None], truth[None])
+
+
+def is_known(point: Array, P: Array, eye: Array) -> bool:
+    """Tell whether all sigmas of a point are below a third of its distance."""
+    return bool(np.isfinite(P).all() and FAR**2 * np.linalg.norm(P, 2) < np.sum((point - eye) ** 2))
 
 
 def position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
@@ -103,7 +106,7 @@ def position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
     return mean[:d], np.eye(d, len(mean))
 
 
-def line(model: Any, mean: Array, truth: Array, turn: Array, coordinates: str) -> Judged:
+def line(model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array) -> Judged | None:
     """Judge a line by how far it passes, in two directions across it, from the two true ends (6,): four numbers."""
     l = mean[None]
     base, _ = model.endpoints(l, np.array([[0.0, 1.0]]))
@@ -112,6 +115,9 @@ def line(model: Any, mean: Array, truth: Array, turn: Array, coordinates: str) -
     t = (ends - a) @ along / (along @ along)
     q, Q_l = model.endpoints(l, t[None])
     across = np.linalg.svd(along[None])[2][1:]  # (2, 3): at right angles to the line
+    to_eye = np.eye(3) - np.outer(along, along) / (along @ along)
+    if not all(is_known(to_eye @ q[0, i], to_eye @ Q_l[0, i] @ P @ Q_l[0, i].T @ to_eye, to_eye @ eye) for i in (0, 1)):
+        return None
     own, world = (point_error(q[0], ends, turn, c) @ across.T for c in (coordinates, "world"))
     F = (across @ Q_l[0]).reshape(4, -1)
     return Judged(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)

@@ -69,7 +69,7 @@ def score(slam: Slam, simulated: Simulation, steps: Sequence[int], map_every: in
         except DivergedError as error:
             stopped = str(error)
             break
-        if isinstance(event, Scan):
+        if isinstance(event, Scan) and len(event.y):
             scorer.after(report, event)
     return scorer.scores(stopped)
 

@@ -111,6 +111,9 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
     times = [round(k * world.dt_s * 1e9) for k in range(world.steps + 1)]
     events: list[Event] = []
     origins: dict[Key, tuple[Id | None, ...]] = {}
+    for robot in robots:
+        if getattr(robot.motion, "coasts", False) and robot.sensors:  # it moves from the first event on: the start
+            events.append(Scan(t_ns=0, robot=robot.name, sensor=next(iter(robot.sensors))))
     for k, (before, now) in enumerate(pairwise(times), 1):
         for robot in robots:
             u = step(robot, world, chance.control)

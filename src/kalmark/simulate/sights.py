@@ -18,8 +18,10 @@ from scipy.spatial import cKDTree
 
 from kalmark.config.sections import Section
 from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE3
 from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.models.tags import corners, tag_seen_from
 from kalmark.simulate.layouts import Scenery
 from kalmark.slam.events import Id
 
@@ -31,6 +33,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Pair = Annotated[tuple[int, int], Field(strict=False)]
 
 POINTS, SEGMENTS, TAGS = "points", "segments", "tags"
+HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
 _LOOK = {3: Point2D(), 7: Point3D()}
 _TRIES = 200  # places drawn for a false measurement before it is given up
 
@@ -133,8 +136,6 @@ def in_frame(sort: str, T: Array, values: Array) -> Array:
         return v
     if sort == SEGMENTS:
         return np.column_stack([look.seen_from(T, values[:, at : at + 3])[0] for at in (0, 3)])
-    from kalmark.models.tags import tag_seen_from
-
     return tag_seen_from(T, np.ascontiguousarray(values))[0]
 
 
@@ -142,12 +143,8 @@ def exact(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
     """Return which things v (K, n) of the sensor's frame it sees, and what it would measure (K, m) without noise."""
     sort = looks_for(sensor)
     if sort == SEGMENTS:
-        from kalmark.models.segments import visible_segment
-
-        k = np.array([sensor.fx_px, sensor.fy_px, sensor.cx_px, sensor.cy_px])
-        size = np.array([sensor.width_px, sensor.height_px], dtype=np.float64)
-        here = np.array([0.0, 0, 0, 0, 0, 0, 1])
-        return visible_segment(here, v[:, :3].copy(), v[:, 3:].copy(), k, size, sensor.min_length_px)
+        seen: tuple[Flags, Array] = sensor.sees_segments(HERE, v[:, :3], v[:, 3:])
+        return seen
     if sort == TAGS:
         return tags_seen(sensor, v, sizes)
     inside = sensor.sees(v)
@@ -161,7 +158,8 @@ def noisy(sensor: Any, e: Array, rng: Generator) -> Array:
     """Return noisy measurements of the exact ones e (K, m), angles wrapped, poses turned."""
     if len(e) == 0:
         return np.empty((0, len(sensor.columns)))
-    n = gaussian(sensor.noise(e), rng)
+    noise = getattr(sensor, "start_noise", sensor.noise)  # of what is measured, where innovations are something else
+    n = gaussian(noise(e), rng)
     if e.shape[1] == 7 and n.shape[1] == 6:
         return np.array([SE3.plus(pose, d) for pose, d in zip(e, n, strict=True)])
     y = e.copy()
@@ -249,17 +247,17 @@ def in_ball(count: int, dimensions: int, radius: float, rng: Generator) -> Array
 
 
 def tags_seen(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
-    """Return which tags at v (K, 7) a sensor sees: those that face it and that its own limits allow; and e (K, m)."""
-    from kalmark.geometry.rotations import matrix
-
+    """Return which tags at v (K, 7) a sensor sees: those that face it, with all corners in its image; and e (K, m)."""
     axis = np.array([matrix(q)[:, 2] for q in np.ascontiguousarray(v[:, 3:])]).reshape(-1, 3)
-    facing = np.einsum("ki,ki->k", axis, v[:, :3]) > 0
+    inside: Flags = np.einsum("ki,ki->k", axis, v[:, :3]) > 0
     if len(sensor.columns) == 7:
-        inside = facing & sensor.sees(v)
-        return inside, v.copy()
+        return inside & sensor.sees(v), v.copy()
     e = np.full((len(v), 9), np.nan)
-    e[:, 8] = sizes
-    inside = facing & sensor.sees(v)
+    for i in np.flatnonzero(inside):
+        at = corners(sizes[i]) @ matrix(v[i, 3:].copy()).T + v[i, :3]
+        inside[i] = sensor.sees(at).all()
     if inside.any():
-        e[inside, :8] = sensor.corners(v[inside], sizes[inside])
+        known = np.zeros((int(inside.sum()), 9))
+        known[:, 8] = sizes[inside]
+        e[inside] = sensor.expect(v[inside], known)[0]
     return inside, e
