@@ -74,7 +74,7 @@ def by_kernels(log: list[Step]) -> Callable[[int], None]:
     slam, first = new_slam(), log[0]
     slam.process(km.Control(0, "r", first[0]))
     slam.process(km.Scan(0, "r", "lidar", first[1], first[2]))
-    m, view = slam.map, slam._views["r", "lidar"]
+    m, look = slam.map, slam._views["r", "lidar"].looks["point"].view
     N, noise, index = np.diag([0.01, 0, 0.02]) ** 2, np.tile(R, (SIGHTINGS, 1, 1)), m.index(0)
     slots = [np.array([slam.slot(i) for i in ids]) for _, _, ids in log]
 
@@ -84,8 +84,8 @@ def by_kernels(log: list[Step]) -> Callable[[int], None]:
         u, y, _ = log[t]
         m.x[:3], F, G = increment(m.x[:3], u)
         kernels.predict(m.P, m.n, index, F, G @ N @ G.T)
-        scan = (0, slots[t], 2, y, noise, view.angular, np.inf)
-        corrections.compiled_invariant(view.look, (m.x, m.P, m.n, m.blocks, m.atoms), scan, 6)
+        scan = (0, -1, slots[t], 2, y, noise, np.inf)
+        corrections.compiled_invariant(look, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, 6)
 
     return step
 

@@ -304,7 +304,7 @@ class Drone(km.motion.Unicycle):
         (lambda m: km.Robot("r", m, cov=NAN * np.eye(3)), "finite"),
         (lambda m: km.Robot("r", m, start="here"), "start is 'here', expected three finite numbers"),
         (lambda m: km.Robot("r", m, start=("0", "0", "0")), "expected three finite numbers"),
-        (lambda m: km.Robot("r", Drone(), start=(0, 0, 0)), "motion is in R4, expected SE2 or SE3"),
+        (lambda m: km.Robot("r", Drone(), start=(0, 0, 0)), "motion is in R4, expected SE2, SE3 or more"),
         (lambda m: km.Mount(km.sensors.RangeBearing), "Mount: sensor is the class RangeBearing, expected an instance"),
         (lambda m: km.Mount(LIDAR, at=(0, 0)), "Mount: at is (0, 0), expected three"),
         (lambda m: km.Mount(LIDAR, landmark=km.landmarks.Point2D), "landmark is the class Point2D"),

@@ -73,13 +73,15 @@ def test_a_spatial_sensor_has_the_jacobians_of_its_differences_and_undoes_itself
             E_l[0],
             difference(lambda x: expectation(r, s, sensor, landmark, x[None])[0][0], POINT3, l[0], sensor.angular),
         )
-        back, L_r, _, L_y = inverse_expectation(r, s, sensor, landmark, e)
+        back, L_r, _, L_y, _ = inverse_expectation(r, s, sensor, landmark, e)
         np.testing.assert_allclose(back, l, atol=1e-9)
         close(L_r[0], difference(lambda x: inverse_expectation(x, s, sensor, landmark, e)[0][0], SE3, r))
         close(L_y[0] @ E_l[0], np.eye(3))
         view = view_of(sensor, landmark, s)
         assert isinstance(view, tuple), "built-in models take the compiled way"
-        for fast, written in zip(linearize(view, r, l), (e, E_r, E_l), strict=True):
+        seen, z, *Jacobians = linearize(view, r, l, e)
+        np.testing.assert_allclose(z, 0, atol=1e-12)
+        for fast, written in zip((seen, *Jacobians), (e, E_r, E_l), strict=True):
             np.testing.assert_allclose(fast, written, atol=1e-12)
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from kalmark.results.record import record
     from kalmark.results.run import Run
     from kalmark.slam import association
+    from kalmark.slam.attention import Attention
     from kalmark.slam.events import Control, Fix, Scan
     from kalmark.slam.report import Observation, Report
     from kalmark.slam.robot import Mount, Robot
@@ -32,8 +33,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Control", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run", "Scan", "Slam",
-    "association", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise", "record", "sensors",
+    "Attention", "Control", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run", "Scan",
+    "Slam", "association", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise", "record",
+    "sensors",
 ]  # fmt: skip
 
 _MODULES = {
@@ -45,6 +47,7 @@ _MODULES = {
     "sensors": "kalmark.models.sensors",
 }
 _NAMES = {
+    "Attention": "kalmark.slam.attention",
     "Control": "kalmark.slam.events",
     "Fix": "kalmark.slam.events",
     "Log": "kalmark.logs",

@@ -1,9 +1,11 @@
 """The corrections: textbook, invariant and first-estimates, each one function from innovation to corrected map.
 
 The same source runs twice: compiled for the built-in models, as plain Python for a user's (`linearize` is the only
-place that differs).  A map is its mean x, covariance P with n rows in use, and tables of `blocks` and `atoms`.  A scan
-is the slot of its robot, the slots of K landmarks of which the first d numbers are seen, measurements y (K, m) with
-noise R (K, m, m), which of them are `angular`, and the gate on d2.  Nothing is changed unless all of it succeeds.
+place that differs).  A map is its mean x, covariance P with n rows in use, tables of `blocks` and `atoms`, and the axes
+of its gauge.  A scan is the slots of its robot and of its sensor's mount (-1: not in the map), the slots of K landmarks
+of which the first d numbers are seen, measurements y (K, m) with the noise R (K, p, p) of their innovations, and the
+gate on d2.  The head of the observed block is the robot's pose and, if it is in the map, the mount.  Nothing is changed
+unless all of it succeeds.
 """
 
 from __future__ import annotations
@@ -16,43 +18,43 @@ from numba.extending import register_jitable
 
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import Index, cholesky_inverse, columns, downdate, submatrix, transport
-from kalmark.geometry.angles import wrap
-from kalmark.geometry.spaces import HEADING, VECTOR, VECTOR3, Table, generator, retract
+from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table, generator, retract
 from kalmark.models.observe import linearize
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-Map = tuple[Array, Array, int, Table, Table]  # x, P, n, blocks, atoms
-Scan = tuple[int, Index, int, Array, Array, Flags, float]  # robot, slots, d, y, R, angular, gate
+Map = tuple[Array, Array, int, Table, Table, int]  # x, P, n, blocks, atoms, axes
+Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
 
 
 @compiled
-def pose_sizes(blocks: Table, atoms: Table, robot: int) -> tuple[int, int, int]:
-    """Return the numbers of a robot's pose, its degrees of freedom, and the axes it turns about: its last rows."""
-    return (3, 3, 1) if atoms[blocks[robot, 4] + 1, 0] == HEADING else (7, 6, 3)
+def head_sizes(blocks: Table, atoms: Table, robot: int, mount: int) -> tuple[int, int]:
+    """Return the numbers of a robot's pose, and those of the head: the pose and, if it is in the map, the mount."""
+    pose = 3 if atoms[blocks[robot, 4] + 1, 0] == HEADING else 7
+    return pose, pose if mount < 0 else 2 * pose
 
 
 @compiled
 def observed_block(
-    x: Array, blocks: Table, atoms: Table, robot: int, slots: Index, d: int
+    x: Array, blocks: Table, atoms: Table, robot: int, mount: int, slots: Index, d: int
 ) -> tuple[Index, Table, Array]:
-    """Return the rows in P, the atoms and the mean of the robot's pose and the first d numbers of K landmarks."""
-    pose, _, _ = pose_sizes(blocks, atoms, robot)
-    size = pose + d * len(slots)
+    """Return the rows in P, the atoms and the mean of the head and of the first d numbers of K landmarks."""
+    pose, head = head_sizes(blocks, atoms, robot, mount)
+    before = head // pose  # blocks in the head
+    size = head + d * len(slots)
     index, mean = np.empty(size, np.int64), np.empty(size)
     table = np.empty((size, 3), np.int64)
     count = x_to = p_to = 0
-    for i in range(len(slots) + 1):
-        slot, width = (robot, pose) if i == 0 else (slots[i - 1], d)
+    for i in range(before + len(slots)):
+        slot, width = (robot, pose) if i == 0 else ((mount, pose) if i < before else (slots[i - before], d))
         x_at, p_at, first = blocks[slot, 0], blocks[slot, 2], blocks[slot, 4]
         mean[x_to : x_to + width] = x[x_at : x_at + width]
         rows = 0
         for a in range(first, first + blocks[slot, 5]):
             if atoms[a, 1] - x_at < width:
-                kind = atoms[a, 0]
-                table[count, 0] = kind
+                table[count, 0] = atoms[a, 0]
                 table[count, 1], table[count, 2] = x_to + atoms[a, 1] - x_at, p_to + rows
-                rows += 3 if kind >= VECTOR3 else (2 if kind == VECTOR else 1)
+                rows += ERROR_SIZE[atoms[a, 0]]
                 count += 1
         for j in range(rows):
             index[p_to + j] = p_at + j
@@ -61,38 +63,40 @@ def observed_block(
 
 
 @compiled
-def residual(y: Array, e: Array, angular: Flags) -> Array:
-    """Return z = y - e (K, m), the angles among them wrapped.  [S] (26)."""
-    z = y - e
-    for j in range(len(angular)):
-        if angular[j]:
-            for i in range(len(z)):
-                z[i, j] = wrap(z[i, j])
-    return z
+def gauge(mean: Array, correction: Array, pose: int, axes: int) -> Array:
+    """Return the motion of the gauge (axes,), d_theta or (xi_p, d_theta), in a correction of the robot's pose.
+
+    The observing robot's pose comes first in `mean` and in `correction`.
+    """
+    theta = (3 if pose == 3 else 6) - axes
+    turn = correction[theta : theta + axes].copy()
+    if axes == 6:
+        turn[:3] += np.cross(mean[:3], turn[3:])  # xi_p = d_p - generator_p d_theta
+    return turn
 
 
 @compiled
 def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array, bool]:
-    """Return each observation's innovation covariance Z (K, m, m) and d2 = z' Z^-1 z (K,).  [S] (27), (83).
+    """Return each observation's innovation covariance Z (K, p, p) and d2 = z' Z^-1 z (K,).  [S] (27), (83).
 
     d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a Z is not positive
     definite: the filter is broken.
     """
     k, m, d = E_l.shape
-    pose = E_r.shape[2]
+    head = E_r.shape[2]
     Z, d2, healthy = np.empty((k, m, m)), np.empty(k), True
-    rows, H = np.empty(pose + d, np.int64), np.empty((m, pose + d))
-    rows[:pose] = index[:pose]
+    rows, H = np.empty(head + d, np.int64), np.empty((m, head + d))
+    rows[:head] = index[:head]
     for i in range(k):
-        rows[pose:] = index[pose + i * d : pose + (i + 1) * d]
-        H[:, :pose], H[:, pose:] = E_r[i], E_l[i]
+        rows[head:] = index[head + i * d : head + (i + 1) * d]
+        H[:, :head], H[:, head:] = E_r[i], E_l[i]
         S = submatrix(P, rows)
         for a in range(m):
             for b in range(a + 1):
                 s = R[i, a, b]
-                for c in range(pose + d):
+                for c in range(head + d):
                     t = 0.0
-                    for f in range(pose + d):
+                    for f in range(head + d):
                         t += S[c, f] * H[b, f]
                     s += H[a, c] * t
                 Z[i, a, b] = Z[i, b, a] = s
@@ -113,19 +117,19 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
 
 @compiled
 def stacked(E_r: Array, E_l: Array) -> Array:
-    """Return the Jacobian H (K m, pose + K d) of all observations of a scan with respect to the observed block."""
+    """Return the Jacobian H (K p, head + K d) of all observations of a scan with respect to the observed block."""
     k, m, d = E_l.shape
-    pose = E_r.shape[2]
-    H = np.zeros((k * m, pose + k * d))
+    head = E_r.shape[2]
+    H = np.zeros((k * m, head + k * d))
     for i in range(k):
-        H[i * m : (i + 1) * m, :pose] = E_r[i]
-        H[i * m : (i + 1) * m, pose + i * d : pose + (i + 1) * d] = E_l[i]
+        H[i * m : (i + 1) * m, :head] = E_r[i]
+        H[i * m : (i + 1) * m, head + i * d : head + (i + 1) * d] = E_l[i]
     return H
 
 
 @compiled
 def add_blocks(S: Array, R: Array) -> None:
-    """S += blockdiag(R), R (K, m, m)."""
+    """S += blockdiag(R), R (K, p, p)."""
     k, m, _ = R.shape
     for i in range(k):
         S[i * m : (i + 1) * m, i * m : (i + 1) * m] += R[i]
@@ -140,7 +144,6 @@ def iterate(
     P_ss: Array,
     y: Array,
     R: Array,
-    angular: Flags,
     most: int,
     tolerance: float,
 ) -> tuple[Array, Array, Array, bool]:
@@ -149,16 +152,17 @@ def iterate(
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta').
     """
-    pose, dof, axes = sizes
-    k, d = len(y), (len(mean) - pose) // len(y)
+    pose, head, axes = sizes
+    k, d = len(y), (len(mean) - head) // len(y)
+    theta = (3 if pose == 3 else 6) - axes
     correction = np.zeros(len(P_ss))
-    turned = generator(table, mean, len(P_ss), axes)
+    turned = generator(table, mean, len(P_ss), axes, mean[:3])
     x_j = mean
     for _ in range(most):
-        e, E_r, E_l = linearize(view, x_j[:pose], x_j[pose:].reshape(k, d))
+        _e, z, E_r, E_l = linearize(view, x_j[:head], x_j[head:].reshape(k, d), y)
         H = stacked(E_r, E_l)
-        H[:, dof - axes : dof] += H @ (generator(table, x_j, len(P_ss), axes) - turned)
-        v = residual(y, e, angular).ravel() + H @ correction
+        H[:, theta : theta + axes] += H @ (generator(table, x_j, len(P_ss), axes, x_j[:3]) - turned)
+        v = z.ravel() + H @ correction
         PH = P_ss @ H.T
         Z = H @ PH
         add_blocks(Z, R)
@@ -169,7 +173,7 @@ def iterate(
         change = np.abs(step - correction).max()
         correction = step
         x_j = mean.copy()
-        retract(table, x_j, correction, correction[dof - axes : dof])
+        retract(table, x_j, correction, gauge(mean, correction, pose, axes))
         if change < tolerance:
             break
     return H, M, v, positive
@@ -191,27 +195,26 @@ def invariant(
 
     Returns e, z, Z, d2 at the prediction, which were fused, and whether the filter can go on.
     """
-    x, P, n, blocks, atoms = map_
-    robot, slots, d, y, R, angular, gate = scan
-    index, table, mean = observed_block(x, blocks, atoms, robot, slots, d)
-    pose, dof, axes = pose_sizes(blocks, atoms, robot)
-    e, E_r, E_l = linearize(view, mean[:pose], mean[pose:].reshape(len(slots), d))
-    z = residual(y, e, angular)
+    x, P, n, blocks, atoms, axes = map_
+    robot, mount, slots, d, y, R, gate = scan
+    index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    pose, head = head_sizes(blocks, atoms, robot, mount)
+    e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
     Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
     near = (d2 <= gate) & (d2 < np.inf)
     if not healthy or not near.any():
         return e, z, Z, d2, near, healthy
     if not near.all():
         y, R = y[near], R[near]
-        index, table, mean = observed_block(x, blocks, atoms, robot, slots[near], d)
-    H, M, v, positive = iterate(view, (pose, dof, axes), table, mean, submatrix(P, index), y, R, angular, most, 1e-7)
+        index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
+    H, M, v, positive = iterate(view, (pose, head, axes), table, mean, submatrix(P, index), y, R, most, 1e-7)
     if not positive:
         return e, z, Z, d2, near, False
-    before = generator(atoms, x, n, axes)
+    before = generator(atoms, x, n, axes, mean[:3])
     correction = fuse(P, n, index, H, M, v)
-    theta = index[dof - axes]
-    retract(atoms, x, correction, correction[theta : theta + axes].copy())
-    transport(P, generator(atoms, x, n, axes) - before, theta)
+    retract(atoms, x, correction, gauge(mean, correction[index], pose, axes))
+    at, theta = blocks[robot, 0], index[(3 if pose == 3 else 6) - axes]
+    transport(P, generator(atoms, x, n, axes, x[at : at + 3]) - before, theta)
     return e, z, Z, d2, near, True
 
 
@@ -219,16 +222,15 @@ def textbook(
     view: Any, map_: Map, scan: Scan, _: None
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3."""
-    x, P, n, blocks, atoms = map_
-    robot, slots, d, y, R, angular, gate = scan
-    k, m = y.shape
-    e, z, Z, d2 = np.empty((k, m)), np.empty((k, m)), np.empty((k, m, m)), np.empty(k)
-    near, healthy, pose = np.zeros(k, np.bool_), True, pose_sizes(blocks, atoms, robot)[0]
+    x, P, n, blocks, atoms, _axes = map_
+    robot, mount, slots, d, y, R, gate = scan
+    k, p = len(y), R.shape[1]
+    e, z, Z, d2 = np.empty((k, y.shape[1])), np.empty((k, p)), np.empty((k, p, p)), np.empty(k)
+    near, healthy, head = np.zeros(k, np.bool_), True, head_sizes(blocks, atoms, robot, mount)[1]
     for i in range(k):
         one = slice(i, i + 1)
-        index, _table, mean = observed_block(x, blocks, atoms, robot, slots[one], d)
-        e[one], E_r, E_l = linearize(view, mean[:pose], mean[pose:].reshape(1, d))
-        z[one] = residual(y[one], e[one], angular)
+        index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots[one], d)
+        e[one], z[one], E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(1, d), y[one])
         Z[one], d2[one], sound = innovation(P, index, E_r, E_l, R[one], z[one])
         healthy = healthy and sound
         near[i] = d2[i] < gate
@@ -242,19 +244,18 @@ def first_estimates(
     view: Any, map_: Map, scan: Scan, x_first: Array
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
-    x, P, n, blocks, atoms = map_
-    robot, slots, d, y, R, angular, gate = scan
-    k, pose = len(slots), pose_sizes(blocks, atoms, robot)[0]
-    index, _, mean = observed_block(x, blocks, atoms, robot, slots, d)
-    _, _, first = observed_block(x_first, blocks, atoms, robot, slots, d)
-    e, _, _ = linearize(view, mean[:pose], mean[pose:].reshape(k, d))
-    _, E_r, E_l = linearize(view, first[:pose], first[pose:].reshape(k, d))
-    z = residual(y, e, angular)
+    x, P, n, blocks, atoms, _axes = map_
+    robot, mount, slots, d, y, R, gate = scan
+    k, head = len(slots), head_sizes(blocks, atoms, robot, mount)[1]
+    index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    _, _, first = observed_block(x_first, blocks, atoms, robot, mount, slots, d)
+    e, z, _, _ = linearize(view, mean[:head], mean[head:].reshape(k, d), y)
+    _, _, E_r, E_l = linearize(view, first[:head], first[head:].reshape(k, d), y)
     Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
     near = (d2 <= gate) & (d2 < np.inf)
     if not healthy or not near.any():
         return e, z, Z, d2, near, healthy
-    index, _, _ = observed_block(x, blocks, atoms, robot, slots[near], d)
+    index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
     H = stacked(E_r[near], E_l[near])
     Z_all = H @ (submatrix(P, index) @ H.T)
     add_blocks(Z_all, R[near])

@@ -39,16 +39,19 @@ class Estimator(Protocol):
     default_gate: ClassVar[float]
 
     def correct(
-        self, map_: StochasticMap, view: Any, robot: int, slots: Index, d: int, y: Array, R: Array, angular: Any,
+        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
         gate: float,
     ) -> Correction:  # fmt: skip
-        """Fuse y (K, m), noise R (K, m, m), of the first d numbers of the blocks `slots`, where d2 <= gate."""
+        """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate.
+
+        `mount` is the slot of the sensor's mount, -1 if it is not in the map.
+        """
 
     def for_fixes(self) -> Estimator:
         """Return the estimator that fuses absolute positions."""
 
     def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
-        """Return the Jacobian J (., 3) with respect to the robot's pose, taken where this estimator linearises."""
+        """Return the Jacobian J (., 3 or more) in the robot's state, taken where this estimator linearises."""
 
 
 class _Estimator:
@@ -58,13 +61,13 @@ class _Estimator:
     compiled: ClassVar[Callable[..., Any]]
 
     def correct(
-        self, map_: StochasticMap, view: Any, robot: int, slots: Index, d: int, y: Array, R: Array, angular: Any,
+        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
         gate: float,
     ) -> Correction:  # fmt: skip
-        """Fuse y (K, m), noise R (K, m, m), of the first d numbers of the blocks `slots`, where d2 <= gate."""
+        """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate."""
         m, run = map_, type(self).compiled if isinstance(view, tuple) else type(self).source
-        scan = (robot, slots, d, y, R, angular, gate)
-        return Correction(*run(view, (m.x, m.P, m.n, m.blocks, m.atoms), scan, self._option(m)))
+        scan = (robot, mount, slots, d, y, R, gate)
+        return Correction(*run(view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, self._option(m)))
 
     def _option(self, map_: StochasticMap) -> Any:
         return None
@@ -133,6 +136,6 @@ class Fej(_Estimator):
         assert space is not None
         x_at, dof, axes = map_.blocks[robot, X_AT], J.shape[1], space.axes
         now, first = (space.generator(x[x_at : x_at + space.size])[:dof] for x in (map_.x, map_.x_first))
-        J = J.copy()
-        J[:, dof - axes : dof] += J @ (now - first)
+        J, theta = J.copy(), 2 if axes == 1 else 3
+        J[:, theta : theta + axes] += J @ (now - first)
         return J

@@ -35,6 +35,7 @@ class StochasticMap:
         self.blocks: Table = np.zeros((0, 6), dtype=np.int64)
         self.atoms: Table = np.zeros((0, 3), dtype=np.int64)
         self.spaces: list[Space | None] = []
+        self.axes = 1  # of the gauge: 1 in the plane, 3 in space, 6 where translations have a generator, too
         self.n = 0  # rows of P in use
         self.x_n = 0  # numbers of x in use
         self._free: dict[tuple[int, ...], list[int]] = {}
@@ -90,6 +91,7 @@ class StochasticMap:
         x_at, size, _, _, atom_at, count = self.blocks[slot]
         self.atoms[atom_at : atom_at + count, 0] = space.kinds
         self.spaces[slot] = space
+        self.axes = max(self.axes, 6 if space.steps else space.axes)
         self.x[x_at : x_at + size] = self.x_first[x_at : x_at + size] = mean
         return slot
 

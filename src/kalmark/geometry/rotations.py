@@ -136,6 +136,26 @@ def left_jacobian_inverse(v: Array) -> Array:
 
 
 @compiled
+def left_jacobian_rate(v: Array, a: Array) -> Array:
+    """Return d (V(v) a) / d v (3, 3)."""
+    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if a2 < 1e-2:
+        p = 1 / 2 - a2 * (1 / 24 - a2 * (1 / 720 - a2 / 40320))
+        q = 1 / 6 - a2 * (1 / 120 - a2 * (1 / 5040 - a2 / 362880))
+        p_a2, q_a2 = -1 / 24 + a2 * (1 / 360 - a2 / 13440), -1 / 120 + a2 * (1 / 2520 - a2 / 120960)
+    else:
+        t = math.sqrt(a2)
+        half = math.sin(0.5 * t)
+        p, q = 2.0 * half * half / a2, (t - math.sin(t)) / (a2 * t)
+        p_a2 = 0.5 * math.sin(t) / (a2 * t) - p / a2
+        q_a2 = 0.5 * p / a2 - 1.5 * q / a2
+    c = np.cross(v, a)
+    cc = np.cross(v, c)
+    rate = np.outer(p_a2 * c + q_a2 * cc, 2.0 * v)
+    return rate - p * skew(a) - q * (skew(c) + skew(v) @ skew(a))
+
+
+@compiled
 def rotate(q: Array, p: Array) -> tuple[Array, Array, Array]:
     """Return the point or direction p (3,) turned by q: pw, PW_q (3, 3), PW_p (3, 3)."""
     Q = matrix(q)

@@ -3,19 +3,26 @@
 An atom is the smallest piece that a rotation of the world treats in its own way.  A block type is a list of atoms, so
 the filter handles any block, and a new kind of block needs no code in the filter:
 
-=========  =============  ==================================================  =================
-atom       mean / error   rotating the world by E                             generator
-=========  =============  ==================================================  =================
-SCALAR     1 / 1          nothing (depth, signature, bias, body rate, noise)  0
-VECTOR     2 / 2          E x (point, velocity; plane)                        J x
-HEADING    1 / 1          + angle, wrapped                                    1
-ANGLE      1 / 1          nothing, but wrapped (a mount's angle)              0
-VECTOR3    3 / 3          E x (point, velocity, direction; space)             -[x]x
-ROTATION   4 / 3          E R (quaternion xyzw)                               I
-=========  =============  ==================================================  =================
+===========  =============  ==================================================  =================
+atom         mean / error   rotating the world by E                             generator
+===========  =============  ==================================================  =================
+SCALAR       1 / 1          nothing (depth, signature, bias, body rate, noise)  0
+VECTOR       2 / 2          E x (point, velocity; plane)                        J x
+HEADING      1 / 1          + angle, wrapped                                    1
+ANGLE        1 / 1          nothing, but wrapped (a mount's angle)              0
+VECTOR3      3 / 3          E x (point, velocity, ray; space)                   -[x]x
+ROTATION     4 / 3          E R (quaternion xyzw)                               I
+DIRECTION    2 / 2          of E m (azimuth, elevation of the unit vector m)    -Y_m [m]x
+TURNED       4 / 3          nothing (a mount's quaternion)                      0
+HOMOGENEOUS  4 / 4          E h, rho (the point h / rho)                        -[h]x, 0
+PLUECKER     6 / 6          E n, E v (the line of direction v, moment n)        -[n]x, -[v]x
+===========  =============  ==================================================  =================
 
 Orientation errors are world errors, R = Exp(d) R_hat, positions and landmarks are additive world vectors: Sola's 2-D
 coordinates and their 3-D counterpart.
+
+The last two are moved by a translation t of the world by what depends on their value, h + rho t and n + t x v, so that
+translation has a generator, too: rho I and -[v]x.  All others are moved by what does not, and need none.
 """
 
 from __future__ import annotations
@@ -29,15 +36,17 @@ import numpy.typing as npt
 
 from kalmark.compiled import compiled
 from kalmark.geometry.angles import exponential_v, rotation, wrap
-from kalmark.geometry.rotations import conjugate, exp, left_jacobian, log, matrix, multiply
+from kalmark.geometry.directions import direction_many, spherical_many
+from kalmark.geometry.rotations import conjugate, exp, left_jacobian, log, matrix, multiply, skew
 
 Array = npt.NDArray[np.float64]
 Table = npt.NDArray[np.int64]
 
-SCALAR, VECTOR, HEADING, ANGLE, VECTOR3, ROTATION = 0, 1, 2, 3, 4, 5
+SCALAR, VECTOR, HEADING, ANGLE, VECTOR3, ROTATION, DIRECTION, TURNED, HOMOGENEOUS, PLUECKER = range(10)
 REMOVED = -1
-MEAN_SIZE = {SCALAR: 1, VECTOR: 2, HEADING: 1, ANGLE: 1, VECTOR3: 3, ROTATION: 4}
-ERROR_SIZE = {SCALAR: 1, VECTOR: 2, HEADING: 1, ANGLE: 1, VECTOR3: 3, ROTATION: 3}
+MEAN_SIZE = np.array([1, 2, 1, 1, 3, 4, 2, 4, 4, 6])
+ERROR_SIZE = np.array([1, 2, 1, 1, 3, 3, 2, 3, 4, 6])
+LINEAR = np.array([0, 0, 0, 0, 3, 0, 0, 0, 3, 6])  # leading numbers that are vectors of space
 
 KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 
@@ -46,12 +55,13 @@ KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
     """Move the mean in place by the correction d: plain plus without `turn`, else the exponential for turn = d_theta.
 
-    `turn` has 0, 1 (plane) or 3 (space) components.  Points move by V(d_theta) d: rotated by Exp(d_theta), then carried
-    along V xi, since V (generator d_theta) = (E - I) l.  Orientations turn by Exp(d_theta), then by their own xi.
+    `turn` has 0, 1 (plane) or 3 (space) components, or 6: (xi_p, d_theta), where a translation matters.  Points move by
+    V(d_theta) d: rotated by Exp(d_theta), then carried along V xi, since V (generator d_theta) = (E - I) l.
+    Orientations turn by Exp(d_theta), then by their own xi.
     """
     p, q = exponential_v(turn[0]) if len(turn) == 1 else (1.0, 0.0)
-    whole = turn if len(turn) == 3 else np.zeros(3)
-    V = left_jacobian(turn) if len(turn) == 3 else np.eye(3)
+    whole = turn[len(turn) - 3 :] if len(turn) >= 3 else np.zeros(3)
+    V = left_jacobian(whole)
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
         if kind == VECTOR:
@@ -61,31 +71,74 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
             x[at] += d[k]
         elif kind in (HEADING, ANGLE):
             x[at] = wrap(x[at] + d[k])
-        elif kind == VECTOR3:
-            for j in range(3):
-                x[at + j] += V[j, 0] * d[k] + V[j, 1] * d[k + 1] + V[j, 2] * d[k + 2]
         elif kind == ROTATION:
             own = exp(d[k : k + 3] - whole)
             x[at : at + 4] = multiply(exp(whole), multiply(own, x[at : at + 4]))
+        elif kind == TURNED:
+            x[at : at + 4] = multiply(exp(d[k : k + 3]), x[at : at + 4])
+        elif kind == DIRECTION:
+            _retract_direction(x[at : at + 2], d[k : k + 2], whole)
+        elif kind >= VECTOR3:
+            if kind == PLUECKER and len(turn) == 6:  # what a large turn and a large step together do to the moment
+                v, step = x[at + 3 : at + 6].copy(), turn[:3].copy()
+                x[at : at + 3] += skew(V @ step) @ (matrix(exp(whole)) @ v) - V @ (skew(step) @ v)
+            for a in range(0, LINEAR[kind], 3):
+                for j in range(3):
+                    x[at + a + j] += V[j, 0] * d[k + a] + V[j, 1] * d[k + a + 1] + V[j, 2] * d[k + a + 2]
+            if kind == HOMOGENEOUS:
+                x[at + 3] += d[k + 3]
 
 
 @compiled
-def generator(atoms: Table, x: Array, size: int, axes: int) -> Array:
-    """Return d x / d phi (size, axes) of rotating the world by phi about its origin, in error coordinates."""
+def _retract_direction(x: Array, d: Array, turn: Array) -> None:
+    """Turn a direction (azimuth, elevation) by Exp(turn), then by its own xi = d - generator turn."""
+    step = d.copy()
+    if turn.any():
+        m = direction_many(x.reshape(1, 2))[0][0]
+        step -= _direction_generator(m) @ turn
+        x[:] = spherical_many((matrix(exp(turn)) @ m).reshape(1, 3))[0][0, 1:]
+    x += step
+    if abs(x[1]) > 0.5 * np.pi:  # over the pole
+        x[1], x[0] = np.sign(x[1]) * np.pi - x[1], x[0] + np.pi
+    x[0] = wrap(x[0])
+
+
+@compiled
+def _direction_generator(m: Array) -> Array:
+    """Return how the azimuth and elevation of m (3,) move (2, 3) when the world turns."""
+    return -spherical_many(m.reshape(1, 3))[1][0, 1:] @ skew(m)
+
+
+@compiled
+def generator(atoms: Table, x: Array, size: int, axes: int, origin: Array) -> Array:
+    """Return how the errors (size, axes) move when the world turns about its origin, d x / d phi.
+
+    With six axes, for maps in which translations matter, the first three are the observing robot's step xi_p; then the
+    last three are turns about the robot, which stands at `origin` (3,): d = xi + (generator - generator_t
+    generator_p) d_theta + generator_t d_p.
+    """
     g = np.zeros((size, axes))
+    turn = axes - 3
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
         if kind == VECTOR:
             g[k, 0], g[k + 1, 0] = -x[at + 1], x[at]
         elif kind == HEADING:
             g[k, 0] = 1.0
-        elif kind == VECTOR3:
-            g[k, 1], g[k, 2] = x[at + 2], -x[at + 1]
-            g[k + 1, 0], g[k + 1, 2] = -x[at + 2], x[at]
-            g[k + 2, 0], g[k + 2, 1] = x[at + 1], -x[at]
         elif kind == ROTATION:
             for j in range(3):
-                g[k + j, j] = 1.0
+                g[k + j, turn + j] = 1.0
+        elif kind == DIRECTION:
+            g[k : k + 2, turn:] = _direction_generator(direction_many(x[at : at + 2].reshape(1, 2))[0][0])
+        elif kind == VECTOR3 or kind >= HOMOGENEOUS:
+            for a in range(0, LINEAR[kind], 3):
+                g[k + a, turn + 1], g[k + a, turn + 2] = x[at + a + 2], -x[at + a + 1]
+                g[k + a + 1, turn], g[k + a + 1, turn + 2] = -x[at + a + 2], x[at + a]
+                g[k + a + 2, turn], g[k + a + 2, turn + 1] = x[at + a + 1], -x[at + a]
+            if kind >= HOMOGENEOUS and axes == 6:
+                moved = x[at + 3] * np.eye(3) if kind == HOMOGENEOUS else -skew(x[at + 3 : at + 6])
+                g[k : k + 3, :3] = moved
+                g[k : k + 3, 3:] += moved @ skew(origin)
     return g
 
 
@@ -105,18 +158,18 @@ class Space:
         rows, x_at, p_at = [], 0, 0
         for kind in self.kinds:
             rows.append((kind, x_at, p_at))
-            x_at, p_at = x_at + MEAN_SIZE[kind], p_at + ERROR_SIZE[kind]
+            x_at, p_at = x_at + int(MEAN_SIZE[kind]), p_at + int(ERROR_SIZE[kind])
         return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
     @cached_property
     def size(self) -> int:
         """Numbers in a mean."""
-        return sum(MEAN_SIZE[k] for k in self.kinds)
+        return sum(int(MEAN_SIZE[k]) for k in self.kinds)
 
     @cached_property
     def dof(self) -> int:
         """Numbers in an error."""
-        return sum(ERROR_SIZE[k] for k in self.kinds)
+        return sum(int(ERROR_SIZE[k]) for k in self.kinds)
 
     def plus(self, x: Array, d: Array) -> Array:
         """Return x moved by the error d."""
@@ -130,23 +183,28 @@ class Space:
         x1, x2 = np.asarray(x1, dtype=np.float64), np.asarray(x2, dtype=np.float64)
         for kind, at, k in self.atoms:
             n = ERROR_SIZE[kind]
-            if kind == ROTATION:
+            if kind in (ROTATION, TURNED):
                 d[k : k + 3] = log(multiply(x2[at : at + 4], conjugate(x1[at : at + 4])))
                 continue
             d[k : k + n] = x2[at : at + n] - x1[at : at + n]
-            if kind in (HEADING, ANGLE):
+            if kind in (HEADING, ANGLE, DIRECTION):
                 d[k] = wrap(d[k])
         return d
 
     @cached_property
     def axes(self) -> int:
         """Axes the world can turn about: 1 in the plane, 3 in space."""
-        return 3 if VECTOR3 in self.kinds or ROTATION in self.kinds else 1
+        return 3 if self.world == "space" else 1
+
+    @cached_property
+    def steps(self) -> bool:
+        """Whether a translation of the world moves it by what depends on its value."""
+        return HOMOGENEOUS in self.kinds or PLUECKER in self.kinds
 
     @cached_property
     def world(self) -> str:
         """Where it lives: "plane", "space", or "" for plain numbers, which fit either."""
-        if any(kind in (VECTOR3, ROTATION) for kind in self.kinds):
+        if any(kind >= VECTOR3 for kind in self.kinds):
             return "space"
         return "plane" if any(kind in (VECTOR, HEADING) for kind in self.kinds) else ""
 
@@ -159,21 +217,25 @@ class Space:
                 x[at : at + 2] = rotation(phi) @ x[at : at + 2]
             elif kind == HEADING:
                 x[at] = wrap(x[at] + phi)
-            elif kind == VECTOR3:
-                x[at : at + 3] = matrix(turn) @ x[at : at + 3]
             elif kind == ROTATION:
                 x[at : at + 4] = multiply(turn, x[at : at + 4])
+            elif kind == DIRECTION:
+                m = direction_many(x[at : at + 2].reshape(1, 2))[0][0]
+                x[at : at + 2] = spherical_many((matrix(turn) @ m).reshape(1, 3))[0][0, 1:]
+            for a in range(0, LINEAR[kind], 3):
+                x[at + a : at + a + 3] = matrix(turn) @ x[at + a : at + a + 3]
         return x
 
     def generator(self, x: Array) -> Array:
         """Return the derivative (dof, axes) of `rotated` at phi = 0."""
-        return generator(self.atoms, np.array(x, dtype=np.float64), self.dof, self.axes)
+        return generator(self.atoms, np.array(x, dtype=np.float64), self.dof, self.axes, np.zeros(3))
 
 
 SE2 = Space("SE2", (VECTOR, HEADING))
 POINT2 = Space("point", (VECTOR,))
 SE3 = Space("SE3", (VECTOR3, ROTATION))
 POINT3 = Space("point3", (VECTOR3,))
+MOUNTS = {3: Space("mount", (SCALAR, SCALAR, ANGLE)), 7: Space("mount in space", (SCALAR, SCALAR, SCALAR, TURNED))}
 
 
 def Rn(n: int) -> Space:

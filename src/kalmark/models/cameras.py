@@ -219,19 +219,22 @@ def back_project_omni(y: Array, k: Array, b: Array) -> tuple[Array, Array]:
 
 @compiled
 def project_stereo(v: Array, k: Array, baseline_m: float) -> tuple[Array, Array]:
-    """Return the pixels e (K, 4) = (u, v of the left, u, v of the right camera) of v (K, 3), and E_v (K, 4, 3).
+    """Return the pixels e (K, 4) = (u, v of the left, u, v of the right camera) of v (K, d), and E_v (K, 4, d).
 
-    A rectified pair: v is in the left camera's frame, the right one is at (baseline, 0, 0) in it.  A sensor without
-    the right image's v takes the first three rows.
+    A rectified pair: v is in the left camera's frame, the right one is at (baseline, 0, 0) in it; v is a point, d = 3,
+    or a ray with its inverse distance, d = 4.  A sensor without the right image's v takes the first three rows.
     """
-    e, E_v = np.empty((len(v), 4)), np.zeros((len(v), 4, 3))
+    d = v.shape[1]
+    e, E_v = np.empty((len(v), 4)), np.zeros((len(v), 4, d))
     for i in range(len(v)):
-        z = v[i, 2]
+        z, right = v[i, 2], baseline_m * (v[i, 3] if d == 4 else 1.0)
         for a in range(4):
             b = a % 2
-            x = v[i, b] - (baseline_m if a == 2 else 0.0)
+            x = v[i, b] - (right if a == 2 else 0.0)
             e[i, a] = k[2 + b] + k[b] * x / z
             E_v[i, a, b], E_v[i, a, 2] = k[b] / z, -k[b] * x / (z * z)
+        if d == 4:
+            E_v[i, 2, 3] = -k[0] * baseline_m / z
     return e, E_v
 
 
@@ -255,6 +258,29 @@ def back_project_stereo(y: Array, k: Array, baseline_m: float) -> tuple[Array, A
         V_y[i, 1, 1] = z / k[1]
         if k4:
             V_y[i, 1, 1] = V_y[i, 1, 3] = 0.5 * z / k[1]
+    return v, V_y
+
+
+@compiled
+def back_project_stereo_ray(y: Array, k: Array, baseline_m: float) -> tuple[Array, Array]:
+    """Return the unit ray and the inverse distance v (K, 4) seen at y (K, 4), and V_y (K, 4, 4): regular far away, too.
+
+    The inverse distance is the disparity over fx baseline, over the length of (x, y, 1).
+    """
+    v, V_y = np.empty((len(y), 4)), np.zeros((len(y), 4, 4))
+    ray, R_y = np.ones((len(y), 3)), np.zeros((3, 4))
+    R_y[0, 0], R_y[1, 1], R_y[1, 3] = 1.0 / k[0], 0.5 / k[1], 0.5 / k[1]
+    for i in range(len(y)):
+        ray[i, 0] = (y[i, 0] - k[2]) / k[0]
+        ray[i, 1] = (0.5 * (y[i, 1] + y[i, 3]) - k[3]) / k[1]
+    m, M_ray = unit_many(ray)
+    for i in range(len(y)):
+        scale = m[i, 2] / (k[0] * baseline_m)  # m[2] is 1 / |(x, y, 1)|
+        v[i, :3], v[i, 3] = m[i], (y[i, 0] - y[i, 2]) * scale
+        V_y[i, :3] = M_ray[i] @ R_y
+        V_y[i, 3] = V_y[i, 2] * (y[i, 0] - y[i, 2]) / (k[0] * baseline_m)
+        V_y[i, 3, 0] += scale
+        V_y[i, 3, 2] -= scale
     return v, V_y
 
 

@@ -2,6 +2,7 @@
 
 `expectation` is the readable form and serves any models.  `linearize` is how the filter's kernels ask for it: plain
 Python for a model written in Python, the compiled twin below for the built-in ones.  Both are tested to be equal.
+The head is the robot's pose or, for a mount in the map, the pose and the mount.
 """
 
 from __future__ import annotations
@@ -21,9 +22,13 @@ from kalmark.models import landmarks, sensors
 from kalmark.models.landmarks import seen_from
 from kalmark.models.landmarks3d import chained
 from kalmark.models.protocols import FullSensor, Landmark, Sensor
-from kalmark.models.sensors import POSITION_FIX, expect, expect3d
+from kalmark.models.seen import expected_in_space, residual, seen_in_space
+from kalmark.models.sensors2d import POSITION_FIX, expect
 
 Array = npt.NDArray[np.float64]
+View = tuple[int, int, int, Array, Array, npt.NDArray[np.bool_]]  # sensor, landmark, lens, mount, parameters, angular
+
+NOTHING = np.zeros(0)
 
 
 def composed(r: Array, mount: Array) -> tuple[Array, Array, Array]:
@@ -40,11 +45,18 @@ def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: A
 
 
 def inverse_expectation(r: Array, mount: Array, sensor: FullSensor, landmark: Landmark, y: Array) -> tuple[Array, ...]:
-    """Return the landmarks l (K, n) that explain y (K, m), with L_r, L_s and L_y.  [S] (64), (31)-(34)."""
+    """Return the landmarks l (K, n) that explain y (K, m), with L_r, L_s, L_y and their prior.  [S] (64), (31)-(34).
+
+    The prior (K, n, n) is the covariance of what y does not tell.
+    """
     T, T_r, T_s = composed(r, mount)
     v, V_y = sensor.invert(y)
+    N = None
+    if hasattr(landmark, "complete"):
+        v, V_y, N = landmark.complete(v, V_y, getattr(sensor, "finds_depth", True))
     l, L_T, L_v = landmark.from_view(T, v)
-    return l, L_T @ T_r, L_T @ T_s, L_v @ V_y
+    prior = np.zeros((len(l), L_v.shape[1], L_v.shape[1])) if N is None else L_v @ N @ L_v.swapaxes(1, 2)
+    return l, L_T @ T_r, L_T @ T_s, L_v @ V_y, prior
 
 
 @dataclass(frozen=True)
@@ -54,54 +66,83 @@ class PythonView:
     sensor: Sensor
     landmark: Landmark
     mount: Array
+    angular: npt.NDArray[np.bool_]
 
-    def linearize(self, r: Array, l: Array) -> tuple[Array, Array, Array]:
-        """Return e (K, m), E_r (K, m, 3), E_l (K, m, n)."""
-        e, E_r, _, E_l = expectation(r, self.mount, self.sensor, self.landmark, l)
-        return e, E_r, E_l
-
-
-def fix_view(antenna: Array) -> tuple[int, Array]:
-    """Return the view of an absolute position fix whose antenna sits at `antenna` (3,) in the robot's frame."""
-    return POSITION_FIX, antenna
+    def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+        """Return e (K, m), z = y - e, E_h (K, m, 3 or more) and E_l (K, m, n)."""
+        size = len(self.mount)
+        r, mount = head[:size], head[size:] if len(head) > size else self.mount
+        e, E_r, E_s, E_l = expectation(r, mount, self.sensor, self.landmark, l)
+        return e, residual(y, e, self.angular), E_r if len(head) == size else np.concatenate([E_r, E_s], axis=2), E_l
 
 
-def view_of(sensor: Sensor, landmark: Landmark, mount: Array) -> Any:
-    """Return what `linearize` takes: (code, mount) for the compiled models, a `PythonView` for others."""
+def fix_view(antenna: Array) -> View:
+    """Return the view of an absolute position fix whose antenna sits at `antenna` (3,) or (7,) in the robot's frame."""
+    return POSITION_FIX, 0, 0, antenna, NOTHING.copy(), np.zeros(3, dtype=np.bool_)
+
+
+def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
+    """Return what `linearize` takes: a `View` for the compiled models, a `PythonView` for others."""
+    angular = np.array(sensor.angular, dtype=np.bool_)
     if type(sensor) in sensors.BUILT_IN and type(landmark) in landmarks.BUILT_IN:  # not a user's subclass of them
-        return int(sensor.code), mount  # type: ignore[attr-defined]
-    return PythonView(sensor, landmark, mount)
+        par = np.array(getattr(sensor, "parameters", NOTHING), dtype=np.float64)
+        return (
+            int(sensor.code),
+            int(getattr(landmark, "code", 0)),
+            int(getattr(sensor, "lens_code", 0)),
+            mount,
+            par,
+            angular,
+        )
+    return PythonView(sensor, landmark, mount, angular)
 
 
-def linearize(view: Any, r: Array, l: Array) -> tuple[Array, Array, Array]:
-    """Return the expectations e (K, m) of landmarks l (K, n) from robot pose r, E_r (K, m, 3), E_l (K, m, n)."""
-    return linearize_built_in(view, r, l) if isinstance(view, tuple) else view.linearize(r, l)
+def linearize(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what landmarks l (K, n) make y (K, m) look like from a robot.
+
+    The expectations e (K, m), the innovations z (K, p), E_h (K, p, 3 or more) with respect to the head, E_l (K, p, n).
+    """
+    return linearize_built_in(view, head, l, y) if isinstance(view, tuple) else view.linearize(head, l, y)
 
 
 @overload(linearize, strict=False)  # type: ignore[untyped-decorator]  # strict: the annotations differ
-def _compiled_linearize(view: Any, r: Any, l: Any) -> Any:
+def _compiled_linearize(view: Any, head: Any, l: Any, y: Any) -> Any:
     if isinstance(view, types.BaseTuple):
-        return lambda view, r, l: linearize_built_in(view, r, l)  # noqa: PLW0108 - numba compares the arguments
+        return lambda view, head, l, y: linearize_built_in(view, head, l, y)  # noqa: PLW0108 - numba compares the arguments
     return None
 
 
 @compiled
-def linearize_built_in(view: tuple[int, Array], r: Array, l: Array) -> tuple[Array, Array, Array]:
+def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """`expectation`, compiled."""
-    code, mount = view
-    if len(r) == 3:
-        T, T_r, _ = compose(r, mount)
+    code, kind, lens, at, par, angular = view
+    pose = len(at)
+    mount = head[pose:] if len(head) > pose else at
+    if pose == 3:
+        T, T_r, T_s = compose(head[:pose], mount)
         if code == POSITION_FIX:  # an absolute position fix looks at no landmark
-            return T[:2].copy().reshape(1, 2), T_r[:2].copy().reshape(1, 2, 3), np.zeros((1, 2, l.shape[1]))
+            e, E_h, E_l = T[:2].copy().reshape(1, 2), T_r[:2].copy().reshape(1, 2, 3), np.zeros((1, 2, l.shape[1]))
+            return e, y - e, E_h, E_l
         v, V_T, V_l = seen_from(T, l)
         e, E_v = expect(code, v)
+        z = residual(y, e, angular)
     else:
-        T, T_r, _ = frames3d.compose(r, mount)
+        T, T_r, T_s = frames3d.compose(head[:pose], mount)
         if code == POSITION_FIX:
-            return T[:3].copy().reshape(1, 3), T_r[:3].copy().reshape(1, 3, 6), np.zeros((1, 3, l.shape[1]))
-        v, V_T, V_l = frames3d.to_frame_many(T, l)
-        e, E_v = expect3d(code, v)
-    return e, turned(chained(E_v, V_T), T_r), chained(E_v, V_l)
+            e, E_h, E_l = T[:3].copy().reshape(1, 3), T_r[:3].copy().reshape(1, 3, 6), np.zeros((1, 3, l.shape[1]))
+            return e, y - e, E_h, E_l
+        v, V_T, V_l = seen_in_space(kind, T, l)
+        e, z, E_v = expected_in_space(code, lens, par, angular, v, y)
+    E_T = chained(E_v, V_T)
+    E_l = chained(E_v, V_l)
+    if len(head) == pose:
+        return e, z, turned(E_T, T_r), E_l
+    k, p, n = E_T.shape
+    E_h = np.empty((k, p, 2 * n))
+    for i in range(k):
+        E_h[i, :, n:] = E_T[i] @ T_s
+    E_h[:, :, :n] = turned(E_T, T_r)
+    return e, z, E_h, E_l
 
 
 @compiled

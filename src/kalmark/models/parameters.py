@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
 from kalmark.errors import ModelError
+
+NEVER_NEGATIVE = ("sigma", "range", "fov", "wheelbase", "min_length")
 
 
 def check_parameters(model: Any, *, noise: str = "", positive: tuple[str, ...] = ()) -> None:
@@ -16,6 +19,11 @@ def check_parameters(model: Any, *, noise: str = "", positive: tuple[str, ...] =
     """
     name = type(model).__name__
     for key, value in vars(model).items():
+        if key in ("lens", "extend"):
+            continue
+        if isinstance(value, Sequence) and not isinstance(value, str):
+            refuse_odd_numbers(f"{name}: {key}", value)
+            continue
         if not isinstance(value, Real) or isinstance(value, bool):
             raise ModelError(f"{name}: {key} is {value!r}, expected a number")
         number = float(value)
@@ -26,5 +34,12 @@ def check_parameters(model: Any, *, noise: str = "", positive: tuple[str, ...] =
             above = False  # the noise may be all relative
         if above and number <= 0:
             raise ModelError(f"{name}: {key} is {value}, expected a positive number")
-        if number < 0 and not key.startswith("encoder_offset"):
+        if number < 0 and key.startswith(NEVER_NEGATIVE):
             raise ModelError(f"{name}: {key} is {value}, expected a number of at least 0")
+
+
+def refuse_odd_numbers(what: str, values: Sequence[Any]) -> None:
+    """Refuse a list in which anything is not a finite number."""
+    for value in values:
+        if not isinstance(value, Real) or isinstance(value, bool) or not math.isfinite(value):
+            raise ModelError(f"{what} holds {value!r}, expected finite numbers")

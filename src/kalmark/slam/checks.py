@@ -46,7 +46,7 @@ def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[Kalma
 
 
 def measurements(event: Scan, sensor: Sensor) -> Array:
-    """Return the noise R (K, m, m) of a scan, refusing measurements its sensor cannot have made."""
+    """Return the noise R (K, p, p) of a scan's innovations, refusing measurements its sensor cannot have made."""
     m, count = len(sensor.columns), len(event.y)
     if event.width != m and (count or event.width):
         expected = f"expected {m}: {', '.join(sensor.columns)}"
@@ -59,8 +59,9 @@ def measurements(event: Scan, sensor: Sensor) -> Array:
             raise EventError(f"scan at t={seconds(event.t_ns)} s: {error}") from None
     if event.cov is None:
         return sensor.noise(event.y) if count else np.zeros((0, m, m))
-    what = f"scan at t={seconds(event.t_ns)} s: cov"
-    if event.cov.shape not in ((m, m), (count, m, m)):
-        raise EventError(f"{what} has shape {event.cov.shape}, expected ({m}, {m}) or ({count}, {m}, {m})")
-    _refuse_indefinite(event.cov.reshape(-1, m, m), what, definite=True)
-    return np.ascontiguousarray(np.broadcast_to(event.cov, (count, m, m)))
+    what, p = f"scan at t={seconds(event.t_ns)} s: cov", getattr(sensor, "cov_size", m)
+    if event.cov.shape not in ((p, p), (count, p, p)):
+        raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
+    _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)
+    covs = np.ascontiguousarray(np.broadcast_to(event.cov, (count, p, p)))
+    return sensor.noise_from(event.y, covs) if hasattr(sensor, "noise_from") else covs

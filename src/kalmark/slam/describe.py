@@ -12,7 +12,7 @@ from kalmark.errors import MapError
 from kalmark.filter import estimators
 from kalmark.models import landmarks, motion, sensors
 from kalmark.models.protocols import Landmark
-from kalmark.slam import association
+from kalmark.slam import association, attention
 from kalmark.slam.robot import Mount, Robot
 
 State = dict[str, Any]
@@ -23,6 +23,7 @@ MODULES = {
     "landmark": (landmarks, "seen_from"),
     "estimator": (estimators, "correct"),
     "association": (association, "associate"),
+    "attention": (attention, "hopeless"),
 }
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 
@@ -37,6 +38,8 @@ def described(model: Any) -> State:
 
 def _plain(value: Any) -> Any:
     """Return NumPy's numbers as Python's, and those JSON has no word for as text."""
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
     value = value.item() if isinstance(value, np.generic) else value
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
@@ -74,6 +77,10 @@ def robot_described(robot: Robot) -> State:
                 "sensor": described(mount.sensor),
                 "at": list(mount.at),
                 "landmark": None if mount.landmark is None else described(mount.landmark),
+                "association": None if mount.association is None else described(mount.association),
+                "detector": mount.detector is not None,
+                "attention": described(mount.attention),
+                "cov": None if mount.cov is None else np.asarray(mount.cov).tolist(),
             },
         ]
         for name, mount in robot.sensors.items()
@@ -87,8 +94,13 @@ def _robot_restored(d: State) -> Robot:
     who, mounts = f"robot {d['name']!r}", {}
     for name, m in d["sensors"]:
         what = f"{who}: sensor {name!r}"
+        if m["detector"]:
+            raise MapError(f"{what} has a detector of your own: give the robots to load() again")
         landmark = m["landmark"] and restored("landmark", m["landmark"], f"{what}: landmark", "robots")
-        mounts[name] = Mount(restored("sensor", m["sensor"], what, "robots"), m["at"], landmark)
+        paired = m["association"] and restored("association", m["association"], f"{what}: association", "robots")
+        budget = restored("attention", m["attention"], f"{what}: attention", "robots")
+        sensor = restored("sensor", m["sensor"], what, "robots")
+        mounts[name] = Mount(sensor, m["at"], landmark, paired, None, budget, m["cov"])
     return Robot(d["name"], restored("motion", d["motion"], f"{who}: motion", "robots"), d["start"], mounts, d["cov"])
 
 

@@ -1,7 +1,8 @@
 """A robot's clock: cuts its controls into the parts by which the robot is moved.
 
 A rate acts from its time until the robot's next control, so a scan in between splits its interval.  The error of the
-control is common to both parts.  An increment is the motion that ended at its time.
+control is common to both parts.  An increment is the motion that ended at its time.  A robot that coasts moves without
+a control, which changes its velocity at its time.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class Drive:
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
+        self.coasts = bool(getattr(motion, "coasts", False))
         self.t_ns: int | None = None
         self.u: Array | None = None
         self.N: Array | None = None
@@ -45,11 +47,21 @@ class Drive:
 
     def advance(self, to_ns: int, last: bool = False) -> Part | None:
         """Return the part from where the robot stands to `to_ns`, or None if it does not move."""
+        if self.coasts:
+            return self._coast(to_ns)
         if self.u is None or self.N is None or self.t_ns is None or to_ns <= self.t_ns:
             return None
         part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last)
         self.t_ns, self.fresh = to_ns, False
         return part
+
+    def _coast(self, to_ns: int) -> Part | None:
+        """Return the part of a robot that needs no control to move, from the first event on."""
+        t_ns, self.t_ns = self.t_ns, to_ns
+        if t_ns is None or to_ns <= t_ns:
+            return None
+        k = len(self.motion.columns)
+        return Part(np.zeros(k), np.zeros((k, k)), (to_ns - t_ns) * 1e-9, True, True)
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:

@@ -33,15 +33,17 @@ class Observation(NamedTuple):
 class Report:
     """The answer to one event.
 
-    `y`, expectation `e` and innovation `z` are (K, m), its covariance `Z` (K, m, m); rows of observations that were not
-    compared with a landmark are NaN.
+    `y` and the expectation `e` are (K, m), the innovation `z` (K, p) and its covariance `Z` (K, p, p), with p = m but
+    for sensors that measure more than can be innovated; rows of observations that were not compared with a landmark
+    are NaN.  `removed` are landmarks given up, each with the reason.
     """
 
-    __slots__ = ("Z", "e", "event", "observations", "y", "z")
+    __slots__ = ("Z", "e", "event", "observations", "removed", "y", "z")
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
         self.observations: tuple[Observation, ...] = ()
+        self.removed: tuple[tuple[Id, str], ...] = ()
         self.y = y
         self.e: Array = NOTHING
         self.z: Array = NOTHING
@@ -57,16 +59,21 @@ class Report:
         """The event's robot."""
         return self.event.robot
 
-    def fill(self, known: Sequence[int], done: Correction | None) -> None:
-        """Enter what was predicted of the observations `known`; the others stay NaN."""
-        count, m = self.y.shape
-        if done is not None and len(known) == count:
+    def blank(self, p: int) -> None:
+        """Enter that nothing was predicted of any observation, whose innovations have p numbers."""
+        count = len(self.y)
+        self.e, self.z, self.Z = (
+            np.full(self.y.shape, np.nan),
+            np.full((count, p), np.nan),
+            np.full((count, p, p), np.nan),
+        )
+
+    def fill(self, rows: Sequence[int], done: Correction) -> None:
+        """Enter what was predicted of the observations `rows`; the others stay as they are."""
+        if len(rows) == len(self.y):
             self.e, self.z, self.Z = done.e, done.z, done.Z
-            return
-        self.e, self.z = np.full((count, m), np.nan), np.full((count, m), np.nan)
-        self.Z = np.full((count, m, m), np.nan)
-        if done is not None:
-            self.e[known], self.z[known], self.Z[known] = done.e, done.z, done.Z
+        else:
+            self.e[rows], self.z[rows], self.Z[rows] = done.e, done.z, done.Z
 
     def __repr__(self) -> str:
         counts = {o: sum(obs.outcome == o for obs in self.observations) for o in OUTCOMES}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import ModelError
-from kalmark.geometry.spaces import SE2, SE3
+from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.protocols import Landmark, Motion, Sensor
+from kalmark.slam.association import Association
+from kalmark.slam.attention import EVERYTHING, Attention
 from kalmark.slam.checks import covariance, instance
-from kalmark.slam.events import finite, shown
+from kalmark.slam.events import Scan, finite, shown
 
 Array = npt.NDArray[np.float64]
 
@@ -44,18 +46,30 @@ def _pose(value: Any, what: str, sizes: tuple[int, ...]) -> Array:
 class Mount:
     """A sensor and where it sits in the robot's frame: `at` = (x, y, heading), m and rad, or (x, y, z, qx, qy, qz, qw).
 
-    `landmark` is the type of landmark this sensor starts, if not the slam's.
+    `landmark` is the type of landmark this sensor starts and `association` its own, if not the slam's.  `detector`
+    turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans.  With `cov`, (3, 3)
+    or (6, 6) in the robot's frame, the mount is uncertain: a block of the map, called "robot.sensor", that calibrates
+    itself.
     """
 
     sensor: Sensor
     at: Any = (0.0, 0.0, 0.0)
     landmark: Landmark | None = None
+    association: Association | None = None
+    detector: Callable[[Scan], Scan] | None = None
+    attention: Attention = EVERYTHING
+    cov: Any = None
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
         if self.landmark is not None:
             instance(self.landmark, Landmark, "Mount: landmark", "a landmark model")
+        instance(self.attention, Attention, "Mount: attention", "an Attention")
         object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
+
+    def covariance(self, dof: int, what: str) -> Array | None:
+        """Return the covariance of the mount in a robot's frame, or None if it is known exactly."""
+        return None if self.cov is None else covariance(self.cov, dof, what, definite=False, error=ModelError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +90,39 @@ class Robot:
             raise ModelError(f"Robot: name is {shown(self.name)}, expected a text that is not empty")
         what = f"robot {self.name!r}"
         instance(self.motion, Motion, f"{what}: motion", "a motion model")
-        if self.motion.space not in (SE2, SE3):
-            space = getattr(self.motion.space, "name", shown(self.motion.space))
-            raise ModelError(f"{what}: motion is in {space}, expected SE2 or SE3: other spaces are not available yet")
-        size, dof = self.motion.space.size, self.motion.space.dof
-        start = IDENTITY[size] if self.start is None else self.start
-        object.__setattr__(self, "start", _pose(start, f"{what}: start", (size,)))
-        object.__setattr__(self, "sensors", _mounts(self.sensors, what, size))
+        space = self.motion.space
+        pose = 3 if space.kinds[:2] == SE2.kinds else 7 if space.kinds[:2] == SE3.kinds else 0
+        if not pose:
+            raise ModelError(f"{what}: motion is in {getattr(space, 'name', shown(space))}, expected SE2, SE3 or more")
+        start = IDENTITY[pose] if self.start is None else self.start
+        object.__setattr__(self, "start", _state(start, pose, space, f"{what}: start"))
+        object.__setattr__(self, "sensors", _mounts(self.sensors, what, pose))
+        for name, mount in self.sensors.items():
+            mount.covariance(3 if pose == 3 else 6, f"{what}: sensor {name!r}: cov")
         if self.cov is not None:
-            cov = covariance(self.cov, dof, f"{what}: cov", definite=False, error=ModelError)
-            object.__setattr__(self, "cov", cov)
+            object.__setattr__(self, "cov", _cov(self.cov, pose, space, f"{what}: cov"))
+
+
+def _state(value: Any, pose: int, space: Space, what: str) -> Array:
+    """Return a start of a motion's space: the whole state, or a pose, the rest of it zero."""
+    try:
+        given = finite(value, what, ModelError)
+    except ModelError:
+        given = np.empty(0)
+    whole = given.shape == (space.size,)
+    rest = given[pose:] if whole else np.zeros(space.size - pose)
+    state = np.concatenate([_pose(given[:pose] if whole else value, what, (pose,)), rest])
+    state.flags.writeable = False
+    return state
+
+
+def _cov(value: Any, pose: int, space: Space, what: str) -> Array:
+    """Return the covariance of a start, of the whole state or of the pose alone, the rest of it known."""
+    given, dof = finite(value, what, ModelError), 3 if pose == 3 else 6
+    size = dof if given.shape == (dof, dof) else space.dof
+    cov = np.zeros((space.dof, space.dof))
+    cov[:size, :size] = covariance(given, size, what, definite=False, error=ModelError)
+    return cov
 
 
 def _mounts(sensors: Any, what: str, size: int) -> dict[str, Mount]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import ModelError
-from kalmark.filter.corrections import innovation, observed_block, residual
+from kalmark.filter.corrections import innovation, observed_block
 from kalmark.filter.map import X_AT, StochasticMap
-from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D
+from kalmark.models import landmarks as kinds
+from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D, Tag
 from kalmark.models.observe import composed, inverse_expectation, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.slam.events import Id, Scan
@@ -20,62 +22,148 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
 
 NOTHING = np.zeros((0, 0, 0))
 
-
 ROBOT = "robot"
-SEEN_AS = {
-    "point": ("point", "point_signature", ROBOT),
-    "point3": ("point3", ROBOT),
-}  # kinds of blocks that a view of one kind applies to
+ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one view applies to
+BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How a sensor sees landmarks of one type: what `linearize` takes, and how many of their numbers."""
+
+    landmark: Landmark
+    view: Any
+    d: int
 
 
 class View:
     """A mounted sensor with its landmark type and gate, ready for the kernels."""
 
-    def __init__(self, mount: Mount, landmarks: Landmark | None, slam: Slam) -> None:
-        self.sensor = mount.sensor
+    def __init__(self, mount: Mount, landmarks: Landmark | None, slam: Slam, slot: int) -> None:
+        self.sensor, self.attention, self.detector = mount.sensor, mount.attention, mount.detector
         self.at: Array = np.array(mount.at)  # writable, like all else: numba compiles per kind of array
+        self.mount = slot  # of the mount in the map, -1 if it is not there
         self.landmark: Landmark = mount.landmark or landmarks or _natural(mount)
         slam.refuse_other_world(type(self.sensor).__name__, getattr(self.sensor, "world", ""))
         slam.refuse_other_world(self.landmark.kind, self.landmark.space.world)
-        self.look = view_of(self.sensor, self.landmark, self.at)
-        self.d = self.landmark.space.size
-        self.angular = np.array(self.sensor.angular, dtype=np.bool_)
-        self.gate = slam.association.threshold(len(self.angular), slam.estimator.default_gate)
-        self.starts = isinstance(self.sensor, FullSensor)
+        self.association = mount.association or slam.association
+        self.looks = self._looks()
+        self._refuse_misfit()
+        self.dof = self._dof()
+        self.gate = self.association.threshold(self.dof, slam.estimator.default_gate)
+        depth = getattr(self.sensor, "finds_depth", True) or hasattr(self.landmark, "prior_rho_per_m")
+        self.starts = isinstance(self.sensor, FullSensor) and (depth or self.landmark.kind != "point3")
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
         self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
-        self.sees = SEEN_AS.get(self.landmark.kind, (self.landmark.kind,))
-        numbers = 3 if len(self.at) == 7 or "signature" in self.sensor.columns else 2
-        if isinstance(self.look, tuple) and numbers != self.d:
-            raise ModelError(
-                f"a {type(self.sensor).__name__} finds {numbers} numbers, a {self.landmark.kind} has {self.d}"
-            )
 
-    def noise(
-        self, map_: StochasticMap, robot: int, slots: npt.NDArray[np.int64], R: Array, event: Scan
-    ) -> Array:  # fmt: skip
+    def _looks(self) -> dict[str, Look]:
+        """Return the looks at all kinds of blocks that this sensor can see: its own landmarks and those like them."""
+        types = [BY_KIND[kind]() for kind in getattr(self.sensor, "sees_kinds", ()) if kind != self.landmark.kind]
+        looks: dict[str, Look] = {}
+        for landmark in (*types, self.landmark):
+            look = Look(landmark, view_of(self.sensor, landmark, self.at), landmark.space.size)
+            looks |= {kind: look for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
+        return looks
+
+    def _refuse_misfit(self) -> None:
+        """Refuse a kind of landmark that one of kalmark's own sensors does not see."""
+        sensor, kind = type(self.sensor).__name__, self.landmark.kind
+        if not isinstance(self.looks[kind].view, tuple):
+            return
+        seen = getattr(self.sensor, "sees_kinds", None)
+        if seen is not None and kind not in seen:
+            raise ModelError(f"a {sensor} does not see a landmark of the type {kind}, expected {' or '.join(seen)}")
+        numbers = 3 if "signature" in self.sensor.columns else 2
+        if seen is None and numbers != self.landmark.space.size:
+            raise ModelError(f"a {sensor} finds {numbers} numbers, a {kind} has {self.landmark.space.size}")
+
+    def _dof(self) -> int:
+        """Return the size p of one innovation."""
+        if isinstance(self.looks[self.landmark.kind].view, tuple):
+            return int(self.sensor.noise(np.zeros((1, len(self.sensor.columns)))).shape[1])
+        return len(self.sensor.angular)
+
+    def head(self, map_: StochasticMap, robot: int) -> Array:
+        """Return the robot's pose, followed by the mount's if it is in the map."""
+        pose = map_.mean(robot)[: len(self.at)]
+        return pose if self.mount < 0 else np.concatenate([pose, map_.mean(self.mount)])
+
+    def head_index(self, map_: StochasticMap, robot: int) -> Index:
+        """Return the rows of the robot's pose and, if it is in the map, of the mount."""
+        pose = map_.index(robot)[: 3 if len(self.at) == 3 else 6]
+        return pose if self.mount < 0 else np.concatenate([pose, map_.index(self.mount)])
+
+    def pose(self, map_: StochasticMap, robot: int) -> Array:
+        """Return the sensor's pose T in the map's frame."""
+        head = self.head(map_, robot)
+        size = len(self.at)
+        return composed(head[:size], head[size:] if len(head) > size else self.at)[0]
+
+    def in_sight(self, map_: StochasticMap, robot: int, look: Look, slots: list[int], ends: list[Any]) -> Index:
+        """Return which of the blocks `slots` the sensor should see now; `ends` are those of the segments of lines."""
+        T, l = self.pose(map_, robot), means(map_, np.array(slots), look.d)
+        sensor: Any = self.sensor
+        if not hasattr(look.landmark, "endpoints"):
+            return np.flatnonzero(sensor.sees(look.landmark.seen_from(T, l)[0]))
+        p, _ = look.landmark.endpoints(l, np.array(ends))
+        return np.flatnonzero(sensor.sees_segments(T, p[:, 0], p[:, 1])[0])
+
+    def noise(self, map_: StochasticMap, robot: int, look: Look, slots: Index, R: Array, event: Scan) -> Array:
         """Return the noise of observations of the blocks `slots`: R, unless it depends on where they are  [F]."""
         if self.noise_at is None or event.cov is not None:
             return R
-        T, _, _ = composed(map_.mean(robot)[: len(self.at)], self.at)
-        l = map_.x[map_.blocks[slots, X_AT][:, None] + np.arange(self.d)]
-        return self.noise_at(self.landmark.seen_from(T, l)[0])
+        return self.noise_at(look.landmark.seen_from(self.pose(map_, robot), means(map_, slots, look.d))[0])
 
-    def explain(self, r: Array, y: Array, R: Array, event: Scan) -> tuple[Array, Array, Array]:
-        """Return the landmark (n,) that explains y (1, m) from r, L_r (n, 3) and Q = L_y R L_y'.  [S] (32)-(35)."""
-        l, L_r, _, L_y = inverse_expectation(r, self.at, self.sensor, self.landmark, y)  # type: ignore[arg-type]
+    def predict(
+        self, map_: StochasticMap, robot: int, look: Look, slots: Index, y: Array, R: Array
+    ) -> tuple[Array, Array]:
+        """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
+        index, _, mean = observed_block(map_.x, map_.blocks, map_.atoms, robot, self.mount, slots, look.d)
+        head = len(mean) - look.d * len(slots)
+        _, z, E_h, E_l = linearize(look.view, mean[:head], mean[head:].reshape(len(slots), look.d), y)
+        Z, d2, _ = innovation(map_.P, index, E_h, E_l, R, z)
+        return Z, d2
+
+    def explain(self, map_: StochasticMap, robot: int, event: Scan, k: int, R: Array) -> tuple[Array, Array, Array]:
+        """Return the landmark (n,) that explains the k-th observation, whose noise is R, and how it came about.
+
+        L_h (., 3 or more) with respect to the head, and Q = L_y R L_y' + prior.  [S] (32)-(35).
+        """
+        y = event.y[k : k + 1]
+        head, size = self.head(map_, robot), len(self.at)
+        r, mount = head[:size], head[size:] if self.mount >= 0 else self.at
+        l, L_r, L_s, L_y, prior = inverse_expectation(r, mount, self.sensor, self.landmark, y)  # type: ignore[arg-type]
         if self.noise_at is not None and event.cov is None:
             R = self.noise_at(self.sensor.invert(y)[0])[0]  # type: ignore[attr-defined]
-        return l[0], L_r[0], L_y[0] @ R @ L_y[0].T
+        if hasattr(self.sensor, "start_noise"):
+            R = (
+                self.sensor.start_noise(y)[0]
+                if event.cov is None
+                else np.broadcast_to(event.cov, (len(event.y), 4, 4))[k]
+            )
+        L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
+        return l[0], L_h, L_y[0] @ R @ L_y[0].T + prior[0]
+
+
+def means(map_: StochasticMap, slots: Index, d: int) -> Array:
+    """Return the first d numbers (K, d) of the blocks `slots`."""
+    return map_.x[map_.blocks[slots, X_AT][:, None] + np.arange(d)]
 
 
 def _natural(mount: Mount) -> Landmark:
-    if len(mount.at) == 7:
-        return Point3D()
-    return PointSignature2D() if "signature" in mount.sensor.columns else Point2D()
+    """Return the type of landmark that a sensor starts if nobody says which."""
+    if "size_m" in mount.sensor.columns or "qw" in mount.sensor.columns:
+        return Tag()
+    if len(mount.at) == 3:
+        return PointSignature2D() if "signature" in mount.sensor.columns else Point2D()
+    seen = getattr(mount.sensor, "sees_kinds", ("point3",))
+    if "point3" not in seen:
+        return kinds.AnchoredHomogeneousLine()
+    return Point3D() if getattr(mount.sensor, "finds_depth", True) else kinds.AnchoredHomogeneous()
 
 
 class Scene:
@@ -86,25 +174,22 @@ class Scene:
         self._slam, self._view, self._event, self._R = slam, view, event, R
 
     def dof(self) -> int:
-        """Return the size m of one measurement."""
-        return len(self._view.angular)
+        """Return the size p of one innovation."""
+        return self._view.dof
 
     def candidates(self) -> list[Id]:
         """Return the ids of the landmarks this sensor could have seen."""
-        return self._slam.landmark_ids(self._view.landmark)
+        return self._slam.landmark_ids(self._view)
 
     def distances(self, candidates: list[Id]) -> Array:
         """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83)."""
-        map_, view = self._slam.map, self._view
-        robot = self._slam.slot(self._event.robot)
-        slots = np.array([self._slam.slot(name) for name in candidates])
-        pose = len(view.at)
-        index, _, mean = observed_block(map_.x, map_.blocks, map_.atoms, robot, slots, view.d)
-        e, E_r, E_l = linearize(view.look, mean[:pose], mean[pose:].reshape(len(slots), view.d))
-        d2 = np.empty((len(self._event.y), len(slots)))
-        there = view.noise(map_, robot, slots, NOTHING, self._event)
-        for k, y in enumerate(self._event.y):
-            z = residual(np.broadcast_to(y, e.shape).copy(), e, view.angular)
-            R = np.tile(self._R[k], (len(slots), 1, 1)) if there is NOTHING else there
-            _, d2[k], _ = innovation(map_.P, index, E_r, E_l, R, z)
+        map_, view, event = self._slam.map, self._view, self._event
+        robot = self._slam.slot(event.robot)
+        d2 = np.empty((len(event.y), len(candidates)))
+        for look, columns in self._slam.by_look(view, candidates):
+            slots = np.array([self._slam.slot(candidates[i]) for i in columns])
+            there = view.noise(map_, robot, look, slots, NOTHING, event)
+            for k, y in enumerate(event.y):
+                R = np.tile(self._R[k], (len(slots), 1, 1)) if there is NOTHING else there
+                _, d2[k, columns] = view.predict(map_, robot, look, slots, np.tile(y, (len(slots), 1)), R)
         return d2

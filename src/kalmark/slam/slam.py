@@ -3,6 +3,7 @@
 robot moves             -> _move         prediction          [S] (14)-(17)
 sensor sees known ones  -> _correct      correction          [S] (26)-(30)
 sensor sees new ones    -> _initialize   augmentation        [S] (32)-(38)
+depth has become clear  -> _simplify     reparametrisation   [TB] 4.4
 landmark is removed     -> remove        reduction           [S] Table 1
 """
 
@@ -22,28 +23,31 @@ from kalmark.filter.kernels import all_finite
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
-from kalmark.geometry.spaces import Rn
-from kalmark.models.landmarks import Point2D
+from kalmark.geometry.spaces import MOUNTS, POINT3, Rn
+from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import NEW, Association, ByIdentity, Decision
 from kalmark.slam.checks import covariance, measurements
 from kalmark.slam.drive import Drive, Part
+from kalmark.slam.ends import extended_ends
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds
 from kalmark.slam.report import LandmarkTable, Observation, Report
 from kalmark.slam.robot import Robot
-from kalmark.slam.scene import ROBOT, Scene, View
+from kalmark.slam.scene import ROBOT, Look, Scene, View
 
 Array = npt.NDArray[np.float64]
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+LINEAR = 0.1  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
 class Slam:
     """Robots and landmarks as one joint Gaussian, corrected event by event.
 
     `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
-    what a landmark is.  Events must come in the order of their times.
+    what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
+    `reparametrize` (None: never).  Events must come in the order of their times.
     """
 
     def __init__(
@@ -53,6 +57,7 @@ class Slam:
         estimator: Estimator | None = None,
         landmarks: Landmark | None = None,
         map: str = "auto",
+        reparametrize: float | None = LINEAR,
     ) -> None:
         if map not in ("auto", "dense"):
             raise ModelError(f"map is {map!r}, expected 'auto' or 'dense'")
@@ -62,11 +67,14 @@ class Slam:
         self.t_ns: int | None = None
         self.map = StochasticMap()
         self.landmark_type = landmarks
+        self.reparametrize = reparametrize
         self._slots: dict[Id, int] = {}  # every robot and landmark by name
         self._drives: dict[str, Drive] = {}
         self._errors: dict[str, int] = {}  # the block of a held control's error, while a scan has split its interval
         self._kinds: dict[Id, Landmark] = {}
         self._seen: dict[Id, int] = {}
+        self._searched: dict[Id, list[int]] = {}  # in how many scans a landmark was looked for, and found
+        self._ends: dict[Id, Array] = {}  # of the segments seen of lines
         self._unnamed = 0
         self._views: dict[tuple[str, str], View] = {}
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
@@ -83,7 +91,10 @@ class Slam:
         self._slots[robot.name] = self.map.add(robot.motion.space, robot.start, robot.cov)
         self._drives[robot.name] = Drive(robot.motion)
         for name, mount in robot.sensors.items():
-            self._views[robot.name, name] = View(mount, landmarks, self)
+            slot, cov = -1, mount.covariance(6 if len(mount.at) == 7 else 3, name)
+            if cov is not None:  # the mount calibrates itself
+                slot = self._slots[mount_name(robot.name, name)] = self.map.add(MOUNTS[len(mount.at)], mount.at, cov)
+            self._views[robot.name, name] = View(mount, landmarks, self, slot)
 
     # ------------------------------------------------------------------ events
     def process(self, event: Event) -> Report:
@@ -126,6 +137,7 @@ class Slam:
         if view is None:
             names = sorted(self.robots[event.robot].sensors)
             raise EventError(f"{_when(event)}: sensor is {event.sensor!r}, expected one of {names}")
+        event = event if view.detector is None else view.detector(event)
         R = measurements(event, view.sensor)
         self.t_ns = event.t_ns
         self._advance(event.robot)
@@ -136,12 +148,12 @@ class Slam:
         for i in ids:
             if i in self.robots:
                 self._advance(i)
-        decisions = self.association.associate(Scene(self, view, event, ids, R))
+        decisions = view.association.associate(Scene(self, view, event, ids, R))
         return self._fuse(event, view, ids, decisions, R)
 
     def _fix(self, event: Fix) -> Report:
         what = _when(event)
-        pose = len(self.robots[event.robot].start)
+        pose = 3 if self.robots[event.robot].motion.space.axes == 1 else 7
         size = 2 if pose == 3 else 3
         if event.y.shape != (size,):
             expected = "x and y in m" if size == 2 else "x, y and z in m"
@@ -151,9 +163,8 @@ class Slam:
         self._advance(event.robot)
         slot, report = self._slots[event.robot], Report(event, event.y.reshape(1, size))
         gate = self.association.threshold(size, self.estimator.default_gate)
-        y, R, straight = report.y, event.cov.reshape(1, size, size), np.zeros(size, dtype=np.bool_)
-        view, estimator = fix_view(ORIGIN[pose]), self.estimator.for_fixes()
-        done = estimator.correct(self.map, view, slot, np.array([slot]), 0, y, R, straight, gate)
+        view, estimator, R = fix_view(ORIGIN[pose]), self.estimator.for_fixes(), event.cov.reshape(1, size, size)
+        done = estimator.correct(self.map, view, slot, -1, np.array([slot]), 0, report.y, R, gate)
         self._healthy(done.healthy, event)
         report.e, report.z, report.Z = done.e, done.z, done.Z
         outcome, reason = ("associated", "") if done.fused[0] else ("rejected", f"outside the gate of {gate:.2f}")
@@ -208,14 +219,19 @@ class Slam:
         report = Report(event, event.y)
         known = [k for k, (name, _) in enumerate(decisions) if self._seen_by(view, event.robot, name)]
         outcomes: list[Observation | None] = [None] * len(decisions)
-        if known:
-            for seen in self._correct(event, report, view, known, ids, decisions, R):
-                outcomes[seen.index] = seen
-        else:
-            report.fill(known, None)
-        for k, (name, reason) in enumerate(decisions):
-            if outcomes[k] is None:
-                outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
+        report.blank(view.dof)
+        for seen in self._correct(event, report, view, known, ids, decisions, R):
+            outcomes[seen.index] = seen
+        fused = [o.landmark for o in outcomes if o is not None and o.outcome == "associated"]
+        self._simplify(view, event.robot, fused)
+        self._extend(view, event, outcomes)
+        if view.attention.delete:
+            report.removed = tuple(self._give_up(event, view, [o for o in outcomes if o is not None]))
+        new = [k for k, outcome in enumerate(outcomes) if outcome is None]
+        reasons = self._starts(view, new, known, event.y, decisions)
+        for k in new:
+            name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
+            outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
         report.observations = tuple(outcomes)  # type: ignore[arg-type]
         return report
 
@@ -223,24 +239,60 @@ class Slam:
         self, event: Scan, report: Report, view: View, known: list[int], ids: tuple[Id | None, ...],
         decisions: Sequence[Decision], R: Array,
     ) -> Iterator[Observation]:  # fmt: skip
-        """Fuse the observations `known` of landmarks in the map.  [S] (26)-(30)."""
+        """Fuse the observations `known` of landmarks in the map, those of one type at once.  [S] (26)-(30)."""
         names: list[Id] = [decisions[k][0] for k in known]  # type: ignore[misc]
-        slots = np.array([self._slots[name] for name in names])
-        y = event.y if len(known) == len(event.y) else event.y[known]
-        R = R if len(known) == len(event.y) else R[known]
-        gate, robot = view.gate, self._slots[event.robot]
-        R = view.noise(self.map, robot, slots, R, event)
-        done = self.estimator.correct(self.map, view.look, robot, slots, view.d, y, R, view.angular, gate)
-        self._healthy(done.healthy, event)
-        report.fill(known, done)
-        for k, name, d2, fused in zip(known, names, done.d2.tolist(), done.fused.tolist(), strict=True):
-            if fused:
-                self._seen[name] = self._seen.get(name, 0) + 1
-                yield Observation(k, ids[k], "associated", name, d2, "")
-            elif math.isnan(d2):
-                yield Observation(k, ids[k], "rejected", name, None, "nothing can be expected of it from here")
-            else:
-                yield Observation(k, ids[k], "rejected", name, d2, f"outside the gate of {gate:.2f}")
+        robot = self._slots[event.robot]
+        groups = [(look, [known[i] for i in rows]) for look, rows in self.by_look(view, names)]
+        if view.attention.updates is not None and len(known) > view.attention.updates:
+            for k in self._least(event, view, groups, decisions, R):
+                reason = f"not among the {view.attention.updates} that tell most"
+                yield Observation(k, ids[k], "ignored", decisions[k][0], None, reason)  # type: ignore[arg-type]
+        if view.attention.sequential:
+            groups = [(look, [k]) for look, rows in groups for k in rows]
+        for look, rows in groups:
+            if not rows:
+                continue
+            slots = np.array([self._slots[decisions[k][0]] for k in rows])  # type: ignore[index]
+            noise = view.noise(self.map, robot, look, slots, R[rows], event)
+            done = self.estimator.correct(
+                self.map, look.view, robot, view.mount, slots, look.d, event.y[rows], noise, view.gate
+            )
+            self._healthy(done.healthy, event)
+            report.fill(rows, done)
+            for k, d2, fused in zip(rows, done.d2.tolist(), done.fused.tolist(), strict=True):
+                yield self._judged(k, ids[k], decisions[k][0], d2, fused, view.gate)  # type: ignore[arg-type]
+
+    def _judged(self, k: int, id_: Id | None, name: Id, d2: float, fused: bool, gate: float) -> Observation:
+        if fused:
+            self._seen[name] = self._seen.get(name, 0) + 1
+            return Observation(k, id_, "associated", name, d2, "")
+        if math.isnan(d2):
+            return Observation(k, id_, "rejected", name, None, "nothing can be expected of it from here")
+        return Observation(k, id_, "rejected", name, d2, f"outside the gate of {gate:.2f}")
+
+    def _least(
+        self, event: Scan, view: View, groups: list[tuple[Look, list[int]]], decisions: Sequence[Decision], R: Array
+    ) -> list[int]:
+        """Take out of the groups what is not worth a correction and return it; a measurement tells log |Z| / |R|."""
+        robot, rows, told = self._slots[event.robot], [], []
+        for look, members in groups:
+            slots = np.array([self._slots[decisions[k][0]] for k in members])  # type: ignore[index]
+            noise = view.noise(self.map, robot, look, slots, R[members], event)
+            Z, _ = view.predict(self.map, robot, look, slots, event.y[members], noise)
+            rows += members
+            told += (np.linalg.slogdet(Z)[1] - np.linalg.slogdet(noise)[1]).tolist()
+        worth = view.attention.worth_a_correction(np.nan_to_num(np.array(told), nan=-np.inf))
+        least = [k for k, good in zip(rows, worth, strict=True) if not good]
+        for _, members in groups:
+            members[:] = [k for k in members if k not in least]
+        return least
+
+    def _starts(
+        self, view: View, new: list[int], known: list[int], y: Array, decisions: Sequence[Decision]
+    ) -> dict[int, str]:
+        """Return why some of the observations that could start landmarks do not."""
+        wanted = [k for k in new if decisions[k][0] is not None and decisions[k][0] not in self._slots]
+        return view.attention.worth_a_start(wanted, known, y, getattr(view.sensor, "image", None), not self._kinds)
 
     def _initialize(
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
@@ -256,25 +308,84 @@ class Slam:
             kind = type(view.sensor).__name__
             return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
         robot = self._slots[event.robot]
-        l, L_r, Q = view.explain(self.map.mean(robot)[: len(view.at)], event.y[k : k + 1], R[k], event)
-        if l.shape != (view.d,):
-            found = f"it finds {len(l)} numbers, a {view.landmark.kind} has {view.d}"
+        l, L_h, Q = view.explain(self.map, robot, event, k, R[k])
+        if l.shape != (view.landmark.space.size,):
+            found = f"it finds {len(l)} numbers, a {view.landmark.kind} has {view.landmark.space.size}"
             return Observation(k, id_, "ignored", None, None, found)
-        if not (np.isfinite(l).all() and np.isfinite(L_r).all() and np.isfinite(Q).all()):
+        if not (np.isfinite(l).all() and np.isfinite(L_h).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
         if name is NEW:
             name = self._new_name()
-        G, index = self.estimator.pose_jacobian(self.map, robot, L_r), self.map.index(robot)[: L_r.shape[1]]
+        G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
         self._slots[name] = self.map.augment(view.landmark.space, l, index, G, Q)
         self._kinds[name] = view.landmark
         self._seen[name] = 1
+        if hasattr(view.landmark, "first_ends"):
+            self._ends[name] = np.array(view.landmark.first_ends)
         return Observation(k, id_, "new", name, None, reason)
+
+    def _simplify(self, view: View, robot: str, names: Sequence[Id | None]) -> None:
+        """Make Euclidean points of those whose depth has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4."""
+        for name in names if self.reparametrize is not None else ():
+            kind: Any = self._kinds.get(name)  # type: ignore[arg-type]
+            if not hasattr(kind, "linearity"):
+                continue
+            slot = self._slots[name]  # type: ignore[index]
+            l, index = self.map.mean(slot)[None], self.map.index(slot)
+            sigma = np.sqrt(np.maximum(self.map.P[index[-1:], index[-1]], 0.0))
+            T = view.pose(self.map, self._slots[robot])
+            if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < self.reparametrize:
+                p, P_l = kind.to_point(l)
+                self._slots[name] = self.map.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3)))  # type: ignore[index]
+                self._kinds[name] = Point3D()  # type: ignore[index]
+                self.map.remove(slot)
+
+    def _extend(self, view: View, event: Scan, outcomes: Sequence[Observation | None]) -> None:
+        """Let the segments seen of lines grow by what was seen of them."""
+        for outcome in outcomes:
+            name = outcome.landmark if outcome is not None and outcome.outcome == "associated" else None
+            kind: Any = self._kinds.get(name)  # type: ignore[arg-type]
+            if name in self._ends and kind.extend:
+                T, l, P = view.pose(self.map, self._slots[event.robot]), self.mean(name), self.covariance(name)
+                y = event.y[outcome.index]  # type: ignore[union-attr]
+                self._ends[name] = extended_ends(view.sensor, kind, T, l, P, self._ends[name], y)
+
+    def _give_up(self, event: Scan, view: View, seen: list[Observation]) -> Iterator[tuple[Id, str]]:
+        """Count what should have been seen and what was; remove the landmarks that are hopeless.  [TB] 4.4."""
+        found = {o.landmark: o.outcome for o in seen}
+        names = self.landmark_ids(view)
+        robot = self._slots[event.robot]
+        for look, rows in self.by_look(view, names):
+            ends = [self._ends.get(names[i]) for i in rows]
+            for i in view.in_sight(self.map, robot, look, [self._slots[names[i]] for i in rows], ends).tolist():
+                name = names[rows[i]]
+                if found.get(name) == "ignored":
+                    continue
+                counts = self._searched.setdefault(name, [1, 1])
+                counts[0] += 1
+                counts[1] += name in found
+                reason = view.attention.hopeless(counts[0], counts[1], self._seen.get(name, 0))
+                if reason:
+                    self.remove(name)
+                    yield name, reason
+
+    def by_look(self, view: View, names: Sequence[Id]) -> list[tuple[Look, list[int]]]:
+        """Return the indices of names grouped by how a sensor looks at them, points of known depth first."""
+        groups: dict[int, tuple[Look, list[int]]] = {}
+        for i, name in enumerate(names):
+            look = view.looks[ROBOT if name in self.robots else self._kinds[name].kind]
+            groups.setdefault(id(look), (look, []))[1].append(i)
+        return sorted(groups.values(), key=lambda group: group[0].landmark.kind != "point3")
 
     def _seen_by(self, view: View, robot: str, name: Any) -> bool:
         """Return whether this sensor's model applies to a block of the map."""
         if name not in self._slots or name == robot:
             return False
-        return (ROBOT if name in self.robots else self._kinds[name].kind) in view.sees
+        return (ROBOT if name in self.robots else self._kind_of(name)) in view.looks
+
+    def _kind_of(self, name: Id) -> str:
+        """Return the kind of a block that is no robot, "" for a mount."""
+        return self._kinds[name].kind if name in self._kinds else ""
 
     def _new_name(self) -> str:
         while True:
@@ -313,9 +424,17 @@ class Slam:
         if world and world != here:
             raise ModelError(f"{what} is of the {world}, expected one of the {here}, where the first robot moves")
 
-    def landmark_ids(self, landmark: Landmark) -> list[Id]:
-        """Return the ids of the landmarks of one type."""
-        return [i for i, kind in self._kinds.items() if kind.kind == landmark.kind]
+    def segment(self, name: Id) -> tuple[Array, Array]:
+        """Return the ends (2, 3) of the segment seen of a line so far, and their covariances (2, 3, 3)."""
+        if name not in self._ends:
+            raise MapError(f"{name!r} is no line of the map, expected one with ends")
+        kind: Any = self._kinds[name]
+        p, P_l = kind.endpoints(self.mean(name)[None], self._ends[name][None])
+        return p[0], P_l[0] @ self.covariance(name) @ P_l[0].swapaxes(1, 2)
+
+    def landmark_ids(self, view: View) -> list[Id]:
+        """Return the ids of the landmarks that a sensor could see."""
+        return [i for i, kind in self._kinds.items() if kind.kind in view.looks]
 
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
@@ -339,8 +458,10 @@ class Slam:
         """Remove a landmark; its place goes to the next new one."""
         if name in self.robots:
             raise MapError(f"{name!r} is a robot, expected a landmark")
+        if name in self._slots and name not in self._kinds:
+            raise MapError(f"{name!r} is a sensor's mount, expected a landmark")
         self.map.remove(self.slot(name))
-        for table in (self._slots, self._kinds, self._seen):
+        for table in (self._slots, self._kinds, self._seen, self._searched, self._ends):
             table.pop(name, None)
 
     def slot(self, name: Id) -> int:
@@ -378,15 +499,21 @@ class Slam:
         return slam_from_config(path)
 
 
-def _body_axes(pose: Array) -> Array:
-    """Return what turns a pose error from the robot's frame into the world's: (3, 3) in the plane, (6, 6) in space."""
-    if len(pose) == 3:
+def _body_axes(state: Array) -> Array:
+    """Return what turns an error from the robot's frame into the world's: (3, 3) in the plane, (6 or more) in space."""
+    if len(state) == 3:
         G = np.eye(3)
-        G[:2, :2] = rotation(pose[2])
+        G[:2, :2] = rotation(state[2])
         return G
-    G = np.zeros((6, 6))
-    G[:3, :3] = G[3:, 3:] = matrix(pose[3:7])
+    G = np.eye(len(state) - 1)
+    turned = min(9, len(G))  # position, orientation and velocity; a body rate is in the robot's frame anyway
+    G[:turned, :turned] = np.kron(np.eye(turned // 3), matrix(state[3:7]))
     return G
+
+
+def mount_name(robot: str, sensor: str) -> str:
+    """Return the name of a sensor's mount in the map."""
+    return f"{robot}.{sensor}"
 
 
 def _when(event: Event) -> str:

@@ -20,17 +20,17 @@ import numpy.typing as npt
 from kalmark.errors import KalmarkError, MapError
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.map import StochasticMap
-from kalmark.geometry.spaces import Rn, Space
+from kalmark.geometry.spaces import MOUNTS, Rn, Space
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
 from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot
-from kalmark.slam.slam import Slam
+from kalmark.slam.slam import Slam, mount_name
 
 Array = npt.NDArray[np.float64]
 
-VERSION = 2
+VERSION = 3
 DESCRIPTION, SUMS = "slam.json", "sha256"
 
 
@@ -69,6 +69,9 @@ def _state(slam: Slam) -> State:
         "free": list(removed),  # of each shape the last removed is the first to be filled again
         "slots": [[_id(name), slot] for name, slot in slam._slots.items()],
         "kinds": [[_id(name), described(kind)] for name, kind in slam._kinds.items()],
+        "reparametrize": slam.reparametrize,
+        "searched": [[_id(name), counts] for name, counts in slam._searched.items()],
+        "ends": [[_id(name), t.tolist()] for name, t in slam._ends.items()],
         "seen": [[_id(name), count] for name, count in slam._seen.items()],
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
@@ -127,6 +130,7 @@ def load(
             association or restored("association", state["association"], "association", "association"),
             estimator or restored("estimator", state["estimator"], "estimator", "estimator"),
             landmark_type(state, landmarks),
+            reparametrize=_threshold(state["reparametrize"]),
         )
         _fill(slam, state, members, landmarks)
     except KalmarkError as error:
@@ -168,7 +172,11 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     own = [view.landmark for view in slam._views.values()] + ([] if given is None else [given])
     slam._kinds = {i: _kind(i, d, own) for i, d in state["kinds"]}
     slam._slots, slam._errors = dict(map(tuple, state["slots"])), dict(state["errors"])
+    for (robot, sensor), view in slam._views.items():
+        view.mount = slam._slots.get(mount_name(robot, sensor), -1)
     slam._seen = {i: _count(count, f"observations of {i!r}") for i, count in state["seen"]}
+    slam._searched = {i: [_count(n, f"searches of {i!r}") for n in counts] for i, counts in state["searched"]}
+    slam._ends = {i: np.array(t, dtype=np.float64).reshape(2) for i, t in state["ends"]}
     slam._unnamed = _count(state["unnamed"], "unnamed")
     slam.t_ns = _time(state["t_ns"])
     _check_owners(slam)
@@ -210,6 +218,9 @@ def _check_owners(slam: Slam) -> None:
     """Refuse a map whose blocks are not each one robot, one landmark or one control's error, of their shapes."""
     spaces: dict[Id, Space] = {name: robot.motion.space for name, robot in slam.robots.items()}
     spaces |= {name: kind.space for name, kind in slam._kinds.items()}
+    for (robot, sensor), view in slam._views.items():
+        if view.mount >= 0:
+            spaces[mount_name(robot, sensor)] = MOUNTS[len(view.at)]
     if (
         slam.robots.keys() & slam._kinds.keys()
         or spaces.keys() != slam._slots.keys()
@@ -231,6 +242,12 @@ def _check_owners(slam: Slam) -> None:
 def _count(value: Any, what: str) -> int:
     if type(value) is not int or value < 0:
         raise MapError(f"{what} is {value!r}, expected an integer of at least 0")
+    return value
+
+
+def _threshold(value: Any) -> float | None:
+    if value is not None and not isinstance(value, float | int):
+        raise MapError(f"reparametrize is {value!r}, expected a number or none")
     return value
 
 

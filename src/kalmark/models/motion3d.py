@@ -1,0 +1,163 @@
+"""Motion models in space: odometry increments, held velocities, constant velocity.  [TB] 4.1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.geometry import frames3d
+from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
+from kalmark.geometry.spaces import ROTATION, SCALAR, SE3, VECTOR3, Space
+from kalmark.models.parameters import check_parameters
+
+Array = npt.NDArray[np.float64]
+
+
+@compiled
+def twist(r: Array, u: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (7,) for dt s by the constant velocity u = (v, w) in its own frame, exactly; R_r (6, 6), R_u (6, 6)."""
+    Q, turn, way = matrix(r[3:]), u[3:] * dt, u[:3] * dt
+    V = left_jacobian(turn)
+    moved, step = np.empty(7), Q @ (V @ way)
+    moved[:3] = r[:3] + step
+    moved[3:] = multiply(r[3:], exp(turn))
+    R_r, R_u = np.eye(6), np.zeros((6, 6))
+    R_r[:3, 3:] = -skew(step)
+    R_u[:3, :3] = Q @ V * dt
+    R_u[:3, 3:] = Q @ left_jacobian_rate(turn, way) * dt
+    R_u[3:, 3:] = Q @ V * dt
+    return moved, R_r, R_u
+
+
+@compiled
+def coast(r: Array, u: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (13,) for dt s at its own velocity, which u then changes; R_r (12, 12), R_u (12, 6).  [TB] constVel."""
+    Q, turn = matrix(r[3:7]), r[10:] * dt
+    moved = r.copy()
+    moved[:3] += r[7:10] * dt
+    moved[3:7] = multiply(r[3:7], exp(turn))
+    moved[7:] += u
+    R_r, R_u = np.eye(12), np.zeros((12, 6))
+    for i in range(3):
+        R_r[i, 6 + i] = dt
+    R_r[3:6, 9:] = Q @ left_jacobian(turn) * dt
+    for i in range(6):
+        R_u[6 + i, i] = 1.0
+    return moved, R_r, R_u
+
+
+@dataclass(frozen=True)
+class Odometry3D:
+    """Odometry in space: u = (dx, dy, dz, rx, ry, rz), translation and rotation vector in the robot's frame, m and rad.
+
+    The sigmas are those of one increment.
+    """
+
+    sigma_x_m: float = 0.01
+    sigma_y_m: float = 0.01
+    sigma_z_m: float = 0.01
+    sigma_rotation_rad: float = 0.005
+
+    space: ClassVar[Space] = SE3
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    held: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    @cached_property
+    def _N(self) -> Array:
+        return np.diag(np.square([self.sigma_x_m, self.sigma_y_m, self.sigma_z_m, *3 * [self.sigma_rotation_rad]]))
+
+    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        """Return the moved pose (7,), R_r (6, 6), R_u (6, 6)."""
+        return frames3d.move(r, u)
+
+    def control_noise(self, u: Array) -> Array:
+        """Return N (6, 6) of one increment."""
+        return self._N
+
+    def diffusion(self, u: Array, dt_s: float) -> None:
+        """Return None: an increment's noise is all in its control."""
+
+
+@dataclass(frozen=True)
+class Velocity3D:
+    """Velocity: u = (vx, vy, vz, wx, wy, wz) in the robot's frame, m/s and rad/s, held from its time on."""
+
+    sigma_vx_mps: float = 0.1
+    sigma_vy_mps: float = 0.1
+    sigma_vz_mps: float = 0.1
+    sigma_wx_radps: float = 0.05
+    sigma_wy_radps: float = 0.05
+    sigma_wz_radps: float = 0.05
+
+    space: ClassVar[Space] = SE3
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    held: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    @cached_property
+    def _N(self) -> Array:
+        v, w = (self.sigma_vx_mps, self.sigma_vy_mps, self.sigma_vz_mps), (self.sigma_wx_radps, self.sigma_wy_radps)
+        return np.diag(np.square([*v, *w, self.sigma_wz_radps]))
+
+    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        """Return the moved pose (7,), R_r (6, 6), R_u (6, 6)."""
+        return twist(r, u, dt_s)
+
+    def control_noise(self, u: Array) -> Array:
+        """Return N (6, 6) of the held velocity."""
+        return self._N
+
+    def diffusion(self, u: Array, dt_s: float) -> None:
+        """Return None: the noise is all in the control."""
+
+
+@dataclass(frozen=True)
+class ConstantVelocity3D:
+    """Constant velocity: the state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.
+
+    It needs no control: it coasts to the time of each event.  A control is an impulse u = (dv (world), dw (body)) at
+    its time, with sigmas `sigma_v_mps`, `sigma_w_radps`; `..._per_sqrt_s` are random walks of velocity and rate.
+    """
+
+    sigma_v_mps: float = 0.01
+    sigma_w_radps: float = 0.002
+    sigma_v_mps_per_sqrt_s: float = 0.0
+    sigma_w_radps_per_sqrt_s: float = 0.0
+
+    space: ClassVar[Space] = Space("SE3 with velocity", (VECTOR3, ROTATION, VECTOR3, SCALAR, SCALAR, SCALAR))
+    columns: ClassVar[tuple[str, ...]] = ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps")
+    held: ClassVar[bool] = False
+    coasts: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+    @cached_property
+    def _N(self) -> Array:
+        return np.diag(np.square([*3 * [self.sigma_v_mps], *3 * [self.sigma_w_radps]]))
+
+    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        """Return the moved state (13,), R_r (12, 12), R_u (12, 6)."""
+        return coast(r, u, dt_s)
+
+    def control_noise(self, u: Array) -> Array:
+        """Return N (6, 6) of one impulse."""
+        return self._N
+
+    def diffusion(self, u: Array, dt_s: float) -> Array | None:
+        """Return the covariance (12, 12) of the walks of velocity and rate, and of the way and turn they make."""
+        v, w = self.sigma_v_mps_per_sqrt_s**2, self.sigma_w_radps_per_sqrt_s**2
+        if not (v or w):
+            return None
+        way = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+        return np.kron(way, np.diag([v, v, v, w, w, w]))

@@ -1,0 +1,234 @@
+"""Sensors of the plane: what each measures of something at v = (x, y[, signature]) in its frame.  [S] A.4, Table 2."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.errors import EventError
+from kalmark.geometry.frames import inv_scan_many, scan_many
+from kalmark.models.parameters import check_parameters
+
+Array = npt.NDArray[np.float64]
+
+RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE, POSITION_FIX = range(1, 7)
+
+
+@compiled
+def expect(code: int, v: Array) -> tuple[Array, Array]:
+    """Return the measurements (K, m) that the built-in sensor `code` makes of v (K, d), and E_v (K, m, d)."""
+    k, d = v.shape
+    if code == POSITION:
+        E_v = np.zeros((k, 2, d))
+        E_v[:, 0, 0] = 1.0
+        E_v[:, 1, 1] = 1.0
+        return v[:, :2].copy(), E_v
+    y, Y_p = scan_many(v)
+    first, last = (1, 2) if code == BEARING else (0, 1 if code == RANGE else 2)
+    m = last - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
+    e, E_v = np.empty((k, m)), np.zeros((k, m, d))
+    for i in range(k):
+        for j in range(first, last):
+            e[i, j - first] = y[i, j]
+            E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
+        if code == RANGE_BEARING_SIGNATURE:
+            e[i, 2], E_v[i, 2, 2] = v[i, 2], 1.0
+    return e, E_v
+
+
+@lru_cache(maxsize=256)
+def _cached(variances: tuple[float, ...], count: int) -> Array:
+    return np.tile(np.diag(variances), (count, 1, 1))
+
+
+def constant(variances: tuple[float, ...], count: int) -> Array:
+    """Return `count` copies of a diagonal covariance (count, m, m)."""
+    return _cached(variances, count).copy()
+
+
+def refuse_negative_ranges(y: Array) -> None:
+    """Refuse a measurement whose first component, a range, is negative."""
+    for i, value in enumerate(y[:, 0].tolist()):
+        if value < 0:
+            raise EventError(f"observation {i}: range is {value} m, expected at least 0")
+
+
+class Planar:
+    """What the planar sensors share: limits of sight, built-in expectation."""
+
+    world: ClassVar[str] = "plane"
+    code: ClassVar[int]
+    range_min_m: float
+    range_max_m: float
+    fov_rad: float
+
+    def __post_init__(self) -> None:
+        check_parameters(self, noise="sigma")
+
+    def expect(self, v: Array) -> tuple[Array, Array]:
+        """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
+        return expect(self.code, np.ascontiguousarray(v, dtype=np.float64))
+
+    @property
+    def additive(self) -> bool:
+        """Whether the noise is the same wherever the landmark is; if not, it is taken where the filter expects it."""
+        return getattr(self, "sigma_range_rel", 0.0) == 0.0
+
+    def noise_at(self, v: Array) -> Array:
+        """Return the noise R (K, m, m) of measuring v (K, d): of the expected range, not of the noisy one."""
+        return self.noise(self.expect(v)[0])
+
+    def noise(self, y: Array) -> Array:
+        """Return the noise R (K, m, m) of measurements y (K, m)."""
+        raise NotImplementedError
+
+    def sees(self, v: Array) -> npt.NDArray[np.bool_]:
+        """Return which of v (K, d) lie within the sensor's range limits and field of view."""
+        distance, bearing = np.hypot(v[:, 0], v[:, 1]), np.abs(np.arctan2(v[:, 1], v[:, 0]))
+        inside: npt.NDArray[np.bool_] = (self.range_min_m <= distance) & (distance <= self.range_max_m)
+        return inside & (bearing <= self.fov_rad / 2)
+
+    def check(self, y: Array) -> None:
+        """Refuse measurements (K, m) that this sensor cannot have made."""
+
+
+@dataclass(frozen=True)
+class RangeBearing(Planar):
+    """Range (m) and bearing (rad), a laser.  sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61)."""
+
+    sigma_range_m: float = 0.1
+    sigma_bearing_rad: float = 0.02
+    sigma_range_rel: float = 0.0
+    range_min_m: float = 0.0
+    range_max_m: float = math.inf
+    fov_rad: float = 2 * math.pi
+
+    code: ClassVar[int] = RANGE_BEARING
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")
+    angular: ClassVar[tuple[bool, ...]] = (False, True)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 2, 2)."""
+        if self.sigma_range_rel == 0.0:
+            return constant((self.sigma_range_m**2, self.sigma_bearing_rad**2), len(y))
+        R = np.zeros((len(y), 2, 2))
+        R[:, 0, 0] = self.sigma_range_m**2 + (self.sigma_range_rel * y[:, 0]) ** 2
+        R[:, 1, 1] = self.sigma_bearing_rad**2
+        return R
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return points v (K, 2) and V_y (K, 2, 2).  [S] (62)."""
+        return inv_scan_many(np.ascontiguousarray(y))
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
+@dataclass(frozen=True)
+class Bearing(Planar):
+    """Bearing (rad) alone: a camera, a radio direction finder."""
+
+    sigma_bearing_rad: float = 0.02
+    range_min_m: float = 0.0
+    range_max_m: float = math.inf
+    fov_rad: float = 2 * math.pi
+
+    code: ClassVar[int] = BEARING
+    columns: ClassVar[tuple[str, ...]] = ("bearing_rad",)
+    angular: ClassVar[tuple[bool, ...]] = (True,)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 1, 1)."""
+        return constant((self.sigma_bearing_rad**2,), len(y))
+
+
+@dataclass(frozen=True)
+class Range(Planar):
+    """Range (m) alone: a radio beacon, a sonar with a wide lobe; sigmas as in `RangeBearing`."""
+
+    sigma_range_m: float = 0.1
+    sigma_range_rel: float = 0.0
+    range_min_m: float = 0.0
+    range_max_m: float = math.inf
+    fov_rad: float = 2 * math.pi
+
+    code: ClassVar[int] = RANGE
+    columns: ClassVar[tuple[str, ...]] = ("range_m",)
+    angular: ClassVar[tuple[bool, ...]] = (False,)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 1, 1)."""
+        return (self.sigma_range_m**2 + (self.sigma_range_rel * y) ** 2)[:, :, None]
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
+@dataclass(frozen=True)
+class Position2D(Planar):
+    """Position (x, y) in the sensor's frame, in metres: [F]'s second measurement model."""
+
+    sigma_x_m: float = 0.1
+    sigma_y_m: float = 0.1
+    range_min_m: float = 0.0
+    range_max_m: float = math.inf
+    fov_rad: float = 2 * math.pi
+
+    code: ClassVar[int] = POSITION
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
+    angular: ClassVar[tuple[bool, ...]] = (False, False)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 2, 2)."""
+        return constant((self.sigma_x_m**2, self.sigma_y_m**2), len(y))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the points themselves and the identity."""
+        return y.copy(), np.tile(np.eye(2), (len(y), 1, 1))
+
+
+@dataclass(frozen=True)
+class RangeBearingSignature(Planar):
+    """Range (m), bearing (rad) and a signature that tells landmarks apart.  [T] 3: a landmark is (x, y, s)."""
+
+    sigma_range_m: float = 0.1
+    sigma_bearing_rad: float = 0.02
+    sigma_signature: float = 0.1
+    sigma_range_rel: float = 0.0
+    range_min_m: float = 0.0
+    range_max_m: float = math.inf
+    fov_rad: float = 2 * math.pi
+
+    code: ClassVar[int] = RANGE_BEARING_SIGNATURE
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "signature")
+    angular: ClassVar[tuple[bool, ...]] = (False, True, False)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 3, 3)."""
+        R = np.zeros((len(y), 3, 3))
+        R[:, 0, 0] = self.sigma_range_m**2 + (self.sigma_range_rel * y[:, 0]) ** 2
+        R[:, 1, 1] = self.sigma_bearing_rad**2
+        R[:, 2, 2] = self.sigma_signature**2
+        return R
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return (x, y, signature) (K, 3) and V_y (K, 3, 3)."""
+        p, P_y = inv_scan_many(np.ascontiguousarray(y[:, :2]))
+        V_y = np.zeros((len(y), 3, 3))
+        V_y[:, :2, :2], V_y[:, 2, 2] = P_y, 1.0
+        return np.column_stack([p, y[:, 2]]), V_y
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
+BUILT_IN = (RangeBearing, Bearing, Range, Position2D, RangeBearingSignature)
