@@ -9,7 +9,9 @@ import pytest
 from pydantic import ValidationError
 
 from kalmark.config import documentation, load_config, resolve_config, shipped_configs
+from kalmark.config.schema import LogConfig
 from kalmark.errors import ConfigError
+from kalmark.logs import FORMATS
 
 GOOD = """\
 log: {path: my_log, robots: [3]}
@@ -278,3 +280,19 @@ def test_what_is_of_the_other_world_is_refused_by_its_place(
     message = refusal_of("\n".join(lines) + "\n", tmp_path)
     assert message.startswith(f"{where}: ")
     assert what in message
+
+
+def test_a_start_of_space_may_have_a_sigma_for_each_axis(tmp_path: Path) -> None:
+    path = tmp_path / "space.yaml"
+    path.write_text(SPACE.replace("sigma_rotation_deg: 1", "sigma_rotation_deg: [1, 2, 0]"))
+    start = load_config(path).robots["each"].start
+    assert start is not None
+    assert start.sigma_rotation_deg == (1, 2, 0)  # type: ignore[union-attr]
+    for bad in ("[1, 2]", "-1", "[1, -2, 3]", "no", "[1, .inf, 3]"):
+        message = refusal(path, f"robots.each.start.sigma_rotation_deg={bad}")
+        assert message.endswith("expected a number >= 0, or a list of three: one for each axis")
+
+
+def test_every_option_of_a_log_format_is_a_key() -> None:
+    options = {option for entry in FORMATS.values() for option in entry.options}
+    assert options <= set(LogConfig.model_fields)

@@ -15,6 +15,7 @@ from kalmark.config import Config, build_slam, config_dict, load_config, open_co
 from kalmark.config.classes import CLASSES, MOUNTED
 from kalmark.config.landmarks import Association, Landmark
 from kalmark.config.models import Motion, Sensor
+from kalmark.config.mounting import AttentionConfig
 from kalmark.config.reading import validate
 from kalmark.config.schema import Estimator
 from kalmark.config.sections import types
@@ -48,6 +49,10 @@ def test_keys_and_defaults_are_those_of_the_models(choice: Any) -> None:
         section = validate(Tree(values={"section": {"type": name}}), holder).section  # type: ignore[attr-defined]
         parameters = {f.name: f.default for f in dataclasses.fields(CLASSES[name]) if f.init}  # type: ignore[arg-type]
         assert section.model_dump(exclude={"type", *MOUNTED}) == parameters, name
+
+
+def test_an_attention_has_the_keys_and_defaults_of_its_model() -> None:
+    assert AttentionConfig().model_dump() == dataclasses.asdict(km.Attention())
 
 
 def test_a_robot_without_a_start_starts_at_the_truth_exactly(tmp_path: Path) -> None:

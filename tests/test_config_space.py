@@ -76,6 +76,58 @@ def test_mounts_and_starts_of_space_are_poses(tmp_path: Path) -> None:
     assert down == pytest.approx([0, 0, -1])
 
 
+def test_a_mount_with_sigmas_is_in_the_map_and_a_sensor_has_its_own_ways(opened: Any) -> None:
+    text = """\
+robots:
+  a:
+    sensors:
+      camera:
+        type: pinhole
+        distortion: [-0.3, 0.1]
+        mount: {roll_deg: -90, yaw_deg: -90, sigma_position_m: [0.1, 0.2, 0], sigma_rotation_deg: 1.5}
+        landmark: {type: inverse_depth, prior_rho_per_m: 0.2}
+        association: {type: nearest}
+        attention: {updates: 10, first_starts: 5, starts: 1, grid: [8, 6], delete: true}
+"""
+    slam = build_slam(*opened(text, log_of("a")))
+    camera = slam.robots["a"].sensors["camera"]
+    assert camera.sensor == km.sensors.PinHole(distortion=(-0.3, 0.1))
+    assert camera.landmark == km.landmarks.InverseDepth3D(prior_rho_per_m=0.2)
+    assert camera.association == km.association.NearestNeighbour()
+    assert camera.attention == km.Attention(updates=10, first_starts=5, starts=1, grid=(8, 6), delete=True)
+    assert slam.covariance("a.camera") == pytest.approx(np.diag([0.01, 0.04, 0, *3 * [np.radians(1.5) ** 2]]))
+    assert slam.robots["a"].sensors["radar"].cov is None
+
+
+def test_a_robot_that_coasts_starts_with_its_velocity(tmp_path: Path) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text(
+        "robots:\n  each:\n    motion: {type: constant_velocity_3d}\n"
+        "    start: {z_m: 1, vx_mps: 0.8, wz_radps: 0.1, sigma_v_mps: [0.1, 0, 0], sigma_w_radps: 0.2}\n"
+    )
+    slam = build_slam(load_config(path))
+    assert slam.mean("robot").tolist() == [0, 0, 1, 0, 0, 0, 1, 0.8, 0, 0, 0, 0, 0.1]
+    assert slam.covariance("robot") == pytest.approx(np.diag([0.0] * 6 + [0.01, 0, 0] + [0.04] * 3))
+
+
+@pytest.mark.parametrize(("value", "linearity"), [("0.05", 0.05), ("off", None), (None, 0.1)])
+def test_points_become_euclidean_below_the_linearity_index_of_the_map(
+    tmp_path: Path, value: str | None, linearity: float | None
+) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text("seed: 1")
+    config = load_config(path, [] if value is None else [f"map.reparametrize={value}"])
+    assert build_slam(config).reparametrize == linearity
+    for bad in ("-1", "true", "on", ".inf"):
+        with pytest.raises(ConfigError, match="expected a number > 0, or off"):
+            load_config(path, [f"map.reparametrize={bad}"])
+
+
+def test_a_landmark_that_a_sensor_does_not_see_is_refused_by_its_place(opened: Any) -> None:
+    with pytest.raises(ConfigError, match=r"robots: a RangeBearing3D does not see .* tag"):
+        build_slam(*opened("landmarks: {type: tag}", log_of("a")))
+
+
 def test_a_point_is_of_the_world_of_the_robots(opened: Any) -> None:
     slam = build_slam(*opened(EMPTY, log_of("a")))
     assert slam.landmark_type == km.landmarks.Point3D()

@@ -30,13 +30,13 @@ ROBOT: tuple[tuple[str, str, str], ...] = (
     ("ate_m", "position RMSE, aligned", "m"),
     ("ate_raw_m", "position RMSE, raw", "m"),
     ("heading_rmse_deg", "heading RMSE", "deg"),
-    ("pose_nees", "pose NEES (3 is consistent)", ""),
+    ("pose_nees", "pose NEES (3 is consistent; 6 in space)", ""),
 )
 _SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
-    """Print the key figures of a run's summary."""
+    """Print the key figures of a run's summary; those of other programs on the same log below ours, in brackets."""
     rows = [
         (label, number(summary[key], unit), unit)
         for key, label, unit in TOTALS
@@ -48,7 +48,9 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     shown = [row for row in shown if any(figures.get(row[0]) is not None for figures in robots.values())]
     if shown:
         columns = ("robot", *(label for _, label, _ in shown))
-        table = [(name, *(number(f.get(key), unit) for key, _, unit in shown)) for name, f in robots.items()]
+        others = {key: value for key, value in summary.items() if isinstance(value, Mapping) and "ate_raw_m" in value}
+        named = [*robots.items(), *((f"({name})", figures) for name, figures in others.items())]
+        table = [(name, *(number(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
         print_table("", columns, table, align="<" + ">" * len(shown))
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:

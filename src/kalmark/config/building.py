@@ -18,6 +18,7 @@ from kalmark.errors import LogError, ModelError
 from kalmark.logs.log import Log
 from kalmark.logs.start import true_start
 from kalmark.models.protocols import Motion as MotionModel
+from kalmark.slam.attention import Attention
 from kalmark.slam.events import Scan
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
@@ -36,7 +37,7 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
         "landmarks": _build(config, ("landmarks",), config.landmarks, robots[0].motion.space.world),
     }
     try:
-        return Slam(robots, **types, map=config.map.type)
+        return Slam(robots, **types, map=config.map.type, reparametrize=config.map.linearity)
     except ModelError as error:
         raise config.error(("robots",), str(error)) from None
 
@@ -124,9 +125,15 @@ def _start(section: Any, name: str, log: Log | None, moves: MotionModel) -> tupl
 
 
 def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mount:
-    landmark = _build(config, (*path, "landmark"), sensor.landmark, world)
+    own = {
+        "landmark": _build(config, (*path, "landmark"), sensor.landmark, world),
+        "association": _build(config, (*path, "association"), sensor.association),
+        "cov": covariance_of(sensor.mount, 3 if world == "plane" else 6),
+    }
+    if sensor.attention is not None:
+        own["attention"] = Attention(**sensor.attention.model_dump())
     try:
-        return Mount(_build(config, path, sensor), at=pose_of(sensor.mount), landmark=landmark)
+        return Mount(_build(config, path, sensor), at=pose_of(sensor.mount), **own)
     except ModelError as error:
         raise config.error(path, str(error)) from None
 

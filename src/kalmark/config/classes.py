@@ -22,6 +22,8 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "odometry_2d": motion.Odometry2D,
     "ackermann": motion.Ackermann,
     "odometry_3d": motion.Odometry3D,
+    "velocity_3d": motion.Velocity3D,
+    "constant_velocity_3d": motion.ConstantVelocity3D,
     "range_bearing": sensors.RangeBearing,
     "bearing": sensors.Bearing,
     "range": sensors.Range,
@@ -29,8 +31,23 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "range_bearing_signature": sensors.RangeBearingSignature,
     "range_bearing_3d": sensors.RangeBearing3D,
     "position_3d": sensors.Position3D,
+    "pinhole": sensors.PinHole,
+    "omnidirectional": sensors.Omnidirectional,
+    "stereo": sensors.Stereo,
+    "segments": sensors.Segments,
+    "tag_pose": sensors.TagPose,
+    "tag_corners": sensors.TagCorners,
     "point": landmarks.Point2D,
     "point_signature": landmarks.PointSignature2D,
+    "inverse_depth": landmarks.InverseDepth3D,
+    "anchored_homogeneous": landmarks.AnchoredHomogeneous,
+    "homogeneous": landmarks.Homogeneous,
+    "tag": landmarks.Tag,
+    "pluecker_line": landmarks.PlueckerLine,
+    "anchored_pluecker_line": landmarks.AnchoredPlueckerLine,
+    "inverse_depth_line": landmarks.InverseDepthLine,
+    "anchored_homogeneous_line": landmarks.AnchoredHomogeneousLine,
+    "homogeneous_line": landmarks.HomogeneousLine,
     "identity": association.ByIdentity,
     "nearest": association.NearestNeighbour,
     "ekf": estimators.Ekf,
@@ -67,12 +84,14 @@ def velocity_of(section: SpaceStartConfig) -> Array:
 
 def covariance_of(section: MountConfig | SpaceMountConfig | StartConfig | SpaceStartConfig, dof: int) -> Array | None:
     """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly."""
-    if isinstance(section, MountConfig):
-        return None
-    if isinstance(section, StartConfig):
+    if isinstance(section, MountConfig | StartConfig):
         sigmas = [section.sigma_xy_m, section.sigma_xy_m, section.sigma_theta_rad]
     else:
-        sigmas = [*3 * [section.sigma_position_m], *3 * [float(np.radians(section.sigma_rotation_deg))]]
+        sigmas = [*_three(section.sigma_position_m), *np.radians(_three(section.sigma_rotation_deg))]
     if isinstance(section, SpaceStartConfig):
-        sigmas += [*3 * [section.sigma_v_mps], *3 * [section.sigma_w_radps]]
+        sigmas += [*_three(section.sigma_v_mps), *_three(section.sigma_w_radps)]
     return np.diag(np.square(sigmas[:dof])) if any(sigmas[:dof]) else None
+
+
+def _three(sigma: float | tuple[float, ...]) -> Array:
+    return np.broadcast_to(np.asarray(sigma, dtype=np.float64), 3)

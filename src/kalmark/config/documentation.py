@@ -133,6 +133,8 @@ def _default(field: Any) -> str:
         return f"`{{type: {kind}}}`" if kind else "see below"
     if isinstance(value, dict):
         return "`{" + ", ".join(f"{key}: {{}}" for key in value) + "}`"
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
     if isinstance(value, float):
         return "`.inf`" if math.isinf(value) else "2 pi" if value == 2 * math.pi else f"`{value:g}`"
     return f"`{value}`"

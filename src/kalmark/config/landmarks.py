@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Tag
 
-from kalmark.config.sections import Gate, Probability, Section, type_or
+from kalmark.config.sections import Gate, NotNegative, Number, Probability, Section, type_or
 
 
 class PointLandmark(Section):
@@ -21,8 +21,104 @@ class PointSignatureLandmark(Section):
     type: Literal["point_signature"] = "point_signature"
 
 
+class _Depth(Section):
+    prior_rho_per_m: Number = 0.01
+    """Inverse distance expected where the sensor sees none."""
+    sigma_rho_per_m: NotNegative = 0.5
+    """Standard deviation of that."""
+
+
+class InverseDepthLandmark(_Depth):
+    """A point of space by anchor, azimuth, elevation and inverse distance (6 numbers)."""
+
+    type: Literal["inverse_depth"] = "inverse_depth"
+
+
+class AnchoredHomogeneousLandmark(_Depth):
+    """A point of space by anchor, ray and inverse distance (7 numbers)."""
+
+    type: Literal["anchored_homogeneous"] = "anchored_homogeneous"
+
+
+class HomogeneousLandmark(_Depth):
+    """A homogeneous point of space (4 numbers)."""
+
+    type: Literal["homogeneous"] = "homogeneous"
+
+
+class TagLandmark(Section):
+    """A square tag: its pose."""
+
+    type: Literal["tag"] = "tag"
+
+
+class _Line(Section):
+    extend: bool = True
+    """The segment kept beside the line grows with what is seen of it."""
+    switch_px: NotNegative = 10.0
+    """Pluecker kinds: a segment whose ends are less certain than this follows the measured one instead."""
+
+
+class _Direction(_Line):
+    prior_beta_1: Number = 0.1
+    """Direction expected in the plane of sight, which one image does not tell: first component."""
+    prior_beta_2: Number = 0.0
+    """Second component."""
+    sigma_beta_1: NotNegative = 0.25
+    """Standard deviation of the first component."""
+    sigma_beta_2: NotNegative = 1.0
+    """Standard deviation of the second component."""
+
+
+class PlueckerLineLandmark(_Direction):
+    """A line by moment and direction (6 numbers)."""
+
+    type: Literal["pluecker_line"] = "pluecker_line"
+
+
+class AnchoredPlueckerLineLandmark(_Direction):
+    """A line by anchor, moment about it and direction (9 numbers)."""
+
+    type: Literal["anchored_pluecker_line"] = "anchored_pluecker_line"
+
+
+class _Depths(_Line):
+    prior_rho_per_m: Number = 0.1
+    """Inverse distance expected of both ends."""
+    sigma_rho_per_m: NotNegative = 0.5
+    """Standard deviation of each."""
+
+
+class InverseDepthLineLandmark(_Depths):
+    """A line by anchor and azimuth, elevation and inverse distance of two points (9 numbers)."""
+
+    type: Literal["inverse_depth_line"] = "inverse_depth_line"
+
+
+class AnchoredHomogeneousLineLandmark(_Depths):
+    """A line by anchor and ray and inverse distance of two points (11 numbers)."""
+
+    type: Literal["anchored_homogeneous_line"] = "anchored_homogeneous_line"
+
+
+class HomogeneousLineLandmark(_Depths):
+    """A line by two homogeneous points (8 numbers)."""
+
+    type: Literal["homogeneous_line"] = "homogeneous_line"
+
+
 Landmark = Annotated[
-    Annotated[PointLandmark, Tag("point")] | Annotated[PointSignatureLandmark, Tag("point_signature")],
+    Annotated[PointLandmark, Tag("point")]
+    | Annotated[PointSignatureLandmark, Tag("point_signature")]
+    | Annotated[InverseDepthLandmark, Tag("inverse_depth")]
+    | Annotated[AnchoredHomogeneousLandmark, Tag("anchored_homogeneous")]
+    | Annotated[HomogeneousLandmark, Tag("homogeneous")]
+    | Annotated[TagLandmark, Tag("tag")]
+    | Annotated[PlueckerLineLandmark, Tag("pluecker_line")]
+    | Annotated[AnchoredPlueckerLineLandmark, Tag("anchored_pluecker_line")]
+    | Annotated[InverseDepthLineLandmark, Tag("inverse_depth_line")]
+    | Annotated[AnchoredHomogeneousLineLandmark, Tag("anchored_homogeneous_line")]
+    | Annotated[HomogeneousLineLandmark, Tag("homogeneous_line")],
     Discriminator(type_or("point")),
 ]
 

@@ -6,19 +6,21 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from kalmark.config.landmarks import Landmark
-from kalmark.config.sections import NotNegative, Number, Reserved, Section
+from kalmark.config.landmarks import Association, Landmark
+from kalmark.config.sections import NotNegative, Number, Reserved, Section, Sigmas
 
+Most = Annotated[int, Field(ge=0)] | None
 Count = Annotated[int, Field(ge=1)]
 
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
 _PLANE_FOR_SPACE = "a key of the plane for a robot of space"
 VELOCITY = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps", "sigma_v_mps", "sigma_w_radps")
+POSE_OF_PLANE = ("theta_rad", "sigma_xy_m", "sigma_theta_rad")
 POSE_OF_SPACE = ("z_m", "roll_deg", "pitch_deg", "yaw_deg", "sigma_position_m", "sigma_rotation_deg")
 
 
 class MountConfig(Section):
-    """Where a sensor sits, in the robot's frame."""
+    """Where a sensor sits, in the robot's frame.  If either sigma is above 0, the mount is calibrated as below."""
 
     elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_SPACE, _SPACE_FOR_PLANE)
 
@@ -28,6 +30,10 @@ class MountConfig(Section):
     """To the left of the robot's origin."""
     theta_rad: Number = 0.0
     """Turned to the left."""
+    sigma_xy_m: NotNegative = 0.0
+    """Standard deviation of each coordinate."""
+    sigma_theta_rad: NotNegative = 0.0
+    """Standard deviation of the direction."""
 
 
 class SpaceMountConfig(Section):
@@ -37,7 +43,7 @@ class SpaceMountConfig(Section):
     yaw -90 deg.  If either sigma is above 0 the mount is in the map, and the filter calibrates it.
     """
 
-    elsewhere: ClassVar[dict[str, str]] = {"theta_rad": _PLANE_FOR_SPACE}
+    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_PLANE, _PLANE_FOR_SPACE)
 
     x_m: Number = 0.0
     """Forward of the robot's origin."""
@@ -51,10 +57,10 @@ class SpaceMountConfig(Section):
     """Turned about y."""
     yaw_deg: Number = 0.0
     """Turned about z."""
-    sigma_position_m: NotNegative = 0.0
-    """Standard deviation of each coordinate."""
-    sigma_rotation_deg: NotNegative = 0.0
-    """Standard deviation of the rotation about each axis."""
+    sigma_position_m: Sigmas = 0.0
+    """Standard deviation of each coordinate; or a list of three."""
+    sigma_rotation_deg: Sigmas = 0.0
+    """Standard deviation of the rotation about each axis; or a list of three."""
 
 
 class StartConfig(Section):
@@ -77,9 +83,7 @@ class StartConfig(Section):
 class SpaceStartConfig(Section):
     """Where a robot of space starts, and how surely; turned by roll, then pitch, then yaw about the world's axes."""
 
-    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(
-        ("theta_rad", "sigma_xy_m", "sigma_theta_rad"), _PLANE_FOR_SPACE
-    )
+    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_PLANE, _PLANE_FOR_SPACE)
 
     x_m: Number = 0.0
     """Position."""
@@ -93,10 +97,10 @@ class SpaceStartConfig(Section):
     """Turned about y."""
     yaw_deg: Number = 0.0
     """Turned about z."""
-    sigma_position_m: NotNegative = 0.0
-    """Standard deviation of each coordinate."""
-    sigma_rotation_deg: NotNegative = 0.0
-    """Standard deviation of the rotation about each axis."""
+    sigma_position_m: Sigmas = 0.0
+    """Standard deviation of each coordinate; or a list of three."""
+    sigma_rotation_deg: Sigmas = 0.0
+    """Standard deviation of the rotation about each axis; or a list of three."""
     vx_mps: Number = 0.0
     """constant_velocity_3d: velocity in the world."""
     vy_mps: Number = 0.0
@@ -109,10 +113,35 @@ class SpaceStartConfig(Section):
     """constant_velocity_3d: rate about the robot's own y."""
     wz_radps: Number = 0.0
     """constant_velocity_3d: rate about the robot's own z."""
-    sigma_v_mps: NotNegative = 0.0
-    """constant_velocity_3d: standard deviation of each velocity."""
-    sigma_w_radps: NotNegative = 0.0
-    """constant_velocity_3d: standard deviation of each rate."""
+    sigma_v_mps: Sigmas = 0.0
+    """constant_velocity_3d: standard deviation of each velocity; or a list of three."""
+    sigma_w_radps: Sigmas = 0.0
+    """constant_velocity_3d: standard deviation of each rate; or a list of three."""
+
+
+class AttentionConfig(Section):
+    """Which landmarks of a scan are corrected, where new ones are taken, and when one is given up."""
+
+    updates: Most = None
+    """At most so many landmarks corrected a scan, those of most expected information first; all if absent."""
+    sequential: bool = False
+    """Correct one landmark after the other, not all of a scan jointly."""
+    starts: Most = None
+    """At most so many new landmarks a scan; all if absent."""
+    first_starts: Most = None
+    """The same while the map is empty; `starts` if absent."""
+    grid: Annotated[tuple[Count, Count], Field(strict=False)] = (1, 1)
+    """New landmarks are spread over so many columns and rows of the image."""
+    margin_px: NotNegative = 0.0
+    """No new landmark nearer to the image's border than this."""
+    searches: Annotated[int, Field(ge=0)] = 10
+    """With `delete`: how often a landmark was expected before it may be given up."""
+    match_ratio: Annotated[float, Field(ge=0, le=1)] = 0.1
+    """With `delete`: give it up if it was found in less than this share of them."""
+    inlier_ratio: Annotated[float, Field(ge=0, le=1)] = 0.5
+    """With `delete`: give it up if less than this share of what was found passed the gate."""
+    delete: bool = False
+    """Give up landmarks that are not found again."""
 
 
 class Mounted(Section):
@@ -120,10 +149,10 @@ class Mounted(Section):
 
     landmark: Landmark | None = None
     """Landmark type of this sensor; `landmarks` if absent."""
-    association: Reserved = None
-    """Reserved: an association of this sensor's own."""
-    attention: Reserved = None
-    """Reserved: which landmarks of a scan to take."""
+    association: Association | None = None
+    """Association of this sensor; the configuration's `association` if absent."""
+    attention: AttentionConfig | None = None
+    """Which landmarks of a scan to take; all if absent."""
     detector: Reserved = None
     """Reserved: how landmarks are found in raw data."""
 

@@ -10,7 +10,7 @@ from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 from kalmark.config.landmarks import Association, IdentityAssociation, Landmark
 from kalmark.config.models import Motion, PlaneSensor, SpaceSensor, UnicycleMotion, world_of
 from kalmark.config.mounting import VELOCITY, SpaceStartConfig, StartConfig
-from kalmark.config.sections import Number, Positive, RobotName, Section, expected, type_or
+from kalmark.config.sections import Linearity, NotNegative, Number, Positive, RobotName, Section, expected, type_or
 from kalmark.errors import ConfigError
 
 
@@ -41,6 +41,16 @@ class LogConfig(Section):
     """victoria_park: which detections."""
     steering: Literal["ascii", "mat"] | None = None
     """victoria_park: which steering calibration."""
+    min_disparity_px: NotNegative | None = None
+    """kitti_stereo_features: drop observations with a smaller disparity (1 if absent)."""
+    rates: Literal["mean", "held"] | None = None
+    """kitti_stereo_features: hold the mean of two rates between them, or the first (mean if absent)."""
+    tag_size_m: Positive | None = None
+    """tagslam: size of the tags that tagslam.yaml gives none of their own."""
+    cameras: Literal["all", "given"] | None = None
+    """tagslam: all, or those with a pose in camera_poses.yaml (all if absent)."""
+    odometry: Literal["auto", "none"] | None = None
+    """tagslam: use the odometry of the bag (auto if absent)."""
 
     def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""
@@ -72,9 +82,9 @@ class SpaceRobotConfig(_AnyRobot):
 
     @model_validator(mode="after")
     def _start_fits(self) -> SpaceRobotConfig:
-        if self.start is not None and self.motion.type not in ("constant_velocity_3d",):
+        if self.start is not None and self.motion.type != "constant_velocity_3d":
             for key in VELOCITY:
-                if getattr(self.start, key) != 0:
+                if getattr(self.start, key) not in (0, (0, 0, 0)):
                     raise expected(f"0: {self.motion.type} has no velocity in its state", "start", key)
         return self
 
@@ -117,6 +127,13 @@ class MapConfig(Section):
 
     type: Literal["auto", "dense"] = "auto"
     """`dense` keeps the full covariance; `auto` chooses."""
+    reparametrize: Linearity = 0.1
+    """Inverse-depth and anchored points become Euclidean below this linearity index; or off."""
+
+    @property
+    def linearity(self) -> float | None:
+        """The linearity index, None for off."""
+        return None if isinstance(self.reparametrize, str) else self.reparametrize
 
 
 def _each() -> dict[str, AnyRobot]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, get_args
 
@@ -17,9 +18,9 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 
 # What the contract names and later versions bring: refused by name, not as a spelling mistake.
 LATER: dict[str, tuple[str, ...]] = {
-    "motion": ("velocity_3d", "constant_velocity_3d", "inertial"),
-    "sensor": ("pinhole", "omnidirectional", "stereo", "segments", "tag_pose", "tag_corners", "position_fix"),
-    "landmark": ("inverse_depth", "anchored_homogeneous", "homogeneous", "tag", "pluecker_line", "polar"),
+    "motion": ("inertial",),
+    "sensor": ("position_fix",),
+    "landmark": ("polar",),
     "association": ("global", "jcbb", "clique", "sample", "jpda", "auto"),
     "estimator": (),
     "map": ("postponed",),
@@ -84,6 +85,31 @@ def _gate(value: Any) -> float | str:
 
 
 Gate = Annotated[float | str, PlainValidator(_gate)]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _sigmas(value: Any) -> float | tuple[float, ...]:
+    three = value if isinstance(value, list | tuple) else [value] * 3
+    if len(three) == 3 and all(_is_number(v) and 0 <= v < math.inf for v in three):
+        return tuple(map(float, three)) if isinstance(value, list | tuple) else float(value)
+    raise expected("a number >= 0, or a list of three: one for each axis")
+
+
+Sigmas = Annotated[float | tuple[float, ...], PlainValidator(_sigmas)]
+
+
+def _linearity(value: Any) -> float | str:
+    if value == "off":
+        return "off"
+    if _is_number(value) and 0 < value < math.inf:
+        return float(value)
+    raise expected("a number > 0, or off")
+
+
+Linearity = Annotated[float | str, PlainValidator(_linearity)]
 
 
 def _robot(value: Any) -> int | str:

@@ -46,7 +46,7 @@ def described(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
     opt = cfg["Opt"]
     return {
         "robots": {robot.name: described_robot(cfg, robot) for robot in robots},
-        "landmarks": landmark(opt["init"]),
+        "landmarks": landmark(opt["init"]) | (ends(opt["correct"]["lines"]) if is_lines(cfg) else {}),
         "map": {"reparametrize": float(opt["correct"]["linTestIdp"]) if opt["correct"]["reparametrize"] else "off"},
     }
 
@@ -61,6 +61,11 @@ def landmark(init: dict[str, Any]) -> dict[str, Any]:
         names = ("prior_beta_1", "prior_beta_2", "sigma_beta_1", "sigma_beta_2")
         return section | dict(zip(names, mean + sigma, strict=True))
     return section if kind == "eucPnt" else section | {"prior_rho_per_m": mean[0], "sigma_rho_per_m": sigma[0]}
+
+
+def ends(lines: dict[str, Any]) -> dict[str, Any]:
+    """Return what becomes of the segment that is kept beside a line."""
+    return {"extend": bool(lines["extPolicy"]), "switch_px": float(lines["extSwitch"])}
 
 
 def described_robot(cfg: dict[str, Any], robot: Part) -> dict[str, Any]:
@@ -83,16 +88,16 @@ def motion(kind: str, noise: Array) -> dict[str, Any]:
     return {"type": "odometry_3d", **along, "sigma_rotation_rad": turn}
 
 
-def start(settings: dict[str, Any], state: Array) -> dict[str, float]:
-    """Return where a robot starts; of standard deviations that differ between the axes the largest."""
-    section = placed(state[WXYZ_TO_XYZW]) | {
-        "sigma_position_m": largest(settings["positionStd"]),
-        "sigma_rotation_deg": largest(settings["orientationStd"]),
+def start(settings: dict[str, Any], state: Array) -> dict[str, Any]:
+    """Return where a robot starts; standard deviations of roll, pitch and yaw are taken about x, y and z."""
+    section: dict[str, Any] = placed(state[WXYZ_TO_XYZW]) | {
+        "sigma_position_m": numbers(settings["positionStd"]),
+        "sigma_rotation_deg": numbers(settings["orientationStd"]),
     }
     if len(state) == 13:
         section |= dict(zip(VELOCITY, state[7:].tolist(), strict=True))
-        section |= {"sigma_v_mps": largest(settings["velStd"])}
-        section |= {"sigma_w_radps": float(np.radians(largest(settings["angVelStd"])))}
+        section |= {"sigma_v_mps": numbers(settings["velStd"])}
+        section |= {"sigma_w_radps": np.radians(settings["angVelStd"]).tolist()}
     return section
 
 
@@ -115,10 +120,10 @@ def camera(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
         else:
             section |= {"lens": "radial", "distortion": numbers(settings["distortion"])}
     section |= {"width_px": int(width), "height_px": int(height), "sigma_px": float(settings["pixErrorStd"])}
-    mount = placed(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
+    mount: dict[str, Any] = placed(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
     if settings["frameInMap"]:
-        mount |= {"sigma_position_m": largest(settings["positionStd"])}
-        mount |= {"sigma_rotation_deg": largest(settings["orientationStd"])}
+        mount |= {"sigma_position_m": numbers(settings["positionStd"])}
+        mount |= {"sigma_rotation_deg": numbers(settings["orientationStd"])}
     return section | {"mount": mount, "attention": attention(cfg, float(width))}
 
 
@@ -140,11 +145,6 @@ def attention(cfg: dict[str, Any], width: float) -> dict[str, Any]:
 def numbers(value: Any) -> list[float]:
     """Return a vector, which the recording has bare if it is of one element."""
     return np.atleast_1d(np.asarray(value, dtype=np.float64)).tolist()
-
-
-def largest(sigmas: Any) -> float:
-    """Return the largest of the standard deviations of three axes."""
-    return float(np.max(sigmas))
 
 
 def root_mean_square(sigmas: Any) -> float:
