@@ -265,3 +265,23 @@ def test_a_run_in_space_without_scans_has_its_pictures(tmp_path: Path) -> None:
     run.save(tmp_path)
     assert load_run(tmp_path).history.in_space
     assert page_data((tmp_path / "report.html").read_text())["maps"] == []
+
+
+def test_a_robot_that_coasts_needs_no_controls() -> None:
+    log = spiral(steps=5)
+    run = record(slam_for(log), [event for event in log if not isinstance(event, km.Control)], progress=False)
+    taken = [line for line in run.evaluate()["warnings"] if "taken to stand still" in line]
+    assert len(taken) == 1
+    moving = np.column_stack([run.history.mean, np.zeros((len(run.history.mean), 6))])
+    coasting = replace(run, history=replace(run.history, mean=moving), summary={})
+    assert not [line for line in coasting.evaluate()["warnings"] if "taken to stand still" in line]
+
+
+def test_true_tags_and_lines_are_drawn_as_such(run: Run) -> None:
+    true = {1: np.array([0, 0, 1.0, 0, 0, 0, 1]), 2: np.array([0, 0, 0, 1.0, 1, 1])}
+    other = replace(run, truth=replace(run.truth, landmarks=true))
+    assert [len(l) for l in Scene.of(other).true_landmarks.values()] == [7, 6]
+    draw_map(other)
+    data = page_data(report_html(other))
+    assert data["trueLandmarks"]["id"] == ["1"]
+    assert data["trueLines"]["x"] == [0.0, 1.0, None]

@@ -104,8 +104,9 @@ def _robot(robot: Any) -> dict[str, Any]:
         for part in ("landmark", "association", "detector"):
             if getattr(mount, part, None) is not None:
                 sensor[part] = model(getattr(mount, part))
-        if getattr(mount, "attention", None) is not None:
-            sensor["attention"] = {key: value for key, value in model(mount.attention).items() if key != "type"}
+        attention = getattr(mount, "attention", None)
+        if attention is not None and attention != type(attention)():
+            sensor["attention"] = {key: value for key, value in model(attention).items() if key != "type"}
         if getattr(mount, "cov", None) is not None:
             sensor["mount"] = at | _sigmas(mount.cov)
         out["sensors"][name] = sensor

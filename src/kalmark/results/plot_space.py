@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 
 from kalmark.results.history import Array
 from kalmark.results.picture import FIX_COLOUR, INK, TRUTH_COLOUR, headline
-from kalmark.results.shapes import LINE, LINES
-from kalmark.results.space import EUCLIDEAN_COLOUR, LINE_COLOUR, OTHER_COLOUR, Scene, ellipsoids, joined
+from kalmark.results.shapes import LINE, LINES, TAG
+from kalmark.results.space import EUCLIDEAN_COLOUR, LINE_COLOUR, OTHER_COLOUR, Scene, ellipsoids, joined, squares
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -137,7 +137,8 @@ def _strokes(scene: Scene) -> list[tuple[Array, dict[str, Any]]]:
     true = list(scene.true_landmarks.values())
     points = np.array([l[:3] for l in true if len(l) != LINE]).reshape(-1, 3)
     out.append((points, _marks("+", TRUTH_COLOUR, 4 if crowded else 7, 2)))
-    lines = joined([l.reshape(2, 3) for l in true if len(l) == LINE])
+    tags = squares(np.array([l for l in true if len(l) == TAG]).reshape(-1, TAG), scene.size)
+    lines = joined([*(l.reshape(2, 3) for l in true if len(l) == LINE), *tags])
     out.append((lines, {"color": TRUTH_COLOUR, "linewidth": 2.0, "alpha": 0.6, "zorder": 2}))
     out += _landmark_strokes(scene, crowded)
     for robot, path in scene.paths.items():

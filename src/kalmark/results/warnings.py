@@ -105,9 +105,10 @@ def _has_bearing(run: Run) -> npt.NDArray[np.bool_]:
 def _robots(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
     history = run.history
     for name in history.robots:
-        scans = history.t_ns[history.robot == name]
-        controls = history.inputs.controls.get(name)
-        if len(scans) and controls is None:
+        mine = history.robot == name
+        scans, controls = history.t_ns[mine], history.inputs.controls.get(name)
+        coasts = np.isfinite(history.mean[mine]).sum(axis=1).max(initial=0) > 7  # its velocity is estimated
+        if len(scans) and controls is None and not coasts:
             yield f"robot {name} has {count(len(scans), 'scan')} but no controls: it is taken to stand still"
         elif len(scans) > 1 and controls is not None and controls.number > 1:
             shared = min(int(scans[-1]), controls.last_ns) - max(int(scans[0]), controls.first_ns)
