@@ -25,7 +25,7 @@ from kalmark.results.report import report_html
 from kalmark.results.run import Run, load_run
 from kalmark.results.shapes import EUCLIDEANS, LINES, OTHERS, shapes
 from kalmark.results.space import Scene, ellipsoids
-from results_space import FORWARD, slam_for, spiral, with_camera
+from results_space import FORWARD, SIGMA, START, slam_for, spiral, with_camera
 
 WRONG = 13
 
@@ -285,3 +285,22 @@ def test_true_tags_and_lines_are_drawn_as_such(run: Run) -> None:
     data = page_data(report_html(other))
     assert data["trueLandmarks"]["id"] == ["1"]
     assert data["trueLines"]["x"] == [0.0, 1.0, None]
+
+
+def test_points_that_a_camera_starts_are_placed_by_their_depth() -> None:
+    """A camera alone: inverse-depth points, mount in the map."""
+    _, log = with_camera(spiral(steps=25, landmarks=40, seed=3))
+    eye = km.Mount(km.sensors.PinHole(), FORWARD, cov=1e-6 * np.eye(6))
+    rover = km.Robot("rover", km.motion.Odometry3D(*SIGMA), START, {"eye": eye})
+    slam = km.Slam([rover], landmarks=km.landmarks.InverseDepth3D(prior_rho_per_m=0.2, sigma_rho_per_m=0.2))
+    events = [event for event in log if getattr(event, "sensor", "eye") == "eye"]
+    run = record(slam, replace(log, events=events), progress=False)
+    summary = run.evaluate()
+    assert summary["mounts"]["rover.eye"]["sigma_rotation_deg"] < 0.06
+    assert summary["robots"]["rover"]["ate_raw_m"] < 0.1
+    assert summary["landmark_rmse_raw_m"] < 1.0
+    assert {len(mean) for mean in run.landmarks.means} == {3}
+    drawn = Scene.of(run).shapes
+    assert (drawn.group == OTHERS).any(), "some points are not yet Euclidean"
+    labels = [text.get_text() for text in draw_sensor(run, "rover", "eye").legends[0].get_texts()]
+    assert r"not Euclidean, used, $3\sigma$" in labels
