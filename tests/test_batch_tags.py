@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import kalmark as km
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames3d, rotations
 from kalmark.models import lenses, tags
 from kalmark.results import batch_tags
 from kalmark.results.batch_tags import Sightings, Tags, adjust
+from kalmark.results.batch_tags_input import adjust_run
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -130,3 +132,31 @@ def test_what_is_not_determined_or_not_in_view_is_refused(rng: np.random.Generat
         adjust(seen, truth.poses, behind, MOUNTS)
     with pytest.raises(KalmarkError, match=r"the last of 1 steps is .* expected 1e-09"):
         adjust(seen, truth.poses, shaken(truth.tags, rng, 0.03), MOUNTS, iterations=1)
+
+
+def test_a_filter_of_corners_ends_near_the_optimum_of_its_own_sightings(rng: np.random.Generator) -> None:
+    seen, truth = scene(rng, poses=60)
+    y = np.hstack([seen.y + SIGMA * rng.normal(size=seen.y.shape), seen.size[:, None]])
+    fisheye = km.sensors.TagCorners(
+        470, 471, 640, 512, 1280, 1024, "equidistant", (-0.018, -0.003, 0.007, -0.003), SIGMA
+    )
+    radtan = km.sensors.TagCorners(600, 600, 640, 512, 1280, 1024, "radtan", (-0.16, 0.09, -2e-4, -2e-4, 0), SIGMA)
+    sensors = {"left": km.Mount(fisheye, at=MOUNTS[0]), "right": km.Mount(radtan, at=MOUNTS[1])}
+    motion = km.motion.Odometry3D(sigma_x_m=0.02, sigma_y_m=0.02, sigma_z_m=0.02, sigma_rotation_rad=0.02)
+    rig = km.Robot("rig", motion=motion, start=truth.poses[0], sensors=sensors)
+    slam = km.Slam([rig], landmarks=km.landmarks.Tag(), association=km.association.ByIdentity())
+    events: list[km.Event] = []
+    for i, pose in enumerate(truth.poses):
+        if i:
+            step = frames3d.compose(frames3d.inverse(truth.poses[i - 1])[0], pose)[0]
+            u = np.concatenate([step[:3], rotations.log(step[3:])]) + 0.02 * rng.normal(size=6)
+            events.append(km.Control(t_s=0.1 * i, robot="rig", u=u))
+        for j, name in enumerate(sensors):
+            mine = (seen.pose == i) & (seen.camera == j)
+            events.append(km.Scan(t_s=0.1 * i, robot="rig", sensor=name, y=y[mine], ids=seen.tag[mine].tolist()))
+    batch = adjust_run(km.record(slam, events, progress=False))
+    figures = batch.compare()
+    assert figures["rms_px"] < figures["filter_rms_px"] < 1.05 * figures["rms_px"]
+    assert figures["map_difference_m"] < 0.003 and figures["tags"] == len(truth.tags)
+    assert 0.9 < figures["sigma_ratio"] < 1.1
+    np.testing.assert_allclose(off(batch.optimum.tags, truth.tags[np.array(batch.ids)]), 0, atol=0.02)
