@@ -16,7 +16,7 @@ from kalmark.errors import KalmarkError
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
 ]
-COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; it can take half a minute\n"
+COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; in space it can take minutes\n"
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that `kalmark run` wrote.")]
 
 

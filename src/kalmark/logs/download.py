@@ -240,7 +240,8 @@ def unpack(path: Path) -> None:
 
 def find_data(path: Path | str, base: Path | str | None = None) -> Path:
     """Return where a log is: a relative path is looked for in `base` (default: the working folder), then in
-    `KALMARK_DATA`, `KALMARK_ORACLE` and the download cache.  Raises LogError if it is in none of them.
+    `KALMARK_DATA`, `KALMARK_ORACLE` and the download cache; it may begin with the name of these folders themselves, as
+    oracle/NAME.json.gz does for a `KALMARK_ORACLE` that ends in /oracle.  Raises LogError if it is in none of them.
     """
     path = Path(path).expanduser()
     folders: list[Path | str | None] = [
@@ -249,6 +250,9 @@ def find_data(path: Path | str, base: Path | str | None = None) -> Path:
         os.environ.get("KALMARK_ORACLE"),
     ]
     places = [path] if path.is_absolute() else [Path(folder) / path for folder in (*folders, cache_folder()) if folder]
+    if not path.is_absolute():
+        named = [Path(folder) for folder in folders[1:] if folder]
+        places += [folder.parent / path for folder in named if path.parts[:1] == (folder.name,)]
     for place in places:
         if place.exists():
             return place
