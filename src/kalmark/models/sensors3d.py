@@ -126,6 +126,7 @@ class Position3D(_Cone):
         return y.copy(), np.tile(np.eye(3), (len(y), 1, 1))
 
 
+TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed
 FISHEYE = (400.0, -254.647909)  # 400 px at 90 degrees from the axis, in proportion to the angle
 FISHEYE_BACK = (
     254.647909,
@@ -452,9 +453,15 @@ class TagCorners(_Lens, _Camera):
         return constant((self.sigma_px**2,) * 8, len(y))
 
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return the tags' poses (K, 7) in the camera, NaN where none explains the corners, and V_y (K, 6, 8)."""
+        """Return the tags' poses (K, 7) in the camera, and V_y (K, 6, 8).
+
+        NaN where none explains the corners, and where two do: a small tag looks like its mirror image.
+        """
         corners, sizes = np.ascontiguousarray(y[:, :8]), np.ascontiguousarray(y[:, 8])
-        v, V_y, _, _ = tags.tag_from_corners(self.lens_code, corners, sizes, np.array(self.parameters))
+        v, V_y, rms, ambiguity = tags.tag_from_corners(self.lens_code, corners, sizes, np.array(self.parameters))
+        with np.errstate(divide="ignore"):
+            worse = (2.0 * rms / self.sigma_px) ** 2 * (1.0 / ambiguity**2 - 1.0)  # chi-square of the other pose
+        v[worse < TELLING] = np.nan
         return v, V_y
 
     def check(self, y: Array) -> None:
