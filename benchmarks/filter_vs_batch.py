@@ -23,6 +23,7 @@ CASES = {
     "victoria_park_known": ("victoria_park_known", ()),
     "dlr": ("dlr", ()),
     "freiburg_course": ("freiburg_course", ()),
+    "starry_night": ("starry_night", ()),
 }
 COLUMNS = ["sigma_ratio", "map_difference_m", "map_difference_sigma", "path_ratio", "path_difference_m"]
 COLUMNS += ["chi2_per_dof", "iterations"]

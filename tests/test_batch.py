@@ -16,11 +16,13 @@ from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
 from kalmark.geometry import V, wrap
 from kalmark.geometry.frames import compose
+from kalmark.geometry.spaces import POINT2
 from kalmark.logs import open_log
 from kalmark.logs.write import write_native
 from kalmark.results.batch import Batch, compare, solve_batch
 from kalmark.results.batch_factors import State
 from kalmark.results.batch_input import batch_input
+from kalmark.results.batch_rows import plus
 from kalmark.results.record import record
 from kalmark.results.run import Run, load_run
 from kalmark.simulate import load_world, simulate
@@ -338,10 +340,9 @@ def test_without_truth_there_is_no_path_ratio() -> None:
 
 
 def test_turned_steps_are_taken_along_the_exponential() -> None:
-    from kalmark.results.batch_solve import _along
-
     a, d = np.array([0.0, 0.3, -2.5, 1e-9]), np.random.default_rng(0).normal(size=(4, 2))
-    assert np.allclose(_along(a, d), [V(angle) @ row for angle, row in zip(a, d, strict=True)], atol=1e-14)
+    moved = plus(POINT2, np.zeros((4, 2)), d, a[:, None])
+    assert np.allclose(moved, [V(angle) @ row for angle, row in zip(a, d, strict=True)], atol=1e-14)
 
 
 @pytest.mark.parametrize(("estimator", "low", "high"), [("invariant", 0.97, 1.03), ("ekf", 0.1, 0.4)])

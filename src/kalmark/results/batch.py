@@ -35,6 +35,7 @@ MANY_NODES = 2000  # from here on a line tells how far it is
 class Batch:
     """The optimum of a run's data: poses (S, 3) at its S steps, points (m, 2) and their covariances (m, 2, 2).
 
+    In space they are (S, 7), (m, 3) and (m, 3, 3).
     `chi2` is the sum of squared whitened residuals (motion included), `dof` their number less what they determine;
     `relative_step` is the last step of `iterations`, over the map's size.
     """
@@ -62,13 +63,14 @@ class Batch:
         """
         at = {str(name): k for k, name in enumerate(self.ids)}
         rows = [(k, at[str(name)]) for k, name in enumerate(run.landmarks.ids) if str(name) in at]
+        d = self.means.shape[1]
         mine = np.array([j for _, j in rows], dtype=np.int64)
         theirs = [k for k, _ in rows]
         sigma = self.sigma()[mine]
-        distance = np.array([np.linalg.norm(run.landmarks.means[k][:2] - self.means[j]) for k, j in rows])
-        filtered = np.array([np.sqrt(np.trace(run.landmarks.covariances[k][:2, :2])) for k in theirs])
+        distance = np.array([np.linalg.norm(run.landmarks.means[k][:d] - self.means[j]) for k, j in rows])
+        filtered = np.array([np.sqrt(np.trace(run.landmarks.covariances[k][:d, :d])) for k in theirs])
         free = sigma > 0
-        path = run.history.mean[:, :2] - self.poses[:, :2]
+        path = run.history.mean[:, :d] - self.poses[:, :d]
         return {
             "sigma_ratio": _or_none(np.median, filtered[free] / sigma[free]),
             "map_difference_m": _or_none(lambda d: np.sqrt(np.mean(d**2)), distance),
@@ -82,13 +84,10 @@ class Batch:
 
     def _path_ratio(self, run: Run) -> float | None:
         truth = run.truth.poses_in_map()
-        known = np.isfinite(truth).all(axis=1)
+        known, d = np.isfinite(truth).all(axis=1), self.means.shape[1]
         if not known.any():
             return None
-        mine, theirs = (
-            rmse(self.poses[known, :2] - truth[known, :2]),
-            rmse(run.history.mean[known, :2] - truth[known, :2]),
-        )
+        mine, theirs = (rmse(path[known, :d] - truth[known, :d]) for path in (self.poses, run.history.mean))
         return theirs / mine if mine > 0 else None
 
 
@@ -120,8 +119,8 @@ def compare(run: Run, log: Log | Iterable[Event] | None = None, *, progress: boo
 
 
 def _batch(given: Input, solution: Solution) -> Batch:
-    m = len(given.ids)
-    blocks = solution.covariance.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)]
+    m, d = given.start.points.shape
+    blocks = solution.covariance.reshape(m, d, m, d)[np.arange(m), :, np.arange(m)]
     residuals = given.problem.sighted(solution.state).z.size
     return Batch(
         poses=solution.state.poses[given.nodes],
@@ -129,7 +128,7 @@ def _batch(given: Input, solution: Solution) -> Batch:
         means=solution.state.points,
         covariances=blocks,
         chi2=solution.chi2,
-        dof=residuals - 2 * int(np.sum(~given.problem.fixed)),
+        dof=residuals - d * int(np.sum(~given.problem.fixed)),
         iterations=solution.iterations,
         relative_step=solution.relative_step,
     )

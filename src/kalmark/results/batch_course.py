@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import KalmarkError
-from kalmark.geometry.angles import rotation
+from kalmark.models.observe import composed
+from kalmark.results.batch_rows import ORIGIN
 from kalmark.slam.drive import Drive, Part
 
 if TYPE_CHECKING:
@@ -21,9 +22,11 @@ class Course:
     """One robot's motion since its last node, in that node's frame, and the errors it gathered."""
 
     def __init__(self, robot: Robot, node: int) -> None:
-        if robot.motion.space.size != 3:
+        if robot.motion.space.size not in ORIGIN:
             size = robot.motion.space.size
-            raise KalmarkError(f"batch solution: robot {robot.name!r} has {size} state coordinates, expected x y theta")
+            raise KalmarkError(
+                f"batch solution: robot {robot.name!r} has {size} state coordinates, expected a pose alone"
+            )
         self.motion = robot.motion
         self.drive = Drive(robot.motion)
         self.held = -1  # which of the split controls is in force
@@ -32,7 +35,8 @@ class Course:
     def reset(self, node: int) -> None:
         """Start from a node."""
         self.node, self.moves = node, 0
-        self.moved, self.Q = np.zeros(3), np.zeros((3, 3))
+        space = self.motion.space
+        self.moved, self.Q = ORIGIN[space.size], np.zeros((space.dof, space.dof))
         self.shared: dict[int, Array] = {}
 
     def add(self, part: Part, roots: list[Array]) -> None:
@@ -50,9 +54,8 @@ class Course:
             self.shared[self.held] = self.shared.get(self.held, 0.0) + R_u @ roots[self.held]
         D = self.motion.diffusion(part.u, part.dt_s)
         if D is not None:
-            turn = rotation(self.moved[2])
-            self.Q[:2, :2] += turn @ D[:2, :2] @ turn.T
-            self.Q[2, 2] += D[2, 2]
+            axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
+            self.Q += axes @ D @ axes.T
 
 
 def _root(N: Array) -> Array:

@@ -5,6 +5,7 @@ Everything is vectorised over the whole log: one factor holds all the observatio
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -12,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from kalmark.geometry.angles import wrap
+from kalmark.geometry.spaces import Space
+from kalmark.results.batch_rows import POINTS, SPACES, looked, plus
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -20,14 +22,51 @@ DIFFERENCE = 1e-5  # m and rad
 
 
 class State(NamedTuple):
-    """Where everything is: poses (n, 3) = (x, y, theta) of the nodes and points (m, 2)."""
+    """Where everything is: poses of the nodes, (n, 3) in the plane or (n, 7) in space, and points (m, 2) or (m, 3).
+
+    A step of the whole state has q numbers a pose, 3 or 6, then d a point, 2 or 3.
+    """
 
     poses: Array
     points: Array
 
+    @property
+    def pose_space(self) -> Space:
+        """SE2 or SE3."""
+        return SPACES[self.poses.shape[1]]
+
+    @property
+    def point_space(self) -> Space:
+        """The space of the points."""
+        return POINTS[self.points.shape[1]]
+
+    @property
+    def q(self) -> int:
+        """Numbers in the error of a pose."""
+        return self.pose_space.dof
+
+    @property
+    def d(self) -> int:
+        """Numbers in a position."""
+        return self.points.shape[1]
+
+    @property
+    def size(self) -> int:
+        """Numbers in a step."""
+        return self.q * len(self.poses) + self.points.size
+
+    def places(self) -> Array:
+        """Return the positions (n + m, d) of the nodes and points."""
+        return np.concatenate([self.poses[:, : self.d], self.points])
+
+    def columns(self, place: Ints) -> Ints:
+        """Return where in a step the positions of some of the `places` begin."""
+        n = len(self.poses)
+        return np.where(place < n, self.q * place, self.q * n + self.d * (place - n))
+
 
 class Rows(NamedTuple):
-    """Whitened residuals z (k,) and their Jacobian H (k, 3 n + 2 m), z - H dx being what a step dx leaves."""
+    """Whitened residuals z (k,) and their Jacobian H (k, q n + d m), z - H dx being what a step dx leaves."""
 
     z: Array
     H: sp.csr_array
@@ -47,11 +86,11 @@ class Factor(Protocol):
 class Sightings:
     """What one mounted sensor measured: K observations `y` (K, m) with noise `R` (K, m, m).
 
-    `node` (K,) is the pose, `target` (K,) the column of the state where the sighted position (x, y) begins.
+    `view` is how the mounted sensor sees points (`kalmark.models.observe`), `node` (K,) are the poses, `target` (K,)
+    says which of the state's `places` is sighted.
     """
 
-    sensor: Any
-    mount: Array
+    view: Any
     node: Ints
     target: Ints
     y: Array
@@ -59,46 +98,30 @@ class Sightings:
 
     def rows(self, state: State) -> Rows:
         """Return the whitened y - h(v), v the target in the sensor's frame.  [S] (63)."""
-        z, E = self._linearised(*self._seen(state))
-        return _whitened(z, self.R, [(3 * self.node, E[:, :, :3]), (self.target, E[:, :, 3:])], size_of(state))
+        z, E_r, E_l = looked(self.view, *self._seen(state), self.y)
+        return _whitened(z, self.R, [(state.q * self.node, E_r), (state.columns(self.target), E_l)], state.size)
 
     def curvature(self, state: State) -> sp.csr_array:
         """Return what the Hessian has beside E' R^-1 E, by central differences of the gradient."""
         r, l = self._seen(state)
-        E = self._linearised(r, l)[1]
-        C = -E.swapaxes(1, 2) @ np.linalg.solve(self.R, E)
-        for c, d in enumerate(DIFFERENCE * np.eye(5)):
-            there, back = self._gradient(r + d[:3], l + d[3:]), self._gradient(r - d[:3], l - d[3:])
-            C[:, :, c] += (there - back) / (2 * DIFFERENCE)
-        C = 0.5 * (C + C.swapaxes(1, 2))
-        at = [(3 * self.node, slice(0, 3)), (self.target, slice(3, 5))]
-        return block_matrix([(row, column, C[:, i, j]) for row, i in at for column, j in at], (size_of(state),) * 2)
+        E = np.concatenate(looked(self.view, r, l, self.y)[1:], axis=2)
+        C = derivative(self._gradient, [state.pose_space, state.point_space], [r, l])
+        C -= E.swapaxes(1, 2) @ np.linalg.solve(self.R, E)
+        return pair_matrix(C, state.q * self.node, state.columns(self.target), state.q, state.size)
 
     def _gradient(self, r: Array, l: Array) -> Array:
-        z, E = self._linearised(r, l)
-        return -np.einsum("kmi,km->ki", E, np.linalg.solve(self.R, z[:, :, None])[:, :, 0])
+        z, E_r, E_l = looked(self.view, r, l, self.y)
+        weighed = np.linalg.solve(self.R, z[:, :, None])
+        return -(np.concatenate([E_r, E_l], axis=2).swapaxes(1, 2) @ weighed)[:, :, 0]
 
     def _seen(self, state: State) -> tuple[Array, Array]:
-        """Return the observing poses (K, 3) and the positions of the targets (K, 2)."""
-        flat = np.concatenate([state.poses.ravel(), state.points.ravel()])
-        return state.poses[self.node], np.stack([flat[self.target], flat[self.target + 1]], axis=1)
-
-    def _linearised(self, r: Array, l: Array) -> tuple[Array, Array]:
-        """Return y - h(v) (K, m) and E (K, m, 5) with respect to poses and targets.  [S] (56), (63), batched."""
-        turned = rotations(-self.mount[2:3])[0]
-        to_sensor = rotations(-r[:, 2] - self.mount[2])
-        v = np.einsum("kij,kj->ki", to_sensor, l - r[:, :2])
-        V = np.concatenate([-to_sensor, np.stack([v[:, 1], -v[:, 0]], axis=1)[:, :, None], to_sensor], axis=2)
-        e, E_v = self.sensor.expect(v - turned @ self.mount[:2])
-        z = self.y - e
-        angular = np.asarray(self.sensor.angular, dtype=bool)
-        z[:, angular] = wrap(z[:, angular])
-        return z, E_v @ V
+        """Return the observing poses and the positions (K, d) of the targets."""
+        return state.poses[self.node], state.places()[self.target]
 
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Absolute positions `y` (K, 2) with noise `R` (K, 2, 2) of whatever begins at the columns `target` (K,)."""
+    """Absolute positions `y` (K, d) with noise `R` (K, d, d) of some of the state's `places`, `target` (K,)."""
 
     target: Ints
     y: Array
@@ -106,9 +129,9 @@ class Positions:
 
     def rows(self, state: State) -> Rows:
         """Return the whitened y - p."""
-        flat = np.concatenate([state.poses.ravel(), state.points.ravel()])
-        z = self.y - np.stack([flat[self.target], flat[self.target + 1]], axis=1)
-        return _whitened(z, self.R, [(self.target, np.tile(np.eye(2), (len(z), 1, 1)))], size_of(state))
+        z = self.y - state.places()[self.target]
+        E = np.tile(np.eye(state.d), (len(z), 1, 1))
+        return _whitened(z, self.R, [(state.columns(self.target), E)], state.size)
 
     def curvature(self, state: State) -> None:
         """Return None: positions are linear."""
@@ -126,13 +149,25 @@ def block_matrix(blocks: list[tuple[Ints, Ints, Array]], shape: tuple[int, int])
     return sp.csr_array(sp.coo_array((np.concatenate(values), at), shape=shape))
 
 
-def size_of(state: State) -> int:
-    return state.poses.size + state.points.size
+def derivative(gradient: Callable[..., Array], spaces: Sequence[Space], at: Sequence[Array]) -> Array:
+    """Return the derivative (K, p, p) of a gradient (K, p) by the errors of its arguments, made symmetric.
+
+    `at` are the arguments, rows of the `spaces`.  Central differences; symmetric, since turns do not commute.
+    """
+    columns = []
+    for k, (space, x) in enumerate(zip(spaces, at, strict=True)):
+        for step in DIFFERENCE * np.eye(space.dof):
+            shifted = (plus(space, x, np.tile(sign * step, (len(x), 1))) for sign in (1.0, -1.0))
+            there, back = (gradient(*at[:k], moved, *at[k + 1 :]) for moved in shifted)
+            columns.append((there - back) / (2 * DIFFERENCE))
+    C = np.stack(columns, axis=2)
+    return 0.5 * (C + C.swapaxes(1, 2))
 
 
-def rotations(angles: Array) -> Array:
-    cos, sin = np.cos(angles), np.sin(angles)
-    return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
+def pair_matrix(C: Array, first: Ints, second: Ints, q: int, size: int) -> sp.csr_array:
+    """Return the sparse sum of blocks C (K, p, p): q of their rows and columns at `first`, the others at `second`."""
+    at = [(first, slice(None, q)), (second, slice(q, None))]
+    return block_matrix([(row, column, C[:, i, j]) for row, i in at for column, j in at], (size, size))
 
 
 def _whitened(z: Array, R: Array, blocks: list[tuple[Ints, Array]], size: int) -> Rows:

@@ -15,12 +15,13 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from kalmark.errors import KalmarkError
-from kalmark.geometry.angles import rotation
-from kalmark.geometry.frames import compose
+from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.models.observe import composed, inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor, NonAdditiveSensor, Sensor
 from kalmark.results.batch_course import Course
 from kalmark.results.batch_factors import Factor, Positions, Sightings, State, block_matrix
 from kalmark.results.batch_problem import Problem
+from kalmark.results.batch_rows import ORIGIN, SPACES
 from kalmark.results.history import History, as_id
 from kalmark.slam.checks import measurements
 from kalmark.slam.events import Control, Event, Fix, Id, Scan
@@ -49,7 +50,7 @@ def batch_input(run: Run, events: Iterable[Event], known: Known | None = None) -
     """Return the problem of a run: the motion and fixes of `events`, the observations that the filter used.
 
     `known` gives the landmarks that were in the map beforehand, id: (mean, covariance or None for exactly).
-    Raises KalmarkError for what is not a pose and points of the plane, or if the events are not those of the run.
+    Raises KalmarkError for what is not poses and points, or if the events are not those of the run.
     """
     if run.fixes_rejected:
         raise KalmarkError(
@@ -77,6 +78,8 @@ class _Replay:
         self.fixes: list[tuple[int, Fix]] = []
         self.nodes = np.full(len(self.history.t_ns), -1, dtype=np.int64)
         self.step = 0
+        self.size = 7 if self.history.in_space else 3
+        self.q, self.point = SPACES[self.size].dof, Point3D() if self.history.in_space else Point2D()
         self.used = _used(self.history)
         self.points = {str(i): mean for i, mean in zip(run.landmarks.ids, run.landmarks.means, strict=True)}
         self.priors = {str(name): prior for name, prior in known.items()}
@@ -84,7 +87,8 @@ class _Replay:
         starts = {s.robot: (s.mean, s.covariance) for s in self.history.starts}
         self.courses: dict[str, Course] = {}
         for name, robot in self.robots.items():
-            mean, P = starts.get(name, (robot.start, np.zeros((3, 3)) if robot.cov is None else robot.cov))
+            exactly = np.zeros((robot.motion.space.dof,) * 2)
+            mean, P = starts.get(name, (robot.start, exactly if robot.cov is None else robot.cov))
             self.courses[name] = Course(robot, self._new_node(-1, np.array(mean), np.array(P)))
 
     def take(self, event: Event) -> None:
@@ -181,37 +185,47 @@ class _Replay:
         if self.step < len(self.nodes):
             t_s = self.history.t_ns[self.step] * 1e-9
             raise KalmarkError(f"batch solution: the log has no scan at t={t_s:.9g} s, expected the log of the run")
-        names = list(
-            dict.fromkeys(l for seen in self.sighted.values() for _, l, _, _ in seen if not l.startswith("\0"))
-        )
-        column = {name: 3 * len(self.steps) + 2 * k for k, name in enumerate(names)}
-        factors: list[Factor] = [
-            self._sightings(self.robots[robot].sensors[sensor], seen, column)
-            for (robot, sensor), seen in self.sighted.items()
-        ]
-        factors += self._positions(column)
+        names = self._names()
+        n, d = len(self.steps), self.point.space.dof
+        place = {name: n + k for k, name in enumerate(names)} | {f"\0{k}": k for k in range(n)}
+        factors: list[Factor] = []
+        for (robot, sensor), seen in self.sighted.items():
+            kept = [s for s in seen if s[1] in place]
+            if kept:
+                factors.append(self._sightings(f"{robot}.{sensor}", self.robots[robot].sensors[sensor], kept, place))
+        factors += self._positions(place)
         fixed = np.array([name in self.priors and self.priors[name][1] is None for name in names], dtype=np.bool_)
         Q = self._covariance()
         problem = Problem(np.array(self.previous), np.array(self.steps), Q, tuple(factors), fixed)
         poses = self._start()
         ids = {str(i): i for i in self.run.landmarks.ids}
-        points = np.array([self._point(name, poses) for name in names]).reshape(-1, 2)
+        points = np.array([self._point(name, poses) for name in names]).reshape(-1, d)
         return Input(problem, State(poses, points), [ids.get(name, as_id(name)) for name in names], self.nodes)
 
-    def _sightings(self, mount: Mount, seen: list[tuple[int, str, Array, Array]], column: dict[str, int]) -> Sightings:
-        if len(mount.sensor.columns) > 2:
-            raise KalmarkError(f"batch solution: {type(mount.sensor).__name__} measures more than points of the plane")
-        target = [column[name] if name in column else 3 * int(name[1:]) for _, name, _, _ in seen]
-        y, R = np.array([s[2] for s in seen]), np.array([s[3] for s in seen])
-        return Sightings(mount.sensor, np.asarray(mount.at), np.array([s[0] for s in seen]), np.array(target), y, R)
+    def _names(self) -> list[str]:
+        """Return the landmarks.  One that was measured by fewer numbers than it has says nothing and is left out."""
+        numbers: dict[str, int] = {}
+        for _, name, y, _ in (s for seen in self.sighted.values() for s in seen):
+            numbers[name] = numbers.get(name, 0) + len(y)
+        least = self.point.space.dof
+        return [l for l, k in numbers.items() if not l.startswith("\0") and (k >= least or l in self.priors)]
 
-    def _positions(self, column: dict[str, int]) -> list[Factor]:
+    def _sightings(
+        self, name: str, mount: Mount, seen: list[tuple[int, str, Array, Array]], place: dict[str, int]
+    ) -> Sightings:
+        if mount.cov is not None:
+            raise KalmarkError(f"batch solution: mount {name!r} is in the map, expected mounts that are known")
+        view = view_of(mount.sensor, self.point, np.array(mount.at, dtype=np.float64))
+        node, target = np.array([s[0] for s in seen]), np.array([place[s[1]] for s in seen])
+        return Sightings(view, node, target, np.array([s[2] for s in seen]), np.array([s[3] for s in seen]))
+
+    def _positions(self, place: dict[str, int]) -> list[Factor]:
         """Return the factors of the fixes and of the landmarks known with a covariance."""
-        given = [(3 * node, fix.y, fix.cov) for node, fix in self.fixes]
+        given = [(node, fix.y, fix.cov) for node, fix in self.fixes]
         given += [
-            (column[name], np.asarray(mean, dtype=np.float64), np.asarray(cov, dtype=np.float64))
+            (place[name], np.asarray(mean, dtype=np.float64), np.asarray(cov, dtype=np.float64))
             for name, (mean, cov) in self.priors.items()
-            if name in column and cov is not None
+            if name in place and cov is not None
         ]
         if not given:
             return []
@@ -220,22 +234,22 @@ class _Replay:
 
     def _covariance(self) -> sp.csr_array:
         """Return Q of all steps, with the blocks between those that share a held control's error."""
-        n = len(self.steps)
-        Q = block_matrix([(3 * np.arange(n), 3 * np.arange(n), np.array(self.Q))], (3 * n, 3 * n))
+        n, q = len(self.steps), self.q
+        Q = block_matrix([(q * np.arange(n), q * np.arange(n), np.array(self.Q))], (q * n, q * n))
         if not self.shared:
             return Q
         first = np.cumsum([0, *(root.shape[1] for root in self.roots)])
-        blocks = [(np.array([3 * node]), first[[key]], S[None]) for node, key, S in self.shared]
-        G = block_matrix(blocks, (3 * n, int(first[-1])))
+        blocks = [(np.array([q * node]), first[[key]], S[None]) for node, key, S in self.shared]
+        G = block_matrix(blocks, (q * n, int(first[-1])))
         return sp.csr_array(Q + G @ G.T)
 
     def _start(self) -> Array:
         """Return the filter's poses at the nodes, chained on where a robot had no scan of its own."""
-        poses = np.full((len(self.steps), 3), np.nan)
-        poses[self.nodes] = self.history.mean[:, :3]
+        poses = np.full((len(self.steps), self.size), np.nan)
+        poses[self.nodes] = self.history.poses
         for i, previous in enumerate(self.previous):
             if np.isnan(poses[i, 0]):
-                poses[i] = self.steps[i] if previous < 0 else compose(poses[previous], self.steps[i])[0]
+                poses[i] = composed(ORIGIN[self.size] if previous < 0 else poses[previous], self.steps[i])[0]
         return poses
 
     def _point(self, name: str, poses: Array) -> Array:
@@ -243,15 +257,16 @@ class _Replay:
         if name in self.priors:
             return np.asarray(self.priors[name][0], dtype=np.float64)
         if name in self.points:
-            if len(self.points[name]) != 2:
-                raise KalmarkError(f"batch solution: landmark {name!r} is no point of the plane, expected x and y")
+            size = self.point.space.size
+            if self.points[name].shape != (size,) or not np.isfinite(self.points[name]).all():
+                what = f"landmark {name!r} is at {self.points[name].tolist()}"
+                raise KalmarkError(f"batch solution: {what}, expected a point of {size} finite numbers")
             return self.points[name]
         for (robot, sensor), seen in self.sighted.items():
             mount = self.robots[robot].sensors[sensor]
             for node, landmark, y, _ in seen:
                 if landmark == name and isinstance(mount.sensor, FullSensor):
-                    T = compose(poses[node], np.asarray(mount.at))[0]
-                    return T[:2] + rotation(T[2]) @ mount.sensor.invert(y[None])[0][0]
+                    return inverse_expectation(poses[node], np.array(mount.at), mount.sensor, self.point, y[None])[0][0]
         raise KalmarkError(f"batch solution: landmark {name!r} is not in the run's map, expected a place to start from")
 
 

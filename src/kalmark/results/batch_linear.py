@@ -28,7 +28,7 @@ FLAT = 1e-12  # least ratio of the squared pivots of S: below, a direction is no
 
 
 class Step(NamedTuple):
-    """A step of the poses (n, 3) and of the points (m, 2), and the multipliers (3 n,) after it."""
+    """A step of the poses (n, q) and of the points (m, d), and the multipliers (q n,) after it."""
 
     poses: Array
     points: Array
@@ -56,35 +56,35 @@ def newton(problem: Problem, state: State, multipliers: Array) -> Step:
 
 
 def covariance(problem: Problem, state: State) -> Array:
-    """Return the joint covariance (2 m, 2 m) of all points, the inverse of S; zero where a point is known exactly."""
-    free = np.flatnonzero(_free(problem))
-    P = np.zeros((2 * len(problem.fixed),) * 2)
+    """Return the joint covariance (d m, d m) of all points, the inverse of S; zero where a point is known exactly."""
+    free = np.flatnonzero(_free(problem, state))
+    P = np.zeros((state.points.size,) * 2)
     if len(free):
         P[np.ix_(free, free)] = la.cho_solve(_factored(_reduced(problem, state, None).S), np.eye(len(free)))
     return P
 
 
 def _step(problem: Problem, state: State, multipliers: Array | None) -> Step:
-    n, m = len(state.poses), len(state.points)
+    n, q = len(state.poses), state.q
     S, g, lu, rhs, coupling = _reduced(problem, state, multipliers)
     d_l = la.cho_solve(_factored(S), g) if len(g) else g
-    x, points = np.empty(6 * n), np.zeros(2 * m)
-    x[_interleaved(n)] = lu.solve(rhs - coupling @ d_l)
-    points[_free(problem)] = d_l
-    return Step(x[: 3 * n].reshape(n, 3), points.reshape(m, 2), x[3 * n :])
+    x, points = np.empty(2 * q * n), np.zeros(state.points.size)
+    x[_interleaved(n, q)] = lu.solve(rhs - coupling @ d_l)
+    points[_free(problem, state)] = d_l
+    return Step(x[: q * n].reshape(n, q), points.reshape(state.points.shape), x[q * n :])
 
 
 def _reduced(problem: Problem, state: State, multipliers: Array | None) -> _Reduced:
-    n3 = state.poses.size
+    path = state.q * len(state.poses)
     z, H = problem.sighted(state)
     e, J = problem.constraints(state.poses)
     A = sp.csr_array(H.T @ H)
     if multipliers is not None:
         A = sp.csr_array(A + problem.curvature(state, multipliers))
-    points = n3 + np.flatnonzero(_free(problem))
-    order = _interleaved(len(state.poses))
-    kkt = sp.block_array([[A[:n3, :n3], J.T], [J, -problem.Q]], format="csc")[order][:, order]
-    coupling = sp.vstack([A[:n3, points], sp.csr_array((n3, len(points)))], format="csr")[order]
+    points = path + np.flatnonzero(_free(problem, state))
+    order = _interleaved(len(state.poses), state.q)
+    kkt = sp.block_array([[A[:path, :path], J.T], [J, -problem.Q]], format="csc")[order][:, order]
+    coupling = sp.vstack([A[:path, points], sp.csr_array((path, len(points)))], format="csr")[order]
     try:
         lu = splu(sp.csc_matrix(kkt), permc_spec="COLAMD", diag_pivot_thresh=0.1)
     except RuntimeError:
@@ -94,7 +94,7 @@ def _reduced(problem: Problem, state: State, multipliers: Array | None) -> _Redu
         columns = slice(first, first + CHUNK)
         S[:, columns] -= coupling.T @ lu.solve(coupling[:, columns].toarray())
     g = H.T @ z
-    rhs = np.concatenate([g[:n3], -e])[order]
+    rhs = np.concatenate([g[:path], -e])[order]
     return _Reduced(S, g[points] - coupling.T @ lu.solve(rhs), lu, rhs, coupling)
 
 
@@ -110,11 +110,11 @@ def _factored(S: Array) -> tuple[Array, bool]:
     return L, lower
 
 
-def _free(problem: Problem) -> npt.NDArray[np.bool_]:
-    return np.repeat(~problem.fixed, 2)
+def _free(problem: Problem, state: State) -> npt.NDArray[np.bool_]:
+    return np.repeat(~problem.fixed, state.d)
 
 
-def _interleaved(n: int) -> npt.NDArray[np.int64]:
+def _interleaved(n: int, q: int) -> npt.NDArray[np.int64]:
     """Return the order that puts each node's multipliers behind its pose: the chain becomes a narrow band."""
-    poses = np.arange(3 * n).reshape(n, 3)
-    return np.concatenate([poses, 3 * n + poses], axis=1).ravel()
+    poses = np.arange(q * n).reshape(n, q)
+    return np.concatenate([poses, q * n + poses], axis=1).ravel()

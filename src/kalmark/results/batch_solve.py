@@ -15,10 +15,10 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from kalmark.errors import KalmarkError
-from kalmark.geometry.angles import wrap
 from kalmark.results.batch_factors import State
 from kalmark.results.batch_linear import Step, covariance, gauss_newton, newton
 from kalmark.results.batch_problem import Problem
+from kalmark.results.batch_rows import plus
 
 Array = npt.NDArray[np.float64]
 NEAR = 1e-2  # relative step below which Newton's method is tried
@@ -27,7 +27,7 @@ ROUNDING = 1e-6  # relative step below which the cost cannot tell any more which
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The optimum: its state, the points' joint covariance (2 m, 2 m), and how it was reached.
+    """The optimum: its state, the points' joint covariance (d m, d m), and how it was reached.
 
     `chi2` is the sum of squared whitened residuals, motion included; `relative_step` the last step over the map's size.
     """
@@ -65,11 +65,11 @@ def minimise(
 
 
 class _Search:
-    """Where the search stands: the state, the multipliers of the motion, the penalty (3,) on its violation."""
+    """Where the search stands: the state, the multipliers of the motion, the penalty (q,) on its violation."""
 
     def __init__(self, problem: Problem, start: State) -> None:
         self.problem, self.state = problem, start
-        self.multipliers, self.penalty = np.zeros(start.poses.size), np.zeros(3)
+        self.multipliers, self.penalty = np.zeros(start.q * len(start.poses)), np.zeros(start.q)
         self.followers = _followers(problem, start)
         self.size = np.inf
 
@@ -91,7 +91,7 @@ class _Search:
     def _take(self, step: Step) -> None:
         """Go the longest of 1, 1/2, 1/4, ... of the step that lowers the merit."""
         size = _relative(self.state, step)
-        self.penalty = np.maximum(self.penalty, 1.5 * np.abs(step.multipliers).reshape(-1, 3).max(axis=0))
+        self.penalty = np.maximum(self.penalty, 1.5 * np.abs(step.multipliers).reshape(-1, self.state.q).max(axis=0))
         now, fraction = self._merit(self.state, self.multipliers), 1.0
         while fraction > 1e-6:
             state = _moved(self.state, step, fraction, self.followers)
@@ -109,38 +109,31 @@ class _Search:
 
     def _merit(self, state: State, multipliers: Array) -> float:
         defect = self.problem.errors(state.poses).ravel() - self.problem.Q @ multipliers
-        return self._cost(state, multipliers) + float(self.penalty @ np.abs(defect).reshape(-1, 3).sum(axis=0))
+        return self._cost(state, multipliers) + float(self.penalty @ np.abs(defect).reshape(-1, state.q).sum(axis=0))
 
 
 def _relative(state: State, step: Step) -> float:
-    """Return the largest change of a heading (rad) or of a position over half the extent of the map (at least 1 m)."""
-    places = np.concatenate([state.poses[:, :2], state.points])
-    extent = max(1.0, 0.5 * float(np.ptp(places, axis=0).max()))
-    shift = max(np.abs(step.poses[:, :2]).max(), np.abs(step.points).max(initial=0.0)) / extent
-    return float(max(shift, np.abs(step.poses[:, 2]).max()))
+    """Return the largest turn of a pose (rad), or shift over half the extent of the map (at least 1 m)."""
+    extent = max(1.0, 0.5 * float(np.ptp(state.places(), axis=0).max()))
+    shift = max(np.abs(step.poses[:, : state.d]).max(), np.abs(step.points).max(initial=0.0)) / extent
+    return float(max(shift, np.abs(step.poses[:, state.d :]).max()))
 
 
 def _moved(state: State, step: Step, fraction: float, followers: sp.csr_array) -> State:
     """Move along the exponential, x + V(dtheta) dx; a point turns with the poses that see it."""
-    d, d_l = fraction * step.poses, fraction * step.points
-    poses = state.poses + np.column_stack([_along(d[:, 2], d[:, :2]), d[:, 2]])
-    poses[:, 2] = wrap(poses[:, 2])
-    return State(poses, state.points + _along(followers @ d[:, 2], d_l))
-
-
-def _along(a: Array, d: Array) -> Array:
-    """Return V(a) d for each row."""
-    p, q = np.sinc(a / np.pi), np.sin(0.5 * a) * np.sinc(0.5 * a / np.pi)
-    return np.column_stack([p * d[:, 0] - q * d[:, 1], q * d[:, 0] + p * d[:, 1]])
+    d, turns = fraction * step.poses, fraction * step.poses[:, state.d :]
+    points = plus(state.point_space, state.points, fraction * step.points, followers @ turns)
+    return State(plus(state.pose_space, state.poses, d, turns), points)
 
 
 def _followers(problem: Problem, state: State) -> sp.csr_array:
     """Return (m, n): for each point the weights, summing to 1, of the poses that see it."""
     n, m = len(state.poses), len(state.points)
     H = problem.sighted(state).H
+    path = state.q * n
     seen = sp.csr_array((np.ones(H.nnz), H.indices, H.indptr), shape=H.shape)
-    together = sp.coo_array(seen[:, 3 * n :].T @ seen[:, : 3 * n])
-    at = together.row // 2, together.col // 3
+    together = sp.coo_array(seen[:, path:].T @ seen[:, :path])
+    at = together.row // state.d, together.col // state.q
     weights = sp.csr_array(sp.coo_array((together.data, at), shape=(m, n)))
     total: Array = np.asarray(weights.sum(axis=1)).ravel()
     return sp.csr_array(sp.diags_array(1.0 / np.maximum(total, 1.0)) @ weights)
