@@ -27,16 +27,6 @@ from kalmark.simulate.sights import Sensing
 
 Count = Annotated[int, Field(ge=1)]
 
-# What a sensor's filter takes for a landmark if `filter` does not say; otherwise a point.
-LANDMARKS = {
-    "range_bearing_signature": "point_signature",
-    "pinhole": "anchored_homogeneous",
-    "omnidirectional": "anchored_homogeneous",
-    "segments": "anchored_homogeneous_line",
-    "tag_pose": "tag",
-    "tag_corners": "tag",
-}
-
 
 class _Underway(Section):
     route: Route
@@ -161,18 +151,10 @@ class World(Section):
 
     def _values(self) -> dict[str, Any]:
         values: dict[str, Any] = {"robots": {}}
-        kinds = set()
         for name, robot in self.robots.items():
             values["robots"][name] = robot.model_dump(exclude={"route", "sensing"}, exclude_none=True)
-            for key, sensor in robot.sensors.items():
-                kinds.add(kind := LANDMARKS.get(sensor.type, "point"))
-                values["robots"][name]["sensors"][key].setdefault("landmark", {"type": kind})
-        if len(kinds) == 1:  # said once, not of each sensor
-            values["landmarks"] = {"type": kinds.pop()}
-            for name, robot in self.robots.items():
-                for key, sensor in robot.sensors.items():
-                    if sensor.landmark is None:
-                        del values["robots"][name]["sensors"][key]["landmark"]
+        if self.dimensions == 2:
+            values["landmarks"] = {"type": "point_signature" if self.has_signatures else "point"}
         return values
 
     def to_yaml(self) -> str:
