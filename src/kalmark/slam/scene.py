@@ -163,7 +163,7 @@ def _natural(mount: Mount) -> Landmark:
     seen = getattr(mount.sensor, "sees_kinds", ("point3",))
     if "point3" not in seen:
         return kinds.AnchoredHomogeneousLine()
-    return Point3D() if getattr(mount.sensor, "finds_depth", True) else kinds.AnchoredHomogeneous()
+    return Point3D() if getattr(mount.sensor, "finds_depth", True) else kinds.Homogeneous()
 
 
 class Scene:
