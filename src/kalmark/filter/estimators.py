@@ -50,9 +50,6 @@ class Estimator(Protocol):
     def for_fixes(self) -> Estimator:
         """Return the estimator that fuses absolute positions."""
 
-    def for_mounts(self) -> Estimator:
-        """Return the estimator that fuses what a sensor on an uncertain mount sees."""
-
     def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
         """Return the Jacobian J (., 3 or more) in the robot's state, taken where this estimator linearises."""
 
@@ -77,10 +74,6 @@ class _Estimator:
 
     def for_fixes(self) -> Any:
         """Return the estimator that fuses absolute positions."""
-        return self
-
-    def for_mounts(self) -> Any:
-        """Return the estimator that fuses what a sensor on an uncertain mount sees."""
         return self
 
     def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
@@ -123,10 +116,6 @@ class Invariant(_Estimator):
     def for_fixes(self) -> Invariant:
         """Return the estimator that fuses absolute positions: a large step must be iterated."""
         return Invariant(max(6, self.iterations))
-
-    def for_mounts(self) -> Invariant:
-        """Return the estimator without iterations: with them the noise of depths ends up in the mount."""
-        return Invariant(1)
 
 
 @dataclass(frozen=True)

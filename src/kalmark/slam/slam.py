@@ -241,9 +241,7 @@ class Slam:
     ) -> Iterator[Observation]:  # fmt: skip
         """Fuse the observations `known` of landmarks in the map, those of one type at once.  [S] (26)-(30)."""
         names: list[Id] = [decisions[k][0] for k in known]  # type: ignore[misc]
-        robot, estimator = self._slots[event.robot], self.estimator
-        if view.mount >= 0:
-            estimator = estimator.for_mounts()
+        robot = self._slots[event.robot]
         groups = [(look, [known[i] for i in rows]) for look, rows in self.by_look(view, names)]
         if view.attention.updates is not None and len(known) > view.attention.updates:
             for k in self._least(event, view, groups, decisions, R):
@@ -256,7 +254,7 @@ class Slam:
                 continue
             slots = np.array([self._slots[decisions[k][0]] for k in rows])  # type: ignore[index]
             noise = view.noise(self.map, robot, look, slots, R[rows], event)
-            done = estimator.correct(
+            done = self.estimator.correct(
                 self.map, look.view, robot, view.mount, slots, look.d, event.y[rows], noise, view.gate
             )
             self._healthy(done.healthy, event)
