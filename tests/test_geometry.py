@@ -66,7 +66,7 @@ def test_from_frame_undoes_to_frame(f: np.ndarray, p: np.ndarray) -> None:
 @pytest.mark.parametrize("function", [g.to_frame, g.from_frame, g.observe])
 @given(f=poses, p=points)
 def test_frame_functions_have_the_jacobians_of_their_differences(function: Any, f: np.ndarray, p: np.ndarray) -> None:
-    if np.linalg.norm(g.to_frame(f, p)[0]) < 1e-2:
+    if np.linalg.norm(g.to_frame(f, p)[0]) < 0.3:  # differences are too rough nearer to the singular point
         return
     angular = (False, True) if function is g.observe else ()
     _, out_f, out_p = function(f, p)

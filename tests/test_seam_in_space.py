@@ -129,6 +129,9 @@ def test_a_landmark_started_from_a_measurement_explains_it(pair: Any) -> None:
             y[0, 3] = y[0, 1]
         r, mount = head[:7].copy(), head[7:].copy()
         l, L_r, L_s, L_y, prior = inverse_expectation(r, mount, sensor, landmark, y)
+        if np.isnan(l).any():
+            assert type(sensor).__name__ == "TagCorners"  # a tag that looks like its mirror image is not started
+            continue
         _, z, _, _ = linearize(view_of(sensor, landmark, mount), r, l, y)
         limit = 5.0 if type(sensor).__name__ == "TagCorners" else 0.02 if getattr(sensor, "distortion", ()) else 1e-6
         assert np.abs(z).max() < limit  # corners moved by noise are of no tag exactly; corrections are fitted
