@@ -37,6 +37,8 @@ _SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     """Print the key figures of a run's summary; those of other programs on the same log below ours, in brackets."""
+    from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
+
     rows = [
         (label, number(summary[key], unit), unit)
         for key, label, unit in TOTALS
@@ -52,6 +54,9 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         named = [*robots.items(), *((f"({name})", figures) for name, figures in others.items())]
         table = [(name, *(number(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
         print_table("", columns, table, align="<" + ">" * len(shown))
+    mounts = mount_rows(summary)
+    if mounts:
+        print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
         print_table("against the batch solution", ("", ""), [(k, number(v)) for k, v in batch.items()], align="<>")

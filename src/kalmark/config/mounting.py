@@ -148,7 +148,7 @@ class Mounted(Section):
     """What every sensor has, whatever its type; and a `mount`, see below."""
 
     landmark: Landmark | None = None
-    """Landmark type of this sensor; `landmarks` if absent."""
+    """Landmark type of this sensor; `landmarks` if absent.  A camera whose mount is calibrated wants anchored ones."""
     association: Association | None = None
     """Association of this sensor; the configuration's `association` if absent."""
     attention: AttentionConfig | None = None

@@ -33,9 +33,14 @@ def cameras(slam: Slam) -> tuple[Camera, ...]:
 
 
 def mounts(slam: Slam) -> tuple[Mounted, ...]:
-    """Return the mounts of the sensors that calibrate themselves, as estimated."""
-    names = (f"{robot.name}.{sensor}" for robot in slam.robots.values() for sensor in robot.sensors)
-    return tuple(Mounted(name, slam.mean(name), slam.covariance(name)) for name in names if _in_map(slam, name))
+    """Return the mounts of the sensors that calibrate themselves, as estimated and as given."""
+    found = []
+    for robot in slam.robots.values():
+        for sensor, mount in robot.sensors.items():
+            name, prior = f"{robot.name}.{sensor}", mount.covariance(3 if len(mount.at) == 3 else 6, sensor)
+            if prior is not None and _in_map(slam, name):
+                found.append(Mounted(name, slam.mean(name), slam.covariance(name), prior))
+    return tuple(found)
 
 
 def _in_map(slam: Slam, name: str) -> bool:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
+from kalmark.results.calibration import mount_figures
 from kalmark.results.consistency import diverged, nees, nis, pose_error
-from kalmark.results.describe import describe_pose
-from kalmark.results.history import Array, History, Ints, Mounted
+from kalmark.results.history import Array, History, Ints
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.shapes import EUCLIDEAN, LINE
 from kalmark.results.truth import Fixes, Truth, fitted
@@ -148,16 +148,6 @@ def line_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
         if max(_sigma(across @ P[k : k + 3, k : k + 3] @ across) for k in (0, 3)) < SETTLED * extent:
             errors.append((true[str(i)] - place[:3]) @ across)
     return {"line_rmse_raw_m": rmse(np.reshape(errors, (-1, 3))), "lines_compared": len(errors)}
-
-
-def mount_figures(mount: Mounted) -> dict[str, Any]:
-    """Return where the filter believes a sensor to sit that calibrates itself, and how far that is known."""
-    d = 3 if len(mount.mean) == 7 else 2
-    sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
-    return describe_pose(mount.mean) | {
-        "sigma_position_m": float(sigma[:d].max()),
-        "sigma_rotation_deg": math.degrees(sigma[d:].max()),
-    }
 
 
 def _sigma(P: Array) -> float:

@@ -59,11 +59,15 @@ class Camera(NamedTuple):
 
 
 class Mounted(NamedTuple):
-    """A sensor that calibrates itself: its name in the map, and its mount (3,) or (7,) with covariance at the end."""
+    """A sensor that calibrates itself: its name in the map, and its mount (3,) or (7,) at the end.
+
+    `covariance` at the end and `prior`, that before the first event, (3, 3) or (6, 6), are in the robot's frame.
+    """
 
     name: str
     mean: Array
     covariance: Array
+    prior: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +149,12 @@ class History:
             "mount": texts([m.name for m in self.mounts]),
             "mount_mean": padded_rows([m.mean for m in self.mounts]),
             "mount_covariance": padded_squares([m.covariance for m in self.mounts]),
+            "mount_prior": padded_squares([m.prior for m in self.mounts]),
         }
 
     @classmethod
     def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> History:
         """Return the history that `arrays` gave."""
-        keys = ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)
         starts = tuple(
             Start(str(robot), mean[~np.isnan(mean)], _cut(covariance), int(t_ns))
             for robot, mean, covariance, t_ns in zip(
@@ -159,9 +163,10 @@ class History:
         )
         kind = named.get("kind", np.full(len(named["landmark"]), "", dtype=np.str_))
         maps, inputs, cameras = _maps(named), Inputs.from_arrays(named), _cameras(named)
-        rows = zip(*(named.get(key, ()) for key in ("mount", "mount_mean", "mount_covariance")), strict=True)
-        mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P)) for name, mean, P in rows)
-        columns = {key: named[key] for key in keys}
+        keys = ("mount", "mount_mean", "mount_covariance", "mount_prior")
+        rows = zip(*(named.get(key, ()) for key in keys), strict=True)
+        mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P), _cut(C)) for name, mean, P, C in rows)
+        columns = {key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)}
         return cls(**columns, maps=maps, starts=starts, inputs=inputs, kind=kind, cameras=cameras, mounts=mounts)
 
 

@@ -7,6 +7,7 @@ import json
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
+from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
 from kalmark.results.files import config_yaml
 from kalmark.results.picture import headline
 from kalmark.results.series import reasons, series
@@ -45,6 +46,7 @@ def report_html(run: Run) -> str:
         robots=robot_table(run.summary),
         summary=_table([(key, show(value)) for key, value in _flat(run.summary)]),
         warnings="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("warnings", ())),
+        mounts=_mounts(run.summary),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),
         skipped=_skipped(run),
         config=html.escape(config_yaml(run.config)),
@@ -80,7 +82,7 @@ def show(value: Any) -> str:
 def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
-        if key in ("robots", "warnings") and not prefix:
+        if (key in ("robots", "warnings") and not prefix) or key == "directions":
             continue
         out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
     return out
@@ -92,6 +94,11 @@ def _table(rows: list[Any], head: tuple[str, ...] = ()) -> str:
     top = "<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in head) + "</tr>" if head else ""
     body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table>{top}{body}</table>"
+
+
+def _mounts(summary: dict[str, Any]) -> str:
+    rows = mount_rows(summary)
+    return f"<h2>Mounts that calibrate themselves</h2>{_table(rows, MOUNT_COLUMNS)}" if rows else ""
 
 
 def _skipped(run: Run) -> str:
@@ -133,7 +140,7 @@ _TEMPLATE = """<!DOCTYPE html>
 <h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
 <section id="nis-section"><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>
 <section id="association"><h2>Association</h2><div id="outcomes"></div>{reasons}</section>
-<section><h2>Figures</h2>{robots}{summary}{skipped}</section>
+<section><h2>Figures</h2>{robots}{summary}{mounts}{skipped}</section>
 <section><h2>Configuration</h2><pre>{config}</pre></section>
 </main>
 <script>{plotly}</script>

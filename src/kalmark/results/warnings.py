@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from kalmark.results.calibration import mount_warnings
 from kalmark.results.inputs import UsedFix
 from kalmark.results.words import count, figure
 
@@ -30,7 +31,7 @@ FEW_FIXES = 5  # fewer say little of the noise
 def warnings(run: Run, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
     parts = (_lost, _observations, _robots, _truth, _fixes, _noise)
-    return [line for part in parts for line in part(run, summary)]
+    return [line for part in parts for line in part(run, summary)] + list(mount_warnings(summary))
 
 
 def _lost(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:

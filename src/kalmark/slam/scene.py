@@ -155,7 +155,11 @@ def means(map_: StochasticMap, slots: Index, d: int) -> Array:
 
 
 def _natural(mount: Mount) -> Landmark:
-    """Return the type of landmark that a sensor starts if nobody says which."""
+    """Return the type of landmark that a sensor starts if nobody says which.
+
+    Homogeneous points go along with steps of the robot (`generator`), not with those of a mount: a mount's place that
+    cannot be observed would seem to be.
+    """
     if "size_m" in mount.sensor.columns or "qw" in mount.sensor.columns:
         return Tag()
     if len(mount.at) == 3:
@@ -163,7 +167,9 @@ def _natural(mount: Mount) -> Landmark:
     seen = getattr(mount.sensor, "sees_kinds", ("point3",))
     if "point3" not in seen:
         return kinds.AnchoredHomogeneousLine()
-    return Point3D() if getattr(mount.sensor, "finds_depth", True) else kinds.Homogeneous()
+    if getattr(mount.sensor, "finds_depth", True):
+        return Point3D()
+    return kinds.Homogeneous() if mount.cov is None else kinds.AnchoredHomogeneous()
 
 
 class Scene:

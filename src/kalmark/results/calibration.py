@@ -1,0 +1,120 @@
+"""What a run found out about mounts that calibrate themselves, and in which directions it found nothing.
+
+The posterior covariance P of a mount is compared with its prior C: the eigenvectors of C^-1/2 P C^-1/2 are directions
+in units of the prior's sigmas, the eigenvalues by how much each has become better known.  An eigenvalue near 1 belongs
+to a direction that nothing told of.  C^-1/2 is the symmetric root: directions stay near the axes they are named by.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kalmark.results.describe import describe_pose
+from kalmark.results.history import Array, Mounted
+from kalmark.results.words import figure
+
+AXES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
+UNOBSERVED = 0.9  # of its prior sigma: so much is left of a direction that counts as not observed
+SINGULAR = 1e-12  # eigenvalues of a prior's correlations that are zero
+NAMED = 0.01  # the least share of an axis in a direction that is named
+
+
+class Direction(NamedTuple):
+    """A direction in which a mount was uncertain: shares of the axes in it, the largest first, and its sigmas.
+
+    The sigmas are those of the first axis, in `unit`, at the end and of the prior.
+    """
+
+    axes: dict[str, float]
+    sigma: float
+    prior: float
+    unit: str
+
+    @property
+    def ratio(self) -> float:
+        """The sigma at the end over the prior's: 1 for a direction that was not observed."""
+        return self.sigma / self.prior
+
+    def __str__(self) -> str:
+        return ", ".join(f"{axis} {share:.2f}" for axis, share in self.axes.items())
+
+
+def directions(prior: Array, posterior: Array) -> list[Direction]:
+    """Return the directions of a mount (3 or 6) between a prior and a posterior covariance, the least observed first.
+
+    Axes that the prior knows exactly are left out.  Turns are about the axes of the robot.
+    """
+    open_ = np.flatnonzero(np.diagonal(prior) > 0)
+    names = [AXES[len(prior)][i] for i in open_]
+    sigma = np.sqrt(np.diagonal(prior)[open_])
+    C, P = (cov[np.ix_(open_, open_)] / np.outer(sigma, sigma) for cov in (prior, posterior))
+    values, vectors = np.linalg.eigh(C)
+    inverse = np.zeros_like(values)
+    inverse[values > SINGULAR] = values[values > SINGULAR] ** -0.5
+    root = (vectors * inverse) @ vectors.T
+    ratios, axes = np.linalg.eigh(root @ P @ root)
+    return [
+        _direction(names, sigma, axis, math.sqrt(max(ratio, 0.0)))
+        for ratio, axis in zip(ratios[::-1], axes.T[::-1], strict=True)
+    ]
+
+
+def _direction(names: list[str], sigma: Array, axis: Array, ratio: float) -> Direction:
+    """Return a direction by the squares of its unit vector (n,), the largest first, the smallest left out."""
+    order = np.argsort(-(axis**2), kind="stable").tolist()
+    shares = {names[i]: float(axis[i] ** 2) for i in order if axis[i] ** 2 >= NAMED}
+    unit = "m" if names[order[0]] in ("x", "y", "z") else "deg"
+    before = float(sigma[order[0]] if unit == "m" else np.degrees(sigma[order[0]]))
+    return Direction(shares, ratio * before, before, unit)
+
+
+def mount_figures(mount: Mounted) -> dict[str, Any]:
+    """Return where the filter believes a sensor to sit that calibrates itself, how far that is known, what was seen."""
+    d = 3 if len(mount.mean) == 7 else 2
+    sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
+    found = [
+        {"direction": str(each), "sigma": each.sigma, "prior_sigma": each.prior, "unit": each.unit, "ratio": each.ratio}
+        for each in directions(mount.prior, mount.covariance)
+    ]
+    return describe_pose(mount.mean) | {
+        "sigma_position_m": float(sigma[:d].max()),
+        "sigma_rotation_deg": math.degrees(sigma[d:].max()),
+        "directions": found,
+    }
+
+
+def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
+    """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
+    return [
+        (name, row["direction"], *(_sigma(row[key], row["unit"]) for key in ("prior_sigma", "sigma")),
+         f"{row['ratio']:.3f}")
+        for name, figures in summary.get("mounts", {}).items()
+        for row in figures.get("directions", ())
+    ]  # fmt: skip
+
+
+MOUNT_COLUMNS = ("mount", "direction", "sigma before", "after", "ratio (1: not observed)")
+
+
+def mount_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Return a line for every direction of a mount that was not observed."""
+    for name, figures in summary.get("mounts", {}).items():
+        for row in figures.get("directions", ()):
+            if row["ratio"] > UNOBSERVED:
+                after, before = (_sigma(row[key], row["unit"]) for key in ("sigma", "prior_sigma"))
+                axis = row["direction"].split()[0]
+                yield f"mount {name}: its {axis} ({row['direction']}) was not observed: sigma {after} of {before}"
+
+
+def _sigma(value: float, unit: str) -> str:
+    """Return a sigma as people read it: 5 cm, 1.2 mm, 0.06 deg."""
+    if unit == "deg":
+        return f"{figure(value)} deg"
+    for scale, name in ((1.0, "m"), (1e-2, "cm")):
+        if value >= scale:
+            return f"{figure(value / scale)} {name}"
+    return f"{figure(value * 1e3)} mm"
