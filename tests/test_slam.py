@@ -33,7 +33,7 @@ def started(**kwargs: Any) -> km.Slam:
 def state(slam: km.Slam) -> tuple[Any, ...]:
     m = slam.map
     drives = [(d.t_ns, d.fresh) for d in slam._drives.values()]
-    return (m.x.tobytes(), m.P.tobytes(), m.n, slam.t_ns, list(slam._slots), drives, dict(slam._seen))
+    return (m.x.tobytes(), m.P.tobytes(), m.n, slam.t_ns, list(slam.members.slots), drives, dict(slam.members.seen))
 
 
 BAD: dict[str, tuple[Any, str]] = {

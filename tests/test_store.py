@@ -213,7 +213,7 @@ def test_a_failed_save_leaves_what_was_there_and_nothing_else(tmp_path: Path, mo
         patch.setattr(zipfile.ZipFile, "writestr", full)
         with pytest.raises(MapError, match="No space left on device"):
             slam.save(path)
-    slam._seen[1, 2] = 1  # type: ignore[index]
+    slam.members.seen[1, 2] = 1  # type: ignore[index]
     with pytest.raises(MapError, match=r"landmark \(1, 2\) cannot be saved"):
         slam.save(path)
     assert [file.name for file in tmp_path.iterdir()] == ["map.kmk"]
@@ -273,10 +273,10 @@ def assert_consistent(slam: km.Slam) -> None:
             assert sum(ERROR_SIZE[k] for k in space.kinds) == p_size
         assert (atoms[:, 1] >= x_at).all() and (atoms[:, 1] < x_at + x_size).all()
         assert (atoms[:, 2] >= p_at).all() and (atoms[:, 2] < p_at + p_size).all()
-    owned = [*slam._slots.values(), *slam._errors.values()]
+    owned = [*slam.members.slots.values(), *slam._errors.values()]
     assert sorted(owned + removed) == list(range(len(m.blocks)))
     for name, robot in slam.robots.items():
-        space = m.spaces[slam._slots[name]]
+        space = m.spaces[slam.members.slots[name]]
         assert space is not None and space.kinds == robot.motion.space.kinds
         drive = slam._drives[name]
         assert drive.u is not None and drive.N is not None

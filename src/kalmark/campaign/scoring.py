@@ -148,8 +148,9 @@ class _Scorer:
         """Yield the landmarks that have a truth, and whose depth is known well enough."""
         slam = self.slam
         for name, true in self.true_id.items():
-            if true in self.log.landmarks and name in slam._kinds:
-                model, mean, P = slam._kinds[name], slam.mean(name), slam.covariance(name)
+            model = slam.landmark_model(name)
+            if true in self.log.landmarks and model is not None:
+                mean, P = slam.mean(name), slam.covariance(name)
                 truth = self.log.landmarks[true]
                 if (j := errors.landmark(model, mean, P, truth, turn, slam.estimator.coordinates, eye)) is not None:
                     yield name, j

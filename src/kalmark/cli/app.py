@@ -36,7 +36,7 @@ for verb in (demo, run, simulate, evaluate, report, campaign, config, convert, c
     app.command()(verb)
 app.add_typer(data, name="data")
 for name, what in COMING.items():
-    app.command(name, help=f"{what}  (coming)", context_settings={"ignore_unknown_options": True})(coming(name, what))
+    app.command(name, hidden=True, context_settings={"ignore_unknown_options": True})(coming(name, what))
 
 
 def _show_version(wanted: bool) -> None:

@@ -1,4 +1,4 @@
-"""Verbs that have their place and are not there yet."""
+"""Verbs that have their place and are not there yet: not in the help, but they say so when they are called."""
 
 from __future__ import annotations
 

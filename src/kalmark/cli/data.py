@@ -16,11 +16,13 @@ data = typer.Typer(help="List and fetch datasets.", no_args_is_help=True)
 
 @data.command("list")
 def list_() -> None:
-    """List the datasets that can be fetched."""
-    from kalmark.logs.download import list_data
+    """List the datasets that can be fetched, and those of which a copy of your own is read."""
+    from kalmark.logs.download import OWN_COPIES, list_data
 
     rows = [(d.name, f"{d.bytes / 1e6:.1f} MB", d.what, d.licence) for d in list_data()]
     print_table("", ("name", "size", "what", "licence"), rows, align="<><<")
+    typer.echo("\nNot fetched; put a copy of your own where it is found:\n")
+    print_table("", ("name", "what", "put"), [(d.name, d.what, d.put) for d in OWN_COPIES], align="<<<")
 
 
 @data.command()

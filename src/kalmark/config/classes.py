@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.config.mounting import MountConfig, SpaceMountConfig, SpaceStartConfig, StartConfig
+from kalmark.config.mounting import PlanePose, SpacePose, SpaceStartConfig
 from kalmark.config.sections import Section
 from kalmark.filter import estimators
 from kalmark.geometry.rotations import from_euler
@@ -68,9 +68,9 @@ def model_of(section: Section, world: str = "plane") -> Any:
     return (IN_SPACE.get(kind, CLASSES[kind]) if world == "space" else CLASSES[kind])(**keys)
 
 
-def pose_of(section: MountConfig | SpaceMountConfig | StartConfig | SpaceStartConfig) -> Array:
+def pose_of(section: PlanePose | SpacePose) -> Array:
     """Return the pose that a mount or a start describes: (3,) in the plane, (7,) in space."""
-    if isinstance(section, MountConfig | StartConfig):
+    if isinstance(section, PlanePose):
         return np.array([section.x_m, section.y_m, section.theta_rad])
     q, _ = from_euler(np.radians([section.roll_deg, section.pitch_deg, section.yaw_deg]))
     return np.array([section.x_m, section.y_m, section.z_m, *q])
@@ -82,9 +82,9 @@ def velocity_of(section: SpaceStartConfig) -> Array:
     return np.array([s.vx_mps, s.vy_mps, s.vz_mps, s.wx_radps, s.wy_radps, s.wz_radps])
 
 
-def covariance_of(section: MountConfig | SpaceMountConfig | StartConfig | SpaceStartConfig, dof: int) -> Array | None:
+def covariance_of(section: PlanePose | SpacePose, dof: int) -> Array | None:
     """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly."""
-    if isinstance(section, MountConfig | StartConfig):
+    if isinstance(section, PlanePose):
         sigmas = [section.sigma_xy_m, section.sigma_xy_m, section.sigma_theta_rad]
     else:
         sigmas = [*_three(section.sigma_position_m), *np.radians(_three(section.sigma_rotation_deg))]

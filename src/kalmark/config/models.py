@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Tag
 
 from kalmark.config.models3d import SpaceMotions, SpaceSensors
-from kalmark.config.mounting import PlaneMounted
-from kalmark.config.sections import Limit, NotNegative, Positive, Section, type_or, types
+from kalmark.config.mounting import PlaneMounted, Ranging
+from kalmark.config.sections import NotNegative, Positive, Section, type_or, types
 
 
 class _Diffusion(Section):
@@ -66,16 +66,12 @@ Motion = Annotated[PlaneMotions | SpaceMotions, Discriminator(type_or())]
 _IN_SPACE = set(types(Motion)).difference(types(Annotated[PlaneMotions, None]))
 
 
-class _Sensor(PlaneMounted):
-    range_min_m: NotNegative = 0.0
-    """Nearest landmark the sensor sees."""
-    range_max_m: Limit = math.inf
-    """Farthest landmark the sensor sees."""
+class _Sector(Ranging, PlaneMounted):
     fov_rad: Positive = 2 * math.pi
     """Field of view, centred forward."""
 
 
-class _Range(_Sensor):
+class _Range(_Sector):
     sigma_range_m: NotNegative = 0.1
     """Constant part a of the range noise sqrt(a^2 + (b r)^2)."""
     sigma_range_rel: NotNegative = 0.0
@@ -106,7 +102,7 @@ class RangeBearingSignatureSensor(_Range):
     """Noise of the signature."""
 
 
-class BearingSensor(_Sensor):
+class BearingSensor(_Sector):
     """Direction of a landmark."""
 
     type: Literal["bearing"] = "bearing"
@@ -114,7 +110,7 @@ class BearingSensor(_Sensor):
     """Noise of the bearing."""
 
 
-class PositionSensor(_Sensor):
+class PositionSensor(_Sector):
     """Position of a landmark in the sensor's frame."""
 
     type: Literal["position"] = "position"

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Tag
 
-from kalmark.config.mounting import SpaceMounted
-from kalmark.config.sections import Limit, NotNegative, Number, Positive, Section
-from kalmark.models.sensors3d import FISHEYE, FISHEYE_BACK
+from kalmark.config.mounting import Ranging, SpaceMounted
+from kalmark.config.sections import NotNegative, Number, Positive, Section
+from kalmark.models.sensors_camera import FISHEYE, FISHEYE_BACK
 
 Numbers = Annotated[tuple[Number, ...], Field(strict=False)]
 
@@ -67,16 +67,12 @@ SpaceMotions = (
 )
 
 
-class _Ranging(SpaceMounted):
-    range_min_m: NotNegative = 0.0
-    """Nearest landmark the sensor sees."""
-    range_max_m: Limit = math.inf
-    """Farthest landmark the sensor sees."""
+class _Cone(Ranging, SpaceMounted):
     fov_rad: Positive = 2 * math.pi
     """Field of view, a cone about the sensor's x axis."""
 
 
-class RangeBearing3DSensor(_Ranging):
+class RangeBearing3DSensor(_Cone):
     """Distance, azimuth and elevation of a landmark; x is forward, z up."""
 
     type: Literal["range_bearing_3d"] = "range_bearing_3d"
@@ -88,7 +84,7 @@ class RangeBearing3DSensor(_Ranging):
     """Noise of the elevation."""
 
 
-class Position3DSensor(_Ranging):
+class Position3DSensor(_Cone):
     """Position of a landmark in the sensor's frame; x is forward, z up."""
 
     type: Literal["position_3d"] = "position_3d"

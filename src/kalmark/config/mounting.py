@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, ClassVar
 
 from pydantic import Field
 
 from kalmark.config.landmarks import Association, Landmark
-from kalmark.config.sections import NotNegative, Number, Reserved, Section, Sigmas
+from kalmark.config.sections import Limit, NotNegative, Number, Reserved, Section, Sigmas
 
 Most = Annotated[int, Field(ge=0)] | None
 Count = Annotated[int, Field(ge=1)]
@@ -19,88 +20,67 @@ POSE_OF_PLANE = ("theta_rad", "sigma_xy_m", "sigma_theta_rad")
 POSE_OF_SPACE = ("z_m", "roll_deg", "pitch_deg", "yaw_deg", "sigma_position_m", "sigma_rotation_deg")
 
 
-class MountConfig(Section):
+class PlanePose(Section):
+    """A pose in the plane, and how sure it is."""
+
+    x_m: Number = 0.0
+    """Position along x: forward."""
+    y_m: Number = 0.0
+    """Position along y: to the left."""
+    theta_rad: Number = 0.0
+    """Turned to the left, from x."""
+    sigma_xy_m: NotNegative = 0.0
+    """Standard deviation of each coordinate."""
+    sigma_theta_rad: NotNegative = 0.0
+    """Standard deviation of the angle."""
+
+
+class SpacePose(Section):
+    """A pose in space, and how sure it is; turned by roll, then pitch, then yaw about the fixed axes."""
+
+    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_PLANE, _PLANE_FOR_SPACE)
+
+    x_m: Number = 0.0
+    """Position along x: forward."""
+    y_m: Number = 0.0
+    """Position along y: to the left."""
+    z_m: Number = 0.0
+    """Position along z: upwards."""
+    roll_deg: Number = 0.0
+    """Turned about x."""
+    pitch_deg: Number = 0.0
+    """Turned about y."""
+    yaw_deg: Number = 0.0
+    """Turned about z."""
+    sigma_position_m: Sigmas = 0.0
+    """Standard deviation of each coordinate; or a list of three."""
+    sigma_rotation_deg: Sigmas = 0.0
+    """Standard deviation of the rotation about each axis; or a list of three."""
+
+
+class MountConfig(PlanePose):
     """Where a sensor sits, in the robot's frame.  If either sigma is above 0, the mount is calibrated as below."""
 
     elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_SPACE, _SPACE_FOR_PLANE)
 
-    x_m: Number = 0.0
-    """Forward of the robot's origin."""
-    y_m: Number = 0.0
-    """To the left of the robot's origin."""
-    theta_rad: Number = 0.0
-    """Turned to the left."""
-    sigma_xy_m: NotNegative = 0.0
-    """Standard deviation of each coordinate."""
-    sigma_theta_rad: NotNegative = 0.0
-    """Standard deviation of the direction."""
 
-
-class SpaceMountConfig(Section):
+class SpaceMountConfig(SpacePose):
     """Where a sensor sits, in the robot's frame; turned by roll, then pitch, then yaw about the robot's axes.
 
     A camera looks along its own z axis, x to the right in its image and y down: one that looks ahead has roll -90 and
     yaw -90 deg.  If either sigma is above 0 the mount is in the map, and the filter calibrates it.
     """
 
-    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_PLANE, _PLANE_FOR_SPACE)
 
-    x_m: Number = 0.0
-    """Forward of the robot's origin."""
-    y_m: Number = 0.0
-    """To the left of the robot's origin."""
-    z_m: Number = 0.0
-    """Above the robot's origin."""
-    roll_deg: Number = 0.0
-    """Turned about x."""
-    pitch_deg: Number = 0.0
-    """Turned about y."""
-    yaw_deg: Number = 0.0
-    """Turned about z."""
-    sigma_position_m: Sigmas = 0.0
-    """Standard deviation of each coordinate; or a list of three."""
-    sigma_rotation_deg: Sigmas = 0.0
-    """Standard deviation of the rotation about each axis; or a list of three."""
-
-
-class StartConfig(Section):
+class StartConfig(PlanePose):
     """Where a robot of the plane starts, and how surely."""
 
     elsewhere: ClassVar[dict[str, str]] = dict.fromkeys((*POSE_OF_SPACE, *VELOCITY), _SPACE_FOR_PLANE)
 
-    x_m: Number = 0.0
-    """Position."""
-    y_m: Number = 0.0
-    """Position."""
-    theta_rad: Number = 0.0
-    """Heading."""
-    sigma_xy_m: NotNegative = 0.0
-    """Standard deviation of each coordinate."""
-    sigma_theta_rad: NotNegative = 0.0
-    """Standard deviation of the heading."""
 
-
-class SpaceStartConfig(Section):
+class SpaceStartConfig(SpacePose):
     """Where a robot of space starts, and how surely; turned by roll, then pitch, then yaw about the world's axes."""
 
-    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_PLANE, _PLANE_FOR_SPACE)
-
-    x_m: Number = 0.0
-    """Position."""
-    y_m: Number = 0.0
-    """Position."""
-    z_m: Number = 0.0
-    """Position."""
-    roll_deg: Number = 0.0
-    """Turned about x."""
-    pitch_deg: Number = 0.0
-    """Turned about y."""
-    yaw_deg: Number = 0.0
-    """Turned about z."""
-    sigma_position_m: Sigmas = 0.0
-    """Standard deviation of each coordinate; or a list of three."""
-    sigma_rotation_deg: Sigmas = 0.0
-    """Standard deviation of the rotation about each axis; or a list of three."""
     vx_mps: Number = 0.0
     """constant_velocity_3d: velocity in the world."""
     vy_mps: Number = 0.0
@@ -169,3 +149,12 @@ class SpaceMounted(Mounted):
 
     mount: SpaceMountConfig = SpaceMountConfig()
     """Where the sensor sits on the robot."""
+
+
+class Ranging(Section):
+    """How far a sensor sees, in the plane and in space."""
+
+    range_min_m: NotNegative = 0.0
+    """Nearest landmark the sensor sees."""
+    range_max_m: Limit = math.inf
+    """Farthest landmark the sensor sees."""

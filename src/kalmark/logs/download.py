@@ -66,6 +66,29 @@ class Dataset:
         return sum(file.bytes for file in self.files)
 
 
+@dataclass(frozen=True)
+class OwnCopy:
+    """Describe a dataset that kalmark reads and does not fetch: `put` says where a copy of one's own belongs."""
+
+    name: str
+    what: str
+    put: str
+
+
+OWN_COPIES = (
+    OwnCopy(
+        "starry_night",
+        "a stereo camera above 20 reflectors, rates, known ids, true poses and map",
+        "vincentive_dataset3.mat into KALMARK_DATA/starry_night (docs/datasets3d.md says where it is from)",
+    ),
+    OwnCopy(
+        "slamtb",
+        "recordings of the Matlab SLAM toolbox: cameras seeing points or segments, its own figures",
+        "NAME.json.gz and NAME.npz into KALMARK_ORACLE (docs/datasets3d.md)",
+    ),
+)
+
+
 @cache
 def list_data() -> tuple[Dataset, ...]:
     """Return the datasets that `fetch` knows."""
@@ -87,6 +110,9 @@ def fetch(name: str, progress: Progress | None = None) -> Path:
     have come and fit their hashes.  Raises DataError.
     """
     wanted = [dataset for dataset in list_data() if f"{dataset.name}/".startswith(f"{name.strip('/')}/")]
+    own = next((copy for copy in OWN_COPIES if copy.name == name.strip("/")), None)
+    if own is not None and not wanted:
+        raise DataError(f"dataset {own.name!r} cannot be fetched, expected a copy of your own: put {own.put}")
     if not wanted:
         names = [dataset.name for dataset in list_data()]
         raise DataError(f"dataset {name!r} is unknown, expected one of {', '.join(names)}{nearest(name, names)}")
@@ -260,7 +286,8 @@ def find_data(path: Path | str, base: Path | str | None = None) -> Path:
     known = [
         dataset.name for dataset in list_data() if f"{path.as_posix()}/".startswith(f"{dataset.name.split('/')[0]}/")
     ]
-    hint = f"; `kalmark data fetch {known[0]}` downloads it" if known else ""
-    if not os.environ.get("KALMARK_DATA"):
+    own = next((copy for copy in OWN_COPIES if path.parts[:1] == (copy.name,)), None)
+    hint = f"; `kalmark data fetch {known[0]}` downloads it" if known else f"; put {own.put}" if own else ""
+    if own is None and not os.environ.get("KALMARK_DATA"):
         hint += "; KALMARK_DATA can name a folder that has it"
     raise LogError(f"log {str(path)!r} not found, expected it at {looked}{hint}")

@@ -78,7 +78,7 @@ class Planar:
     @property
     def additive(self) -> bool:
         """Whether the noise is the same wherever the landmark is; if not, it is taken where the filter expects it."""
-        return getattr(self, "sigma_range_rel", 0.0) == 0.0
+        return True
 
     def noise_at(self, v: Array) -> Array:
         """Return the noise R (K, m, m) of measuring v (K, d): of the expected range, not of the noisy one."""
@@ -98,8 +98,28 @@ class Planar:
         """Refuse measurements (K, m) that this sensor cannot have made."""
 
 
+class _Ranging(Planar):
+    """Sensors whose first component is a range: its noise may grow with it.  [F]."""
+
+    sigma_range_m: float
+    sigma_range_rel: float
+
+    @property
+    def additive(self) -> bool:
+        """Whether the range's noise does not grow with it."""
+        return self.sigma_range_rel == 0.0
+
+    def range_variance(self, y: Array) -> Array:
+        """Return a^2 + (b range)^2 (K,) of measurements y (K, m)."""
+        return np.asarray(self.sigma_range_m**2 + (self.sigma_range_rel * y[:, 0]) ** 2)
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
 @dataclass(frozen=True)
-class RangeBearing(Planar):
+class RangeBearing(_Ranging):
     """Range (m) and bearing (rad), a laser.  sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61)."""
 
     sigma_range_m: float = 0.1
@@ -118,17 +138,13 @@ class RangeBearing(Planar):
         if self.sigma_range_rel == 0.0:
             return constant((self.sigma_range_m**2, self.sigma_bearing_rad**2), len(y))
         R = np.zeros((len(y), 2, 2))
-        R[:, 0, 0] = self.sigma_range_m**2 + (self.sigma_range_rel * y[:, 0]) ** 2
+        R[:, 0, 0] = self.range_variance(y)
         R[:, 1, 1] = self.sigma_bearing_rad**2
         return R
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return points v (K, 2) and V_y (K, 2, 2).  [S] (62)."""
         return inv_scan_many(np.ascontiguousarray(y))
-
-    def check(self, y: Array) -> None:
-        """Refuse negative ranges."""
-        refuse_negative_ranges(y)
 
 
 @dataclass(frozen=True)
@@ -150,7 +166,7 @@ class Bearing(Planar):
 
 
 @dataclass(frozen=True)
-class Range(Planar):
+class Range(_Ranging):
     """Range (m) alone: a radio beacon, a sonar with a wide lobe; sigmas as in `RangeBearing`."""
 
     sigma_range_m: float = 0.1
@@ -165,11 +181,7 @@ class Range(Planar):
 
     def noise(self, y: Array) -> Array:
         """Return R (K, 1, 1)."""
-        return (self.sigma_range_m**2 + (self.sigma_range_rel * y) ** 2)[:, :, None]
-
-    def check(self, y: Array) -> None:
-        """Refuse negative ranges."""
-        refuse_negative_ranges(y)
+        return self.range_variance(y)[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -196,7 +208,7 @@ class Position2D(Planar):
 
 
 @dataclass(frozen=True)
-class RangeBearingSignature(Planar):
+class RangeBearingSignature(_Ranging):
     """Range (m), bearing (rad) and a signature that tells landmarks apart.  [T] 3: a landmark is (x, y, s)."""
 
     sigma_range_m: float = 0.1
@@ -214,7 +226,7 @@ class RangeBearingSignature(Planar):
     def noise(self, y: Array) -> Array:
         """Return R (K, 3, 3)."""
         R = np.zeros((len(y), 3, 3))
-        R[:, 0, 0] = self.sigma_range_m**2 + (self.sigma_range_rel * y[:, 0]) ** 2
+        R[:, 0, 0] = self.range_variance(y)
         R[:, 1, 1] = self.sigma_bearing_rad**2
         R[:, 2, 2] = self.sigma_signature**2
         return R
@@ -225,10 +237,6 @@ class RangeBearingSignature(Planar):
         V_y = np.zeros((len(y), 3, 3))
         V_y[:, :2, :2], V_y[:, 2, 2] = P_y, 1.0
         return np.column_stack([p, y[:, 2]]), V_y
-
-    def check(self, y: Array) -> None:
-        """Refuse negative ranges."""
-        refuse_negative_ranges(y)
 
 
 BUILT_IN = (RangeBearing, Bearing, Range, Position2D, RangeBearingSignature)

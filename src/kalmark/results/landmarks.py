@@ -53,9 +53,8 @@ class MapLandmarks:
     def of(cls, slam: Slam) -> MapLandmarks:
         """Return the places of the landmarks of a filter's map."""
         table = slam.landmarks()
-        ends = getattr(slam, "_ends", {})
         rows = zip(table.ids, table.means, table.covariances, strict=True)
-        places = [place(slam._kinds[i], mean, cov, ends.get(i)) for i, mean, cov in rows]
+        places = [place(slam.landmark_model(i), mean, cov, slam.segment_ends(i)) for i, mean, cov in rows]
         return cls(
             list(table.ids),
             list(table.kinds),

@@ -122,7 +122,7 @@ class _Recorder:
             self.maps.append(self._snapshot())
 
     def _kind(self, name: Id | None) -> str:
-        model = self.slam._kinds.get(name) if name is not None else None
+        model = self.slam.landmark_model(name) if name is not None else None
         return "" if model is None else model.kind
 
     def _snapshot(self) -> MapSnapshot:

@@ -1,4 +1,4 @@
-"""The boundary: what a model, a covariance and a scan must be before they are let in."""
+"""The boundary: what models, covariances and events must be before they are let in."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from kalmark.errors import EventError, KalmarkError, ModelError
 from kalmark.models.protocols import Sensor
-from kalmark.slam.events import Scan, finite, seconds, shown
+from kalmark.slam.events import Control, Fix, Scan, finite, shown, when
 
 Array = npt.NDArray[np.float64]
 
@@ -45,21 +45,48 @@ def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[Kalma
         raise error(f"{what} has the eigenvalue {lowest[np.argmax(bad)]:.3g}, expected a {kind} matrix")
 
 
+def numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -> Array:
+    """Return a copy of (size,) finite numbers; raise `error` if it is anything else."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise error(f"{what} is {value!r}, expected {size} finite numbers") from None
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise error(f"{what} is {array.tolist()}, expected {size} finite numbers")
+    return array
+
+
+def refuse_bad_control(event: Control, columns: tuple[str, ...]) -> None:
+    """Refuse a control that is not of these components, or whose own noise is no covariance."""
+    if event.u.shape != (len(columns),):
+        raise EventError(f"{when(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
+    if event.cov is not None:
+        covariance(event.cov, len(columns), f"{when(event)}: cov", definite=False)
+
+
+def refuse_bad_fix(event: Fix, size: int) -> None:
+    """Refuse a fix that is not a position (size,) with its covariance."""
+    if event.y.shape != (size,):
+        expected = "x and y in m" if size == 2 else "x, y and z in m"
+        raise EventError(f"{when(event)}: y has shape {event.y.shape}, expected ({size},): {expected}")
+    covariance(event.cov, size, f"{when(event)}: cov", definite=True)
+
+
 def measurements(event: Scan, sensor: Sensor) -> Array:
     """Return the noise R (K, p, p) of a scan's innovations, refusing measurements its sensor cannot have made."""
     m, count = len(sensor.columns), len(event.y)
     if event.width != m and (count or event.width):
         expected = f"expected {m}: {', '.join(sensor.columns)}"
-        raise EventError(f"scan at t={seconds(event.t_ns)} s: y has {event.width} columns, {expected}")
+        raise EventError(f"{when(event)}: y has {event.width} columns, {expected}")
     check = getattr(sensor, "check", None)
     if check is not None and count:
         try:
             check(event.y)
         except EventError as error:
-            raise EventError(f"scan at t={seconds(event.t_ns)} s: {error}") from None
+            raise EventError(f"{when(event)}: {error}") from None
     if event.cov is None:
         return sensor.noise(event.y) if count else np.zeros((0, m, m))
-    what, p = f"scan at t={seconds(event.t_ns)} s: cov", getattr(sensor, "cov_size", m)
+    what, p = f"{when(event)}: cov", getattr(sensor, "cov_size", m)
     if event.cov.shape not in ((p, p), (count, p, p)):
         raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
     _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)

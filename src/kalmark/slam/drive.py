@@ -15,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import EventError
+from kalmark.geometry.angles import rotation
+from kalmark.geometry.rotations import matrix
 from kalmark.models.protocols import Motion
 from kalmark.slam.events import Control
 
@@ -83,3 +85,15 @@ class Drive:
         part = self.advance(control.t_ns, last=True)
         self.t_ns, self.u, self.N, self.fresh = control.t_ns, control.u, N, True
         return [] if part is None else [part]
+
+
+def body_axes(state: Array) -> Array:
+    """Return what turns an error from the robot's frame into the world's: (3, 3) in the plane, (6 or more) in space."""
+    if len(state) == 3:
+        G = np.eye(3)
+        G[:2, :2] = rotation(state[2])
+        return G
+    G = np.eye(len(state) - 1)
+    turned = min(9, len(G))  # position, orientation and velocity; a body rate is in the robot's frame anyway
+    G[:turned, :turned] = np.kron(np.eye(turned // 3), matrix(state[3:7]))
+    return G

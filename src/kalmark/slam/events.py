@@ -249,6 +249,11 @@ Event = Control | Scan | Fix
 _RANK = {Control: 0, Scan: 1, Fix: 2}
 
 
+def when(event: Event) -> str:
+    """Return what kind of event it is and its time, for an error's line."""
+    return f"{type(event).__name__.lower()} at t={seconds(event.t_ns)} s"
+
+
 def order(event: Event) -> tuple[int, int, str, str]:
     """Sort key of events: time, then Control, Scan, Fix, then robot, then sensor (a stable sort keeps arrival)."""
     return event.t_ns, _RANK[type(event)], event.robot, event.sensor if isinstance(event, Scan) else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -28,6 +29,15 @@ class Observation(NamedTuple):
     landmark: Id | None
     d2: float | None
     reason: str
+
+
+def judged(index: int, id_: Id | None, name: Any, d2: float, fused: bool, gate: float) -> Observation:
+    """Return what became of an observation that was compared with the landmark `name`; NaN if it could not be."""
+    if fused:
+        return Observation(index, id_, "associated", name, d2, "")
+    if math.isnan(d2):
+        return Observation(index, id_, "rejected", name, None, "nothing can be expected of it from here")
+    return Observation(index, id_, "rejected", name, d2, f"outside the gate of {gate:.2f}")
 
 
 class Report:

@@ -103,6 +103,11 @@ class Robot:
             object.__setattr__(self, "cov", _cov(self.cov, pose, space, f"{what}: cov"))
 
 
+def mount_name(robot: str, sensor: str) -> str:
+    """Return the name of a sensor's mount in the map."""
+    return f"{robot}.{sensor}"
+
+
 def _state(value: Any, pose: int, space: Space, what: str) -> Array:
     """Return a start of a motion's space: the whole state, or a pose, the rest of it zero."""
     try:

@@ -128,6 +128,14 @@ class View:
         Z, d2, _ = innovation(map_.P, index, E_h, E_l, R, z)
         return Z, d2
 
+    def information(
+        self, map_: StochasticMap, robot: int, look: Look, slots: Index, event: Scan, rows: list[int], R: Array
+    ) -> Array:
+        """Return how much the observations `rows` tell of the blocks `slots`: log |Z| / |R| (K,), -inf if unknown."""
+        noise = self.noise(map_, robot, look, slots, R, event)
+        Z, _ = self.predict(map_, robot, look, slots, event.y[rows], noise)
+        return np.nan_to_num(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(noise)[1], nan=-np.inf)
+
     def explain(self, map_: StochasticMap, robot: int, event: Scan, k: int, R: Array) -> tuple[Array, Array, Array]:
         """Return the landmark (n,) that explains the k-th observation, whose noise is R, and how it came about.
 
@@ -185,15 +193,15 @@ class Scene:
 
     def candidates(self) -> list[Id]:
         """Return the ids of the landmarks this sensor could have seen."""
-        return self._slam.landmark_ids(self._view)
+        return self._slam.members.in_reach(self._view)
 
     def distances(self, candidates: list[Id]) -> Array:
         """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83)."""
-        map_, view, event = self._slam.map, self._view, self._event
-        robot = self._slam.slot(event.robot)
+        map_, members, view, event = self._slam.map, self._slam.members, self._view, self._event
+        robot = members.slots[event.robot]
         d2 = np.empty((len(event.y), len(candidates)))
-        for look, columns in self._slam.by_look(view, candidates):
-            slots = np.array([self._slam.slot(candidates[i]) for i in columns])
+        for look, columns in members.by_look(view, candidates):
+            slots = members.slots_of([candidates[i] for i in columns])
             there = view.noise(map_, robot, look, slots, NOTHING, event)
             for k, y in enumerate(event.y):
                 R = np.tile(self._R[k], (len(slots), 1, 1)) if there is NOTHING else there

@@ -3,13 +3,13 @@
 robot moves             -> _move         prediction          [S] (14)-(17)
 sensor sees known ones  -> _correct      correction          [S] (26)-(30)
 sensor sees new ones    -> _initialize   augmentation        [S] (32)-(38)
-depth has become clear  -> _simplify     reparametrisation   [TB] 4.4
 landmark is removed     -> remove        reduction           [S] Table 1
+
+`association` says which landmark was seen, `members` who is in the map, `lifecycle` what becomes of landmarks later.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,20 +21,19 @@ from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.filter.estimators import Estimator, Invariant
 from kalmark.filter.kernels import all_finite
 from kalmark.filter.map import StochasticMap
-from kalmark.geometry.angles import rotation
-from kalmark.geometry.rotations import matrix
-from kalmark.geometry.spaces import MOUNTS, POINT3, Rn
-from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.geometry.spaces import MOUNTS, Rn
+from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
+from kalmark.slam import lifecycle
 from kalmark.slam.association import NEW, Association, ByIdentity, Decision
-from kalmark.slam.checks import covariance, measurements
-from kalmark.slam.drive import Drive, Part
-from kalmark.slam.ends import extended_ends
-from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds
-from kalmark.slam.report import LandmarkTable, Observation, Report
-from kalmark.slam.robot import Robot
-from kalmark.slam.scene import ROBOT, Look, Scene, View
+from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
+from kalmark.slam.drive import Drive, Part, body_axes
+from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
+from kalmark.slam.members import Members
+from kalmark.slam.report import LandmarkTable, Observation, Report, judged
+from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.scene import Look, Scene, View
 
 Array = npt.NDArray[np.float64]
 
@@ -68,14 +67,9 @@ class Slam:
         self.map = StochasticMap()
         self.landmark_type = landmarks
         self.reparametrize = reparametrize
-        self._slots: dict[Id, int] = {}  # every robot and landmark by name
+        self.members = Members(self.robots)
         self._drives: dict[str, Drive] = {}
         self._errors: dict[str, int] = {}  # the block of a held control's error, while a scan has split its interval
-        self._kinds: dict[Id, Landmark] = {}
-        self._seen: dict[Id, int] = {}
-        self._searched: dict[Id, list[int]] = {}  # in how many scans a landmark was looked for, and found
-        self._ends: dict[Id, Array] = {}  # of the segments seen of lines
-        self._unnamed = 0
         self._views: dict[tuple[str, str], View] = {}
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
         for robot in robots:
@@ -88,12 +82,13 @@ class Slam:
             raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
         self.robots[robot.name] = robot
         self.refuse_other_world(f"robot {robot.name!r}", robot.motion.space.world)
-        self._slots[robot.name] = self.map.add(robot.motion.space, robot.start, robot.cov)
+        self.members.slots[robot.name] = self.map.add(robot.motion.space, robot.start, robot.cov)
         self._drives[robot.name] = Drive(robot.motion)
         for name, mount in robot.sensors.items():
             slot, cov = -1, mount.covariance(6 if len(mount.at) == 7 else 3, name)
             if cov is not None:  # the mount calibrates itself
-                slot = self._slots[mount_name(robot.name, name)] = self.map.add(MOUNTS[len(mount.at)], mount.at, cov)
+                slot = self.map.add(MOUNTS[len(mount.at)], mount.at, cov)
+                self.members.slots[mount_name(robot.name, name)] = slot
             self._views[robot.name, name] = View(mount, landmarks, self, slot)
 
     # ------------------------------------------------------------------ events
@@ -107,10 +102,10 @@ class Slam:
             raise EventError(f"got {type(event).__name__}, expected a Control, a Scan or a Fix")
         before = self.t_ns
         if before is not None and event.t_ns < before:
-            raise EventError(f"{_when(event)} comes after one at t={seconds(before)} s")
+            raise EventError(f"{when(event)} comes after one at t={seconds(before)} s")
         if event.robot not in self.robots:
             names = sorted(self.robots)
-            raise EventError(f"{_when(event)}: robot is {event.robot!r}, expected one of {names}")
+            raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
         try:
             return take(event)
         except EventError:
@@ -119,12 +114,7 @@ class Slam:
 
     def _control(self, event: Control) -> Report:
         drive = self._drives[event.robot]
-        size = len(drive.motion.columns)
-        if event.u.shape != (size,):
-            expected = ", ".join(drive.motion.columns)
-            raise EventError(f"{_when(event)}: u has shape {event.u.shape}, expected ({expected})")
-        if event.cov is not None:
-            covariance(event.cov, size, f"{_when(event)}: cov", definite=False)
+        refuse_bad_control(event, drive.motion.columns)
         self.t_ns = event.t_ns
         with drive.kept_on_error():
             for part in drive.accept(event):
@@ -136,7 +126,7 @@ class Slam:
         view = self._views.get((event.robot, event.sensor))
         if view is None:
             names = sorted(self.robots[event.robot].sensors)
-            raise EventError(f"{_when(event)}: sensor is {event.sensor!r}, expected one of {names}")
+            raise EventError(f"{when(event)}: sensor is {event.sensor!r}, expected one of {names}")
         event = event if view.detector is None else view.detector(event)
         R = measurements(event, view.sensor)
         self.t_ns = event.t_ns
@@ -152,16 +142,11 @@ class Slam:
         return self._fuse(event, view, ids, decisions, R)
 
     def _fix(self, event: Fix) -> Report:
-        what = _when(event)
-        pose = 3 if self.robots[event.robot].motion.space.axes == 1 else 7
-        size = 2 if pose == 3 else 3
-        if event.y.shape != (size,):
-            expected = "x and y in m" if size == 2 else "x, y and z in m"
-            raise EventError(f"{what}: y has shape {event.y.shape}, expected ({size},): {expected}")
-        covariance(event.cov, size, f"{what}: cov", definite=True)
+        pose, size = (3, 2) if self.robots[event.robot].motion.space.axes == 1 else (7, 3)
+        refuse_bad_fix(event, size)
         self.t_ns = event.t_ns
         self._advance(event.robot)
-        slot, report = self._slots[event.robot], Report(event, event.y.reshape(1, size))
+        slot, report = self.members.slots[event.robot], Report(event, event.y.reshape(1, size))
         gate = self.association.threshold(size, self.estimator.default_gate)
         view, estimator, R = fix_view(ORIGIN[pose]), self.estimator.for_fixes(), event.cov.reshape(1, size, size)
         done = estimator.correct(self.map, view, slot, -1, np.array([slot]), 0, report.y, R, gate)
@@ -183,7 +168,7 @@ class Slam:
 
     def _move(self, name: str, part: Part) -> None:
         """Predict: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
-        slot, motion = self._slots[name], self.robots[name].motion
+        slot, motion = self.members.slots[name], self.robots[name].motion
         error = self._errors.get(name)
         r, index = self.map.mean(slot), self.map.index(slot)
         u = part.u if error is None else part.u + self.map.mean(error)
@@ -191,8 +176,8 @@ class Slam:
         F = self.estimator.pose_jacobian(self.map, slot, F)
         Q = R_u @ part.N @ R_u.T
         if not all_finite(moved, F, Q):
-            when = f"{name!r} at t={seconds(self.t_ns or 0)} s"
-            raise EventError(f"{when}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
+            what = f"{name!r} at t={seconds(self.t_ns or 0)} s"
+            raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
         if error is None and part.N.any() and not (part.first and part.last):
             error = self._errors[name] = self.map.add(Rn(len(u)), np.zeros(len(u)), part.N)
         if error is not None:  # the control's error is a block of the map, common to all parts of its interval
@@ -201,7 +186,7 @@ class Slam:
             Q = np.zeros((len(index), len(index)))
         D = motion.diffusion(part.u, part.dt_s)
         if D is not None:
-            G = _body_axes(moved)
+            G = body_axes(moved)
             Q[: len(G), : len(G)] += G @ D @ G.T
         self.map.predict(index, F, Q)
         self.map.set_predicted(slot, moved)
@@ -217,16 +202,16 @@ class Slam:
     ) -> Report:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
         report = Report(event, event.y)
-        known = [k for k, (name, _) in enumerate(decisions) if self._seen_by(view, event.robot, name)]
+        known = [k for k, (name, _) in enumerate(decisions) if self.members.known_to(view, event.robot, name)]
         outcomes: list[Observation | None] = [None] * len(decisions)
         report.blank(view.dof)
         for seen in self._correct(event, report, view, known, ids, decisions, R):
             outcomes[seen.index] = seen
-        fused = [o.landmark for o in outcomes if o is not None and o.outcome == "associated"]
-        self._simplify(view, event.robot, fused)
-        self._extend(view, event, outcomes)
+        matched = [o for o in outcomes if o is not None]
+        lifecycle.simplify(self, view, event.robot, [o.landmark for o in matched if o.outcome == "associated"])
+        lifecycle.extend(self, view, event, matched)
         if view.attention.delete:
-            report.removed = tuple(self._give_up(event, view, [o for o in outcomes if o is not None]))
+            report.removed = tuple(lifecycle.give_up(self, view, event, matched))
         new = [k for k, outcome in enumerate(outcomes) if outcome is None]
         reasons = self._starts(view, new, known, event.y, decisions)
         for k in new:
@@ -241,8 +226,8 @@ class Slam:
     ) -> Iterator[Observation]:  # fmt: skip
         """Fuse the observations `known` of landmarks in the map, those of one type at once.  [S] (26)-(30)."""
         names: list[Id] = [decisions[k][0] for k in known]  # type: ignore[misc]
-        robot = self._slots[event.robot]
-        groups = [(look, [known[i] for i in rows]) for look, rows in self.by_look(view, names)]
+        robot = self.members.slots[event.robot]
+        groups = [(look, [known[i] for i in rows]) for look, rows in self.members.by_look(view, names)]
         if view.attention.updates is not None and len(known) > view.attention.updates:
             for k in self._least(event, view, groups, decisions, R):
                 reason = f"not among the {view.attention.updates} that tell most"
@@ -252,7 +237,7 @@ class Slam:
         for look, rows in groups:
             if not rows:
                 continue
-            slots = np.array([self._slots[decisions[k][0]] for k in rows])  # type: ignore[index]
+            slots = self.members.slots_of([decisions[k][0] for k in rows])
             noise = view.noise(self.map, robot, look, slots, R[rows], event)
             done = self.estimator.correct(
                 self.map, look.view, robot, view.mount, slots, look.d, event.y[rows], noise, view.gate
@@ -260,39 +245,31 @@ class Slam:
             self._healthy(done.healthy, event)
             report.fill(rows, done)
             for k, d2, fused in zip(rows, done.d2.tolist(), done.fused.tolist(), strict=True):
-                yield self._judged(k, ids[k], decisions[k][0], d2, fused, view.gate)  # type: ignore[arg-type]
-
-    def _judged(self, k: int, id_: Id | None, name: Id, d2: float, fused: bool, gate: float) -> Observation:
-        if fused:
-            self._seen[name] = self._seen.get(name, 0) + 1
-            return Observation(k, id_, "associated", name, d2, "")
-        if math.isnan(d2):
-            return Observation(k, id_, "rejected", name, None, "nothing can be expected of it from here")
-        return Observation(k, id_, "rejected", name, d2, f"outside the gate of {gate:.2f}")
+                self.members.count(decisions[k][0], fused)
+                yield judged(k, ids[k], decisions[k][0], d2, fused, view.gate)
 
     def _least(
         self, event: Scan, view: View, groups: list[tuple[Look, list[int]]], decisions: Sequence[Decision], R: Array
     ) -> list[int]:
-        """Take out of the groups what is not worth a correction and return it; a measurement tells log |Z| / |R|."""
-        robot, rows, told = self._slots[event.robot], [], []
-        for look, members in groups:
-            slots = np.array([self._slots[decisions[k][0]] for k in members])  # type: ignore[index]
-            noise = view.noise(self.map, robot, look, slots, R[members], event)
-            Z, _ = view.predict(self.map, robot, look, slots, event.y[members], noise)
-            rows += members
-            told += (np.linalg.slogdet(Z)[1] - np.linalg.slogdet(noise)[1]).tolist()
-        worth = view.attention.worth_a_correction(np.nan_to_num(np.array(told), nan=-np.inf))
-        least = [k for k, good in zip(rows, worth, strict=True) if not good]
-        for _, members in groups:
-            members[:] = [k for k in members if k not in least]
+        """Take out of the groups what is not worth a correction and return it."""
+        robot, order, told = self.members.slots[event.robot], [], []
+        for look, rows in groups:
+            slots = self.members.slots_of([decisions[k][0] for k in rows])
+            order += rows
+            told += view.information(self.map, robot, look, slots, event, rows, R[rows]).tolist()
+        worth = view.attention.worth_a_correction(np.array(told))
+        least = [k for k, good in zip(order, worth, strict=True) if not good]
+        for _, rows in groups:
+            rows[:] = [k for k in rows if k not in least]
         return least
 
     def _starts(
         self, view: View, new: list[int], known: list[int], y: Array, decisions: Sequence[Decision]
     ) -> dict[int, str]:
         """Return why some of the observations that could start landmarks do not."""
-        wanted = [k for k in new if decisions[k][0] is not None and decisions[k][0] not in self._slots]
-        return view.attention.worth_a_start(wanted, known, y, getattr(view.sensor, "image", None), not self._kinds)
+        wanted = [k for k in new if decisions[k][0] is not None and decisions[k][0] not in self.members.slots]
+        image, empty = getattr(view.sensor, "image", None), not self.members.kinds
+        return view.attention.worth_a_start(wanted, known, y, image, empty)
 
     def _initialize(
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
@@ -302,12 +279,12 @@ class Slam:
             return Observation(k, id_, "ignored", None, None, reason)
         if name == event.robot:
             return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
-        if name in self._slots:
+        if name in self.members.slots:
             return Observation(k, id_, "rejected", name, None, f"it is no {view.landmark.kind}")
         if not view.starts:
             kind = type(view.sensor).__name__
             return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
-        robot = self._slots[event.robot]
+        robot = self.members.slots[event.robot]
         l, L_h, Q = view.explain(self.map, robot, event, k, R[k])
         if l.shape != (view.landmark.space.size,):
             found = f"it finds {len(l)} numbers, a {view.landmark.kind} has {view.landmark.space.size}"
@@ -315,88 +292,14 @@ class Slam:
         if not (np.isfinite(l).all() and np.isfinite(L_h).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
         if name is NEW:
-            name = self._new_name()
+            name = self.members.new_name()
         G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
-        self._slots[name] = self.map.augment(view.landmark.space, l, index, G, Q)
-        self._kinds[name] = view.landmark
-        self._seen[name] = 1
-        if hasattr(view.landmark, "first_ends"):
-            self._ends[name] = np.array(view.landmark.first_ends)
+        self.members.start(name, self.map.augment(view.landmark.space, l, index, G, Q), view.landmark)
         return Observation(k, id_, "new", name, None, reason)
-
-    def _simplify(self, view: View, robot: str, names: Sequence[Id | None]) -> None:
-        """Make Euclidean points of those whose depth has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4."""
-        for name in names if self.reparametrize is not None else ():
-            kind: Any = self._kinds.get(name)  # type: ignore[arg-type]
-            if not hasattr(kind, "linearity"):
-                continue
-            slot = self._slots[name]  # type: ignore[index]
-            l, index = self.map.mean(slot)[None], self.map.index(slot)
-            sigma = np.sqrt(np.maximum(self.map.P[index[-1:], index[-1]], 0.0))
-            T = view.pose(self.map, self._slots[robot])
-            if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < self.reparametrize:
-                p, P_l = kind.to_point(l)
-                self._slots[name] = self.map.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3)))  # type: ignore[index]
-                self._kinds[name] = Point3D()  # type: ignore[index]
-                self.map.remove(slot)
-
-    def _extend(self, view: View, event: Scan, outcomes: Sequence[Observation | None]) -> None:
-        """Let the segments seen of lines grow by what was seen of them."""
-        for outcome in outcomes:
-            name = outcome.landmark if outcome is not None and outcome.outcome == "associated" else None
-            kind: Any = self._kinds.get(name)  # type: ignore[arg-type]
-            if name in self._ends and kind.extend:
-                T, l, P = view.pose(self.map, self._slots[event.robot]), self.mean(name), self.covariance(name)
-                y = event.y[outcome.index]  # type: ignore[union-attr]
-                self._ends[name] = extended_ends(view.sensor, kind, T, l, P, self._ends[name], y)
-
-    def _give_up(self, event: Scan, view: View, seen: list[Observation]) -> Iterator[tuple[Id, str]]:
-        """Count what should have been seen and what was; remove the landmarks that are hopeless.  [TB] 4.4."""
-        found = {o.landmark: o.outcome for o in seen}
-        names = self.landmark_ids(view)
-        robot = self._slots[event.robot]
-        for look, rows in self.by_look(view, names):
-            ends = [self._ends.get(names[i]) for i in rows]
-            for i in view.in_sight(self.map, robot, look, [self._slots[names[i]] for i in rows], ends).tolist():
-                name = names[rows[i]]
-                if found.get(name) == "ignored":
-                    continue
-                counts = self._searched.setdefault(name, [1, 1])
-                counts[0] += 1
-                counts[1] += name in found
-                reason = view.attention.hopeless(counts[0], counts[1], self._seen.get(name, 0))
-                if reason:
-                    self.remove(name)
-                    yield name, reason
-
-    def by_look(self, view: View, names: Sequence[Id]) -> list[tuple[Look, list[int]]]:
-        """Return the indices of names grouped by how a sensor looks at them, points of known depth first."""
-        groups: dict[int, tuple[Look, list[int]]] = {}
-        for i, name in enumerate(names):
-            look = view.looks[ROBOT if name in self.robots else self._kinds[name].kind]
-            groups.setdefault(id(look), (look, []))[1].append(i)
-        return sorted(groups.values(), key=lambda group: group[0].landmark.kind != "point3")
-
-    def _seen_by(self, view: View, robot: str, name: Any) -> bool:
-        """Return whether this sensor's model applies to a block of the map."""
-        if name not in self._slots or name == robot:
-            return False
-        return (ROBOT if name in self.robots else self._kind_of(name)) in view.looks
-
-    def _kind_of(self, name: Id) -> str:
-        """Return the kind of a block that is no robot, "" for a mount."""
-        return self._kinds[name].kind if name in self._kinds else ""
-
-    def _new_name(self) -> str:
-        while True:
-            self._unnamed += 1
-            name = f"u{self._unnamed}"
-            if name not in self._slots:
-                return name
 
     def _healthy(self, healthy: bool, event: Event) -> None:
         if not healthy:
-            raise DivergedError(f"{_when(event)}: the innovation's covariance is not positive definite")
+            raise DivergedError(f"{when(event)}: the innovation's covariance is not positive definite")
 
     # ------------------------------------------------------------------ reading and editing the map
     def mean(self, name: Id) -> Array:
@@ -409,13 +312,13 @@ class Slam:
 
     def landmarks(self) -> LandmarkTable:
         """Return ids, kinds, means, covariances and numbers of observations of all landmarks."""
-        ids = list(self._kinds)
+        ids, kinds, seen = list(self.members.kinds), self.members.kinds, self.members.seen
         return LandmarkTable(
             ids=ids,
-            kinds=[self._kinds[i].kind for i in ids],
+            kinds=[kinds[i].kind for i in ids],
             means=[self.mean(i) for i in ids],
             covariances=[self.covariance(i) for i in ids],
-            observations=[self._seen.get(i, 0) for i in ids],
+            observations=[seen.get(i, 0) for i in ids],
         )
 
     def refuse_other_world(self, what: str, world: str) -> None:
@@ -424,52 +327,48 @@ class Slam:
         if world and world != here:
             raise ModelError(f"{what} is of the {world}, expected one of the {here}, where the first robot moves")
 
+    def landmark_model(self, name: Id) -> Landmark | None:
+        """Return what a landmark is, None for what is no landmark of the map."""
+        return self.members.kinds.get(name)
+
     def segment(self, name: Id) -> tuple[Array, Array]:
         """Return the ends (2, 3) of the segment seen of a line so far, and their covariances (2, 3, 3)."""
-        if name not in self._ends:
+        kind: Any = self.landmark_model(name)
+        ends = self.segment_ends(name)
+        if ends is None:
             raise MapError(f"{name!r} is no line of the map, expected one with ends")
-        kind: Any = self._kinds[name]
-        p, P_l = kind.endpoints(self.mean(name)[None], self._ends[name][None])
+        p, P_l = kind.endpoints(self.mean(name)[None], ends[None])
         return p[0], P_l[0] @ self.covariance(name) @ P_l[0].swapaxes(1, 2)
 
-    def landmark_ids(self, view: View) -> list[Id]:
-        """Return the ids of the landmarks that a sensor could see."""
-        return [i for i, kind in self._kinds.items() if kind.kind in view.looks]
+    def segment_ends(self, name: Id) -> Array | None:
+        """Return where on its line the segment seen so far ends, as abscissas (2,); None for what is no line."""
+        return self.members.ends.get(name)
 
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
         name = checked_id(name, "landmark")
         kind = landmark or next((v.landmark for v in self._views.values()), Point2D())
         self.refuse_other_world(kind.kind, kind.space.world)
-        if name in self._slots:
+        if name in self.members.slots:
             raise MapError(f"landmark {name!r} is in the map already, expected a new id")
-        try:
-            mean = np.array(mean, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise MapError(f"landmark {name!r}: mean is {mean!r}, expected {kind.space.size} finite numbers") from None
-        if mean.shape != (kind.space.size,) or not np.isfinite(mean).all():
-            raise MapError(f"landmark {name!r}: mean is {mean.tolist()}, expected {kind.space.size} finite numbers")
+        mean = numbers(mean, kind.space.size, f"landmark {name!r}: mean", MapError)
         if cov is not None:
             cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
-        self._slots[name] = self.map.add(kind.space, mean, cov)
-        self._kinds[name] = kind
+        self.members.slots[name] = self.map.add(kind.space, mean, cov)
+        self.members.kinds[name] = kind
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
         if name in self.robots:
             raise MapError(f"{name!r} is a robot, expected a landmark")
-        if name in self._slots and name not in self._kinds:
+        if name in self.members.slots and name not in self.members.kinds:
             raise MapError(f"{name!r} is a sensor's mount, expected a landmark")
         self.map.remove(self.slot(name))
-        for table in (self._slots, self._kinds, self._seen, self._searched, self._ends):
-            table.pop(name, None)
+        self.members.forget(name)
 
     def slot(self, name: Id) -> int:
         """Return the slot of a robot or landmark in `map`."""
-        slot = self._slots.get(name)
-        if slot is None:
-            raise MapError(f"{name!r} is not in the map, expected a robot or a landmark: it has {len(self._kinds)}")
-        return slot
+        return self.members.slot(name)
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:
@@ -497,25 +396,3 @@ class Slam:
         from kalmark.config import slam_from_config
 
         return slam_from_config(path)
-
-
-def _body_axes(state: Array) -> Array:
-    """Return what turns an error from the robot's frame into the world's: (3, 3) in the plane, (6 or more) in space."""
-    if len(state) == 3:
-        G = np.eye(3)
-        G[:2, :2] = rotation(state[2])
-        return G
-    G = np.eye(len(state) - 1)
-    turned = min(9, len(G))  # position, orientation and velocity; a body rate is in the robot's frame anyway
-    G[:turned, :turned] = np.kron(np.eye(turned // 3), matrix(state[3:7]))
-    return G
-
-
-def mount_name(robot: str, sensor: str) -> str:
-    """Return the name of a sensor's mount in the map."""
-    return f"{robot}.{sensor}"
-
-
-def _when(event: Event) -> str:
-    """Return what kind of event it is and its time, for an error's line."""
-    return f"{type(event).__name__.lower()} at t={seconds(event.t_ns)} s"

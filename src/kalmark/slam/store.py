@@ -25,8 +25,8 @@ from kalmark.models.protocols import Landmark
 from kalmark.slam.association import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
 from kalmark.slam.events import Id
-from kalmark.slam.robot import Robot
-from kalmark.slam.slam import Slam, mount_name
+from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
 
@@ -67,15 +67,15 @@ def _state(slam: Slam) -> State:
         "capacity": len(m.x),
         "blocks": [[space.name, list(space.kinds)] for space in spaces],
         "free": list(removed),  # of each shape the last removed is the first to be filled again
-        "slots": [[_id(name), slot] for name, slot in slam._slots.items()],
-        "kinds": [[_id(name), described(kind)] for name, kind in slam._kinds.items()],
+        "slots": [[_id(name), slot] for name, slot in slam.members.slots.items()],
+        "kinds": [[_id(name), described(kind)] for name, kind in slam.members.kinds.items()],
         "reparametrize": slam.reparametrize,
-        "searched": [[_id(name), counts] for name, counts in slam._searched.items()],
-        "ends": [[_id(name), t.tolist()] for name, t in slam._ends.items()],
-        "seen": [[_id(name), count] for name, count in slam._seen.items()],
+        "searched": [[_id(name), counts] for name, counts in slam.members.searched.items()],
+        "ends": [[_id(name), t.tolist()] for name, t in slam.members.ends.items()],
+        "seen": [[_id(name), count] for name, count in slam.members.seen.items()],
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
-        "unnamed": slam._unnamed,
+        "unnamed": slam.members.unnamed,
     }
 
 
@@ -170,14 +170,14 @@ def _array(members: dict[str, bytes], name: str, shape: tuple[int, ...]) -> Arra
 def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark | None) -> None:
     slam.map = _map(state, members)
     own = [view.landmark for view in slam._views.values()] + ([] if given is None else [given])
-    slam._kinds = {i: _kind(i, d, own) for i, d in state["kinds"]}
-    slam._slots, slam._errors = dict(map(tuple, state["slots"])), dict(state["errors"])
+    slam.members.kinds = {i: _kind(i, d, own) for i, d in state["kinds"]}
+    slam.members.slots, slam._errors = dict(map(tuple, state["slots"])), dict(state["errors"])
     for (robot, sensor), view in slam._views.items():
-        view.mount = slam._slots.get(mount_name(robot, sensor), -1)
-    slam._seen = {i: _count(count, f"observations of {i!r}") for i, count in state["seen"]}
-    slam._searched = {i: [_count(n, f"searches of {i!r}") for n in counts] for i, counts in state["searched"]}
-    slam._ends = {i: np.array(t, dtype=np.float64).reshape(2) for i, t in state["ends"]}
-    slam._unnamed = _count(state["unnamed"], "unnamed")
+        view.mount = slam.members.slots.get(mount_name(robot, sensor), -1)
+    slam.members.seen = {i: _count(count, f"observations of {i!r}") for i, count in state["seen"]}
+    slam.members.searched = {i: [_count(n, f"searches of {i!r}") for n in counts] for i, counts in state["searched"]}
+    slam.members.ends = {i: np.array(t, dtype=np.float64).reshape(2) for i, t in state["ends"]}
+    slam.members.unnamed = _count(state["unnamed"], "unnamed")
     slam.t_ns = _time(state["t_ns"])
     _check_owners(slam)
     for i, (drive, (t_ns, fresh)) in enumerate(zip(slam._drives.values(), state["drives"], strict=True)):
@@ -217,17 +217,17 @@ def _kind(name: Id, description: State, own: list[Landmark]) -> Landmark:
 def _check_owners(slam: Slam) -> None:
     """Refuse a map whose blocks are not each one robot, one landmark or one control's error, of their shapes."""
     spaces: dict[Id, Space] = {name: robot.motion.space for name, robot in slam.robots.items()}
-    spaces |= {name: kind.space for name, kind in slam._kinds.items()}
+    spaces |= {name: kind.space for name, kind in slam.members.kinds.items()}
     for (robot, sensor), view in slam._views.items():
         if view.mount >= 0:
             spaces[mount_name(robot, sensor)] = MOUNTS[len(view.at)]
     if (
-        slam.robots.keys() & slam._kinds.keys()
-        or spaces.keys() != slam._slots.keys()
-        or not spaces.keys() >= slam._seen.keys()
+        slam.robots.keys() & slam.members.kinds.keys()
+        or spaces.keys() != slam.members.slots.keys()
+        or not spaces.keys() >= slam.members.seen.keys()
     ):
         raise MapError("the slots' names are not those of the robots and landmarks")
-    owners = [(f"{name!r}", slot, spaces[name]) for name, slot in slam._slots.items()]
+    owners = [(f"{name!r}", slot, spaces[name]) for name, slot in slam.members.slots.items()]
     for name, slot in slam._errors.items():
         owners.append((f"the error of {name!r}", slot, Rn(len(slam.robots[name].motion.columns))))
     used = [i for i, space in enumerate(slam.map.spaces) if space is not None]

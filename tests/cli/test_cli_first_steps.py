@@ -9,24 +9,24 @@ from pathlib import Path
 
 import numba
 import pytest
+from command_line import Kalmark, write_log
 
 from kalmark.cli.options import COMPILING, announce_compilation, say_compiling
 from kalmark.config import load_config, shipped_configs
 from kalmark.logs import list_data
 from kalmark.simulate import load_world
-from test_cli import Kalmark, kalmark, write_log  # noqa: F401 - `kalmark` is a fixture
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def test_the_example_of_an_own_sensor_passes_the_check_that_it_names(kalmark: Kalmark) -> None:  # noqa: F811
+def test_the_example_of_an_own_sensor_passes_the_check_that_it_names(kalmark: Kalmark) -> None:
     done = kalmark("check", f"{EXAMPLES / '03_own_sensor.py'}:sonar")
     assert (done.status, done.err) == (0, "")
     assert "expect(invert(y)) = y" in done.out
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_check_finds_a_wrong_inverse_without_a_warning(kalmark: Kalmark, tmp_path: Path) -> None:  # noqa: F811
+def test_a_check_finds_a_wrong_inverse_without_a_warning(kalmark: Kalmark, tmp_path: Path) -> None:
     text = (EXAMPLES / "03_own_sensor.py").read_text().replace("np.arcsin(y[1])", "2 * np.arcsin(y[1])")
     (tmp_path / "wrong.py").write_text(text)
     done = kalmark("check", "wrong.py:sonar")
@@ -58,7 +58,7 @@ def test_compiling_is_announced_once_and_what_is_compiled_already_is_not(
 
 @pytest.mark.parametrize("world", ["two_robots", "loop_b2"])
 def test_what_simulate_leaves_runs_with_the_command_it_prints(
-    kalmark: Kalmark,  # noqa: F811
+    kalmark: Kalmark,
     tmp_path: Path,
     world: str,
 ) -> None:
@@ -81,7 +81,7 @@ def test_what_simulate_leaves_runs_with_the_command_it_prints(
     assert set(summary["robots"]) == set(fitting.robots)
 
 
-def test_config_prints_a_shipped_configuration_to_start_from(kalmark: Kalmark, tmp_path: Path) -> None:  # noqa: F811
+def test_config_prints_a_shipped_configuration_to_start_from(kalmark: Kalmark, tmp_path: Path) -> None:
     done = kalmark("config", "native")
     assert (done.status, done.err) == (0, "")
     (tmp_path / "mine.yaml").write_text(done.out)
@@ -92,7 +92,7 @@ def test_config_prints_a_shipped_configuration_to_start_from(kalmark: Kalmark, t
     assert refused.err.endswith("did you mean native?\n")
 
 
-def test_a_truth_of_other_columns_is_told_both_poses(kalmark: Kalmark, tmp_path: Path) -> None:  # noqa: F811
+def test_a_truth_of_other_columns_is_told_both_poses(kalmark: Kalmark, tmp_path: Path) -> None:
     log = write_log(tmp_path / "log")
     truth = (log / "truth.csv").read_text()
     (log / "truth.csv").write_text(truth.replace("theta_rad", "theta", 1))
@@ -103,7 +103,7 @@ def test_a_truth_of_other_columns_is_told_both_poses(kalmark: Kalmark, tmp_path:
 
 
 def test_names_of_datasets_are_whole_in_a_narrow_terminal(
-    kalmark: Kalmark,  # noqa: F811
+    kalmark: Kalmark,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")

@@ -1,0 +1,332 @@
+"""Cameras: points, stereo pairs, segments, corners of tags.  They look along z; x is right in the image, y down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import EventError, ModelError
+from kalmark.models import cameras, lenses, lines, seen, segments, tags
+from kalmark.models.parameters import check_parameters
+from kalmark.models.sensors2d import constant
+from kalmark.models.sensors3d import Spatial
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+PINHOLES = tuple(lens for lens in lenses.LENSES if lens != "omnidirectional")
+TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed
+FISHEYE = (400.0, -254.647909)  # 400 px at 90 degrees from the axis, in proportion to the angle
+FISHEYE_BACK = (
+    254.647909,
+    0.0,
+    -0.00130899694,
+    0.0,
+    -1.34575854e-09,
+    0.0,
+    -1.97650363e-15,
+    0.0,
+    -3.04801702e-21,
+    0.0,
+    -4.74790438e-27,
+    0.0,
+    -7.41305337e-33,
+    0.0,
+    -1.15807555e-38,
+    0.0,
+    -1.80940987e-44,
+    0.0,
+    -2.82717051e-50,
+)
+
+
+class _Camera(Spatial):
+    """Cameras: an image, a lens, the points in view."""
+
+    width_px: float
+    height_px: float
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point3", "inverse_depth", "anchored_homogeneous", "homogeneous")
+    finds_depth: ClassVar[bool] = False
+
+    @property
+    def image(self) -> tuple[float, float]:
+        """Width and height of the image, px."""
+        return self.width_px, self.height_px
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, 3 or 4) appear in the image, borders included."""
+        rays = np.ascontiguousarray(v[:, :3], dtype=np.float64)
+        return lenses.in_view(self.lens_code, rays, np.array(self.parameters), np.array(self.image, dtype=np.float64))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the viewing rays (K, 3), unit vectors, of pixels y (K, 2), and their Jacobian (K, 3, 2)."""
+        return lenses.back_project(self.lens_code, np.ascontiguousarray(y), np.array(self.parameters))
+
+
+class _Lens:
+    """The intrinsics of a pin-hole camera with a lens."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: float
+    height_px: float
+    lens: str
+    distortion: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check_parameters(self, noise="sigma", positive=("fx_px", "fy_px", "width_px", "height_px"))
+        if self.lens not in PINHOLES:
+            raise ModelError(f"{type(self).__name__}: lens is {self.lens!r}, expected one of {', '.join(PINHOLES)}")
+        object.__setattr__(self, "distortion", tuple(float(d) for d in self.distortion))
+        self.parameters  # noqa: B018 - a lens that folds the image over is refused here
+
+    @property
+    def lens_code(self) -> int:
+        """The code of the lens."""
+        return lenses.LENSES[self.lens]
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The numbers of the lens as `lenses.project` takes them."""
+        k = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        return lenses.parameters(self.lens, k, self.distortion, size=(self.width_px, self.height_px))
+
+
+@dataclass(frozen=True)
+class PinHole(_Lens, _Camera):
+    """Pixels (u, v) of points: a perspective camera with a lens.  [TB] pinHole.
+
+    `lens`: "radial" (coefficients of r^2, r^4, ...), "radtan" (k1, k2, p1, p2, k3), "equidistant" (k1 to k4, fish-eye).
+    """
+
+    fx_px: float = 320.0
+    fy_px: float = 320.0
+    cx_px: float = 320.0
+    cy_px: float = 240.0
+    width_px: float = 640
+    height_px: float = 480
+    lens: str = "radial"
+    distortion: tuple[float, ...] = ()
+    sigma_px: float = 1.0
+
+    code: ClassVar[int] = seen.CAMERA
+    columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
+    angular: ClassVar[tuple[bool, ...]] = (False, False)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 2, 2)."""
+        return constant((self.sigma_px**2,) * 2, len(y))
+
+
+@dataclass(frozen=True)
+class Omnidirectional(_Camera):
+    """Pixels (u, v) of points: Scaramuzza's camera; `cameras.project_omni` explains the polynomials.  [TB] omniCam."""
+
+    cx_px: float = 640.0
+    cy_px: float = 400.0
+    c: float = 1.0
+    d: float = 0.0
+    e: float = 0.0
+    projection: tuple[float, ...] = FISHEYE
+    back_projection: tuple[float, ...] = FISHEYE_BACK
+    width_px: float = 1280
+    height_px: float = 800
+    sigma_px: float = 1.0
+
+    code: ClassVar[int] = seen.CAMERA
+    columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
+    angular: ClassVar[tuple[bool, ...]] = (False, False)
+
+    def __post_init__(self) -> None:
+        check_parameters(self, noise="sigma", positive=("width_px", "height_px"))
+        for name in ("projection", "back_projection"):
+            object.__setattr__(self, name, tuple(float(a) for a in getattr(self, name)))
+
+    @property
+    def lens_code(self) -> int:
+        """The code of the lens."""
+        return lenses.OMNI
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The numbers of the lens as `lenses.project` takes them."""
+        k = (self.cx_px, self.cy_px, self.c, self.d, self.e)
+        return lenses.parameters("omnidirectional", k, self.projection, self.back_projection)
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 2, 2)."""
+        return constant((self.sigma_px**2,) * 2, len(y))
+
+
+@dataclass(frozen=True)
+class Stereo(_Camera):
+    """Pixels (u, v) of the left and (u, v) of the right camera of a rectified pair; the frame is the left camera's."""
+
+    fx_px: float = 320.0
+    fy_px: float = 320.0
+    cx_px: float = 320.0
+    cy_px: float = 240.0
+    baseline_m: float = 0.2
+    width_px: float = 640
+    height_px: float = 480
+    sigma_ul_px: float = 1.0
+    sigma_vl_px: float = 1.0
+    sigma_ur_px: float = 1.0
+    sigma_vr_px: float = 1.0
+
+    code: ClassVar[int] = seen.STEREO
+    columns: ClassVar[tuple[str, ...]] = ("ul_px", "vl_px", "ur_px", "vr_px")
+    angular: ClassVar[tuple[bool, ...]] = (False,) * 4
+    finds_depth: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_parameters(self, noise="sigma", positive=("fx_px", "fy_px", "baseline_m", "width_px", "height_px"))
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The intrinsics and the baseline."""
+        return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.baseline_m])
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 4, 4)."""
+        sigmas = (self.sigma_ul_px, self.sigma_vl_px, self.sigma_ur_px, self.sigma_vr_px)
+        return constant(tuple(s**2 for s in sigmas), len(y))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return unit rays with their inverse distances (K, 4), and their Jacobian (K, 4, 4)."""
+        return cameras.back_project_stereo_ray(np.ascontiguousarray(y), self.parameters[:4].copy(), self.baseline_m)
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, 3 or 4) appear in both images, borders included."""
+        e, _ = self.expect(v)
+        return cameras.in_image(e, v, self.image)
+
+    def check(self, y: Array) -> None:
+        """Refuse points behind the cameras, whose disparity is negative."""
+        for i, row in enumerate(y):
+            if row[0] < row[2]:
+                raise EventError(f"observation {i}: ul_px {row[0]} is less than ur_px {row[2]}, expected at least it")
+
+
+@dataclass(frozen=True)
+class Segments(_Camera):
+    """Pixels (u, v) of both ends of line segments.  [TB] Fig. 9: the innovation is two distances, `ortDst`.
+
+    The ends wander along the line, so that only the distances of the measured ends from the expected line count.
+    """
+
+    fx_px: float = 320.0
+    fy_px: float = 320.0
+    cx_px: float = 320.0
+    cy_px: float = 240.0
+    width_px: float = 640
+    height_px: float = 480
+    sigma_px: float = 1.0
+    min_length_px: float = 20.0
+
+    code: ClassVar[int] = seen.SEGMENTS
+    columns: ClassVar[tuple[str, ...]] = ("u1_px", "v1_px", "u2_px", "v2_px")
+    angular: ClassVar[tuple[bool, ...]] = (False,) * 4
+    sees_kinds: ClassVar[tuple[str, ...]] = (
+        "pluecker_line", "anchored_pluecker_line", "inverse_depth_line", "anchored_homogeneous_line",
+        "homogeneous_line",
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_parameters(self, noise="sigma", positive=("fx_px", "fy_px", "width_px", "height_px"))
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The intrinsics."""
+        return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px])
+
+    def noise(self, y: Array) -> Array:
+        """Return the noise (K, 2, 2) of the two distances."""
+        return constant((self.sigma_px**2,) * 2, len(y))
+
+    def noise_from(self, y: Array, cov: Array) -> Array:
+        """Return the noise (K, 2, 2) of the two distances, of pixels' covariances (K, 4, 4)."""
+        return lines.segment_noise(np.ascontiguousarray(y), np.ascontiguousarray(cov))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the viewing rays (K, 6) of both ends, and V_y (K, 6, 4)."""
+        none, both = np.zeros(0), np.zeros((len(y), 6, 4))
+        halves = [
+            cameras.back_project_pinhole(np.ascontiguousarray(y[:, i : i + 2]), self.parameters, none) for i in (0, 2)
+        ]
+        both[:, :3, :2], both[:, 3:, 2:] = halves[0][1], halves[1][1]
+        return np.column_stack([halves[0][0], halves[1][0]]), both
+
+    def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
+        """Return which segments from p1 to p2 (K, 3) of the world are seen from T, and their pixels in the image."""
+        size = np.array(self.image, dtype=np.float64)
+        a, b = np.ascontiguousarray(p1), np.ascontiguousarray(p2)
+        return segments.visible_segment(T, a, b, self.parameters, size, self.min_length_px)
+
+    def start_noise(self, y: Array) -> Array:
+        """Return the noise (K, 4, 4) of the pixels themselves, which starts a line."""
+        return constant((self.sigma_px**2,) * 4, len(y))
+
+    def check(self, y: Array) -> None:
+        """Refuse segments whose ends coincide."""
+        for i, row in enumerate(y):
+            if row[0] == row[2] and row[1] == row[3]:
+                raise EventError(f"observation {i}: both ends are at {row[:2].tolist()} px, expected a segment")
+
+
+@dataclass(frozen=True)
+class TagCorners(_Lens, _Camera):
+    """Pixels of the four corners of square tags, and the tags' sizes, which are known.
+
+    Corners in the tag's frame: (-s, -s), (s, -s), (s, s), (-s, s), s half the size.
+    """
+
+    fx_px: float = 320.0
+    fy_px: float = 320.0
+    cx_px: float = 320.0
+    cy_px: float = 240.0
+    width_px: float = 640
+    height_px: float = 480
+    lens: str = "radial"
+    distortion: tuple[float, ...] = ()
+    sigma_px: float = 1.0
+
+    code: ClassVar[int] = seen.TAG_CORNERS
+    cov_size: ClassVar[int] = 8
+    columns: ClassVar[tuple[str, ...]] = (
+        "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
+    )  # fmt: skip
+    angular: ClassVar[tuple[bool, ...]] = (False,) * 9
+    sees_kinds: ClassVar[tuple[str, ...]] = ("tag",)
+    finds_depth: ClassVar[bool] = True
+
+    def noise(self, y: Array) -> Array:
+        """Return R (K, 8, 8)."""
+        return constant((self.sigma_px**2,) * 8, len(y))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the tags' poses (K, 7) in the camera, and V_y (K, 6, 8).
+
+        NaN where none explains the corners, and where two do: a small tag looks like its mirror image.
+        """
+        corners, sizes = np.ascontiguousarray(y[:, :8]), np.ascontiguousarray(y[:, 8])
+        v, V_y, rms, ambiguity = tags.tag_from_corners(self.lens_code, corners, sizes, np.array(self.parameters))
+        with np.errstate(divide="ignore"):
+            worse = (2.0 * rms / self.sigma_px) ** 2 * (1.0 / ambiguity**2 - 1.0)  # chi-square of the other pose
+        v[worse < TELLING] = np.nan
+        return v, V_y
+
+    def check(self, y: Array) -> None:
+        """Refuse tags without a size."""
+        for i, size in enumerate(y[:, 8].tolist()):
+            if size <= 0:
+                raise EventError(f"observation {i}: size_m is {size}, expected a positive length")
+
+
+BUILT_IN = (PinHole, Omnidirectional, Stereo, Segments, TagCorners)

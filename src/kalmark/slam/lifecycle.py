@@ -1,0 +1,68 @@
+"""What becomes of a landmark once it is in the map: it is simplified, extended or given up.  [TB] 4.4."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.geometry.spaces import POINT3
+from kalmark.models.landmarks import Point3D
+from kalmark.slam.ends import extended_ends
+from kalmark.slam.events import Id, Scan
+from kalmark.slam.report import Observation
+from kalmark.slam.scene import View
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
+
+
+def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:
+    """Make Euclidean points of those whose depth has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4."""
+    map_, members = slam.map, slam.members
+    for name in names if slam.reparametrize is not None else ():
+        kind: Any = members.kinds.get(name)  # type: ignore[arg-type]
+        if name is None or not hasattr(kind, "linearity"):
+            continue
+        slot = members.slots[name]
+        l, index = map_.mean(slot)[None], map_.index(slot)
+        sigma = np.sqrt(np.maximum(map_.P[index[-1:], index[-1]], 0.0))
+        T = view.pose(map_, members.slots[robot])
+        if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < slam.reparametrize:
+            p, P_l = kind.to_point(l)
+            members.slots[name] = map_.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3)))
+            members.kinds[name] = Point3D()
+            map_.remove(slot)
+
+
+def extend(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation]) -> None:
+    """Let the segments seen of lines grow by what was seen of them."""
+    members = slam.members
+    for seen in outcomes:
+        name = seen.landmark if seen.outcome == "associated" else None
+        kind: Any = members.kinds.get(name)  # type: ignore[arg-type]
+        if name in members.ends and kind.extend:
+            T, l, P = view.pose(slam.map, members.slots[event.robot]), slam.mean(name), slam.covariance(name)
+            members.ends[name] = extended_ends(view.sensor, kind, T, l, P, members.ends[name], event.y[seen.index])
+
+
+def give_up(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation]) -> Iterator[tuple[Id, str]]:
+    """Count what should have been seen and what was; remove the landmarks that are hopeless, each with its reason."""
+    members = slam.members
+    found = {o.landmark: o.outcome for o in outcomes}
+    names = members.in_reach(view)
+    robot = members.slots[event.robot]
+    for look, rows in members.by_look(view, names):
+        slots, ends = [members.slots[names[i]] for i in rows], [members.ends.get(names[i]) for i in rows]
+        for i in view.in_sight(slam.map, robot, look, slots, ends).tolist():
+            name = names[rows[i]]
+            if found.get(name) == "ignored":
+                continue
+            counts = members.searched.setdefault(name, [1, 1])
+            counts[0] += 1
+            counts[1] += name in found
+            reason = view.attention.hopeless(counts[0], counts[1], members.seen.get(name, 0))
+            if reason:
+                slam.remove(name)
+                yield name, reason

@@ -1,0 +1,91 @@
+"""Who is in the map: robots, landmarks and mounts by name, the block and the kind of each, how often it was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import MapError
+from kalmark.models.protocols import Landmark
+from kalmark.slam.events import Id
+from kalmark.slam.robot import Robot
+from kalmark.slam.scene import ROBOT, Look, View
+
+Array = npt.NDArray[np.float64]
+
+
+class Members:
+    """The names of the map's blocks: `slots` of all of them, `kinds` of the landmarks alone.
+
+    Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
+    found.  `ends` are the abscissas (2,) of the segments seen of lines.
+    """
+
+    def __init__(self, robots: Mapping[str, Robot]) -> None:
+        self.robots = robots
+        self.slots: dict[Id, int] = {}
+        self.kinds: dict[Id, Landmark] = {}
+        self.seen: dict[Id, int] = {}
+        self.searched: dict[Id, list[int]] = {}
+        self.ends: dict[Id, Array] = {}
+        self.unnamed = 0
+
+    def slot(self, name: Id) -> int:
+        """Return the slot of a block.  Raises MapError if there is none of that name."""
+        slot = self.slots.get(name)
+        if slot is None:
+            raise MapError(f"{name!r} is not in the map, expected a robot or a landmark: it has {len(self.kinds)}")
+        return slot
+
+    def slots_of(self, names: Sequence[Any]) -> npt.NDArray[np.int64]:
+        """Return the slots (K,) of blocks that are in the map."""
+        return np.array([self.slots[name] for name in names])
+
+    def start(self, name: Id, slot: int, kind: Landmark) -> None:
+        """Enter a landmark that a sensor has just seen for the first time."""
+        self.slots[name], self.kinds[name], self.seen[name] = slot, kind, 1
+        if hasattr(kind, "first_ends"):
+            self.ends[name] = np.array(kind.first_ends)
+
+    def count(self, name: Any, used: bool) -> None:
+        """Count an observation of a landmark or a robot if it was used."""
+        if used:
+            self.seen[name] = self.seen.get(name, 0) + 1
+
+    def forget(self, name: Id) -> None:
+        """Strike out a landmark."""
+        for table in (self.slots, self.kinds, self.seen, self.searched, self.ends):
+            table.pop(name, None)
+
+    def new_name(self) -> str:
+        """Return a name for a landmark that has none: u1, u2, ..."""
+        while True:
+            self.unnamed += 1
+            name = f"u{self.unnamed}"
+            if name not in self.slots:
+                return name
+
+    def in_reach(self, view: View) -> list[Id]:
+        """Return the landmarks that a sensor could see."""
+        return [name for name, kind in self.kinds.items() if kind.kind in view.looks]
+
+    def known_to(self, view: View, robot: str, name: Any) -> bool:
+        """Return whether a sensor of this robot can observe what has that name in the map."""
+        return name in self.slots and name != robot and self._kind(name) in view.looks
+
+    def by_look(self, view: View, names: Sequence[Id]) -> list[tuple[Look, list[int]]]:
+        """Return the indices of names grouped by how a sensor looks at them, points of known depth first."""
+        groups: dict[int, tuple[Look, list[int]]] = {}
+        for i, name in enumerate(names):
+            look = view.looks[self._kind(name)]
+            groups.setdefault(id(look), (look, []))[1].append(i)
+        return sorted(groups.values(), key=lambda group: group[0].landmark.kind != "point3")
+
+    def _kind(self, name: Id) -> str:
+        """Return the kind of a block, "" of a mount."""
+        if name in self.robots:
+            return ROBOT
+        return self.kinds[name].kind if name in self.kinds else ""

@@ -1,0 +1,191 @@
+"""Bad input on the command line: one line, status 2, nothing left behind."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import Kalmark, refused
+
+BAD_ROWS = [
+    ("not a number", "scans.csv", 5, "0.1,rover,lidar,1,nan,0.1", "nan"),
+    ("infinite", "controls.csv", 5, "0.3,rover,inf,0.0", "inf"),
+    ("a text", "controls.csv", 5, "0.3,rover,fast,0.0", "fast"),
+    ("a negative range", "scans.csv", 5, "0.1,rover,lidar,1,-2.5,0.1", "-2.5"),
+    ("a cell too few", "scans.csv", 5, "0.1,rover,lidar,1,2.5", "5"),
+    ("a cell too many", "controls.csv", 5, "0.3,rover,0.5,0.0,7", "5"),
+    ("a truncated row", "controls.csv", 21, "1.9,rov", "2"),
+    ("a landmark twice in a scan", "scans.csv", 6, "0.1,rover,lidar,1,2.5,0.1", "1"),
+    ("time running backwards", "truth.csv", 5, "0.05,rover,0,0,0", "0.05"),
+    ("no time", "scans.csv", 5, ",rover,lidar,1,2.5,0.1", "t_s"),
+    ("no robot", "scans.csv", 5, "0.1,,lidar,1,2.5,0.1", "robot"),
+]
+
+
+@pytest.mark.parametrize(("name", "line", "row", "value"), [b[1:] for b in BAD_ROWS], ids=[b[0] for b in BAD_ROWS])
+def test_a_bad_row_is_refused_by_file_and_line(
+    kalmark: Kalmark, log: Path, tmp_path: Path, name: str, line: int, row: str, value: str
+) -> None:
+    lines = (log / name).read_text().splitlines()
+    lines[line - 1] = row
+    (log / name).write_text("\n".join(lines) + "\n")
+    message = refused(kalmark("run", "native", "--log", log))
+    assert message.startswith(f"{log / name}:{line}:")
+    assert value in message
+    assert "expected" in message
+    assert not (tmp_path / "out").exists()
+
+
+def with_columns(log: Path, name: str, header: str, cells: str) -> None:
+    first, *rows = (log / name).read_text().splitlines()
+    (log / name).write_text("\n".join([first + header, *(row + cells for row in rows)]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "header", "cells", "value"),
+    [
+        ("scans.csv", ",sigma_range_m,sigma_bearing_rad", ",0.1,0", "definite"),
+        ("scans.csv", ",sigma_range_m,sigma_bearing_rad", ",-0.1,0.1", "-0.1"),
+        ("scans.csv", ",cov_00,cov_01,cov_11", ",1,2,1", "definite"),
+        ("controls.csv", ",cov_00,cov_01,cov_11", ",1,2,1", "semidefinite"),
+    ],
+)
+def test_noise_that_is_no_covariance_is_refused(
+    kalmark: Kalmark, log: Path, tmp_path: Path, name: str, header: str, cells: str, value: str
+) -> None:
+    with_columns(log, name, header, cells)
+    message = refused(kalmark("run", "native", "--log", log))
+    assert value in message
+    assert "expected" in message
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["controls.csv", "scans.csv"])
+@pytest.mark.parametrize("text", ["", "t_s\n", "\x00\x01"], ids=["empty", "header cut off", "binary"])
+def test_an_empty_or_truncated_file_is_refused(
+    kalmark: Kalmark, log: Path, tmp_path: Path, name: str, text: str
+) -> None:
+    (log / name).write_text(text)
+    message = refused(kalmark("run", "native", "--log", log))
+    assert message.startswith(str(log / name))
+    assert "expected" in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_robot_or_sensor_without_configuration_is_refused(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
+    config = tmp_path / "my.yaml"
+    config.write_text("log: {path: log}\nrobots:\n  rovr: {motion: {type: unicycle}}\n")
+    message = refused(kalmark("run", config))
+    assert message == (
+        f"{config}:3:9: robots.rovr: got a robot that the log does not have, expected one of rover; did you mean rover?"
+    )
+    config.write_text("log: {path: log}\nrobots:\n  each: {sensors: {radar: {type: range_bearing}}}\n")
+    message = refused(kalmark("run", config))
+    assert message == (
+        f"{log}: rover has scans of the sensor 'lidar', expected one of radar; add robots.each.sensors.lidar"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_motion_that_does_not_fit_the_controls_is_refused(kalmark: Kalmark, log: Path) -> None:
+    message = refused(kalmark("run", "native", "--log", log, "--set", "robots.each.motion.type=odometry_2d"))
+    assert message == (
+        f"{log}: the controls of rover have the columns v_mps, w_radps, expected dx_m, dy_m, dtheta_rad of its motion "
+        "odometry_2d; try --set robots.each.motion.type=unicycle"
+    )
+    controls = (log / "controls.csv").read_text()
+    (log / "controls.csv").write_text(controls.replace("v_mps", "v", 1))
+    message = refused(kalmark("run", "native", "--log", log))
+    assert message == (
+        f"{log}: the controls of rover have the columns w_radps, v, expected v_mps, w_radps of its motion unicycle"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        (["run", "mrclm"], "did you mean mrclam?"),
+        (["run", "native"], "log.path: got nothing, expected the path of a log"),
+        (["run", "native", "--log", "nowhere"], "log 'nowhere' not found, expected it at"),
+        (
+            ["run", "native", "--log", "log", "--set", "log.r_max=1"],
+            "log.r_max: got 1.0, which logs of format native do",
+        ),
+        (
+            ["run", "native", "--log", "log", "--set", "log.format=nativ"],
+            "log.format: got 'nativ', expected one of nati",
+        ),
+        (
+            ["run", "native", "--log", "log", "--set", "robots.each.motion.sigma_v_mps=-1"],
+            "got -1, expected a number >=",
+        ),
+        (["run", "native", "--log", "log", "--set", "robots.each.start.sigma_xy_m=.nan"], "got nan, expected a finite"),
+        (
+            ["run", "native", "--log", "log", "--set", "log.from_s=1", "--set", "log.to_s=0"],
+            "no event from 1.0 to 0.0 s",
+        ),
+        (["run", "native", "--log", "log", "--out", "log/scans.csv"], "scans.csv is a file, expected a folder"),
+        (["run", "native", "--on-error", "ignore"], "'ignore'"),
+        (["run", "native", "--lgo", "log"], "No such option: --lgo"),
+        (["run"], "Missing argument 'CONFIG'"),
+        (["evaluate", "log"], "summary.json: no such file, expected the folder of a complete run"),
+        (["report", "nowhere"], "summary.json: no such file, expected the folder of a complete run"),
+        (["simulate", "cloistr", "--out", "x"], "did you mean cloister?"),
+        (
+            ["simulate", "cloister", "--out", "x", "--set", "steps=0"],
+            "--set steps=0: steps: got 0, expected a number >= 1",
+        ),
+        (["campaign", "cloister", "--runs", "1", "--estimator", "efk"], "did you mean ekf?"),
+        (["convert", "nowhere", "x"], "log 'nowhere' not found"),
+        (["data", "fetch", "mrclm"], "dataset 'mrclm' is unknown, expected one of"),
+        (["nonsense"], "No such command 'nonsense'"),
+        *[([verb, "x"], f"{verb} is not available yet") for verb in ("view", "diagnose", "explain", "tune", "live")],
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(
+    kalmark: Kalmark, log: Path, tmp_path: Path, arguments: list[str], what: str
+) -> None:
+    assert what in refused(kalmark(*arguments))
+    assert [path.name for path in tmp_path.iterdir()] == ["log"]
+
+
+def test_on_error_skip_counts_and_lists_what_it_leaves_out(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
+    lines = (log / "scans.csv").read_text().splitlines()
+    lines[4] = "0.1,rover,lidar,1,nan,0.1"
+    lines[7] = "0.2,rover,radar,1,2.5,0.1"
+    (log / "scans.csv").write_text("\n".join(lines) + "\n")
+    done = kalmark("run", "native", "--log", log, "--on-error", "skip")
+    assert done.status == 0
+    assert "3 left out:" in done.out
+    assert f"{log / 'scans.csv'}:5:" in done.out
+    assert "radar" in done.out
+    summary = json.loads((tmp_path / "out" / "native" / "summary.json").read_text())
+    assert (summary["skipped"], summary["observations"]) == (3, 56)
+
+
+def test_run_prints_what_to_look_at_twice_after_the_table(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
+    scans = (log / "scans.csv").read_text().splitlines()
+    nameless = [scans[0], *(",".join([*line.split(",")[:3], "", *line.split(",")[4:]]) for line in scans[1:])]
+    (log / "scans.csv").write_text("\n".join(nameless) + "\n")
+    done = kalmark("run", "native", "--log", log)
+    assert done.status == 0
+    line = "60 observations have no id and were ignored; try --set association.type=nearest"
+    assert f"warning: {line}" in done.out.splitlines()
+    assert line in json.loads((tmp_path / "out" / "native" / "summary.json").read_text())["warnings"]
+
+
+def test_a_filter_that_stops_leaves_its_folder_and_status_2(
+    kalmark: Kalmark, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from kalmark.errors import DivergedError
+    from kalmark.slam.slam import Slam
+
+    def refuse(slam: Slam, event: object) -> None:
+        raise DivergedError("the innovation is absurd")
+
+    monkeypatch.setattr(Slam, "process", refuse)
+    done = kalmark("run", "native", "--log", log)
+    assert done.status == 2
+    assert "warning: the filter stopped: the innovation is absurd" in done.out.splitlines()
+    assert (tmp_path / "out" / "native" / "summary.json").is_file()

@@ -1,0 +1,131 @@
+"""Native logs that are wrong: refused with file, line, value and expectation, or left out and listed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from native_logs import GOOD, HEAD, SCANS, native
+
+from kalmark.errors import LogError
+from kalmark.logs import open_log
+from kalmark.slam.events import Scan
+
+BAD_ROWS = {
+    "a value that is NaN": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,nan,0.3\n", 3, "range_m is 'nan'", "finite"),
+    "an infinite value": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,4,inf\n", 3, "bearing_rad is 'inf'", "finite"),
+    "text for a number": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,four,0.3\n", 3, "range_m is 'four'", "number"),
+    "an empty cell": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,,0.3\n", 3, "range_m is ''", "finite number"),
+    "a bad time": (f"{HEAD}\n{GOOD}\nsoon,rover,lidar,7,4,0.3\n", 3, "t_s is 'soon'", "seconds"),
+    "too few cells": (f"{HEAD}\n{GOOD}\n0.2,rover,li", 3, "3 cells", "expected 6"),
+    "too many cells": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,4,0.3,9\n", 3, "7 cells", "expected 6"),
+    "a negative range": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,-4.2,0.3\n", 3, "range_m is -4.2", "at least 0"),
+    "a landmark twice in a scan": (
+        f"{HEAD}\n{GOOD}\n0.1,rover,lidar,7,4,0\n",
+        3,
+        "id 7",
+        "expected each landmark once",
+    ),
+    "time running backwards": (
+        f"{HEAD}\n{GOOD}\n0.05,rover,lidar,7,4,0\n",
+        3,
+        "0.05 s after 0.1 s",
+        "never run backwards",
+    ),
+    "no robot": (f"{HEAD}\n0.1,,lidar,7,4,0\n", 2, "robot is empty", "a name"),
+    "no sensor": (f"{HEAD}\n0.1,rover,,7,4,0\n", 2, "sensor is empty", "a name"),
+    "a missing column": ("t_s,robot,sensor,range_m\n0.1,r,s,4\n", 1, "no column id", "t_s, robot, sensor, id"),
+    "a column twice": (f"{HEAD},range_m\n{GOOD},4\n", 1, "'range_m' appears 2 times", "expected"),
+    "a header and nothing else": (f"{HEAD}\n", 1, "no rows", "at least one"),
+    "an empty file": ("", 1, "empty", "expected"),
+    "blanks only": ("\n \n", 1, "empty", "expected"),
+    "a quote left open": (f'{HEAD}\n0.1,"rover,lidar,7,4.2,0.3\n', 2, "end of data", "comma separated"),
+    "half a noise": (f"{HEAD},sigma_range_m,sigma_bearing_rad\n{GOOD},0.1,\n", 2, "sigma_range_m", "sigma_bearing_rad"),
+    "noise that is negative": (f"{HEAD},sigma_range_m,sigma_bearing_rad\n{GOOD},0.1,-1\n", 2, "-1.0", "at least 0"),
+    "noise of zero": (
+        f"{HEAD},sigma_range_m,sigma_bearing_rad\n{GOOD},0.1,0\n",
+        2,
+        "eigenvalue 0",
+        "positive definite",
+    ),
+    "noise that is indefinite": (
+        f"{HEAD},cov_00,cov_01,cov_11\n{GOOD},1,2,1\n",
+        2,
+        "eigenvalue -1",
+        "positive definite",
+    ),
+    "noise with a wrong name": (f"{HEAD},cov_00,cov_01,cov_22\n{GOOD},1,0,1\n", 2, "cov_22", "cov_00, cov_01, cov_11"),
+    "noise for one of two": (
+        f"{HEAD},cov_00,cov_01,cov_11\n{GOOD},1,0,1\n0.1,rover,lidar,8,4,0,,,\n",
+        3,
+        "own noise",
+        "all",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD_ROWS)
+def test_a_bad_row_is_refused_with_file_line_value_and_expectation(what: str, tmp_path: Path) -> None:
+    text, line, value, expected = BAD_ROWS[what]
+    native(tmp_path, scans=text)
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    message = str(refused.value)
+    assert message.startswith(f"{tmp_path / 'scans.csv'}:{line}: ")
+    assert value in message and expected in message
+    assert "\n" not in message
+
+
+OTHER_FILES = {
+    "controls.csv": ("t_s,robot,v_mps,w_radps\n0.1,r,nan,0\n", 2, "v_mps is 'nan'"),
+    "controls.csv without values": ("t_s,robot,v_mps,w_radps\n0.1,r,,\n", 2, "no value in the row"),
+    "controls.csv with negative noise": ("t_s,robot,v_mps,cov_00\n0.1,r,1,-1\n", 2, "positive semidefinite"),
+    "fixes.csv": ("t_s,robot,x_m,y_m,cov_xx,cov_xy,cov_yy\n0.1,r,1,2,1,0,\n", 2, "cov_xx, cov_xy"),
+    "fixes.csv without noise": ("t_s,robot,x_m,y_m\n0.1,r,1,2\n", 1, "no column of noise"),
+    "fixes.csv with an empty noise": ("t_s,robot,x_m,y_m,sigma_x_m,sigma_y_m\n0.1,r,1,2,,\n", 2, "no noise"),
+    "truth.csv": ("t_s,robot,x_m,y_m,theta_rad\n0.1,r,1,2,x\n", 2, "theta_rad is 'x'"),
+    "truth.csv with a time twice": ("t_s,robot,x_m,y_m,theta_rad\n1,r,1,2,0\n1,r,1,2,0\n", 3, "increasing times"),
+    "truth.csv with half a pose": ("t_s,robot,x_m,y_m\n1,r,1,2\n", 1, "theta_rad"),
+    "truth.csv with a bad quaternion": ("t_s,robot,x_m,y_m,z_m,qx,qy,qz,qw\n1,r,0,0,0,0,0,0,2\n", 2, "norm 2"),
+    "landmarks.csv": ("id,x_m,y_m\n1,2,3\n1,4,5\n", 3, "already"),
+    "landmarks.csv without id": ("id,x_m,y_m\n,2,3\n", 2, "id is empty"),
+    "landmarks.csv with a typo": ("id,x_m,y_n\n1,2,3\n", 1, "did you mean 'y_n'"),
+    "gps.csv": ("t_s,robot,x_m,y_m,antenna_x_m,antenna_y_m\n1,r,0,0,1,1\n2,r,0,0,1,2\n", 3, "antenna"),
+}
+
+
+@pytest.mark.parametrize("what", OTHER_FILES)
+def test_every_other_file_is_checked_too(what: str, tmp_path: Path) -> None:
+    text, line, value = OTHER_FILES[what]
+    name = what.split(" ", maxsplit=1)[0]
+    native(tmp_path, **{name.removesuffix(".csv"): text})
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    assert str(refused.value).startswith(f"{tmp_path / name}:{line}: ")
+    assert value in str(refused.value)
+
+
+def test_a_file_cut_anywhere_inside_a_row_is_refused(tmp_path: Path) -> None:
+    whole = SCANS.rstrip("\n")
+    row = whole.rindex("\n") + 1
+    for end in range(row + 1, row + whole[row:].rindex(",") + 1):
+        native(tmp_path, scans=whole[:end])
+        with pytest.raises(LogError, match=r"scans\.csv:3: "):
+            open_log(tmp_path)
+
+
+def test_with_skip_a_bad_row_takes_its_scan_along_and_is_listed(tmp_path: Path) -> None:
+    text = f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,nan,0.3\n0.2,rover,lidar,8,4,0.3\n0.3,rover,lidar,8,4,0.3\n"
+    log = open_log(native(tmp_path, scans=text), on_error="skip")
+    scans = [event for event in log if isinstance(event, Scan)]
+    assert [scan.t_ns for scan in scans] == [100_000_000, 300_000_000]
+    assert len(log.skipped) == 2
+    assert "scans.csv:3: range_m is 'nan'" in log.skipped[0]
+    assert "t=0.200000000 s" in log.skipped[1]
+
+
+def test_a_byte_that_is_not_text_is_refused(tmp_path: Path) -> None:
+    native(tmp_path)
+    (tmp_path / "scans.csv").write_bytes(HEAD.encode() + b"\n\xff\xfe")
+    with pytest.raises(LogError, match="not text"):
+        open_log(tmp_path)
