@@ -22,10 +22,11 @@ MEASURED, NAME = "#7d838d", "#1e4d2b"
 
 
 def draw_sensor(run: Run, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> Figure:
-    """Return the figure of a camera's last scan, or of that at a step, or of the last up to a time in seconds.
+    """Return the figure of a camera's last scan, or of that at a step, or of the last up to a time.
 
     Pixels, v downwards; measurements are grey crosses or thick lines, expectations 3-sigma ellipses of Z around e or
-    thin lines.  Raises RunError if there is no such camera or scan.
+    thin lines.  `t_s`, and the time in the title, are seconds since the first scan, as in the report.  Raises RunError
+    if there is no such camera or scan.
     """
     camera, at = find(run, robot, sensor), chosen(run, robot, sensor, step, t_s)
     seen = images(run.history, camera, at)
@@ -35,7 +36,7 @@ def draw_sensor(run: Run, robot: str, sensor: str, step: int | None = None, t_s:
     grid = figure.subplots(1, len(seen), squeeze=False)[0]
     for axes, image in zip(grid, seen, strict=True):
         draw_image(axes, image, camera.size)
-    t, outcomes = run.history.t_ns[at] * 1e-9, Counter(s.outcome for s in seen[0].sightings)
+    t, outcomes = (run.history.t_ns[at] - run.history.t_ns[0]) * 1e-9, Counter(s.outcome for s in seen[0].sightings)
     said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
     figure.suptitle(
         f"{robot} · {sensor} · t = {t:.3f} s · {said}", x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK
@@ -57,7 +58,7 @@ def chosen(run: Run, robot: str, sensor: str, step: int | None = None, t_s: floa
     """Return the step of a camera's scan: the last of all, of those up to a step, or of those up to a time."""
     steps = steps_of(run.history, find(run, robot, sensor))
     if t_s is not None:
-        steps = steps[run.history.t_ns[steps] <= round(t_s * 1e9)]
+        steps = steps[run.history.t_ns[steps] - run.history.t_ns[0] <= round(t_s * 1e9)]
     if step is not None:
         steps = steps[steps <= step]
     if len(steps) == 0:

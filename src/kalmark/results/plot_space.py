@@ -27,6 +27,7 @@ GROUPS = (
 CROWD = 100  # with more landmarks than this, everything about them is drawn thinner
 FEW = 40  # landmarks that are labelled
 GROUND, SHADOW, TICK, LABEL = "#d7dbe1", "#c3c8d0", "#7a818c", "#1e4d2b"
+POSE_COLOUR = "#d62f2f"
 
 
 def draw_map(run: Run, step: int | None = None, view: str | tuple[float, float] = "normal") -> Figure:
@@ -47,7 +48,7 @@ def draw_map(run: Run, step: int | None = None, view: str | tuple[float, float] 
     at, part = 0.95 / height, tall / height
     draw_space(figure.add_axes((0.01, at - 0.3 / height, 0.9 * share, part + 0.3 / height)), scene, projection)
     draw_top(figure.add_axes((0.065 + 0.9 * share, at, 0.9 * (1 - share) + 0.02, part)), scene)
-    figure.legend(handles=legend(scene), loc="lower center", ncols=6, frameon=False, fontsize=10)
+    figure.legend(handles=legend(scene), loc="lower center", ncols=9, columnspacing=1.4, frameon=False, fontsize=10)
     return figure
 
 
@@ -168,7 +169,7 @@ def _robot_strokes(scene: Scene, robot: str, path: Array) -> list[tuple[Array, d
     return [
         (path[:, :3], {"color": colour, "linewidth": 1.3, "zorder": 6}),
         (joined(frames), {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}),
-        (joined(list(contour)), {"color": "#d62f2f", "linewidth": 0.8, "zorder": 7}),
+        (joined(list(contour)), {"color": POSE_COLOUR, "linewidth": 0.8, "zorder": 7}),
         (path[:1, :3], {**_marks("o", colour, 6, 7), "markerfacecolor": "white"}),
         (path[-1:, :3], {**_marks("o", colour, 6, 8), "markeredgecolor": "white"}),
     ]
@@ -245,16 +246,8 @@ def legend(scene: Scene) -> list[Line2D]:
     out = [Line2D([], [], color=scene.colours[r], label=r if several else "estimated path") for r in scene.paths]
     sizes = {len(l) for l in scene.true_landmarks.values()}
     if scene.truth:
-        out.append(
-            Line2D(
-                [],
-                [],
-                color=TRUTH_COLOUR,
-                linewidth=2.4,
-                alpha=0.6,
-                label="true path, true lines" if LINE in sizes else "true path",
-            )
-        )
+        label = "true path, true lines" if LINE in sizes else "true path"
+        out.append(Line2D([], [], color=TRUTH_COLOUR, linewidth=2.4, alpha=0.6, label=label))
     if scene.used:
         out.append(Line2D([], [], **_marks("x", FIX_COLOUR, 5, 1), label="fixes used"))
     if sizes - {LINE}:
@@ -264,4 +257,8 @@ def legend(scene: Scene) -> list[Line2D]:
     for group, (colour, label) in enumerate(GROUPS):
         if (scene.shapes.group == group).any():
             out.append(Line2D([], [], color=colour, marker=".", label=label))
+    if any(len(path) for path in scene.paths.values()):
+        out.append(Line2D([], [], **{**_marks("o", INK, 6, 1), "markerfacecolor": "white"}, label="start"))
+        out.append(Line2D([], [], **_marks("o", INK, 6, 1), label="end"))
+        out.append(Line2D([], [], color=POSE_COLOUR, linewidth=0.8, label=r"$3\sigma$ of the end"))
     return out

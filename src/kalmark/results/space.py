@@ -132,7 +132,7 @@ def _pyramid(camera: Camera, depth: float) -> Array:
 
 
 def _box(run: Run, picture: Picture) -> tuple[Array, Array]:
-    """Return the corners of what is to be seen: paths, truth, and the landmarks whose place is clear."""
+    """Return the corners of what is to be seen: paths, their ends' contours, truth, landmarks whose place is clear."""
     means, covariances = run.landmarks.places()
     path = np.concatenate([p[:, :3] for p in picture.paths.values()] or [np.empty((0, 3))])
     drawn, _, _, group = shapes(means, covariances, run.landmarks.kinds)
@@ -142,11 +142,23 @@ def _box(run: Run, picture: Picture) -> tuple[Array, Array]:
     distance = np.linalg.norm(np.where(known[:, None], drawn.means, np.inf) - middle, axis=1)
     clear = np.logical_and(known, np.logical_or(group == EUCLIDEANS, sigma < CLEAR * distance))
     true = [l.reshape(2, 3) if len(l) == LINE else l[None, :3] for l in picture.landmarks.values()]
-    reach = np.minimum(3 * sigma[clear], 0.1 * (float(np.ptp(path, axis=0).max()) if len(path) else 10.0))[:, None]
-    seen = [path, drawn.means[clear] - reach, drawn.means[clear] + reach, *picture.truth.values(), *true]
+    limit = 0.1 * (float(np.ptp(path, axis=0).max()) if len(path) else 10.0)
+    reach, ends = np.minimum(3 * sigma[clear], limit)[:, None], _ends(run, picture, limit)
+    seen = [path, drawn.means[clear] - reach, drawn.means[clear] + reach, ends, *picture.truth.values(), *true]
     points = np.concatenate([part[np.isfinite(part).all(axis=1)] for part in seen])
     if len(points) == 0:
         return -np.ones(3), np.ones(3)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = max(0.04 * float((high - low).max()), 0.2)
     return low - pad, high + pad
+
+
+def _ends(run: Run, picture: Picture, limit: float) -> Array:
+    """Return the corners (2 R, 3) of the robots' last positions, 3 sigma around them, but not more than `limit`."""
+    out = [np.empty((0, 3))]
+    for name, path in picture.paths.items():
+        if len(path):
+            P = run.history.pose_covariances[run.history.robot == name][-1]
+            reach = np.fmin(3 * np.sqrt(np.maximum(np.diag(P)[:3], 0.0)), limit)
+            out.append(np.array([path[-1, :3] - reach, path[-1, :3] + reach]))
+    return np.concatenate(out)

@@ -93,22 +93,26 @@ function spatialMoving(frame) {
                  hovertemplate: "%{text}: %{x:.3f}, %{y:.3f}, %{z:.3f}<br>sigma %{customdata:.3g} m<extra></extra>"});
   });
   traces.push(stroke(boxed(map.lines), GROUPS[2][0], 4, quiet), stroke(map.tags, TAG, 3, quiet));
-  for (const r of DATA.robots) {
+  DATA.robots.forEach((r, i) => {
     const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path", at = {legendgroup: r.name, ...quiet};
     traces.push(stroke({x: r.x.slice(0, n), y: r.y.slice(0, n), z: r.z.slice(0, n)}, r.colour, 4, {name, legendgroup: r.name}));
     traces.push(stroke(n ? placed(DATA.bodies[r.name], r, n - 1) : {x: [], y: [], z: []}, r.colour, 3, at));
-    traces.push(stroke(ellipsoids(r, n ? [n - 1] : [], 32), POSE, 2, at));
-  }
+    traces.push(stroke(ellipsoids(r, n ? [n - 1] : [], 32), POSE, 2,
+                       {name: "robot, 3 sigma", legendgroup: "pose", showlegend: i === 0}));
+  });
   return traces;
 }
 
 /* The picture of a map in space: a function that draws it, and the images, at a position of the slider. */
 function spatialMap() {
   const {low, high} = DATA.space, background = spatialStill();
+  const spans = high.map((v, a) => v - low[a]), unit = Math.max(...spans) / 1.05;
+  const ratio = Object.fromEntries(["x", "y", "z"].map((axis, a) => [axis, spans[a] / unit]));
   const side = (title, a) => ({title: {text: title}, range: [low[a], high[a]], backgroundcolor: "white", gridcolor: "#e6e8ec",
                                zerolinecolor: "#e6e8ec", showspikes: false});
   const page = layout({height: 640, uirevision: "map", margin: {l: 0, r: 0, t: 0, b: 0}, legend: {orientation: "h", y: 0.02, x: 0.02},
-    scene: {aspectmode: "data", uirevision: "map", xaxis: side("x (m)", 0), yaxis: side("y (m)", 1), zaxis: side("z (m)", 2),
+    scene: {aspectmode: "manual", aspectratio: ratio, uirevision: "map",
+            xaxis: side("x (m)", 0), yaxis: side("y (m)", 1), zaxis: side("z (m)", 2),
             camera: {center: {x: 0, y: 0, z: -0.18}, eye: {x: 0.95, y: -1.4, z: 0.9}, up: {x: 0, y: 0, z: 1}}, dragmode: "turntable"}});
   return frame => {
     const shown = el("map")._fullLayout?.scene?._scene;  /* the slider must not turn the view back */
@@ -165,15 +169,15 @@ function drawImage(id, camera, scan, image) {
   }
   const dots = (points, name, marker) => ({x: points.map(p => p[0]), y: points.map(p => p[1]), text: points.map(p => p[2]), name,
     mode: "markers", marker, hovertemplate: `%{text} ${name}: %{x:.1f}, %{y:.1f}<extra></extra>`, showlegend: points.length > 0});
-  const height = (el(id).clientWidth || 500) * size[1] / size[0] + 70;
+  const high = (el(id).clientWidth || 500) * size[1] / size[0];  /* below the image its ticks, then a legend of two rows at most */
   const title = `${camera.name}${image.side ? " · " + image.side : ""}${scan ? ` · ${scan.t.toFixed(2)} s` : ""}`;
   Plotly.react(id, [
     dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: MEASURED, width: 1.3}}), ...lines.values(),
     dots(marks.new, "new", {symbol: "square-open", size: 10, color: "#1e4d2b"}),
     dots(marks.rejected, "rejected", {symbol: "x-thin", size: 9, line: {color: INK, width: 1.6}}),
     {...names, mode: "text", textfont: {size: 10, color: "#1e4d2b"}, hoverinfo: "skip", showlegend: false}],
-    layout({height, title: {text: title, x: 0.01, font: {size: 13}}, margin: {l: 44, r: 10, t: 30, b: 30},
+    layout({height: high + 100, title: {text: title, x: 0.01, font: {size: 13}}, margin: {l: 44, r: 10, t: 30, b: 70},
             xaxis: {...axis(""), range: [0, size[0]], constrain: "domain", mirror: true, showline: true},
             yaxis: {...axis(""), range: [size[1], 0], scaleanchor: "x", constrain: "domain", mirror: true, showline: true},
-            showlegend: true, legend: {orientation: "h", y: -0.06, yanchor: "top", x: 0, font: {size: 11}}}), {...CONFIG, displayModeBar: false});
+            showlegend: true, legend: {orientation: "h", y: -24 / high, yanchor: "top", x: 0, font: {size: 11}}}), {...CONFIG, displayModeBar: false});
 }
