@@ -18,8 +18,9 @@ from numba.extending import register_jitable
 
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import Index, cholesky_inverse, columns, downdate, submatrix, transport
+from kalmark.filter.parallax import anchored, carried, carry_back, retract_parallax, spread, transport_parallax
 from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table, generator, retract
-from kalmark.models.observe import linearize
+from kalmark.models.observe import linearize, sensor_at
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -150,17 +151,23 @@ def iterate(
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
 
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
-    those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta').
+    those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
+    back where inverse distances are corrected by their parallax.
     """
     pose, head, axes = sizes
     k, d = len(y), (len(mean) - head) // len(y)
     theta = (3 if pose == 3 else 6) - axes
     correction = np.zeros(len(P_ss))
     turned = generator(table, mean, len(P_ss), axes, mean[:3])
+    depths = anchored(table if most > 1 else table[:0])  # a single step is worse off with it: docs/bearing_only.md
+    s, S = s_j, S_j = sensor_at(view, mean[:head])
+    h = S.shape[1]
+    baselines = (depths, s, S, spread(P_ss, np.arange(h), S, depths))
     x_j = mean
     for _ in range(most):
         _e, z, E_r, E_l = linearize(view, x_j[:head], x_j[head:].reshape(k, d), y)
         H = stacked(E_r, E_l)
+        carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
         H[:, theta : theta + axes] += H @ (generator(table, x_j, len(P_ss), axes, x_j[:3]) - turned)
         v = z.ravel() + H @ correction
         PH = P_ss @ H.T
@@ -174,6 +181,8 @@ def iterate(
         correction = step
         x_j = mean.copy()
         retract(table, x_j, correction, gauge(mean, correction, pose, axes))
+        s_j, S_j = sensor_at(view, x_j[:head])
+        retract_parallax(x_j, mean, baselines, correction, correction[:h], s_j)
         if change < tolerance:
             break
     return H, M, v, positive
@@ -191,7 +200,9 @@ def fuse(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> Array:
 def invariant(
     view: Any, map_: Map, scan: Scan, most: int
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
-    """Correct with one scan: gate, iterate, fuse, retract, transport.  docs/invariant.md.
+    """Correct with one scan: gate, iterate, fuse, retract, transport; inverse distances by their parallax.
+
+    docs/invariant.md, docs/bearing_only.md.
 
     Returns e, z, Z, d2 at the prediction, which were fused, and whether the filter can go on.
     """
@@ -210,11 +221,19 @@ def invariant(
     H, M, v, positive = iterate(view, (pose, head, axes), table, mean, submatrix(P, index), y, R, most, 1e-7)
     if not positive:
         return e, z, Z, d2, near, False
-    before = generator(atoms, x, n, axes, mean[:3])
+    before, x_before = generator(atoms, x, n, axes, mean[:3]), x.copy()
+    depths = anchored(atoms if most > 1 else atoms[:0])
+    s, S = sensor_at(view, mean[:head])
+    rows = index[: S.shape[1]]
+    baselines = (depths, s, S, spread(P, rows, S, depths))
     correction = fuse(P, n, index, H, M, v)
     retract(atoms, x, correction, gauge(mean, correction[index], pose, axes))
     at, theta = blocks[robot, 0], index[(3 if pose == 3 else 6) - axes]
     transport(P, generator(atoms, x, n, axes, x[at : at + 3]) - before, theta)
+    if len(depths):
+        s_now, S_now = sensor_at(view, observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2])
+        retract_parallax(x, x_before, baselines, correction, correction[rows], s_now)
+        transport_parallax(P, n, rows, depths, carried(x_before, x, baselines, s_now, S_now))
     return e, z, Z, d2, near, True
 
 

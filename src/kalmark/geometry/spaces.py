@@ -16,13 +16,16 @@ DIRECTION    2 / 2          of E m (azimuth, elevation of the unit vector m)    
 TURNED       4 / 3          nothing (a mount's quaternion)                      0
 HOMOGENEOUS  4 / 4          E h, rho (the point h / rho)                        -[h]x, 0
 PLUECKER     6 / 6          E n, E v (the line of direction v, moment n)        -[n]x, -[v]x
+ANCHOR       3 / 3          as VECTOR3: where inverse distances count from      -[x]x
+RHO          1 / 1          as SCALAR: the inverse of a distance to the ANCHOR  0
 ===========  =============  ==================================================  =================
 
 Orientation errors are world errors, R = Exp(d) R_hat, positions and landmarks are additive world vectors: Sola's 2-D
 coordinates and their 3-D counterpart.
 
-The last two are moved by a translation t of the world by what depends on their value, h + rho t and n + t x v, so that
-translation has a generator, too: rho I and -[v]x.  All others are moved by what does not, and need none.
+HOMOGENEOUS and PLUECKER are moved by a translation t of the world by what depends on their value, h + rho t and
+n + t x v, so that translation has a generator, too: rho I and -[v]x.  All others are moved by what does not, and need
+none.  What the invariant estimator does about inverse distances is in `filter/parallax.py`.
 """
 
 from __future__ import annotations
@@ -42,11 +45,11 @@ from kalmark.geometry.rotations import conjugate, exp, left_jacobian, log, matri
 Array = npt.NDArray[np.float64]
 Table = npt.NDArray[np.int64]
 
-SCALAR, VECTOR, HEADING, ANGLE, VECTOR3, ROTATION, DIRECTION, TURNED, HOMOGENEOUS, PLUECKER = range(10)
+SCALAR, VECTOR, HEADING, ANGLE, VECTOR3, ROTATION, DIRECTION, TURNED, HOMOGENEOUS, PLUECKER, ANCHOR, RHO = range(12)
 REMOVED = -1
-MEAN_SIZE = np.array([1, 2, 1, 1, 3, 4, 2, 4, 4, 6])
-ERROR_SIZE = np.array([1, 2, 1, 1, 3, 3, 2, 3, 4, 6])
-LINEAR = np.array([0, 0, 0, 0, 3, 0, 0, 0, 3, 6])  # leading numbers that are vectors of space
+MEAN_SIZE = np.array([1, 2, 1, 1, 3, 4, 2, 4, 4, 6, 3, 1])
+ERROR_SIZE = np.array([1, 2, 1, 1, 3, 3, 2, 3, 4, 6, 3, 1])
+LINEAR = np.array([0, 0, 0, 0, 3, 0, 0, 0, 3, 6, 3, 0])  # leading numbers that are vectors of space
 
 KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 
@@ -67,7 +70,7 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
         if kind == VECTOR:
             x[at] += p * d[k] - q * d[k + 1]
             x[at + 1] += q * d[k] + p * d[k + 1]
-        elif kind == SCALAR:
+        elif kind in (SCALAR, RHO):
             x[at] += d[k]
         elif kind in (HEADING, ANGLE):
             x[at] = wrap(x[at] + d[k])
@@ -130,12 +133,12 @@ def generator(atoms: Table, x: Array, size: int, axes: int, origin: Array) -> Ar
                 g[k + j, turn + j] = 1.0
         elif kind == DIRECTION:
             g[k : k + 2, turn:] = _direction_generator(direction_many(x[at : at + 2].reshape(1, 2))[0][0])
-        elif kind == VECTOR3 or kind >= HOMOGENEOUS:
+        elif LINEAR[kind] > 0:
             for a in range(0, LINEAR[kind], 3):
                 g[k + a, turn + 1], g[k + a, turn + 2] = x[at + a + 2], -x[at + a + 1]
                 g[k + a + 1, turn], g[k + a + 1, turn + 2] = -x[at + a + 2], x[at + a]
                 g[k + a + 2, turn], g[k + a + 2, turn + 1] = x[at + a + 1], -x[at + a]
-            if kind >= HOMOGENEOUS and axes == 6:
+            if kind in (HOMOGENEOUS, PLUECKER) and axes == 6:
                 moved = x[at + 3] * np.eye(3) if kind == HOMOGENEOUS else -skew(x[at + 3 : at + 6])
                 g[k : k + 3, :3] = moved
                 g[k : k + 3, 3:] += moved @ skew(origin)

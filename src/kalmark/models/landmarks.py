@@ -16,11 +16,13 @@ from kalmark.compiled import compiled
 from kalmark.geometry.directions import unit_many
 from kalmark.geometry.frames import from_frame_many, to_frame_many
 from kalmark.geometry.spaces import (
+    ANCHOR,
     DIRECTION,
     HOMOGENEOUS,
     PLUECKER,
     POINT2,
     POINT3,
+    RHO,
     SCALAR,
     SE3,
     VECTOR,
@@ -171,7 +173,7 @@ class InverseDepth3D(_Depth):
     """Anchor, azimuth and elevation of the ray, inverse depth (6).  [TB] idpPnt; Civera, Davison, Montiel 2008."""
 
     kind: ClassVar[str] = "inverse_depth"
-    space: ClassVar[Space] = Space("inverse_depth", (VECTOR3, DIRECTION, SCALAR))
+    space: ClassVar[Space] = Space("inverse_depth", (ANCHOR, DIRECTION, RHO))
     code: ClassVar[int] = seen.INVERSE_DEPTH
     _from_view = landmarks3d.inverse_depth_from_view
     _to_point = landmarks3d.inverse_depth_to_point
@@ -186,7 +188,7 @@ class AnchoredHomogeneous(_Depth):
     """Anchor, ray and inverse depth (7).  [TB] ahmPnt; Sola 2012."""
 
     kind: ClassVar[str] = "anchored_homogeneous"
-    space: ClassVar[Space] = Space("anchored_homogeneous", (VECTOR3, VECTOR3, SCALAR))
+    space: ClassVar[Space] = Space("anchored_homogeneous", (ANCHOR, VECTOR3, RHO))
     code: ClassVar[int] = seen.ANCHORED
     _from_view = landmarks3d.anchored_from_view
     _to_point = landmarks3d.anchored_to_point
@@ -321,7 +323,7 @@ class InverseDepthLine(_DepthsPrior):
     """Anchor and two inverse-depth rays (9).  [TB] idpLin."""
 
     kind: ClassVar[str] = "inverse_depth_line"
-    space: ClassVar[Space] = Space("inverse_depth_line", (VECTOR3, DIRECTION, SCALAR, DIRECTION, SCALAR))
+    space: ClassVar[Space] = Space("inverse_depth_line", (ANCHOR, DIRECTION, RHO, DIRECTION, RHO))
     code: ClassVar[int] = seen.INVERSE_DEPTH_LINE
     name: ClassVar[str] = "inverse_depth_line"
 
@@ -331,7 +333,7 @@ class AnchoredHomogeneousLine(_DepthsPrior):
     """Anchor and two rays with inverse depths (11).  [TB] ahmLin."""
 
     kind: ClassVar[str] = "anchored_homogeneous_line"
-    space: ClassVar[Space] = Space("anchored_homogeneous_line", (VECTOR3, VECTOR3, SCALAR, VECTOR3, SCALAR))
+    space: ClassVar[Space] = Space("anchored_homogeneous_line", (ANCHOR, VECTOR3, RHO, VECTOR3, RHO))
     code: ClassVar[int] = seen.ANCHORED_LINE
     name: ClassVar[str] = "anchored_homogeneous_line"
 

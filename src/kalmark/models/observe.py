@@ -112,6 +112,31 @@ def _compiled_linearize(view: Any, head: Any, l: Any, y: Any) -> Any:
     return None
 
 
+def sensor_at(view: Any, head: Array) -> tuple[Array, Array]:
+    """Return the position (2 or 3,) of the sensor of a view, and its Jacobian in the head."""
+    return position_of_mount(view[3] if isinstance(view, tuple) else view.mount, head)
+
+
+@overload(sensor_at, strict=False)  # type: ignore[untyped-decorator]
+def _compiled_sensor_at(view: Any, head: Any) -> Any:
+    return lambda view, head: position_of_mount(view[3], head)
+
+
+@compiled
+def position_of_mount(mount: Array, head: Array) -> tuple[Array, Array]:
+    """Return the position of a mount on a robot, S, and S_h, h being the pose and, if it is in the map, the mount."""
+    pose = len(mount)
+    at = head[pose:] if len(head) > pose else mount
+    size = 2 if pose == 3 else 3
+    if pose == 3:
+        T, T_r, T_s = compose(head[:pose], at)
+    else:
+        T, T_r, T_s = frames3d.compose(head[:pose], at)
+    if len(head) == pose:
+        return T[:size].copy(), T_r[:size].copy()
+    return T[:size].copy(), np.concatenate((T_r[:size], T_s[:size]), axis=1)
+
+
 @compiled
 def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """`expectation`, compiled."""
