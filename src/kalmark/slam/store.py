@@ -30,7 +30,7 @@ from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
 
-VERSION = 3
+VERSION = 4
 DESCRIPTION, SUMS = "slam.json", "sha256"
 
 
