@@ -110,7 +110,7 @@ def test_a_robot_that_coasts_starts_with_its_velocity(tmp_path: Path) -> None:
     assert slam.covariance("robot") == pytest.approx(np.diag([0.0] * 6 + [0.01, 0, 0] + [0.04] * 3))
 
 
-@pytest.mark.parametrize(("value", "linearity"), [("0.05", 0.05), ("off", None), (None, 0.1)])
+@pytest.mark.parametrize(("value", "linearity"), [("0.05", 0.05), ("off", None), (None, 0.03)])
 def test_points_become_euclidean_below_the_linearity_index_of_the_map(
     tmp_path: Path, value: str | None, linearity: float | None
 ) -> None:

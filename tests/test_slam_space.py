@@ -78,7 +78,7 @@ def test_a_camera_maps_what_it_sees_and_says_how_well(sensor: Any, landmark: Any
 
 
 def test_depth_that_has_become_clear_makes_a_euclidean_point_where_the_landmark_is() -> None:
-    slam = km.Slam([robot(km.sensors.PinHole(), km.landmarks.InverseDepth3D())])
+    slam = km.Slam([robot(km.sensors.PinHole(), km.landmarks.InverseDepth3D())], reparametrize=0.1)
     drive(slam, 60, 0)
     clear = [l for l in slam.landmarks() if l.kind == "point3"]
     assert len(clear) > 5

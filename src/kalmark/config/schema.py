@@ -127,7 +127,7 @@ class MapConfig(Section):
 
     type: Literal["auto", "dense"] = "auto"
     """`dense` keeps the full covariance; `auto` chooses."""
-    reparametrize: Linearity = 0.1
+    reparametrize: Linearity = 0.03
     """Inverse-depth and anchored points become Euclidean below this linearity index; or off."""
 
     @property

@@ -38,7 +38,7 @@ from kalmark.slam.scene import Look, Scene, View
 Array = npt.NDArray[np.float64]
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
-LINEAR = 0.1  # the linearity index of [TB]; Civera, Davison and Montiel 2008
+LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
 class Slam:
