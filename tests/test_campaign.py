@@ -121,6 +121,12 @@ def test_an_estimator_may_be_given_with_a_key_of_its_own() -> None:
     assert [*configs_of(load_world("cloister", ["filter.estimator.type=fej"]), None)] == ["fej"]
 
 
+def test_the_worlds_own_estimator_keeps_its_keys_unless_they_are_given_anew() -> None:
+    world = load_world("cloister", ["filter.estimator.type=invariant", "filter.estimator.iterations=2"])
+    configs = configs_of(world, ["invariant", "invariant:iterations=3"])
+    assert [c.estimator.iterations for c in configs.values()] == [2, 3]
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

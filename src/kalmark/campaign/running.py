@@ -97,7 +97,10 @@ def run_campaign(
 
 
 def configs_of(world: World, estimators: Sequence[str] | None) -> dict[str, Config]:
-    """Return the configuration of each estimator, by its label.  Raises ConfigError on an unknown one."""
+    """Return the configuration of each estimator, by its label; the world's own keeps the world's keys.
+
+    Raises ConfigError on an unknown one.
+    """
     base = world.config()
     if estimators is None:
         return {base.estimator.type: base}
@@ -109,7 +112,8 @@ def configs_of(world: World, estimators: Sequence[str] | None) -> dict[str, Conf
         if name not in ESTIMATORS:
             expected = f"expected one of {', '.join(ESTIMATORS)}{did_you_mean(name, ESTIMATORS)}"
             raise ConfigError(f"campaign: estimator is {label!r}, {expected}")
-        section: dict[str, Any] = {"type": name}
+        same = name == base.estimator.type
+        section: dict[str, Any] = base.estimator.model_dump() if same else {"type": name}
         for key, _, value in (pair.partition("=") for pair in keys.split(",") if pair):
             section[key.strip()] = int(value) if value.strip().isdecimal() else value
         if label in configs:
