@@ -129,6 +129,23 @@ def stacked(E_r: Array, E_l: Array) -> Array:
 
 
 @compiled
+def sparse_product(H: Array, S: Array, head: int, k: int) -> Array:
+    """Return H S, H being zero but in the columns of the head and, for each of K observations, of its landmark."""
+    q, n = len(H) // k, S.shape[1]
+    d = (H.shape[1] - head) // k
+    out = np.empty((len(H), n))
+    for r in range(len(H)):
+        own = head + r // q * d
+        row = H[r, 0] * S[0]
+        for c in range(1, head):
+            row += H[r, c] * S[c]
+        for c in range(own, own + d):
+            row += H[r, c] * S[c]
+        out[r] = row
+    return out
+
+
+@compiled
 def add_blocks(S: Array, R: Array) -> None:
     """S += blockdiag(R), R (K, p, p)."""
     k, m, _ = R.shape
@@ -170,13 +187,13 @@ def iterate(
         carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
         H[:, theta : theta + axes] += H @ (generator(table, x_j, len(P_ss), axes, x_j[:3]) - turned)
         v = z.ravel() + H @ correction
-        PH = P_ss @ H.T
-        Z = H @ PH
+        HP = sparse_product(H, P_ss, h, k)
+        Z = sparse_product(H, HP.T.copy(), h, k)
         add_blocks(Z, R)
         M, positive = cholesky_inverse(Z)
         if not positive:
             break
-        step = PH @ (M.T @ (M @ v))
+        step = HP.T @ (M.T @ (M @ v))
         change = np.abs(step - correction).max()
         correction = step
         x_j = mean.copy()
