@@ -15,10 +15,7 @@ from kalmark.simulate.robots import simulate
 from kalmark.simulate.worlds import load_world
 from kalmark.slam.events import Event
 
-ANGLES = (
-    "inverse_depth",
-    "inverse_depth_line",
-)  # azimuth and elevation: a correction turns with the world to first order
+ANGLES = ("inverse_depth", "inverse_depth_line")  # azimuth and elevation: turns with the world to first order only
 TURN = np.array([0.7, -1.1, 0.4])
 LINES = ("pluecker", "anchored_pluecker", "inverse_depth", "anchored_homogeneous", "homogeneous")
 CASES = [
@@ -35,7 +32,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("iterations", [1, 6])
-@pytest.mark.parametrize(("name", "kind", "keys"), CASES, ids=lambda value: str(value))
+@pytest.mark.parametrize(("name", "kind", "keys"), CASES, ids=str)
 def test_rotating_the_world_rotates_the_estimate(name: str, kind: str, keys: tuple[str, ...], iterations: int) -> None:
     filter_ = (f"filter.landmarks.type={kind}", "filter.estimator.type=invariant")
     world = load_world(name, ["steps=20", *filter_, f"filter.estimator.iterations={iterations}", *keys])
