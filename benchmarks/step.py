@@ -24,7 +24,7 @@ import numpy as np
 import kalmark as km
 from kalmark.filter import corrections, kernels
 from kalmark.filter.textbook import TextbookSlam
-from kalmark.models.motion import increment
+from kalmark.models.motion2d import increment
 
 SIGHTINGS = 6
 BLOCK = 25  # steps a way takes in its turn, so that each runs with its own data in the processor's cache

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+import re
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,8 @@ from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import exp, from_euler, matrix, multiply
 from kalmark.geometry.spaces import MOUNTS
 from kalmark.models import landmarks
-from kalmark.models.observe import inverse_expectation, linearize, view_of
+from kalmark.models.observe import expectation, inverse_expectation, linearize, linearize_built_in, view_of
+from kalmark.slam.scene import Look
 
 BY_KIND: dict[str, Any] = {kind.kind: kind for kind in landmarks.BUILT_IN}
 SENSORS: list[Any] = [
@@ -117,6 +122,37 @@ def test_the_jacobians_of_every_composition_are_those_of_differences(pair: Any) 
         _, _, E_r, same = linearize(view, head[:7].copy(), l[None], y)  # a mount that is not in the map
         np.testing.assert_allclose(E_r, E_h[:, :, :6], atol=1e-9 * (1 + np.abs(E_h).max()))
         np.testing.assert_allclose(same, E_l)
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=name)
+def test_the_compiled_models_called_by_address_equal_the_written_out_composition(pair: Any) -> None:
+    sensor, landmark = pair
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        head, l, y = drawn(rng, sensor, landmark)
+        r, mount, l = head[:7].copy(), head[7:].copy(), l[None]
+        told = SimpleNamespace(expect=lambda v, y=y: sensor.expect(v, y))  # y tells sizes of tags and ends of segments
+        e, E_r, E_s, E_l = expectation(r, mount, told, landmark, l)  # type: ignore[arg-type]
+        view = view_of(sensor, landmark, mount)
+        assert isinstance(view, tuple), "built-in models take the compiled way"
+        ours = linearize(view, head, l, y)
+        for mine, written in zip((ours[0], *ours[2:]), (e, np.concatenate([E_r, E_s], axis=2), E_l), strict=True):
+            np.testing.assert_allclose(mine, written, rtol=1e-12, atol=1e-12 * (1 + np.abs(written).max()))
+        for mine, plain in zip(ours, linearize_built_in.py_func(view, head, l, y), strict=True):  # type: ignore[attr-defined]
+            np.testing.assert_allclose(mine, plain, rtol=1e-12, atol=1e-12 * (1 + np.abs(plain).max()))
+
+
+def test_the_filter_is_compiled_from_no_model_but_observe_that_its_folder_is_named_after() -> None:
+    sources = [path.read_text() for path in (Path(km.__file__).parent / "filter").glob("*.py")]
+    assert {m for text in sources for m in re.findall(r"kalmark\.models[.\w]*", text)} == {"kalmark.models.observe"}
+
+
+def test_a_look_that_is_copied_to_another_process_leaves_the_addresses_behind() -> None:
+    look = Look(km.landmarks.Homogeneous(), km.sensors.PinHole(), np.array([0.0, 0, 0, 0, 0, 0, 1]))
+    assert look.view[0] and "view" in vars(look)
+    copy = pickle.loads(pickle.dumps(look))
+    assert "view" not in vars(copy)
+    assert copy.view[:4] == look.view[:4]  # in this process they are found again
 
 
 @pytest.mark.parametrize("pair", STARTS, ids=name)

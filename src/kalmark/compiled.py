@@ -1,31 +1,54 @@
-"""Compile the inner loops with numba and keep them on disk, in a folder named after the sources they come from.
+"""Compile the inner loops with numba and keep them on disk, in folders named after the sources they come from.
 
 numba checks only the file of the function itself when it looks for a stored version, not the files of what that
-function calls.  The folder therefore carries a digest of all compiled sources: an edit or an upgrade starts afresh.
+function calls.  A folder therefore carries a digest of the sources: an edit or an upgrade starts afresh.
+
+What one compiled function calls is compiled into it once more.  Where that would cost much, or where not all of it is
+ever needed, the call goes `by_address` instead: the callee is compiled once, alone, and only when it is used.  The
+filter calls the models so, hence its code does not depend on theirs: each has a folder of its own.
+
+An address holds in the process that made it, as long as the function lives.  So it is always an argument of compiled
+code, never a constant in it that the disk would keep; who is copied to another process leaves it behind and asks again.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import sys
 from collections.abc import Callable
 from functools import cache
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 import platformdirs
+from llvmlite import ir
+from numba import types
+from numba.core import event
+from numba.core.sigutils import normalize_signature
+from numba.core.typing.templates import Signature
+from numba.extending import intrinsic, overload
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; it can take a minute\n"
+
+_FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
+
+SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` calls them
+    "models": ("compiled.py", "geometry/*.py", "models/*.py"),
+    "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/*.py"),
+}
+
 
 @cache
-def cache_folder() -> str:
-    """Return the folder of the compiled code, below ``KALMARK_CACHE`` or the user's cache."""
-    digest = hashlib.sha256()
-    package = Path(__file__).parent
-    for folder in ("geometry", "models", "filter"):
-        for source in sorted((package / folder).glob("*.py")):
+def cache_folder(part: str) -> str:
+    """Return the folder of compiled code, "models" or "filter", below ``KALMARK_CACHE`` or the user's cache."""
+    digest, package = hashlib.sha256(), Path(__file__).parent
+    for pattern in SOURCES[part]:
+        for source in sorted(package.glob(pattern)):
             digest.update(source.read_bytes())
     root = os.environ.get("KALMARK_CACHE") or platformdirs.user_cache_dir("kalmark")
     return str(Path(root) / "compiled" / digest.hexdigest()[:16])
@@ -34,8 +57,75 @@ def cache_folder() -> str:
 def compiled(function: F) -> F:
     """Compile `function` with numba in nopython mode, cached on disk."""
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = cache_folder()
+    numba.config.CACHE_DIR = cache_folder("filter" if function.__module__.startswith("kalmark.filter.") else "models")
     try:
-        return numba.njit(cache=True, error_model="numpy")(function)
+        return numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     finally:
         numba.config.CACHE_DIR = before
+
+
+@cache
+def address_of(function: Any, signature: Signature) -> int:
+    """Return the address of a compiled function for arguments of a signature: compiled, or loaded from disk, now."""
+    function.compile(signature.args)
+    result = function.overloads[signature.args]
+    if result.signature.return_type != signature.return_type:
+        raise TypeError(f"{function} returns {result.signature.return_type}, expected {signature.return_type}")
+    address = int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+    _FUNCTIONS[address] = function
+    return address
+
+
+@cache
+def say_compiling() -> None:
+    """Say on stderr that this takes longer than it will the next time; once in a process."""
+    sys.stderr.write(COMPILING)
+
+
+class _Announcer(event.Listener):  # type: ignore[misc, unused-ignore]
+    """Says so when an inner loop is being compiled; one loaded from the disk is not, and many workers say nothing."""
+
+    def on_start(self, event: Any) -> None:
+        if event.data["dispatcher"].py_func.__module__.startswith("kalmark.") and parent_process() is None:
+            say_compiling()
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Announcer())
+
+
+def by_address(signature: Signature) -> Callable[[int, tuple[Any, ...]], Any]:
+    """Return a function that calls what is at an address with a tuple of arguments, from compiled code or Python."""
+    arguments_type = types.Tuple(signature.args)
+
+    def call(address: int, arguments: tuple[Any, ...]) -> Any:
+        return _FUNCTIONS[address](*arguments)
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def compiled_call(context: Any, address: Any, arguments: Any) -> Any:
+        def generate(context: Any, builder: Any, _: Any, values: Any) -> Any:
+            function = context.call_conv.get_function_type(signature.return_type, signature.args)
+            pointer = builder.inttoptr(values[0], ir.PointerType(function))
+            given = [builder.extract_value(values[1], i) for i in range(len(signature.args))]
+            status, returned = context.call_conv.call_function(
+                builder, pointer, signature.return_type, signature.args, given
+            )
+            with builder.if_then(status.is_error, likely=False):
+                context.call_conv.return_status_propagate(builder, status)
+            return returned
+
+        return signature.return_type(types.intp, arguments_type), generate
+
+    @overload(call, strict=False)  # type: ignore[untyped-decorator]  # strict: the annotations differ
+    def compiled_form(address: Any, arguments: Any) -> Any:
+        return lambda address, arguments: compiled_call(address, arguments)  # noqa: PLW0108 - numba compares the arguments
+
+    return call
+
+
+def signature_of(text: str) -> Signature:
+    """Return the signature that a text like ``f8[::1](f8[:, ::1], i8)`` describes."""
+    args, returned = normalize_signature(text)
+    return returned(*args)

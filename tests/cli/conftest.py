@@ -14,7 +14,7 @@ from kalmark.cli import main
 def kalmark(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Kalmark:
     """Run the command line in an empty folder; whether it has to compile first is not what these tests look at."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("kalmark.cli.options.say_compiling", lambda: None)
+    monkeypatch.setattr("kalmark.compiled.say_compiling", lambda: None)
 
     def run(*arguments: str | Path) -> Done:
         status = main([str(a) for a in arguments])

@@ -11,7 +11,7 @@ import numba
 import pytest
 from command_line import Kalmark, write_log
 
-from kalmark.cli.options import COMPILING, announce_compilation, say_compiling
+from kalmark.compiled import COMPILING, say_compiling
 from kalmark.config import load_config, shipped_configs
 from kalmark.logs import list_data
 from kalmark.simulate import load_world
@@ -45,7 +45,6 @@ def test_compiling_is_announced_once_and_what_is_compiled_already_is_not(
 
     own.__module__ = "kalmark.own"
     kernel = numba.njit(own)
-    announce_compilation()
     say_compiling.cache_clear()
     numba.njit(others)(1.0)
     assert capsys.readouterr().err == ""

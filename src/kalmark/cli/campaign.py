@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.options import Overrides, announce_compilation, announce_compilation_elsewhere, writable
+from kalmark.cli.options import Overrides, announce_compilation_elsewhere, writable
 from kalmark.cli.tables import number, print_table
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ def campaign(
     overrides: Overrides = None,
 ) -> None:
     """Run a world many times: ANEES and its band, RMSE, divergences, estimators side by side."""
-    announce_compilation()
     announce_compilation_elsewhere()
     from kalmark.campaign import run_campaign
     from kalmark.simulate import load_world

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
@@ -33,12 +32,16 @@ def mahalanobis(x: Any, mean: Any, cov: Any) -> float:
 
 def gate(probability: float, dof: int) -> float:
     """Return the squared Mahalanobis distance within which a Gaussian of `dof` dimensions lies so often."""
-    return float(stats.chi2.ppf(probability, dof))
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(dof / 2, probability))  # the quantile of chi-square
 
 
 def sigma_probability(sigmas: float, dof: int) -> float:
     """Return how often a Gaussian of `dof` dimensions lies inside its n-sigma ellipsoid.  [S] Table 3."""
-    return float(stats.chi2.cdf(sigmas**2, dof))
+    from scipy.special import chdtr
+
+    return float(chdtr(dof, sigmas**2))
 
 
 def sigma_table(sigmas: tuple[float, ...] = (1, 2, 3, 4), dofs: tuple[int, ...] = (2, 3)) -> Array:

@@ -69,6 +69,7 @@ class Point2D:
 
     kind: ClassVar[str] = "point"
     space: ClassVar[Space] = POINT2
+    look: ClassVar[Any] = staticmethod(seen_from)
 
     def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
         """Return v (K, d), V_T (K, d, 3), V_l (K, d, d)."""
@@ -88,13 +89,13 @@ class PointSignature2D(Point2D):
 
 
 class _Spatial:
-    """What the landmarks of space share: the compiled view, chosen by `code`."""
+    """What the landmarks of space share: the compiled view `look`, of the form `seen.LOOK`."""
 
-    code: ClassVar[int]
+    look: ClassVar[Any]
 
     def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
         """Return the view v (K, d), V_T (K, ., 6), V_l (K, ., n), in error coordinates."""
-        return seen.seen_in_space(self.code, T, np.ascontiguousarray(l))
+        return self.look(T, np.ascontiguousarray(l))
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class Point3D(_Spatial):
 
     kind: ClassVar[str] = "point3"
     space: ClassVar[Space] = POINT3
-    code: ClassVar[int] = seen.POINT
+    look: ClassVar[Any] = staticmethod(landmarks3d.point_seen_from)
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return l (K, 3), L_T (K, 3, 6), L_v (K, 3, 3)."""
@@ -174,7 +175,7 @@ class InverseDepth3D(_Depth):
 
     kind: ClassVar[str] = "inverse_depth"
     space: ClassVar[Space] = Space("inverse_depth", (ANCHOR, DIRECTION, RHO))
-    code: ClassVar[int] = seen.INVERSE_DEPTH
+    look: ClassVar[Any] = staticmethod(seen.inverse_depth)
     _from_view = landmarks3d.inverse_depth_from_view
     _to_point = landmarks3d.inverse_depth_to_point
 
@@ -189,7 +190,7 @@ class AnchoredHomogeneous(_Depth):
 
     kind: ClassVar[str] = "anchored_homogeneous"
     space: ClassVar[Space] = Space("anchored_homogeneous", (ANCHOR, VECTOR3, RHO))
-    code: ClassVar[int] = seen.ANCHORED
+    look: ClassVar[Any] = staticmethod(seen.anchored)
     _from_view = landmarks3d.anchored_from_view
     _to_point = landmarks3d.anchored_to_point
 
@@ -204,7 +205,7 @@ class Homogeneous(_Depth):
 
     kind: ClassVar[str] = "homogeneous"
     space: ClassVar[Space] = Space("homogeneous", (HOMOGENEOUS,))
-    code: ClassVar[int] = seen.HOMOGENEOUS_POINT
+    look: ClassVar[Any] = staticmethod(seen.homogeneous)
     _from_view = landmarks3d.homogeneous_from_view
     _to_point = landmarks3d.homogeneous_to_point
 
@@ -215,7 +216,7 @@ class Tag(_Spatial):
 
     kind: ClassVar[str] = "tag"
     space: ClassVar[Space] = SE3
-    code: ClassVar[int] = seen.TAG
+    look: ClassVar[Any] = staticmethod(tags.tag_seen_from)
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return poses l (K, 7), L_T (K, 6, 6), L_v (K, 6, 6)."""
@@ -304,7 +305,7 @@ class PlueckerLine(_DirectionPrior):
 
     kind: ClassVar[str] = "pluecker_line"
     space: ClassVar[Space] = Space("pluecker_line", (PLUECKER,))
-    code: ClassVar[int] = seen.PLUECKER_LINE
+    look: ClassVar[Any] = staticmethod(lines.pluecker_seen_from)
     name: ClassVar[str] = "pluecker"
 
 
@@ -314,7 +315,7 @@ class AnchoredPlueckerLine(_DirectionPrior):
 
     kind: ClassVar[str] = "anchored_pluecker_line"
     space: ClassVar[Space] = Space("anchored_pluecker_line", (VECTOR3, VECTOR3, VECTOR3))
-    code: ClassVar[int] = seen.ANCHORED_PLUECKER_LINE
+    look: ClassVar[Any] = staticmethod(lines.anchored_pluecker_seen_from)
     name: ClassVar[str] = "anchored_pluecker"
 
 
@@ -324,7 +325,7 @@ class InverseDepthLine(_DepthsPrior):
 
     kind: ClassVar[str] = "inverse_depth_line"
     space: ClassVar[Space] = Space("inverse_depth_line", (ANCHOR, DIRECTION, RHO, DIRECTION, RHO))
-    code: ClassVar[int] = seen.INVERSE_DEPTH_LINE
+    look: ClassVar[Any] = staticmethod(lines.inverse_depth_line_seen_from)
     name: ClassVar[str] = "inverse_depth_line"
 
 
@@ -334,7 +335,7 @@ class AnchoredHomogeneousLine(_DepthsPrior):
 
     kind: ClassVar[str] = "anchored_homogeneous_line"
     space: ClassVar[Space] = Space("anchored_homogeneous_line", (ANCHOR, VECTOR3, RHO, VECTOR3, RHO))
-    code: ClassVar[int] = seen.ANCHORED_LINE
+    look: ClassVar[Any] = staticmethod(lines.anchored_homogeneous_line_seen_from)
     name: ClassVar[str] = "anchored_homogeneous_line"
 
 
@@ -344,7 +345,7 @@ class HomogeneousLine(_DepthsPrior):
 
     kind: ClassVar[str] = "homogeneous_line"
     space: ClassVar[Space] = Space("homogeneous_line", (HOMOGENEOUS, HOMOGENEOUS))
-    code: ClassVar[int] = seen.HOMOGENEOUS_LINE
+    look: ClassVar[Any] = staticmethod(lines.homogeneous_line_seen_from)
     name: ClassVar[str] = "homogeneous_line"
 
 

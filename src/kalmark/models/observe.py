@@ -15,18 +15,23 @@ import numpy.typing as npt
 from numba import types
 from numba.extending import overload
 
-from kalmark.compiled import compiled
+from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
-from kalmark.models import landmarks, sensors
-from kalmark.models.landmarks import seen_from
+from kalmark.models import landmarks, seen, sensors
 from kalmark.models.landmarks3d import chained
 from kalmark.models.protocols import FullSensor, Landmark, Sensor
-from kalmark.models.seen import expected_in_space, residual, seen_in_space
-from kalmark.models.sensors2d import POSITION_FIX, expect
+from kalmark.models.seen import EXPECT, LOOK, residual
 
 Array = npt.NDArray[np.float64]
-View = tuple[int, int, int, Array, Array, npt.NDArray[np.bool_]]  # sensor, landmark, lens, mount, parameters, angular
+View = tuple[int, int, int, int, Array, Array, npt.NDArray[np.bool_]]
+# addresses of `linearize_built_in`, the landmark's `look`, the sensor's `expected`; its code, mount, parameters, angles
+VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
+LINEARIZE = signature_of(
+    f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
+)
+call_linearize = by_address(LINEARIZE)
+MOUNT = 4  # where a view has the mount
 
 NOTHING = np.zeros(0)
 
@@ -78,22 +83,28 @@ class PythonView:
 
 def fix_view(antenna: Array) -> View:
     """Return the view of an absolute position fix whose antenna sits at `antenna` (3,) or (7,) in the robot's frame."""
-    return POSITION_FIX, 0, 0, antenna, NOTHING.copy(), np.zeros(3, dtype=np.bool_)
+    return built_in_view(seen.oneself, seen.position, 0, antenna, NOTHING.copy(), np.zeros(3, dtype=np.bool_))
+
+
+def built_in_view(
+    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: npt.NDArray[np.bool_]
+) -> View:  # fmt: skip
+    """Return the view through a landmark's `look` and a sensor's `expected`, which are compiled now if need be."""
+    linearize_at = address_of(linearize_built_in, LINEARIZE)
+    return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular
+
+
+def is_built_in(sensor: Any, landmark: Any) -> bool:
+    """Return whether both are kalmark's own, and no user's subclass of them."""
+    return type(sensor) in sensors.BUILT_IN and type(landmark) in landmarks.BUILT_IN
 
 
 def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
     """Return what `linearize` takes: a `View` for the compiled models, a `PythonView` for others."""
     angular = np.array(sensor.angular, dtype=np.bool_)
-    if type(sensor) in sensors.BUILT_IN and type(landmark) in landmarks.BUILT_IN:  # not a user's subclass of them
+    if is_built_in(sensor, landmark):
         par = np.array(getattr(sensor, "parameters", NOTHING), dtype=np.float64)
-        return (
-            int(sensor.code),
-            int(getattr(landmark, "code", 0)),
-            int(getattr(sensor, "lens_code", 0)),
-            mount,
-            par,
-            angular,
-        )
+        return built_in_view(landmark.look, type(sensor).expected, int(sensor.code), mount, par, angular)
     return PythonView(sensor, landmark, mount, angular)
 
 
@@ -102,24 +113,24 @@ def linearize(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array,
 
     The expectations e (K, m), the innovations z (K, p), E_h (K, p, 3 or more) with respect to the head, E_l (K, p, n).
     """
-    return linearize_built_in(view, head, l, y) if isinstance(view, tuple) else view.linearize(head, l, y)
+    return call_linearize(view[0], (view, head, l, y)) if isinstance(view, tuple) else view.linearize(head, l, y)
 
 
 @overload(linearize, strict=False)  # type: ignore[untyped-decorator]  # strict: the annotations differ
 def _compiled_linearize(view: Any, head: Any, l: Any, y: Any) -> Any:
     if isinstance(view, types.BaseTuple):
-        return lambda view, head, l, y: linearize_built_in(view, head, l, y)  # noqa: PLW0108 - numba compares the arguments
+        return lambda view, head, l, y: call_linearize(view[0], (view, head, l, y))
     return None
 
 
 def sensor_at(view: Any, head: Array) -> tuple[Array, Array]:
     """Return the position (2 or 3,) of the sensor of a view, and its Jacobian in the head."""
-    return position_of_mount(view[3] if isinstance(view, tuple) else view.mount, head)
+    return position_of_mount(view[MOUNT] if isinstance(view, tuple) else view.mount, head)
 
 
 @overload(sensor_at, strict=False)  # type: ignore[untyped-decorator]
 def _compiled_sensor_at(view: Any, head: Any) -> Any:
-    return lambda view, head: position_of_mount(view[3], head)
+    return lambda view, head: position_of_mount(view[MOUNT], head)
 
 
 @compiled
@@ -140,24 +151,12 @@ def position_of_mount(mount: Array, head: Array) -> tuple[Array, Array]:
 @compiled
 def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """`expectation`, compiled."""
-    code, kind, lens, at, par, angular = view
+    _, look_at, expect_at, code, at, par, angular = view
     pose = len(at)
     mount = head[pose:] if len(head) > pose else at
-    if pose == 3:
-        T, T_r, T_s = compose(head[:pose], mount)
-        if code == POSITION_FIX:  # an absolute position fix looks at no landmark
-            e, E_h, E_l = T[:2].copy().reshape(1, 2), T_r[:2].copy().reshape(1, 2, 3), np.zeros((1, 2, l.shape[1]))
-            return e, y - e, E_h, E_l
-        v, V_T, V_l = seen_from(T, l)
-        e, E_v = expect(code, v)
-        z = residual(y, e, angular)
-    else:
-        T, T_r, T_s = frames3d.compose(head[:pose], mount)
-        if code == POSITION_FIX:
-            e, E_h, E_l = T[:3].copy().reshape(1, 3), T_r[:3].copy().reshape(1, 3, 6), np.zeros((1, 3, l.shape[1]))
-            return e, y - e, E_h, E_l
-        v, V_T, V_l = seen_in_space(kind, T, l)
-        e, z, E_v = expected_in_space(code, lens, par, angular, v, y)
+    T, T_r, T_s = compose(head[:pose], mount) if pose == 3 else frames3d.compose(head[:pose], mount)
+    v, V_T, V_l = seen.look(look_at, (T, l))
+    e, z, E_v = seen.expect(expect_at, (code, par, angular, v, y))
     E_T = chained(E_v, V_T)
     E_l = chained(E_v, V_l)
     if len(head) == pose:

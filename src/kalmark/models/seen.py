@@ -1,16 +1,17 @@
-"""The views of space, compiled: what a landmark of any kind looks like from a pose, what a sensor makes of that view.
+"""What a landmark looks like from a pose and what a sensor makes of that view, each called by its address.
 
 ======================================  ===========================================  ==================
 landmark                                view v (K, d)                                sensors
 ======================================  ===========================================  ==================
+point of the plane                      the point in the sensor's frame, 2 or more   those of the plane
 Euclidean point                         the point in the sensor's frame, 3           points, cameras
 inverse depth, anchored, homogeneous    the ray rho (p - t) and rho, 4               cameras
 tag                                     its pose in the sensor's frame, 7            tags
 line                                    normal of the plane through it, 3            segments
 ======================================  ===========================================  ==================
 
-The rows below, `seen_in_space` by the landmark's code and `expected_in_space` by the sensor's, are the whole table of
-models that the compiled filter knows in space; the plane's are in `landmarks` and `sensors`.
+A built-in landmark has a function `look` of the form LOOK, a built-in sensor one `expected` of the form EXPECT: the
+filter compiles neither into itself and never those that nobody uses.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.compiled import compiled
+from kalmark.compiled import by_address, compiled, signature_of
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.directions import spherical_many
 from kalmark.models import cameras, landmarks3d, lenses, lines, tags
@@ -26,37 +27,37 @@ from kalmark.models import cameras, landmarks3d, lenses, lines, tags
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-# landmarks
-POINT, INVERSE_DEPTH, ANCHORED, HOMOGENEOUS_POINT, TAG = range(5)
-PLUECKER_LINE, ANCHORED_PLUECKER_LINE, INVERSE_DEPTH_LINE, ANCHORED_LINE, HOMOGENEOUS_LINE = range(5, 10)
-# sensors
-RANGE_BEARING_3D, POSITION_3D, CAMERA, STEREO, SEGMENTS, TAG_POSE, TAG_CORNERS = range(10, 17)
+# of the sensor's pose T and landmarks l (K, n): views v (K, d), V_T (K, ., 3 or 6), V_l (K, ., n)
+LOOK = signature_of("Tuple((f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))(f8[::1], f8[:, ::1])")
+# of the sensor's code, parameters and angles, views v and measurements y (K, m): e (K, m), innovations z (K, p), E_v
+EXPECT = signature_of("Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1]))(i8, f8[::1], b1[::1], f8[:, ::1], f8[:, ::1])")
+look, expect = by_address(LOOK), by_address(EXPECT)
+
+
+# ------------------------------------------------------------------ landmarks
+@compiled
+def inverse_depth(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the views (K, 4) of inverse-depth points l (K, 6), V_T (K, 4, 6), V_l (K, 4, 6)."""
+    return with_distance(l, landmarks3d.inverse_depth_seen_from(T, l))
 
 
 @compiled
-def seen_in_space(kind: int, T: Array, l: Array) -> tuple[Array, Array, Array]:
-    """Return the views v (K, d) of landmarks l (K, n) of one kind, V_T (K, ., 6) and V_l (K, ., n)."""
-    if kind == POINT:
-        return landmarks3d.point_seen_from(T, l)
-    if kind == TAG:
-        return tags.tag_seen_from(T, l)
-    if kind == PLUECKER_LINE:
-        return lines.pluecker_seen_from(T, l)
-    if kind == ANCHORED_PLUECKER_LINE:
-        return lines.anchored_pluecker_seen_from(T, l)
-    if kind == INVERSE_DEPTH_LINE:
-        return lines.inverse_depth_line_seen_from(T, l)
-    if kind == ANCHORED_LINE:
-        return lines.anchored_homogeneous_line_seen_from(T, l)
-    if kind == HOMOGENEOUS_LINE:
-        return lines.homogeneous_line_seen_from(T, l)
-    if kind == INVERSE_DEPTH:
-        ray, R_T, R_l = landmarks3d.inverse_depth_seen_from(T, l)
-    elif kind == ANCHORED:
-        ray, R_T, R_l = landmarks3d.anchored_seen_from(T, l)
-    else:
-        ray, R_T, R_l = landmarks3d.homogeneous_seen_from(T, l)
-    k, n = l.shape  # the inverse distance is their last number
+def anchored(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the views (K, 4) of anchored points l (K, 7), V_T (K, 4, 6), V_l (K, 4, 7)."""
+    return with_distance(l, landmarks3d.anchored_seen_from(T, l))
+
+
+@compiled
+def homogeneous(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the views (K, 4) of homogeneous points l (K, 4), V_T (K, 4, 6), V_l (K, 4, 4)."""
+    return with_distance(l, landmarks3d.homogeneous_seen_from(T, l))
+
+
+@compiled
+def with_distance(l: Array, rays: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """Return rays (K, 3), R_T, R_l with the inverse distances, which are the last numbers of l (K, n)."""
+    ray, R_T, R_l = rays
+    k, n = l.shape
     v, V_T, V_l = np.empty((k, 4)), np.zeros((k, 4, 6)), np.zeros((k, 4, n))
     v[:, :3], v[:, 3] = ray, l[:, n - 1]
     V_T[:, :3], V_l[:, :3], V_l[:, 3, n - 1] = R_T, R_l, 1.0
@@ -64,42 +65,69 @@ def seen_in_space(kind: int, T: Array, l: Array) -> tuple[Array, Array, Array]:
 
 
 @compiled
-def expected_in_space(
-    code: int, lens: int, par: Array, angular: Flags, v: Array, y: Array
-) -> tuple[Array, Array, Array]:
-    """Return what a sensor expects to measure e (K, m), the innovations z (K, p) of y (K, m), and E_v = -Z_v."""
-    if code == SEGMENTS:
-        return lines.segment_innovation(v, y, par)
-    if code == TAG_POSE:
-        z, E_v = tags.pose_residual(y, v)
-        return v.copy(), z, E_v
-    if code == TAG_CORNERS:
-        corners, E_v = tags.project_corners(lens, v, y[:, 8].copy(), par)
-        e = y.copy()
-        e[:, :8] = corners
-        return e, y[:, :8] - corners, E_v
-    if code == CAMERA:
-        e, E_ray = lenses.project(lens, v[:, :3].copy(), par)
-        E_v = padded(E_ray, v.shape[1])
-    elif code == STEREO:
-        e, E_v = cameras.project_stereo(v, par[:4], par[4])
-    elif code == RANGE_BEARING_3D:
-        e, E_v = spherical_many(v)
-    else:
-        e, E_v = v.copy(), np.zeros((len(v), 3, 3))
-        for j in range(3):
-            E_v[:, j, j] = 1.0
+def oneself(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return where T itself is, (1, 2 or 3), V_T and V_l = 0: an absolute position fix looks at no landmark."""
+    d = 2 if len(T) == 3 else 3
+    V_T = np.zeros((1, d, 3 if d == 2 else 6))
+    for j in range(d):
+        V_T[0, j, j] = 1.0
+    return T[:d].copy().reshape((1, d)), V_T, np.zeros((1, d, l.shape[1]))
+
+
+# ------------------------------------------------------------------ sensors
+@compiled
+def position(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z, E_v of what is measured as it is seen."""
+    k, d = v.shape
+    E_v = np.zeros((k, d, d))
+    for j in range(d):
+        E_v[:, j, j] = 1.0
+    return v.copy(), y - v, E_v
+
+
+@compiled
+def range_bearing(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z, E_v of ranges, azimuths and elevations."""
+    e, E_v = spherical_many(v)
     return e, residual(y, e, angular), E_v
 
 
 @compiled
-def padded(E_v: Array, d: int) -> Array:
-    """Return E_v (K, m, 3) as (K, m, d): the pixel of a ray does not depend on its inverse distance."""
-    if d == 3:
-        return E_v
-    wide = np.zeros((E_v.shape[0], E_v.shape[1], d))
-    wide[:, :, :3] = E_v
-    return wide
+def camera(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z, E_v of the pixels of a camera, `code` its lens."""
+    e, E_ray = lenses.project(code, v[:, :3].copy(), par)
+    E_v = np.zeros((len(v), 2, v.shape[1]))  # the pixel of a ray does not depend on its inverse distance
+    E_v[:, :, :3] = E_ray
+    return e, y - e, E_v
+
+
+@compiled
+def stereo(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z, E_v of the pixels of a stereo pair."""
+    e, E_v = cameras.project_stereo(v, par[:4], par[4])
+    return e, y - e, E_v
+
+
+@compiled
+def segment(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z, E_v of segments of lines: z are the distances of the measured ends."""
+    return lines.segment_innovation(v, y, par)
+
+
+@compiled
+def tag_pose(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z, E_v of poses of tags."""
+    z, E_v = tags.pose_residual(y, v)
+    return v.copy(), z, E_v
+
+
+@compiled
+def tag_corners(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z, E_v of the corners of tags, `code` the lens; y tells the sizes."""
+    pixels, E_v = tags.project_corners(code, v, y[:, 8].copy(), par)
+    e = y.copy()
+    e[:, :8] = pixels
+    return e, y[:, :8] - pixels, E_v
 
 
 @compiled

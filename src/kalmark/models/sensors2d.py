@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +14,12 @@ from kalmark.compiled import compiled
 from kalmark.errors import EventError
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.models.parameters import check_parameters
+from kalmark.models.seen import residual
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
-RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE, POSITION_FIX = range(1, 7)
+RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE = range(1, 6)
 
 
 @compiled
@@ -42,6 +44,15 @@ def expect(code: int, v: Array) -> tuple[Array, Array]:
     return e, E_v
 
 
+@compiled
+def expected_in_plane(
+    code: int, par: Array, angular: Flags, v: Array, y: Array
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return e (K, m), the innovations z (K, m) of y (K, m), and E_v (K, m, d): of the form `seen.EXPECT`."""
+    e, E_v = expect(code, v)
+    return e, residual(y, e, angular), E_v
+
+
 @lru_cache(maxsize=256)
 def _cached(variances: tuple[float, ...], count: int) -> Array:
     return np.tile(np.diag(variances), (count, 1, 1))
@@ -63,6 +74,7 @@ class Planar:
     """What the planar sensors share: limits of sight, built-in expectation."""
 
     world: ClassVar[str] = "plane"
+    expected: ClassVar[Any] = expected_in_plane
     code: ClassVar[int]
     range_min_m: float
     range_max_m: float

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,10 +23,10 @@ Flags = npt.NDArray[np.bool_]
 
 
 class Spatial:
-    """What the sensors of space share: the built-in expectation."""
+    """What the sensors of space share: the compiled expectation `expected`, of the form `seen.EXPECT`."""
 
     world: ClassVar[str] = "space"
-    code: ClassVar[int]
+    expected: ClassVar[Any]
     columns: ClassVar[tuple[str, ...]]
     angular: ClassVar[tuple[bool, ...]]
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
@@ -36,6 +36,11 @@ class Spatial:
     def lens_code(self) -> int:
         """The lens of a camera, 0 for other sensors."""
         return 0
+
+    @property
+    def code(self) -> int:
+        """What `expected` is told of the sensor: its lens."""
+        return self.lens_code
 
     @property
     def parameters(self) -> Array:
@@ -50,7 +55,7 @@ class Spatial:
         y = np.zeros((len(v), len(self.columns))) if y is None else y
         angular = np.array(self.angular, dtype=np.bool_)
         v, y = np.ascontiguousarray(v, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
-        e, _, E_v = seen.expected_in_space(self.code, self.lens_code, np.array(self.parameters), angular, v, y)
+        e, _, E_v = type(self).expected(self.code, np.array(self.parameters), angular, v, y)
         return e, E_v
 
 
@@ -82,7 +87,7 @@ class RangeBearing3D(_Cone):
     range_max_m: float = math.inf
     fov_rad: float = 2 * math.pi
 
-    code: ClassVar[int] = seen.RANGE_BEARING_3D
+    expected: ClassVar[Any] = seen.range_bearing
     columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad")
     angular: ClassVar[tuple[bool, ...]] = (False, True, True)
 
@@ -110,7 +115,7 @@ class Position3D(_Cone):
     range_max_m: float = math.inf
     fov_rad: float = 2 * math.pi
 
-    code: ClassVar[int] = seen.POSITION_3D
+    expected: ClassVar[Any] = seen.position
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
     angular: ClassVar[tuple[bool, ...]] = (False, False, False)
 
@@ -130,7 +135,7 @@ class TagPose(Spatial):
     sigma_position_m: float = 0.02
     sigma_rotation_rad: float = 0.02
 
-    code: ClassVar[int] = seen.TAG_POSE
+    expected: ClassVar[Any] = seen.tag_pose
     cov_size: ClassVar[int] = 6
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     angular: ClassVar[tuple[bool, ...]] = (False,) * 7

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -115,7 +115,7 @@ class PinHole(_Lens, _Camera):
     distortion: tuple[float, ...] = ()
     sigma_px: float = 1.0
 
-    code: ClassVar[int] = seen.CAMERA
+    expected: ClassVar[Any] = seen.camera
     columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
     angular: ClassVar[tuple[bool, ...]] = (False, False)
 
@@ -139,7 +139,7 @@ class Omnidirectional(_Camera):
     height_px: float = 800
     sigma_px: float = 1.0
 
-    code: ClassVar[int] = seen.CAMERA
+    expected: ClassVar[Any] = seen.camera
     columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
     angular: ClassVar[tuple[bool, ...]] = (False, False)
 
@@ -180,7 +180,7 @@ class Stereo(_Camera):
     sigma_ur_px: float = 1.0
     sigma_vr_px: float = 1.0
 
-    code: ClassVar[int] = seen.STEREO
+    expected: ClassVar[Any] = seen.stereo
     columns: ClassVar[tuple[str, ...]] = ("ul_px", "vl_px", "ur_px", "vr_px")
     angular: ClassVar[tuple[bool, ...]] = (False,) * 4
     finds_depth: ClassVar[bool] = True
@@ -230,7 +230,7 @@ class Segments(_Camera):
     sigma_px: float = 1.0
     min_length_px: float = 20.0
 
-    code: ClassVar[int] = seen.SEGMENTS
+    expected: ClassVar[Any] = seen.segment
     columns: ClassVar[tuple[str, ...]] = ("u1_px", "v1_px", "u2_px", "v2_px")
     angular: ClassVar[tuple[bool, ...]] = (False,) * 4
     sees_kinds: ClassVar[tuple[str, ...]] = (
@@ -297,7 +297,7 @@ class TagCorners(_Lens, _Camera):
     distortion: tuple[float, ...] = ()
     sigma_px: float = 1.0
 
-    code: ClassVar[int] = seen.TAG_CORNERS
+    expected: ClassVar[Any] = seen.tag_corners
     cov_size: ClassVar[int] = 8
     columns: ClassVar[tuple[str, ...]] = (
         "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from kalmark.filter.corrections import innovation, observed_block
 from kalmark.filter.map import X_AT, StochasticMap
 from kalmark.models import landmarks as kinds
 from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D, Tag
-from kalmark.models.observe import composed, inverse_expectation, linearize, view_of
+from kalmark.models.observe import composed, inverse_expectation, is_built_in, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.robot import Mount
@@ -33,11 +34,30 @@ BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """How a sensor sees landmarks of one type: what `linearize` takes, and how many of their numbers."""
+    """How a sensor on a mount `at` sees landmarks of one type."""
 
     landmark: Landmark
-    view: Any
-    d: int
+    sensor: Any
+    at: Array
+
+    @cached_property
+    def view(self) -> Any:
+        """What `linearize` takes.  Made when it is first needed: models that are built in are compiled then."""
+        return view_of(self.sensor, self.landmark, self.at)
+
+    @cached_property
+    def built_in(self) -> bool:
+        """Whether sensor and landmark are kalmark's own."""
+        return is_built_in(self.sensor, self.landmark)
+
+    @cached_property
+    def d(self) -> int:
+        """How many of the landmark's numbers are seen."""
+        return self.landmark.space.size
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but the view, whose addresses mean nothing to another process."""
+        return {name: value for name, value in self.__dict__.items() if name != "view"}
 
 
 class View:
@@ -65,14 +85,14 @@ class View:
         types = [BY_KIND[kind]() for kind in getattr(self.sensor, "sees_kinds", ()) if kind != self.landmark.kind]
         looks: dict[str, Look] = {}
         for landmark in (*types, self.landmark):
-            look = Look(landmark, view_of(self.sensor, landmark, self.at), landmark.space.size)
+            look = Look(landmark, self.sensor, self.at)
             looks |= {kind: look for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
         return looks
 
     def _refuse_misfit(self) -> None:
         """Refuse a kind of landmark that one of kalmark's own sensors does not see."""
         sensor, kind = type(self.sensor).__name__, self.landmark.kind
-        if not isinstance(self.looks[kind].view, tuple):
+        if not self.looks[kind].built_in:
             return
         seen = getattr(self.sensor, "sees_kinds", None)
         if seen is not None and kind not in seen:
@@ -83,7 +103,7 @@ class View:
 
     def _dof(self) -> int:
         """Return the size p of one innovation."""
-        if isinstance(self.looks[self.landmark.kind].view, tuple):
+        if self.looks[self.landmark.kind].built_in:
             return int(self.sensor.noise(np.zeros((1, len(self.sensor.columns)))).shape[1])
         return len(self.sensor.angular)
 
