@@ -2,8 +2,8 @@
 
     KALMARK_DATA=... python benchmarks/filter_vs_batch.py [NAME ...] [--estimator invariant ekf]
 
-One line a log and filter: the figures of `Batch.compare`, and the processor times of the filter and of the batch
-solution.
+One line a log and filter: raw position RMSE and pose NEES (mean over the robots, where there is a truth), the figures
+of `Batch.compare`, and the processor times of the filter and of the batch solution.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ CASES = {
     "freiburg_course": ("freiburg_course", ()),
     "starry_night": ("starry_night", ()),
 }
-COLUMNS = ["sigma_ratio", "map_difference_m", "map_difference_sigma", "path_ratio", "path_difference_m"]
+ROBOT = ["ate_raw_m", "pose_nees"]
+COLUMNS = [*ROBOT, "sigma_ratio", "map_difference_m", "map_difference_sigma", "path_ratio", "path_difference_m"]
 COLUMNS += ["chi2_per_dof", "iterations"]
 
 
@@ -40,7 +41,9 @@ def row(name: str, estimator: str) -> str:
     filtered = time.process_time()
     batch = solve_batch(run, log)
     solved = time.process_time()
-    figures = batch.compare(run)
+    robots = run.evaluate()["robots"].values()
+    known = {c: [f[c] for f in robots if f.get(c) is not None] for c in ROBOT}
+    figures = {c: sum(values) / len(values) if values else None for c, values in known.items()} | batch.compare(run)
     cells = " ".join(f"{figures[c]:>20.4g}" if figures[c] is not None else f"{'-':>20}" for c in COLUMNS)
     return f"{name:<22} {estimator:<10} {cells} {filtered - start:>8.1f} {solved - filtered:>8.1f}"
 

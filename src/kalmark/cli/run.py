@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -51,16 +51,35 @@ def run(
     on_error: Annotated[
         OnError | None, typer.Option(help="Refuse bad input, or leave it out and list it. (default: raise)")
     ] = None,
+    batch: Annotated[
+        bool | None,
+        typer.Option(help="Compare with the batch solution. (default: if tags' corners were seen)"),
+    ] = None,
 ) -> None:
     """Run one log through one filter and write a run folder."""
     out = writable(out or Path("out") / Path(config).stem)
     with computing():
         result = run_log(config, log, overrides=overrides or (), on_error=on_error.value if on_error else None)
         summary = result.evaluate()
+        if batch or (batch is None and summary.get("corner_rms_px") is not None):
+            summary = against_batch(result, summary, needed=bool(batch))
         result.save(out)
     finish(result, out, f"{Path(config).stem} on {result.log.name}")
     if summary.get("stopped"):
         raise typer.Exit(2)
+
+
+def against_batch(result: Run, summary: dict[str, Any], needed: bool) -> dict[str, Any]:
+    """Return the summary with the batch solution in it, or say why there is none unless that is needed."""
+    from kalmark.errors import KalmarkError
+
+    try:
+        return result.evaluate(batch=True)
+    except KalmarkError as error:
+        if needed:
+            raise
+        typer.echo(f"warning: no batch solution: {error}", err=True)
+        return summary
 
 
 def finish(result: Run, out: Path, title: str) -> None:

@@ -20,6 +20,7 @@ TOTALS: tuple[tuple[str, str, str], ...] = (
     ("fix_nis_per_dof", "  NIS per degree of freedom", ""),
     ("landmark_rmse_m", "landmark RMSE, aligned", "m"),
     ("landmark_rmse_raw_m", "landmark RMSE, raw", "m"),
+    ("corner_rms_px", "reprojection of corners, RMS", "px"),
     ("fix_median_m", "distance to position fixes, median", "m"),
     ("fix_rms_10m", "distance to position fixes, RMS within 10 m", "m"),
     ("fix_within_10m", "position fixes within 10 m", "%"),

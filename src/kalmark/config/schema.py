@@ -51,6 +51,8 @@ class LogConfig(Section):
     """tagslam: all, or those with a pose in camera_poses.yaml (all if absent)."""
     odometry: Literal["auto", "none"] | None = None
     """tagslam: use the odometry of the bag (auto if absent)."""
+    sigma_px: Positive | None = None
+    """tagslam: noise of a corner's coordinate (the pixel_noise of tagslam.yaml if absent)."""
 
     def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""

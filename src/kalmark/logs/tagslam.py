@@ -79,15 +79,21 @@ class Detections:
         return f"detections of tag {tag.id} twice in one image" if tag.id in ids else ""
 
 
-def read(path: Path, request: Request, tag_size_m: Any = None, cameras: Any = "all", odometry: Any = "auto") -> Log:
+def read(
+    path: Path, request: Request, tag_size_m: Any = None, cameras: Any = "all", odometry: Any = "auto",
+    sigma_px: Any = None,
+) -> Log:  # fmt: skip
     """Return the log of a test.
 
     `tag_size_m` is the size of the tags whose own size tagslam.yaml does not give (None: its default);
-    `cameras="given"` leaves out those without a pose in camera_poses.yaml; `odometry="none"` does without it.
+    `cameras="given"` leaves out those without a pose in camera_poses.yaml; `odometry="none"` does without it;
+    `sigma_px` is the noise of a corner's coordinate (None: the `pixel_noise` of tagslam.yaml).
     """
     scene = read_scene(path / "tagslam.yaml")
     if tag_size_m is not None:
         scene.other_size = quantity(tag_size_m, "tag_size_m", 1e-6)
+    if sigma_px is not None:
+        scene.pixel_noise = quantity(sigma_px, "sigma_px", 1e-6)
     bag = find_bag(path, "tag_detections")
     if bag is None:
         raise LogError(f"{path}: no tag_detections.bag or tag_detections.bag.bz2, expected one of them")
@@ -168,4 +174,4 @@ def robot(
 
 
 TAGSLAM = Format("tagslam", "a folder with tagslam.yaml, cameras.yaml and tag_detections.bag", find, read,
-                 options=("tag_size_m", "cameras", "odometry"))  # fmt: skip
+                 options=("tag_size_m", "cameras", "odometry", "sigma_px"))  # fmt: skip

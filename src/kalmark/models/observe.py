@@ -54,11 +54,17 @@ def inverse_expectation(r: Array, mount: Array, sensor: FullSensor, landmark: La
 
     The prior (K, n, n) is the covariance of what y does not tell.
     """
+    return landmark_at(r, mount, landmark, *sensor.invert(y), getattr(sensor, "finds_depth", True))
+
+
+def landmark_at(
+    r: Array, mount: Array, landmark: Landmark, v: Array, V_y: Array, finds_depth: bool = True
+) -> tuple[Array, ...]:
+    """Return the landmarks l (K, n) at v (K, d) in the sensor's frame; see `inverse_expectation`."""
     T, T_r, T_s = composed(r, mount)
-    v, V_y = sensor.invert(y)
     N = None
     if hasattr(landmark, "complete"):
-        v, V_y, N = landmark.complete(v, V_y, getattr(sensor, "finds_depth", True))
+        v, V_y, N = landmark.complete(v, V_y, finds_depth)
     l, L_T, L_v = landmark.from_view(T, v)
     prior = np.zeros((len(l), L_v.shape[1], L_v.shape[1])) if N is None else L_v @ N @ L_v.swapaxes(1, 2)
     return l, L_T @ T_r, L_T @ T_s, L_v @ V_y, prior

@@ -315,12 +315,27 @@ class TagCorners(_Lens, _Camera):
 
         NaN where none explains the corners, and where two do: a small tag looks like its mirror image.
         """
+        v, V_y, chi2 = self.both(y)
+        v[~(chi2[:, 1] - chi2[:, 0] >= TELLING)] = np.nan
+        return v[:, 0], V_y[:, 0]
+
+    def both(self, y: Array) -> tuple[Array, Array, Array]:
+        """Return the two poses (K, 2, 7) that look like y, the better first, V_y (K, 2, 6, 8), chi-squares (K, 2)."""
         corners, sizes = np.ascontiguousarray(y[:, :8]), np.ascontiguousarray(y[:, 8])
-        v, V_y, rms, ambiguity = tags.tag_from_corners(self.lens_code, corners, sizes, np.array(self.parameters))
-        with np.errstate(divide="ignore"):
-            worse = (2.0 * rms / self.sigma_px) ** 2 * (1.0 / ambiguity**2 - 1.0)  # chi-square of the other pose
-        v[worse < TELLING] = np.nan
-        return v, V_y
+        v, V_y, cost = tags.tags_from_corners(self.lens_code, corners, sizes, np.array(self.parameters))
+        return v, V_y, cost / self.sigma_px**2
+
+    def is_far(self, y: Array, z: Array) -> Flags:
+        """Tell which tags y (K, 9) are off by half their size or more by their innovations z (K, 8), or unexpected."""
+        sides = np.diff(y[:, [0, 1, 2, 3, 4, 5, 6, 7, 0, 1]].reshape(-1, 5, 2), axis=1)
+        size = np.linalg.norm(sides, axis=2).mean(axis=1)
+        near: Flags = np.sqrt(np.sum(z**2, axis=1) / 4) < 0.5 * size
+        return ~near
+
+    def poses(self, y: Array, R: Array) -> tuple[Array, Array]:
+        """Return y (K, 9) with noise R (K, 8, 8) as poses (K, 7) with covariances (K, 6, 6); NaN where `invert` is."""
+        v, V_y = self.invert(y)
+        return v, V_y @ R @ V_y.swapaxes(1, 2)
 
     def check(self, y: Array) -> None:
         """Refuse tags without a size."""

@@ -20,6 +20,7 @@ from kalmark.models.lenses import back_project, project
 Array = npt.NDArray[np.float64]
 
 ITERATIONS = 50
+FACING = 0.3  # rad: a tag that faces the camera so well is near its mirror image
 SAME = 1e-4  # distance (tag sizes) and angle (rad) below which two solutions are one
 
 
@@ -89,43 +90,50 @@ def pose_residual(y: Array, v: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def tag_from_corners(lens: int, y: Array, size: Array, par: Array) -> tuple[Array, Array, Array, Array]:
-    """Find the tags whose corners are seen at y (K, 8): v (K, 7), V_y (K, 6, 8), RMS (K,) px, ambiguity (K,).
+def tags_from_corners(lens: int, y: Array, size: Array, par: Array) -> tuple[Array, Array, Array]:
+    """Find the two tags whose corners look like y (K, 8): v (K, 2, 7), V_y (K, 2, 6, 8), sums of squares (K, 2) px^2.
 
-    v minimises the sum of squared pixels.  From afar a tag looks the same when it is mirrored along the line of sight,
-    so that there are two minima: both are sought, by Levenberg's method from the homography of the corners and from its
-    mirror image, and the lower one is kept.  The ambiguity is the ratio of both RMS: 1, no telling which; 0, only one.
-    V_y = (E'E)^-1 E' of Gauss-Newton, so that V_y N V_y' is the covariance for noise N of the pixels.  The RMS is of
-    the distances of the corners.  All is NaN where the four pixels are no convex quadrangle of rays ahead.
+    From afar a tag looks the same when it is mirrored along the line of sight, so that the sum of squared pixels has
+    two minima: both are sought, by Levenberg's method from the homography of the corners and from its mirror image, and
+    the lower one comes first.  Where noise has left but one, the second is its mirror image, without V_y; its sum is
+    infinite where that is within `FACING`, for then it does not matter.  All is NaN where the four pixels are no convex
+    quadrangle of rays ahead.  V_y = (E'E)^-1 E' of Gauss-Newton, so that V_y N V_y' is the covariance for noise N of
+    the pixels.
     """
     k = len(y)
-    v, V_y, rms, ambiguity = np.empty((k, 7)), np.empty((k, 6, 8)), np.empty(k), np.empty(k)
+    v, V_y, cost = np.full((k, 2, 7), np.nan), np.full((k, 2, 6, 8), np.nan), np.full((k, 2), np.nan)
     for i in range(k):
         first, second = from_homography(back_project(lens, y[i].copy().reshape((4, 2)), par)[0], size[i])
         a, E_a, cost_a = refined(lens, y[i], size[i], first, par)
         b, E_b, cost_b = refined(lens, y[i], size[i], second, par)
         if cost_b < cost_a or math.isnan(cost_a):
             a, b, E_a, E_b, cost_a, cost_b = b, a, E_b, E_a, cost_b, cost_a
-        v[i], rms[i] = a, math.sqrt(0.25 * cost_a)
+        if math.isnan(cost_a):
+            continue
+        v[i, 0], V_y[i, 0], cost[i, 0] = a, np.linalg.solve(E_a.T @ E_a, E_a.T), cost_a
         apart = minus(a, b)
         same = np.abs(apart[:3]).max() < SAME * size[i] and np.abs(apart[3:]).max() < SAME
-        ambiguity[i] = 0.0 if same or math.isnan(cost_b) else math.sqrt(cost_a / cost_b)
-        V_y[i] = np.nan
-        if not math.isnan(cost_a):
-            V_y[i] = np.linalg.solve(E_a.T @ E_a, E_a.T)
+        if same or math.isnan(cost_b):
+            b, cost_b = mirrored(a), np.inf
+            if np.abs(minus(b, a)).max() > FACING:
+                e = project_corners(lens, b.reshape((1, 7)), np.array([size[i]]), par)[0]
+                cost_b = np.sum((y[i] - e[0]) ** 2)
+            v[i, 1], cost[i, 1] = b, cost_b if math.isfinite(cost_b) else np.inf
         else:
-            ambiguity[i] = np.nan
-    return v, V_y, rms, ambiguity
+            v[i, 1], V_y[i, 1], cost[i, 1] = b, np.linalg.solve(E_b.T @ E_b, E_b.T), cost_b
+    return v, V_y, cost
 
 
 def tag_pose(lens: int, y: Array, size: float, par: Array, sigma_px: float) -> tuple[Array, Array, float, float]:
     """Find one tag from its corners y (8,): pose (7,) in the camera, covariance (6, 6), RMS px, ambiguity.
 
-    See `tag_from_corners`; the covariance is that of independent pixels.
+    See `tags_from_corners`; the covariance is that of independent pixels, the RMS that of the distances of the corners.
+    The ambiguity is the ratio of the RMS of both poses: 1, no telling which; 0, only one.
     """
     rows = np.ascontiguousarray(y, dtype=np.float64).reshape(1, 8)
-    v, V_y, rms, ambiguity = tag_from_corners(lens, rows, np.array([float(size)]), par)
-    return v[0], sigma_px**2 * V_y[0] @ V_y[0].T, float(rms[0]), float(ambiguity[0])
+    v, V_y, cost = tags_from_corners(lens, rows, np.array([float(size)]), par)
+    rms = np.sqrt(0.25 * cost[0])
+    return v[0, 0], sigma_px**2 * V_y[0, 0] @ V_y[0, 0].T, float(rms[0]), float(rms[0] / rms[1])
 
 
 @compiled
@@ -158,8 +166,7 @@ def refined(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple
 def from_homography(m: Array, size: float) -> tuple[Array, Array]:
     """Return both poses (7,) of a tag whose corners are on the rays m (4, 3): the homography's, and its mirror image.
 
-    The second is the first, mirrored in the plane through the tag's centre across the line of sight, and in its own
-    plane.  NaN unless the rays are a convex quadrangle, less than 87 degrees from their mean.
+    NaN unless the rays are a convex quadrangle, less than 87 degrees from their mean.
     """
     nothing = np.full(7, np.nan)
     W = _looking_along(m)
@@ -191,12 +198,19 @@ def from_homography(m: Array, size: float) -> tuple[Array, Array]:
             Q[0, 0] * Q[1, 1] - Q[1, 0] * Q[0, 1],
         ]
     )
-    sight = H[:, 2] / math.sqrt(np.sum(H[:, 2] ** 2))
+    first = np.empty(7)
+    first[:3], first[3:] = H[:, 2] * size / (a0 + a1), from_matrix(Q)
+    return first, mirrored(first)
+
+
+@compiled
+def mirrored(v: Array) -> Array:
+    """Return a tag's pose (7,) mirrored in the plane through its centre across the line of sight, and in its own."""
+    sight = v[:3] / math.sqrt(np.sum(v[:3] ** 2))
     mirror = np.eye(3) - 2.0 * sight.reshape((3, 1)) * sight
-    first, second = np.empty(7), np.empty(7)
-    first[:3] = second[:3] = H[:, 2] * size / (a0 + a1)
-    first[3:], second[3:] = from_matrix(Q), from_matrix(mirror @ Q @ np.diag(np.array([1.0, 1.0, -1.0])))
-    return first, second
+    out = v.copy()
+    out[3:] = from_matrix(mirror @ matrix(v[3:]) @ np.diag(np.array([1.0, 1.0, -1.0])))
+    return out
 
 
 @compiled

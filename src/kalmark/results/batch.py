@@ -21,6 +21,7 @@ from kalmark.results.align import rmse
 from kalmark.results.batch_factors import State
 from kalmark.results.batch_input import Input, Known, batch_input
 from kalmark.results.batch_solve import Solution, minimise
+from kalmark.results.batch_tags_input import adjust_run
 from kalmark.slam.events import Event, Id
 
 if TYPE_CHECKING:
@@ -114,7 +115,12 @@ def solve_batch(
 
 
 def compare(run: Run, log: Log | Iterable[Event] | None = None, *, progress: bool = True) -> dict[str, Any]:
-    """Return the entry `batch` of a run's summary (see `Batch.compare`); the log is read again unless it is given."""
+    """Return the entry `batch` of a run's summary (see `Batch.compare`, of a run that saw tags `TagBatch.compare`).
+
+    The log is read again unless it is given or not needed.
+    """
+    if not np.isnan(run.history.left_px).all():
+        return adjust_run(run).compare()
     return solve_batch(run, _log_of(run) if log is None else log, progress=progress).compare(run)
 
 

@@ -2,8 +2,9 @@
 
 A sighting is y = e(v), v = (r o s)^-1 o l: rig pose r at its time, mount s, tag l.  `adjust` minimises the squared
 distances in pixels over all r, l and, if asked, s, by Levenberg's method.  One pose or one tag is held, for the whole
-may be moved anywhere.  Given tags and mounts the poses are independent: the normal equations reduce to tags and mounts,
-and an iteration takes O(sightings) and O(tags^3).
+may be moved anywhere, and one pose of each part that shares no tag with the others (`parts`).  Given tags and mounts
+the poses are independent: the normal equations reduce to tags and mounts, and an iteration takes O(sightings) and
+O(tags^3).
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from threadpoolctl import threadpool_limits
 
 from kalmark.errors import KalmarkError
@@ -21,6 +24,7 @@ from kalmark.geometry.frames3d import compose, plus
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.batch_factors import block_matrix
 from kalmark.results.batch_linear import FLAT
+from kalmark.results.corners import rms_of_corners
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -72,7 +76,7 @@ def adjust(
     tags: Array,
     mounts: Array,
     *,
-    hold_pose: int | None = 0,
+    hold_pose: int | Sequence[int] | None = 0,
     hold_tag: int | None = None,
     free_mounts: Sequence[int] = (),
     sigma_px: float = 1.0,
@@ -89,7 +93,9 @@ def adjust(
     n, m, c = len(poses), len(tags), len(mounts)
     free = np.repeat([True, False], [n + m, c])
     free[n + m + np.array(free_mounts, dtype=np.int64)] = True
-    free[[first + held for held, first in ((hold_pose, 0), (hold_tag, n)) if held is not None]] = False
+    for held, first in ((hold_pose, 0), (hold_tag, n)):
+        if held is not None:
+            free[first + np.array(held)] = False
     at, E = look(seen, poses, tags, mounts)
     hidden = np.flatnonzero(np.isnan(at.residuals).any(axis=1))
     if len(hidden):
@@ -128,6 +134,22 @@ def look(seen: Sightings, poses: Array, tags: Array, mounts: Array) -> tuple[Tag
     return Tags(poses, tags, mounts, seen.y - e, np.zeros((len(tags), 6, 6))), E
 
 
+def parts(seen: Sightings) -> Ints:
+    """Return the first pose of each part of the sightings that no tag connects with the others."""
+    n, m = int(seen.pose.max()) + 1, int(seen.tag.max()) + 1
+    links = coo_array((np.ones(len(seen.y)), (seen.pose, n + seen.tag)), shape=(n + m, n + m))
+    _, part = connected_components(links, directed=False)
+    first: Ints = np.unique(part[:n], return_index=True)[1]
+    return first
+
+
+def together(seen: Sightings) -> list[int]:
+    """Return the cameras that saw a tag at the same pose as another: the mounts of others move with their poses."""
+    pairs = np.unique(np.stack([seen.pose, seen.camera], axis=1), axis=0)
+    shared = np.bincount(pairs[:, 0])[pairs[:, 0]] > 1
+    return [int(k) for k in np.unique(pairs[shared, 1])]
+
+
 def _step(
     seen: Sightings, at: Tags, E: Array, free: npt.NDArray[np.bool_], huber_px: float, damping: float
 ) -> tuple[Array, Array]:
@@ -136,7 +158,7 @@ def _step(
     Solves (A + damping diag A) dx = E' W z, A = E' W E, by elimination of the poses, whose part of A is block diagonal.
     """
     k, n, behind = len(seen.y), len(at.poses), len(at.tags) + len(at.mounts)
-    root = np.sqrt(np.minimum(1.0, huber_px / np.maximum(_rms(at), 1e-300)))
+    root = np.sqrt(np.minimum(1.0, huber_px / np.maximum(rms_of_corners(at.residuals), 1e-300)))
     index: Ints = np.stack([seen.pose, n + seen.tag, n + len(at.tags) + seen.camera])
     E, z = E * (root * free[index])[:, :, None, None], root[:, None] * at.residuals
     g, D = np.zeros((n + behind, 6)), np.zeros((n, 6, 6))
@@ -178,14 +200,9 @@ def _lifted(diagonal: Array, damping: float) -> Array:
     return damping * diagonal + (diagonal == 0.0)
 
 
-def _rms(at: Tags) -> Array:
-    """Return the RMS (K,) of the four corners of each sighting, px."""
-    return np.sqrt(0.25 * np.sum(at.residuals**2, axis=1))
-
-
 def _cost(at: Tags, huber_px: float) -> float:
     """Return the sum over the corners of the squared distances, of Huber's function beyond `huber_px`."""
-    rms = _rms(at)
+    rms = rms_of_corners(at.residuals)
     if not rms.max(initial=0.0) > huber_px:
         return float(4 * rms @ rms)
     inside = np.minimum(rms, huber_px)

@@ -16,7 +16,8 @@ from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.align import rigid, rmse
-from kalmark.results.batch_tags import Sightings, Tags, adjust, look
+from kalmark.results.batch_tags import Sightings, Tags, adjust, look, parts, together
+from kalmark.results.corners import USED
 from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-USED = ("associated", "new")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,8 @@ class TagBatch:
 def adjust_run(run: Run, huber_px: float = np.inf) -> TagBatch:
     """Adjust the path and tags of a run to the corners that its filter used, from where the filter has them.
 
-    The first pose is held; mounts that the filter calibrates are adjusted.  Raises KalmarkError unless one robot alone
+    The first pose is held, of each part of the path that shares no tag with the others; mounts that the filter
+    calibrates are adjusted where another camera saw a tag at the same time.  Raises KalmarkError unless one robot alone
     saw tags.
     """
     history, slam = run.history, run.final_slam()
@@ -110,7 +111,8 @@ def adjust_run(run: Run, huber_px: float = np.inf) -> TagBatch:
     optimum = adjust(
         seen,
         *(filtered.poses, filtered.tags, filtered.mounts),
-        free_mounts=[list(cameras).index(n) for n in calibrated],
+        hold_pose=parts(seen).tolist(),
+        free_mounts=[k for k in together(seen) if list(cameras)[k] in calibrated],
         sigma_px=next(iter(cameras.values())).sigma_px,
         huber_px=huber_px,
     )

@@ -21,7 +21,7 @@ def cameras(slam: Slam) -> tuple[Camera, ...]:
         Camera(
             robot.name,
             name,
-            _mount(slam, robot.name, name, mount.at),
+            mount_now(slam, robot.name, name, mount.at),
             _size(mount.sensor),
             columns,
             _corners(mount.sensor),
@@ -51,7 +51,8 @@ def _in_map(slam: Slam, name: str) -> bool:
     return True
 
 
-def _mount(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
+def mount_now(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
+    """Return where a sensor sits on its robot: as given, or as estimated so far if its mount is in the map."""
     name = f"{robot}.{sensor}"
     return np.array(slam.mean(name) if _in_map(slam, name) else at, dtype=np.float64)
 

@@ -55,6 +55,8 @@ def evaluate(run: Run) -> dict[str, Any]:
         summary["stopped"] = run.stopped
     summary["robots"] = robots
     summary |= landmark_figures(run.landmarks, run.truth) | line_figures(run.landmarks, run.truth)
+    if not np.isnan(history.left_px).all():
+        summary["corner_rms_px"] = float(np.sqrt(np.nanmean(history.left_px**2)))
     if history.mounts:
         summary["mounts"] = {mount.name: mount_figures(mount) for mount in history.mounts}
     summary |= run.reference

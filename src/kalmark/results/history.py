@@ -77,7 +77,8 @@ class History:
     Steps: time, robot, its mean (S, n) and covariance (S, q, q) after the scan, and the wall time in microseconds.
     Observations: `step` is the row of the step, `id` and `landmark` are texts ("" for none), `kind` is that of the
     landmark after the scan, `d2` is NaN where there is none; measured `y` and expected `e` (O, m), innovation `z`
-    (O, p) and its covariance `Z` (O, p, p).  All are padded with NaN where robots or sensors differ in size.
+    (O, p) and its covariance `Z` (O, p, p).  All are padded with NaN where robots or sensors differ in size.  `left_px`
+    (O,) is what the corners of tags are off by after the scan (`kalmark.results.corners`).
     """
 
     t_ns: Ints
@@ -101,6 +102,7 @@ class History:
     starts: tuple[Start, ...] = ()
     inputs: Inputs = field(default_factory=Inputs)
     kind: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    left_px: Array = field(default_factory=lambda: np.empty(0))
     cameras: tuple[Camera, ...] = ()
     mounts: tuple[Mounted, ...] = ()
 
@@ -135,7 +137,7 @@ class History:
         """Return everything as named arrays, those of the contract (t in seconds) first."""
         named = {"t": self.t_ns * 1e-9} | {key: getattr(self, key) for key in ("robot", "mean", "covariance")}
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
-        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind")}
+        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px")}
         return (
             named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._sensor_arrays()
         )
@@ -161,13 +163,15 @@ class History:
                 *(named["start_" + key] for key in ("robot", "mean", "covariance", "t_ns")), strict=True
             )
         )
-        kind = named.get("kind", np.full(len(named["landmark"]), "", dtype=np.str_))
+        count = len(named["landmark"])
+        kind, left = named.get("kind", np.full(count, "", dtype=np.str_)), named.get("left_px", np.full(count, np.nan))
         maps, inputs, cameras = _maps(named), Inputs.from_arrays(named), _cameras(named)
         keys = ("mount", "mount_mean", "mount_covariance", "mount_prior")
         rows = zip(*(named.get(key, ()) for key in keys), strict=True)
         mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P), _cut(C)) for name, mean, P, C in rows)
         columns = {key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)}
-        return cls(**columns, maps=maps, starts=starts, inputs=inputs, kind=kind, cameras=cameras, mounts=mounts)
+        columns |= {"kind": kind, "left_px": left}
+        return cls(**columns, maps=maps, starts=starts, inputs=inputs, cameras=cameras, mounts=mounts)
 
 
 def _map_arrays(maps: tuple[MapSnapshot, ...]) -> dict[str, npt.NDArray[Any]]:
@@ -230,7 +234,7 @@ _EXTRA = (
     "outcome",
     "d2",
     "reason",
-)  # and kind, which runs saved by the first version lack
+)  # and kind and left_px, which runs saved by the first version lack
 
 
 def texts(values: list[Any]) -> Texts:

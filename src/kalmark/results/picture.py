@@ -103,6 +103,9 @@ def headline(run: Run) -> tuple[str, list[str]]:
     if summary.get("landmark_rmse_m") is not None:
         raw, aligned = figure(summary["landmark_rmse_raw_m"]), figure(summary["landmark_rmse_m"])
         parts.append(f"landmarks {raw} m ({aligned} m aligned)")
+    if summary.get("corner_rms_px") is not None:
+        batch = f" (batch {figure(summary['batch']['rms_px'])} px)" if "batch" in summary else ""
+        parts.append(f"corners {figure(summary['corner_rms_px'])} px{batch}")
     if summary.get("fix_median_m") is not None:
         parts.append(f"fixes: median {summary['fix_median_m']:.2f} m, {summary['fix_within_10m']:.1%} within 10 m")
     if any(figures.get("pose_nees") is not None for figures in errors):

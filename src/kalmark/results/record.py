@@ -13,6 +13,7 @@ import numpy.typing as npt
 from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
 from kalmark.results.cameras import cameras, mounts
+from kalmark.results.corners import left_px
 from kalmark.results.describe import describe, plain
 from kalmark.results.history import Array, History, MapSnapshot, Start, padded, texts
 from kalmark.results.inputs import Controlled, Inputs, UsedFix
@@ -93,6 +94,7 @@ class _Recorder:
     covariances: list[Array] = field(default_factory=list)
     step_ns: list[int] = field(default_factory=list)
     kinds: list[str] = field(default_factory=list)
+    left: list[Array] = field(default_factory=list)
     maps: list[MapSnapshot] = field(default_factory=list)
     _spent_ns: int = 0
 
@@ -118,6 +120,7 @@ class _Recorder:
         self.means.append(self.slam.mean(event.robot))
         self.covariances.append(self.slam.covariance(event.robot))
         self.kinds += [self._kind(o.landmark) for o in report.observations]
+        self.left.append(left_px(self.slam, event, report))
         if len(self.maps) < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[len(self.maps)]:
             self.maps.append(self._snapshot())
 
@@ -186,6 +189,7 @@ class _Recorder:
             starts=self.starts,
             inputs=Inputs(self.controls, tuple(self.fixes)),
             kind=texts(list(self.kinds)),
+            left_px=np.concatenate([np.empty(0), *self.left]),
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),
         )

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from kalmark.errors import MapError
 from kalmark.models.protocols import Landmark
+from kalmark.slam.doubts import Doubts
 from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot
 from kalmark.slam.scene import ROBOT, Look, View
@@ -21,7 +22,7 @@ class Members:
     """The names of the map's blocks: `slots` of all of them, `kinds` of the landmarks alone.
 
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
-    found.  `ends` are the abscissas (2,) of the segments seen of lines.
+    found.  `ends` are the abscissas (2,) of the segments seen of lines, `doubts` what waits to become a landmark.
     """
 
     def __init__(self, robots: Mapping[str, Robot]) -> None:
@@ -31,6 +32,7 @@ class Members:
         self.seen: dict[Id, int] = {}
         self.searched: dict[Id, list[int]] = {}
         self.ends: dict[Id, Array] = {}
+        self.doubts = Doubts()
         self.unnamed = 0
 
     def slot(self, name: Id) -> int:

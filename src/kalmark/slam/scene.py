@@ -14,8 +14,9 @@ from kalmark.filter.corrections import innovation, observed_block
 from kalmark.filter.map import X_AT, StochasticMap
 from kalmark.models import landmarks as kinds
 from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D, Tag
-from kalmark.models.observe import composed, inverse_expectation, is_built_in, linearize, view_of
+from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
+from kalmark.models.sensors import TagPose
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.robot import Mount
 
@@ -79,6 +80,9 @@ class View:
         self.starts = isinstance(self.sensor, FullSensor) and (depth or self.landmark.kind != "point3")
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
         self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
+        self.rough: Look | None = None  # how to come near to what is far away: `approach`
+        if hasattr(self.sensor, "is_far"):
+            self.rough = Look(self.landmark, view_of(TagPose(), self.landmark, self.at), self.landmark.space.size)
 
     def _looks(self) -> dict[str, Look]:
         """Return the looks at all kinds of blocks that this sensor can see: its own landmarks and those like them."""
@@ -138,6 +142,10 @@ class View:
             return R
         return self.noise_at(look.landmark.seen_from(self.pose(map_, robot), means(map_, slots, look.d))[0])
 
+    def innovation_of(self, map_: StochasticMap, robot: int, look: Look, slots: Index, y: Array) -> Array:
+        """Return the innovations z (K, p) of y (K, m) from the blocks `slots`."""
+        return linearize(look.view, self.head(map_, robot), means(map_, slots, look.d), y)[1]
+
     def predict(
         self, map_: StochasticMap, robot: int, look: Look, slots: Index, y: Array, R: Array
     ) -> tuple[Array, Array]:
@@ -156,15 +164,21 @@ class View:
         Z, _ = self.predict(map_, robot, look, slots, event.y[rows], noise)
         return np.nan_to_num(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(noise)[1], nan=-np.inf)
 
-    def explain(self, map_: StochasticMap, robot: int, event: Scan, k: int, R: Array) -> tuple[Array, Array, Array]:
+    def explain(
+        self, map_: StochasticMap, robot: int, event: Scan, k: int, R: Array, which: int = 0
+    ) -> tuple[Array, Array, Array]:
         """Return the landmark (n,) that explains the k-th observation, whose noise is R, and how it came about.
 
-        L_h (., 3 or more) with respect to the head, and Q = L_y R L_y' + prior.  [S] (32)-(35).
+        L_h (., 3 or more) with respect to the head, and Q = L_y R L_y' + prior.  [S] (32)-(35).  Of two that do,
+        `which` is taken.
         """
         y = event.y[k : k + 1]
         head, size = self.head(map_, robot), len(self.at)
         r, mount = head[:size], head[size:] if self.mount >= 0 else self.at
-        l, L_r, L_s, L_y, prior = inverse_expectation(r, mount, self.sensor, self.landmark, y)  # type: ignore[arg-type]
+        sensor: Any = self.sensor
+        v, V_y = (a[:, which] for a in sensor.both(y)[:2]) if hasattr(sensor, "both") else sensor.invert(y)
+        depth = getattr(sensor, "finds_depth", True)
+        l, L_r, L_s, L_y, prior = landmark_at(r, mount, self.landmark, v, V_y, depth)
         if self.noise_at is not None and event.cov is None:
             R = self.noise_at(self.sensor.invert(y)[0])[0]  # type: ignore[attr-defined]
         if hasattr(self.sensor, "start_noise"):

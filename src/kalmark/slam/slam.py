@@ -25,15 +25,17 @@ from kalmark.geometry.spaces import MOUNTS, Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
-from kalmark.slam import lifecycle
+from kalmark.slam import budget, lifecycle
+from kalmark.slam.approach import approach
 from kalmark.slam.association import NEW, Association, ByIdentity, Decision
 from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
+from kalmark.slam.doubts import MIRRORED
 from kalmark.slam.drive import Drive, Part, body_axes
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
 from kalmark.slam.members import Members
 from kalmark.slam.report import LandmarkTable, Observation, Report, judged
 from kalmark.slam.robot import Robot, mount_name
-from kalmark.slam.scene import Look, Scene, View
+from kalmark.slam.scene import Scene, View
 
 Array = npt.NDArray[np.float64]
 
@@ -213,7 +215,7 @@ class Slam:
         if view.attention.delete:
             report.removed = tuple(lifecycle.give_up(self, view, event, matched))
         new = [k for k, outcome in enumerate(outcomes) if outcome is None]
-        reasons = self._starts(view, new, known, event.y, decisions)
+        reasons = budget.starts(self, view, new, known, event.y, decisions)
         for k in new:
             name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
             outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
@@ -229,7 +231,7 @@ class Slam:
         robot = self.members.slots[event.robot]
         groups = [(look, [known[i] for i in rows]) for look, rows in self.members.by_look(view, names)]
         if view.attention.updates is not None and len(known) > view.attention.updates:
-            for k in self._least(event, view, groups, decisions, R):
+            for k in budget.least(self, event, view, groups, decisions, R):
                 reason = f"not among the {view.attention.updates} that tell most"
                 yield Observation(k, ids[k], "ignored", decisions[k][0], None, reason)  # type: ignore[arg-type]
         if view.attention.sequential:
@@ -238,6 +240,7 @@ class Slam:
             if not rows:
                 continue
             slots = self.members.slots_of([decisions[k][0] for k in rows])
+            approach(self, view, robot, look, slots, event.y[rows], R[rows])
             noise = view.noise(self.map, robot, look, slots, R[rows], event)
             done = self.estimator.correct(
                 self.map, look.view, robot, view.mount, slots, look.d, event.y[rows], noise, view.gate
@@ -247,29 +250,6 @@ class Slam:
             for k, d2, fused in zip(rows, done.d2.tolist(), done.fused.tolist(), strict=True):
                 self.members.count(decisions[k][0], fused)
                 yield judged(k, ids[k], decisions[k][0], d2, fused, view.gate)
-
-    def _least(
-        self, event: Scan, view: View, groups: list[tuple[Look, list[int]]], decisions: Sequence[Decision], R: Array
-    ) -> list[int]:
-        """Take out of the groups what is not worth a correction and return it."""
-        robot, order, told = self.members.slots[event.robot], [], []
-        for look, rows in groups:
-            slots = self.members.slots_of([decisions[k][0] for k in rows])
-            order += rows
-            told += view.information(self.map, robot, look, slots, event, rows, R[rows]).tolist()
-        worth = view.attention.worth_a_correction(np.array(told))
-        least = [k for k, good in zip(order, worth, strict=True) if not good]
-        for _, rows in groups:
-            rows[:] = [k for k in rows if k not in least]
-        return least
-
-    def _starts(
-        self, view: View, new: list[int], known: list[int], y: Array, decisions: Sequence[Decision]
-    ) -> dict[int, str]:
-        """Return why some of the observations that could start landmarks do not."""
-        wanted = [k for k in new if decisions[k][0] is not None and decisions[k][0] not in self.members.slots]
-        image, empty = getattr(view.sensor, "image", None), not self.members.kinds
-        return view.attention.worth_a_start(wanted, known, y, image, empty)
 
     def _initialize(
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
@@ -285,7 +265,10 @@ class Slam:
             kind = type(view.sensor).__name__
             return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
         robot = self.members.slots[event.robot]
-        l, L_h, Q = view.explain(self.map, robot, event, k, R[k])
+        which = self.members.doubts.which(view, self.map, robot, name, event.y[k], event.t_ns)
+        if which is None:
+            return Observation(k, id_, "deferred", None, None, MIRRORED)
+        l, L_h, Q = view.explain(self.map, robot, event, k, R[k], which)
         if l.shape != (view.landmark.space.size,):
             found = f"it finds {len(l)} numbers, a {view.landmark.kind} has {view.landmark.space.size}"
             return Observation(k, id_, "ignored", None, None, found)

@@ -24,13 +24,14 @@ from kalmark.geometry.spaces import MOUNTS, Rn, Space
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
+from kalmark.slam.doubts import Doubt
 from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
 
-VERSION = 4
+VERSION = 5
 DESCRIPTION, SUMS = "slam.json", "sha256"
 
 
@@ -72,6 +73,7 @@ def _state(slam: Slam) -> State:
         "reparametrize": slam.reparametrize,
         "searched": [[_id(name), counts] for name, counts in slam.members.searched.items()],
         "ends": [[_id(name), t.tolist()] for name, t in slam.members.ends.items()],
+        "doubts": [[_id(i), d.poses.tolist(), d.evidence, d.t_ns] for i, d in slam.members.doubts.open.items()],
         "seen": [[_id(name), count] for name, count in slam.members.seen.items()],
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
@@ -177,6 +179,7 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.seen = {i: _count(count, f"observations of {i!r}") for i, count in state["seen"]}
     slam.members.searched = {i: [_count(n, f"searches of {i!r}") for n in counts] for i, counts in state["searched"]}
     slam.members.ends = {i: np.array(t, dtype=np.float64).reshape(2) for i, t in state["ends"]}
+    slam.members.doubts.open = {i: _doubt(i, *rest) for i, *rest in state["doubts"]}
     slam.members.unnamed = _count(state["unnamed"], "unnamed")
     slam.t_ns = _time(state["t_ns"])
     _check_owners(slam)
@@ -237,6 +240,13 @@ def _check_owners(slam: Slam) -> None:
         block = slam.map.spaces[slot]
         if block is None or block.kinds != space.kinds:
             raise MapError(f"{what} is a {space.name} of {space.size} numbers, its block in the map is {block}")
+
+
+def _doubt(name: Id, poses: Any, evidence: Any, t_ns: Any) -> Doubt:
+    found = np.array(poses, dtype=np.float64)
+    if found.shape != (2, 7) or not np.isfinite(found).all() or not isinstance(evidence, float):
+        raise MapError(f"the doubt about {name!r} is {poses!r} by {evidence!r}, expected two poses and a number")
+    return Doubt(found, evidence, _count(t_ns, f"the time of the doubt about {name!r}"))
 
 
 def _count(value: Any, what: str) -> int:
