@@ -18,10 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
-from kalmark.filter.estimators import Estimator, Invariant
+from kalmark.filter.estimators import Estimator, Invariant, Map
 from kalmark.filter.kernels import all_finite
-from kalmark.filter.map import StochasticMap
-from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.spaces import MOUNTS, Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
@@ -41,7 +39,6 @@ from kalmark.slam.scene import Scene, View
 Array = npt.NDArray[np.float64]
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
-MAPS: dict[str, Any] = {"auto": StochasticMap, "dense": StochasticMap, "postponed": PostponedMap}
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
@@ -50,8 +47,9 @@ class Slam:
 
     `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
     what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
-    `reparametrize` (None: never).  `map` is "dense", "postponed" (docs/postponed.md), or "auto": dense while small.
-    Events must come in the order of their times.
+    `reparametrize` (None: never).  `map` is "dense", "postponed" (docs/postponed.md), or "auto": dense while small;
+    `numbers` ("float64", "float32") are those in which a postponed one keeps what is at rest.  Events must come in the
+    order of their times.
     """
 
     def __init__(
@@ -62,15 +60,14 @@ class Slam:
         landmarks: Landmark | None = None,
         map: str = "auto",
         reparametrize: float | None = LINEAR,
+        numbers: str = "float64",
     ) -> None:
-        if map not in MAPS:
-            raise ModelError(f"map is {map!r}, expected one of {', '.join(MAPS)}")
         self.robots: dict[str, Robot] = {}
         self.association: Association = association or ByIdentity()
         self.estimator: Estimator = estimator or Invariant()
         self.t_ns: int | None = None
-        self.map_type = map
-        self.map: StochasticMap | PostponedMap = MAPS[map]()
+        self.map_type, self.numbers = map, numbers
+        self.map: Map = lifecycle.new_map(map, numbers)
         self.landmark_type = landmarks
         self.reparametrize = reparametrize
         self.members = Members(self.robots)
@@ -210,7 +207,6 @@ class Slam:
         report = Report(event, event.y)
         known = [k for k, (name, _) in enumerate(decisions) if self.members.known_to(view, event.robot, name)]
         outcomes: list[Observation | None] = [None] * len(decisions)
-        report.blank(view.dof)
         for seen in self._correct(event, report, view, known, ids, decisions, R):
             outcomes[seen.index] = seen
         matched = [o for o in outcomes if o is not None]
@@ -241,6 +237,8 @@ class Slam:
                 yield Observation(k, ids[k], "ignored", decisions[k][0], None, reason)  # type: ignore[arg-type]
         if view.attention.sequential:
             groups = [(look, [k]) for look, rows in groups for k in rows]
+        if len(groups) != 1 or len(groups[0][1]) < len(report.y):
+            report.blank(view.dof)
         for look, rows in groups:
             if not rows:
                 continue
@@ -282,7 +280,11 @@ class Slam:
         if name is NEW:
             name = self.members.new_name()
         G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
-        self.members.start(name, self.map.augment(view.landmark.space, l, index, G, Q), view.landmark)
+        try:
+            slot = self.map.augment(view.landmark.space, l, index, G, Q)
+        except MapError as full:
+            return Observation(k, id_, "ignored", None, None, str(full))
+        self.members.start(name, slot, view.landmark)
         return Observation(k, id_, "new", name, None, reason)
 
     def _healthy(self, healthy: bool, event: Event) -> None:

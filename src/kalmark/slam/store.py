@@ -74,6 +74,7 @@ def _state(slam: Slam) -> State:
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
         "unnamed": slam.members.unnamed,
         "map": slam.map_type,
+        "numbers": slam.numbers,
         "postponed": None,
     } | map_described(slam.map)
 
@@ -127,6 +128,7 @@ def load(
             estimator or restored("estimator", state["estimator"], "estimator", "estimator"),
             landmark_type(state, landmarks),
             map=state["map"],
+            numbers=state["numbers"],
             reparametrize=_threshold(state["reparametrize"]),
         )
         _fill(slam, state, members, landmarks)
