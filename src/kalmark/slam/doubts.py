@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.filter.map import StochasticMap
+from kalmark.filter.estimators import Map
 from kalmark.models.sensors_camera import TELLING
 from kalmark.slam.events import Id
 
@@ -41,7 +41,7 @@ class Doubts:
     def __init__(self) -> None:
         self.open: dict[Id, Doubt] = {}
 
-    def which(self, view: View, map_: StochasticMap, robot: int, name: Any, y: Array, t_ns: int) -> int | None:
+    def which(self, view: View, map_: Map, robot: int, name: Any, y: Array, t_ns: int) -> int | None:
         """Return which of the landmarks that look like y (m,) to start, None if there is no telling yet.
 
         0 wherever there is but one.  What has no name cannot be recognised: it is settled by one scan or not at all.

@@ -15,11 +15,10 @@ from kalmark.filter.postponed import PostponedMap
 from kalmark.filter.storage import Triangle
 from kalmark.geometry.spaces import POINT3, RHO
 from kalmark.models.landmarks import Point3D
-from kalmark.slam.association import Decision
 from kalmark.slam.ends import extended_ends
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation
-from kalmark.slam.scene import Look, View
+from kalmark.slam.scene import View
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
