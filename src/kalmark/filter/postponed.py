@@ -23,7 +23,7 @@ import numpy.typing as npt
 from kalmark.filter import kernels
 from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Leap, Phase, displaced
-from kalmark.filter.map import Layout, StochasticMap
+from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
@@ -54,6 +54,7 @@ class PostponedMap(Layout):
         self.active = StochasticMap()
         self.storage = storage or Triangle()
         self.most = most
+        self.phase = 0  # number of flushes
         self._at: Index = np.full(64, -1)  # slot in the active map, -1 at rest
         self._job: Flush | None = None
         self._anchored: set[int] = set()  # blocks with inverse distances
@@ -62,6 +63,7 @@ class PostponedMap(Layout):
 
     def _begin(self) -> None:
         """Begin a phase: nothing is active."""
+        self.phase += 1
         self.active.reset()
         self._at[:] = -1
         self._owners: dict[int, int] = {}  # slots in the active map by slot
@@ -136,6 +138,24 @@ class PostponedMap(Layout):
     def means(self, slots: Index, d: int) -> Array:
         """Return the first d numbers (K, d) of blocks."""
         return np.array([self.mean(slot)[:d] for slot in slots.tolist()]).reshape(len(slots), d)
+
+    def places(self, slots: Index, d: int) -> Array:
+        """Return the first d numbers (K, d), a place, of blocks at rest: x_B = x0_B + P0_BA theta."""
+        rows = (self.blocks[slots, P_AT][:, None] + np.arange(d)).ravel()
+        if self._job is not None:
+            for slot in slots.tolist():
+                self._job.know(slot)
+        moved = self._read(rows, self._A0) @ self._displacements().sum(axis=1)
+        return self.x[self.blocks[slots, X_AT][:, None] + np.arange(d)] + moved.reshape(-1, d)
+
+    def awake(self, d: int) -> tuple[Index, Array]:
+        """Return the slots (N,) of the active blocks, and their first d numbers (N, d)."""
+        slots = np.array([s for s in self._owners if self.blocks[s, X_SIZE] >= d], dtype=np.int64)
+        return slots, self.active.means(self._at[slots], d)
+
+    def is_at_rest(self, slots: Index) -> npt.NDArray[np.bool_]:
+        """Tell which blocks (K,) are not active."""
+        return self._at[slots] < 0
 
     def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
         """Return a dense map to read these blocks from, and their slots there; blocks at rest stay there."""

@@ -60,8 +60,7 @@ def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> 
         T = view.pose(map_, members.slots[robot])
         if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < slam.reparametrize:
             p, P_l = kind.to_point(l)
-            members.slots[name] = map_.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3)))
-            members.kinds[name] = Point3D()
+            members.place(name, map_.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3))), Point3D())
             map_.remove(slot)
 
 

@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Members:
-    """The names of the map's blocks: `slots` of all of them, `kinds` of the landmarks alone.
+    """The names of the map's blocks: `slots` of all of them, `kinds` of the landmarks alone, and their `names` by slot.
 
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
     found.  `ends` are the abscissas (2,) of the segments seen of lines, `doubts` what waits to become a landmark.
@@ -28,6 +28,7 @@ class Members:
     def __init__(self, robots: Mapping[str, Robot]) -> None:
         self.robots = robots
         self.slots: dict[Id, int] = {}
+        self.names: dict[int, Id] = {}
         self.kinds: dict[Id, Landmark] = {}
         self.seen: dict[Id, int] = {}
         self.searched: dict[Id, list[int]] = {}
@@ -46,9 +47,15 @@ class Members:
         """Return the slots (K,) of blocks that are in the map."""
         return np.array([self.slots[name] for name in names])
 
+    def place(self, name: Id, slot: int, kind: Landmark) -> None:
+        """Enter a landmark, or give one another slot and kind."""
+        self.names.pop(self.slots.get(name, -1), None)
+        self.slots[name], self.kinds[name], self.names[slot] = slot, kind, name
+
     def start(self, name: Id, slot: int, kind: Landmark) -> None:
         """Enter a landmark that a sensor has just seen for the first time."""
-        self.slots[name], self.kinds[name], self.seen[name] = slot, kind, 1
+        self.place(name, slot, kind)
+        self.seen[name] = 1
         if hasattr(kind, "first_ends"):
             self.ends[name] = np.array(kind.first_ends)
 
@@ -59,6 +66,7 @@ class Members:
 
     def forget(self, name: Id) -> None:
         """Strike out a landmark."""
+        self.names.pop(self.slots[name], None)
         for table in (self.slots, self.kinds, self.seen, self.searched, self.ends):
             table.pop(name, None)
 

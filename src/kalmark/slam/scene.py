@@ -18,6 +18,7 @@ from kalmark.models.observe import composed, is_built_in, landmark_at, linearize
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.models.sensors import TagPose
 from kalmark.slam.events import Id, Scan
+from kalmark.slam.nearby import has_place
 from kalmark.slam.robot import Mount
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-
-NOTHING = np.zeros((0, 0, 0))
 
 AT_ONCE = 32  # landmarks whose joint covariance is looked at
 
@@ -80,6 +79,8 @@ class View:
         self.gate = self.association.threshold(self.dof, slam.estimator.default_gate)
         depth = getattr(self.sensor, "finds_depth", True) or hasattr(self.landmark, "prior_rho_per_m")
         self.starts = isinstance(self.sensor, FullSensor) and (depth or self.landmark.kind != "point3")
+        full = isinstance(self.sensor, FullSensor) and getattr(self.sensor, "finds_depth", True)
+        self.tells_places = full and all(has_place(look.landmark.space) for look in self.looks.values())
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
         self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
         self.rough: Look | None = None  # how to come near to what is far away: `approach`
@@ -128,6 +129,15 @@ class View:
         head = self.head(map_, robot)
         size = len(self.at)
         return composed(head[:size], head[size:] if len(head) > size else self.at)[0]
+
+    def places(self, map_: Map, robot: int, y: Array) -> Array | None:
+        """Return where measurements y (K, m) seem to come from (K, 2 or 3); None if this sensor does not tell."""
+        sensor: Any = self.sensor
+        if not self.tells_places:
+            return None
+        return self.landmark.from_view(self.pose(map_, robot), sensor.invert(y)[0])[0][
+            :, : 2 if len(self.at) == 3 else 3
+        ]
 
     def in_sight(self, map_: Map, robot: int, look: Look, slots: list[int], ends: list[Any]) -> Index:
         """Return which of the blocks `slots` the sensor should see now; `ends` are those of the segments of lines."""
@@ -220,24 +230,45 @@ class Scene:
     def __init__(self, slam: Slam, view: View, event: Scan, ids: tuple[Id | None, ...], R: Array) -> None:
         self.ids = ids
         self._slam, self._view, self._event, self._R = slam, view, event, R
+        self._pairs: tuple[Index, list[Id]] | None = None
 
     def dof(self) -> int:
         """Return the size p of one innovation."""
         return self._view.dof
 
     def candidates(self) -> list[Id]:
-        """Return the ids of the landmarks this sensor could have seen."""
-        return self._slam.members.in_reach(self._view)
+        """Return the ids of the landmarks that this sensor could have seen where these observations seem to come from.
+
+        A sensor that does not tell where its measurements come from could have seen any.
+        """
+        places = self._view.places(self._slam.map, self._slam.members.slots[self._event.robot], self._event.y)
+        if places is None:
+            return self._slam.members.in_reach(self._view)
+        self._pairs = self._slam.nearby.pairs(self._slam, frozenset(self._view.looks), places)
+        return list(dict.fromkeys(self._pairs[1]))
 
     def distances(self, candidates: list[Id]) -> Array:
-        """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83)."""
+        """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83).
+
+        inf where a candidate is not near an observation.
+        """
         map_, members, view, event = self._slam.map, self._slam.members, self._view, self._event
         robot = members.slots[event.robot]
-        d2 = np.empty((len(event.y), len(candidates)))
-        for look, columns in members.by_look(view, candidates):
-            slots = members.slots_of([candidates[i] for i in columns])
-            there = view.noise(map_, robot, look, slots, NOTHING, event)
-            for k, y in enumerate(event.y):
-                R = np.tile(self._R[k], (len(slots), 1, 1)) if there is NOTHING else there
-                _, d2[k, columns] = view.predict(map_, robot, look, slots, np.tile(y, (len(slots), 1)), R)
+        d2 = np.full((len(event.y), len(candidates)), np.inf)
+        rows, columns = self._near(candidates)
+        for look, which in members.by_look(view, [candidates[c] for c in columns.tolist()]):
+            k, c = rows[which], columns[which]
+            slots = members.slots_of([candidates[i] for i in c.tolist()])
+            R = view.noise(map_, robot, look, slots, self._R[k], event)
+            d2[k, c] = view.predict(map_, robot, look, slots, event.y[k], R)[1]
         return d2
+
+    def _near(self, candidates: list[Id]) -> tuple[Index, Index]:
+        """Return the observations and the numbers of candidates that are near each other."""
+        if self._pairs is None:
+            rows, columns = np.indices((len(self._event.y), len(candidates)))
+            return rows.ravel(), columns.ravel()
+        number = {name: i for i, name in enumerate(candidates)}
+        rows, names = self._pairs
+        columns = np.array([number.get(name, -1) for name in names], dtype=np.int64)
+        return rows[columns >= 0], columns[columns >= 0]

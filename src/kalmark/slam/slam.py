@@ -32,6 +32,7 @@ from kalmark.slam.doubts import MIRRORED
 from kalmark.slam.drive import Drive, Part, body_axes
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
 from kalmark.slam.members import Members
+from kalmark.slam.nearby import Nearby
 from kalmark.slam.report import LandmarkTable, Observation, Report, judged
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.scene import Scene, View
@@ -70,7 +71,7 @@ class Slam:
         self.map: Map = lifecycle.new_map(map, numbers)
         self.landmark_type = landmarks
         self.reparametrize = reparametrize
-        self.members = Members(self.robots)
+        self.members, self.nearby = Members(self.robots), Nearby()
         self._drives: dict[str, Drive] = {}
         self._errors: dict[str, int] = {}  # the block of a held control's error, while a scan has split its interval
         self._views: dict[tuple[str, str], View] = {}
@@ -344,8 +345,7 @@ class Slam:
         mean = numbers(mean, kind.space.size, f"landmark {name!r}: mean", MapError)
         if cov is not None:
             cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
-        self.members.slots[name] = self.map.add(kind.space, mean, cov)
-        self.members.kinds[name] = kind
+        self.members.place(name, self.map.add(kind.space, mean, cov), kind)
         lifecycle.let_grow(self)
 
     def remove(self, name: Id) -> None:
