@@ -85,7 +85,7 @@ class View:
         self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
         self.rough: Look | None = None  # how to come near to what is far away: `approach`
         if hasattr(self.sensor, "is_far"):
-            self.rough = Look(self.landmark, view_of(TagPose(), self.landmark, self.at), self.landmark.space.size)
+            self.rough = Look(self.landmark, TagPose(), self.at)
 
     def _looks(self) -> dict[str, Look]:
         """Return the looks at all kinds of blocks that this sensor can see: its own landmarks and those like them."""
