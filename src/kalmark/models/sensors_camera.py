@@ -317,7 +317,7 @@ class TagCorners(_Lens, _Camera):
         """
         v, V_y, chi2 = self.both(y)
         v[~(chi2[:, 1] - chi2[:, 0] >= TELLING)] = np.nan
-        return v[:, 0], V_y[:, 0]
+        return np.ascontiguousarray(v[:, 0]), V_y[:, 0]
 
     def both(self, y: Array) -> tuple[Array, Array, Array]:
         """Return the two poses (K, 2, 7) that look like y, the better first, V_y (K, 2, 6, 8), chi-squares (K, 2)."""
