@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from kalmark.errors import ModelError
 from kalmark.filter import corrections
-from kalmark.filter.map import X_AT, StochasticMap
+from kalmark.filter.map import StochasticMap
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -59,15 +59,19 @@ class _Estimator:
 
     source: ClassVar[Callable[..., Any]]
     compiled: ClassVar[Callable[..., Any]]
+    transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
 
     def correct(
         self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
         gate: float,
     ) -> Correction:  # fmt: skip
         """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate."""
-        m, run = map_, type(self).compiled if isinstance(view, tuple) else type(self).source
-        scan = (robot, mount, slots, d, y, R, gate)
-        return Correction(*run(view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, self._option(m)))
+        run = type(self).compiled if isinstance(view, tuple) else type(self).source
+        m, *here = map_.opened(robot, mount, slots)
+        scan = (*here, d, y, R, gate)
+        done = Correction(*run(view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, self._option(m)))
+        map_.corrected(robot, self.transports)
+        return done
 
     def _option(self, map_: StochasticMap) -> Any:
         return None
@@ -102,6 +106,7 @@ class Invariant(_Estimator):
     iterations: int = 6
 
     coordinates: ClassVar[str] = "log"
+    transports: ClassVar[bool] = True
     default_gate: ClassVar[float] = math.inf
     source = corrections.invariant
     compiled = corrections.compiled_invariant
@@ -134,8 +139,8 @@ class Fej(_Estimator):
         """Return J (I + (generator(x) - generator(x_first)) e_theta'): displacements counted from x_first."""
         space = map_.spaces[robot]
         assert space is not None
-        x_at, dof, axes = map_.blocks[robot, X_AT], J.shape[1], space.axes
-        now, first = (space.generator(x[x_at : x_at + space.size])[:dof] for x in (map_.x, map_.x_first))
+        dof, axes = J.shape[1], space.axes
+        now, first = (space.generator(x)[:dof] for x in (map_.mean(robot), map_.first(robot)))
         J, theta = J.copy(), 2 if axes == 1 else 3
         J[:, theta : theta + axes] += J @ (now - first)
         return J

@@ -22,15 +22,14 @@ Index = npt.NDArray[np.int64]
 X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
 
 
-class StochasticMap:
-    """The joint Gaussian of all blocks, dense: predict O(n), correct O(n^2), augment O(n), reduce O(n).
+class Layout:
+    """Where blocks are: their slots, means, and the rows they have in a covariance that a subclass keeps.
 
-    Blocks are addressed by slots, the rows of `blocks`; names are the caller's business.  P is a lower triangle.
+    Blocks are addressed by slots, the rows of `blocks`; names are the caller's business.
     """
 
     def __init__(self, capacity: int = 64) -> None:
         self.x: Array = np.zeros(capacity)
-        self.P: Array = np.zeros((capacity, capacity))
         self.x_first: Array = np.zeros(capacity)  # where each block was first estimated, robots last predicted
         self.blocks: Table = np.zeros((0, 6), dtype=np.int64)
         self.atoms: Table = np.zeros((0, 3), dtype=np.int64)
@@ -40,16 +39,85 @@ class StochasticMap:
         self.x_n = 0  # numbers of x in use
         self._free: dict[tuple[int, ...], list[int]] = {}
 
-    # ------------------------------------------------------------------ reading
-    def index(self, slot: int) -> Index:
+    def rows(self, slot: int) -> Index:
         """Return the rows of P of a block."""
         at = self.blocks[slot, P_AT]
         return np.arange(at, at + self.blocks[slot, P_SIZE])
 
+    def numbers(self, slot: int) -> slice:
+        """Return where a block's mean is in x."""
+        at = int(self.blocks[slot, X_AT])
+        return slice(at, at + int(self.blocks[slot, X_SIZE]))
+
+    def _place(self, space: Space, mean: Array) -> int:
+        """Return a slot for a block, its mean written, its rows of P not yet."""
+        if mean.shape != (space.size,):
+            raise MapError(f"a {space.name} has {space.size} numbers, got an array of shape {mean.shape}")
+        free = self._free.get(space.kinds)
+        slot = free.pop() if free else self._append(space)
+        _, _, _, _, atom_at, count = self.blocks[slot]
+        self.atoms[atom_at : atom_at + count, 0] = space.kinds
+        self.spaces[slot] = space
+        self.axes = max(self.axes, 6 if space.steps else space.axes)
+        where = self.numbers(slot)
+        self.x[where] = self.x_first[where] = mean
+        return slot
+
+    def _append(self, space: Space) -> int:
+        first = self._first_row(space.dof)
+        self._reserve(max(self.x_n + space.size, first + space.dof))
+        row = [self.x_n, space.size, first, space.dof, len(self.atoms), len(space.kinds)]
+        self.blocks = _appended(self.blocks, np.array([row]))
+        self.atoms = _appended(self.atoms, space.atoms + np.array([0, self.x_n, first]))
+        self.spaces.append(space)
+        self.x_n, self.n = self.x_n + space.size, first + space.dof
+        return len(self.blocks) - 1
+
+    def _first_row(self, dof: int) -> int:
+        """Return where the rows of a new block begin."""
+        return self.n
+
+    def _reserve(self, size: int) -> None:
+        """Make room for a mean and a covariance of that size."""
+        capacity = len(self.x)
+        if size > capacity:
+            x, x_first = np.zeros(max(size, 2 * capacity)), np.zeros(max(size, 2 * capacity))
+            x[:capacity], x_first[:capacity] = self.x, self.x_first
+            self.x, self.x_first = x, x_first
+
+    def _vacate(self, slot: int) -> None:
+        """Forget a block; its slot is free for another of its shape."""
+        space = self.spaces[slot]
+        assert space is not None
+        self.x[self.numbers(slot)] = 0.0
+        self._free.setdefault(space.kinds, []).append(slot)
+        atom_at, count = self.blocks[slot, ATOM_AT], self.blocks[slot, ATOMS]
+        self.atoms[atom_at : atom_at + count, 0] = REMOVED
+        self.spaces[slot] = None
+
+
+class StochasticMap(Layout):
+    """The joint Gaussian of all blocks, dense: predict O(n), correct O(n^2), augment O(n), reduce O(n).
+
+    P is a lower triangle.
+    """
+
+    def __init__(self, capacity: int = 64) -> None:
+        super().__init__(capacity)
+        self.P: Array = np.zeros((capacity, capacity))
+
+    # ------------------------------------------------------------------ reading
+    def index(self, slot: int) -> Index:
+        """Return the rows of P of a block."""
+        return self.rows(slot)
+
     def mean(self, slot: int) -> Array:
         """Return a copy of a block's mean."""
-        at, size = self.blocks[slot, X_AT], self.blocks[slot, X_SIZE]
-        return self.x[at : at + size].copy()
+        return self.x[self.numbers(slot)].copy()
+
+    def first(self, slot: int) -> Array:
+        """Return a copy of a block's first estimate, of a robot its last predicted one."""
+        return self.x_first[self.numbers(slot)].copy()
 
     def covariance(self, slots: Sequence[int]) -> Array:
         """Return the joint covariance of blocks, in the order given."""
@@ -73,45 +141,21 @@ class StochasticMap:
 
     def remove(self, slot: int) -> None:
         """Marginalise a block out; its slot is free for another of its shape.  [S] Table 1, state reduction."""
-        x_at, x_size, p_at, p_size, atom_at, count = self.blocks[slot]
-        kernels.clear(self.P, self.n, p_at, p_size)
-        self.x[x_at : x_at + x_size] = 0.0
-        space = self.spaces[slot]
-        assert space is not None
-        self._free.setdefault(space.kinds, []).append(slot)
-        self.atoms[atom_at : atom_at + count, 0] = REMOVED
-        self.spaces[slot] = None
+        kernels.clear(self.P, self.n, self.blocks[slot, P_AT], self.blocks[slot, P_SIZE])
+        self._vacate(slot)
 
-    def _place(self, space: Space, mean: Array) -> int:
-        """Return a slot for a block, its mean written, its rows of P not yet."""
-        if mean.shape != (space.size,):
-            raise MapError(f"a {space.name} has {space.size} numbers, got an array of shape {mean.shape}")
-        free = self._free.get(space.kinds)
-        slot = free.pop() if free else self._append(space)
-        x_at, size, _, _, atom_at, count = self.blocks[slot]
-        self.atoms[atom_at : atom_at + count, 0] = space.kinds
-        self.spaces[slot] = space
-        self.axes = max(self.axes, 6 if space.steps else space.axes)
-        self.x[x_at : x_at + size] = self.x_first[x_at : x_at + size] = mean
-        return slot
-
-    def _append(self, space: Space) -> int:
-        row = [self.x_n, space.size, self.n, space.dof, len(self.atoms), len(space.kinds)]
-        self.blocks = _appended(self.blocks, np.array([row]))
-        self.atoms = _appended(self.atoms, space.atoms + np.array([0, self.x_n, self.n]))
-        self.spaces.append(space)
-        self.x_n, self.n = self.x_n + space.size, self.n + space.dof
-        self._reserve(max(self.x_n, self.n))
-        return len(self.blocks) - 1
+    def reset(self) -> None:
+        """Forget all blocks, keep the room."""
+        self.blocks, self.atoms, self.spaces = self.blocks[:0], self.atoms[:0], []
+        self.n, self.x_n, self._free = 0, 0, {}
 
     def _reserve(self, size: int) -> None:
-        capacity = len(self.x)
-        if size <= capacity:
-            return
-        bigger = max(size, 2 * capacity)
-        x, x_first, P = np.zeros(bigger), np.zeros(bigger), np.zeros((bigger, bigger))
-        x[:capacity], x_first[:capacity], P[:capacity, :capacity] = self.x, self.x_first, self.P
-        self.x, self.x_first, self.P = x, x_first, P
+        super()._reserve(size)
+        capacity, bigger = len(self.P), len(self.x)
+        if bigger > capacity:
+            P = np.zeros((bigger, bigger))
+            P[:capacity, :capacity] = self.P
+            self.P = P
 
     # ------------------------------------------------------------------ moving
     def predict(self, index: Index, F: Array, Q: Array) -> None:
@@ -120,8 +164,16 @@ class StochasticMap:
 
     def set_predicted(self, slot: int, mean: Array) -> None:
         """Write a block's mean after a motion."""
-        at, size = self.blocks[slot, X_AT], self.blocks[slot, X_SIZE]
-        self.x[at : at + size] = self.x_first[at : at + size] = mean
+        where = self.numbers(slot)
+        self.x[where] = self.x_first[where] = mean
+
+    # ------------------------------------------------------------------ correcting
+    def opened(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
+        """Return the dense map on which a scan of these blocks is fused, and their slots there."""
+        return self, robot, mount, slots
+
+    def corrected(self, robot: int, transports: bool) -> None:
+        """Take note that `robot` has corrected what `opened` returned."""
 
 
 def _appended(table: Table, rows: Table) -> Table:

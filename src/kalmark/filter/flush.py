@@ -1,0 +1,221 @@
+"""The flush of a postponed map: what a phase has learnt enters the blocks at rest.  docs/postponed.md.
+
+It is a job that can be done in slices, panel by panel from the first.  Until a panel is done, a read of its elements is
+corrected by what is still to come; that makes a slice as long or as short as one likes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg.lapack import dpstrf
+
+from kalmark.compiled import compiled
+from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, X_AT, X_SIZE, Layout
+from kalmark.filter.storage import PANEL, Stored, Triangle, subtract
+from kalmark.geometry.spaces import Table, generator, retract
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+
+@compiled
+def displaced(atoms: Table, x: Array, D: Array, axes: int, origins: Array) -> tuple[Array, Array]:
+    """Add the displacements D (n, R) to the mean x, one robot's after the other's.
+
+    Return the mean and a (n, R axes), how the errors' coordinates have turned with each robot's: generator(after) -
+    generator(before); without axes nothing turns.  `origins` (R, 3) is where the robots stand.
+    """
+    x, a = x.copy(), np.zeros((D.shape[0], D.shape[1] * axes))
+    for r in range(D.shape[1]):
+        d, columns = D[:, r].copy(), slice(r * axes, (r + 1) * axes)
+        if axes > 0:
+            a[:, columns] -= generator(atoms, x, len(d), axes, origins[r])
+        retract(atoms, x, d, np.zeros(0))
+        if axes > 0:
+            a[:, columns] += generator(atoms, x, len(d), axes, origins[r])
+    return x, a
+
+
+@compiled
+def turned(atoms: Table, x: Array, d: Array, turn: Array, axes: int, origin: Array) -> tuple[Array, Array]:
+    """Move the mean x by a correction d that turns the world by `turn`; return it and how the coordinates turned."""
+    x, a = x.copy(), -generator(atoms, x, len(d), axes, origin)
+    retract(atoms, x, d, turn)
+    return x, a + generator(atoms, x, len(d), axes, origin)
+
+
+@compiled
+def fill(panel: Stored, first: int, last: int, A: Index, where: Index, V: Array, P_AA: Array) -> None:
+    """Write the covariances of the active blocks into the rows first..last of a panel."""
+    for i in range(first, last):
+        row = panel[i - first]
+        if where[i] < 0:
+            for c in range(len(A)):
+                if A[c] < i:
+                    row[A[c]] = V[i, c]
+            continue
+        for j in range(i + 1):
+            row[j] = V[j, where[i]] if where[j] < 0 else P_AA[where[i], where[j]]
+
+
+@compiled
+def corrected(
+    C: Array, rows: Index, columns: Index, done: tuple[int, int], where: Index, R: Array, V: Array, P_AA: Array, q: int
+) -> None:  # fmt: skip
+    """Bring elements [rows][:, columns] that were read before their panel was done up to date."""
+    panel, column = done
+    m = (R.shape[1] - q) // 2
+    for a in range(len(rows)):
+        for b in range(len(columns)):
+            i, j = max(rows[a], columns[b]), min(rows[a], columns[b])
+            if i // PANEL < panel:
+                continue
+            if where[i] >= 0:
+                C[a, b] = P_AA[where[i], where[j]] if where[j] >= 0 else V[j, where[i]]
+            elif where[j] >= 0:
+                C[a, b] = V[i, where[j]]
+            elif i // PANEL > panel or j >= column:
+                s = 0.0
+                for c in range(q):
+                    s += R[i, c] * R[j, c]
+                for c in range(m):
+                    s -= R[i, q + m + c] * R[j, q + c] + R[i, q + c] * R[j, q + m + c]
+                C[a, b] -= s
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What a phase leaves behind: its rows A0 of the storage and those, A, of its active blocks at the end.
+
+    `Psi` (A0, A0), `Phi` (A, A0) and P_AA as in docs/postponed.md, the displacements `S` (A0, R) that each robot's
+    corrections have caused, the rows of A in which the robots' turns are (R axes,), where they stand, and the axes.
+    """
+
+    A0: Index
+    A: Index
+    Psi: Array
+    Phi: Array
+    P_AA: Array
+    S: Array
+    thetas: Index
+    origins: Array
+    axes: int
+
+
+@dataclass(frozen=True)
+class Leap:
+    """A last correction that is applied as in the dense filter: by which robot (its column of S), the shadows' part ds,
+    how it turns the world, and what it did to the robots' turns, e' d (R axes,).
+    """
+
+    robot: int
+    ds: Array
+    turn: Array
+    turns: Array
+
+
+class Flush:
+    """P_BB <- P_BB - W W', P_AB, P_AA and the means, in slices."""
+
+    def __init__(self, map_: Layout, storage: Triangle, phase: Phase, leap: Leap | None) -> None:
+        self.map, self.storage, self.phase, self.leap = map_, storage, phase, leap
+        self.x_before, self.n = map_.x[: map_.x_n].copy(), map_.n
+        self.where: Index = np.full(self.n, -1)
+        self.where[phase.A] = np.arange(len(phase.A))
+        self.L = _root(phase.Psi, storage.diagonal(phase.A0))
+        self.q = self.L.shape[1]
+        self.R = np.zeros((self.n, self.q + 2 * len(phase.thetas)))
+        self.V = np.zeros((self.n, len(phase.A)))
+        self.known = self.where >= 0
+        self.panel = self.column = 0
+        self.cost = 2 * PANEL * max(self.R.shape[1], 1)  # of a column of a panel
+        self.work = self.cost * sum(min(k + PANEL, self.n) for k in range(0, self.n, PANEL))
+        self.spent = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.panel * PANEL >= self.n
+
+    def advance(self, work: float) -> None:
+        """Do so many multiplications, at least a panel's worth of one tile."""
+        while work > 0 and not self.done:
+            first = self.panel * PANEL
+            last = min(first + PANEL, self.n)
+            if self.column == 0:
+                self._know_panel(first, last)
+            end = min(last, self.column + PANEL * max(1, int(work // (self.cost * PANEL))))
+            if self.R.shape[1]:
+                W, m = self.R[first:last, : self.q], len(self.phase.thetas)
+                L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
+                subtract(self.storage.panels[self.panel][: last - first], L, self.R, self.column, end)
+            work -= self.cost * (end - self.column)
+            self.spent += self.cost * (end - self.column)
+            self.column = end
+            if end == last:
+                rows = self.storage.panels[self.panel]
+                fill(rows, first, last, self.phase.A, self.where, self.V, self.phase.P_AA)
+                self.panel, self.column = self.panel + 1, 0
+
+    def read(self, rows: Index, columns: Index) -> Array:
+        """Return elements as they will be when all is done; all rows must be known."""
+        C = self.storage.get(rows, columns)
+        if not self.done:
+            done = self.panel, self.column
+            corrected(C, rows, columns, done, self.where, self.R, self.V, self.phase.P_AA, self.q)
+        return C
+
+    def know(self, slot: int) -> None:
+        """Bring a block's mean up to date and make its elements readable."""
+        rows = self.map.rows(slot)
+        if rows[0] < self.n and not self.known[rows[0]]:
+            self._know(slot, slot + 1)
+
+    def _know_panel(self, first: int, last: int) -> None:
+        starts = self.map.blocks[:, P_AT]
+        self._know(*np.searchsorted(starts, [first, last]))
+
+    def _know(self, slot: int, end: int) -> None:
+        """Work out the means of the blocks slot..end, their rows of R = [W, w, a], and their covariances V with A."""
+        p, blocks = self.phase, self.map.blocks[slot:end]
+        if len(blocks) == 0:
+            return
+        atoms = self.map.atoms[blocks[0, ATOM_AT] : blocks[-1, ATOM_AT] + blocks[-1, ATOMS]]
+        first, last = self.map.rows(slot)[0], self.map.rows(end - 1)[-1] + 1
+        where = slice(blocks[0, X_AT], blocks[-1, X_AT] + blocks[-1, X_SIZE])
+        atoms = atoms - np.array([0, where.start, first])
+        rows = np.arange(first, last)
+        G = self.storage.get(rows, p.A0)
+        x, a = displaced(atoms, self.x_before[where], G @ p.S, p.axes, p.origins)
+        if self.leap is not None:
+            leap, columns = self.leap, slice(self.leap.robot * p.axes, (self.leap.robot + 1) * p.axes)
+            d = G @ leap.ds + a @ leap.turns
+            x, a_leap = turned(atoms, x, d, leap.turn, p.axes, p.origins[leap.robot])
+            a[:, columns] += a_leap
+        V = G @ p.Phi.T
+        w = V[:, p.thetas] + a @ (0.5 * p.P_AA[np.ix_(p.thetas, p.thetas)])
+        new = ~self.known[rows]
+        self.R[rows[new]] = np.hstack([G @ self.L, w, a])[new]
+        self.V[rows[new]] = (V + a @ p.P_AA[p.thetas])[new]
+        self.known[rows] = True
+        for block in blocks:
+            if self.where[block[P_AT]] < 0:
+                here = slice(block[X_AT], block[X_AT] + block[X_SIZE])
+                self.map.x[here] = x[here.start - where.start : here.stop - where.start]
+
+
+def _root(Psi: Array, variances: Array) -> Array:
+    """Return L (n, rank) with L L' = Psi, by pivoted Cholesky of Psi in units of the blocks' sigmas."""
+    sigma = np.sqrt(np.maximum(variances, 0.0))
+    scaled = Psi * sigma[:, None] * sigma
+    if not len(Psi) or not scaled.any():
+        return np.zeros((len(Psi), 0))
+    c, pivots, rank, _ = dpstrf(scaled, lower=1, tol=1e-15 * scaled.diagonal().max())
+    L = np.zeros((len(Psi), rank))
+    L[pivots - 1] = np.tril(c)[:, :rank]
+    known = sigma > 0
+    L[known] /= sigma[known, None]
+    return L

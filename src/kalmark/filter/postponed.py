@@ -1,0 +1,391 @@
+"""The postponed map: an exact EKF whose ordinary step does not grow with the map.  docs/postponed.md.
+
+Blocks in view now or lately are active; they live in a small dense map, which any estimator corrects as it stands.  For
+each block that came there from the rest, the dense map also holds its *shadow*: numbers s, zero at first, with
+
+    P_As = Phi,   P_ss = -Psi,   x_s = theta,      Phi = 1, Psi = 0, theta = 0 at the last flush.
+
+Predicting, correcting and transporting treat shadows like any other scalars, which is all that a block B at rest needs:
+x_B = x0_B + P0_BA theta, P_BA = P0_BA Phi', P_BB = P0_BB - P0_BA Psi P0_AB.  A block enters by being augmented from the
+shadows.  When the dense map has grown too large, a flush writes everything back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.filter import kernels
+from kalmark.filter.flush import Flush, Leap, Phase, displaced
+from kalmark.filter.map import Layout, StochasticMap
+from kalmark.filter.storage import PANEL, Triangle
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
+from kalmark.geometry.spaces import DIRECTION, ERROR_SIZE, HOMOGENEOUS, MEAN_SIZE, VECTOR, VECTOR3, Rn, Space
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
+LEAST = 1e8  # multiplications of a flush to do after each correction
+
+NO_ROWS = np.zeros(0, dtype=np.int64)
+scalars = lru_cache(maxsize=64)(Rn)
+
+
+class Watch(NamedTuple):
+    """Numbers of an active block that tell how far it is from where it was frozen, in sigmas."""
+
+    at: Index
+    frozen: Array
+    per_sigma: Array
+
+
+class PostponedMap(Layout):
+    """The joint Gaussian of all blocks, of which a few are active and the others at rest.
+
+    Slots are the same for a whole life.  `index` and `predict` speak of rows of the active map: an index holds until
+    the next correction.  `most` limits the rows of the active map, shadows included; by default it grows with the map.
+    """
+
+    def __init__(self, storage: Triangle | None = None, most: int | None = None) -> None:
+        self.active = StochasticMap()
+        self.storage = storage or Triangle()
+        self.most = most
+        self._at: Index = np.full(64, -1)  # slot in the active map, -1 at rest
+        self._job: Flush | None = None
+        self._spent = 0.0  # work on the storage that is asked for
+        super().__init__()
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin a phase: nothing is active."""
+        self.active.reset()
+        self._at[:] = -1
+        self._owners: dict[int, int] = {}  # slots in the active map by slot
+        self._A0: Index = NO_ROWS  # rows of the storage that have shadows,
+        self._s: Index = NO_ROWS  # their shadows' rows in the active map,
+        self._s_x: Index = NO_ROWS  # and their numbers
+        self._shadowed: set[int] = set()
+        self._gone: list[tuple[int, Space]] = []  # removed, their shadows are still here
+        self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
+        self._watched: dict[int, Watch] = {}
+        self._moving: dict[int, tuple[Index, Array]] = {}
+        self._watch: Watch | None = None
+        self._before: dict[int, Array] = {}
+        self._start = 0
+
+    @classmethod
+    def from_dense(cls, dense: StochasticMap, storage: Triangle | None = None, most: int | None = None) -> PostponedMap:
+        """Return a dense map as a postponed one; slots stay what they are."""
+        m = cls(storage, most)
+        removed = {slot: kinds for kinds, slots in dense._free.items() for slot in slots}
+        spaces = [Space("removed", removed[i]) if space is None else space for i, space in enumerate(dense.spaces)]
+        for space in spaces:
+            m._place(space, np.zeros(space.size))
+        rows, old = (np.concatenate([each.rows(i) for i in range(len(spaces))]) for each in (m, dense))
+        m.storage.put(rows, rows, kernels.submatrix(dense.P, old))
+        m.x[: m.x_n], m.x_first[: m.x_n], m.axes = dense.x[: m.x_n], dense.x_first[: m.x_n], dense.axes
+        for slot in removed:  # in the order in which they were removed
+            m._vacate(slot)
+        return m
+
+    # ------------------------------------------------------------------ reading
+    def index(self, slot: int) -> Index:
+        """Return the rows of a block in the active map, which it enters if need be."""
+        self._enter(slot)
+        return self.active.rows(self._owners[slot])
+
+    def mean(self, slot: int) -> Array:
+        """Return a copy of a block's mean."""
+        at = self._owners.get(slot)
+        return self.active.mean(at) if at is not None else self._preview(slot)[0]
+
+    def first(self, slot: int) -> Array:
+        """Return a copy of a block's first estimate, of a robot its last predicted one."""
+        at = self._owners.get(slot)
+        return self.active.first(at) if at is not None else self.x_first[self.numbers(slot)].copy()
+
+    def covariance(self, slots: Sequence[int]) -> Array:
+        """Return the joint covariance of blocks, in the order given.  Blocks at rest stay there."""
+        ats = [self._owners.get(slot) for slot in slots]
+        if all(at is not None for at in ats):
+            return kernels.submatrix(self.active.P, np.concatenate([self.active.rows(at) for at in ats]))  # type: ignore[arg-type]
+        rows, extra = [self.rows(slot) for slot in slots], self._resting_rows()
+        own = [NO_ROWS if at is None else self.active.rows(at) for at in ats]
+        index = np.concatenate([extra, *own])
+        starts, place = np.cumsum([0, *(len(r) for r in rows)]), len(extra)
+        T, Q = np.zeros((starts[-1], len(index))), np.zeros((starts[-1], starts[-1]))
+        resting = [i for i, at in enumerate(ats) if at is None]
+        for i in resting if self._job is not None else ():
+            self._job.know(slots[i])
+        for i, slot in enumerate(slots):
+            here = slice(starts[i], starts[i + 1])
+            if i in resting:
+                T[here, : len(extra)] = self._preview(slot)[1]
+                for j in resting:
+                    Q[here, starts[j] : starts[j + 1]] = self._read(rows[i], rows[j])
+            else:
+                T[here, place : place + len(rows[i])] = np.eye(len(rows[i]))
+                place += len(rows[i])
+        C = T @ (kernels.submatrix(self.active.P, index) @ T.T) + Q
+        return 0.5 * (C + C.T)
+
+    def _resting_rows(self) -> Index:
+        """Return the rows of the active map that blocks at rest depend on: the shadows and the robots' turns."""
+        return np.concatenate([self._s, *(self._turn_rows(robot) for robot in self._moved)])
+
+    def _turn_rows(self, robot: int) -> Index:
+        """Return the rows of what turns the world with a robot: of its orientation, or its whole pose."""
+        space = self.spaces[robot]
+        assert space is not None
+        pose = 3 if space.axes == 1 else 6
+        at = int(self.active.rows(self._owners[robot])[0])
+        return np.arange(at + pose - self.axes, at + pose)
+
+    def _read(self, rows: Index, columns: Index) -> Array:
+        return self.storage.get(rows, columns) if self._job is None else self._job.read(rows, columns)
+
+    def _preview(self, slot: int) -> tuple[Array, Array, Array]:
+        """Return the mean of a block at rest, its Jacobian G in `_resting_rows`, and the covariance it has besides."""
+        space, rows = self.spaces[slot], self.rows(slot)
+        assert space is not None
+        if self._job is not None:
+            self._job.know(slot)
+        G = self._read(rows, self._A0)
+        x, a = displaced(space.atoms, self.x[self.numbers(slot)], G @ self._displacements(), *self._gauges())
+        return x, np.hstack([G, a]), self._read(rows, rows)
+
+    def _displacements(self) -> Array:
+        """Return the part (A0, R) that each robot's corrections have in the shadows."""
+        if not self._moved:
+            return self.active.x[self._s_x][:, None]
+        return np.column_stack(list(self._moved.values()))
+
+    def _gauges(self) -> tuple[int, Array]:
+        """Return the axes of the robots' turns and where the robots stand; without transport there are none."""
+        if not self._moved:
+            return 0, np.zeros((1, 3))
+        return self.axes, np.array([self.active.mean(self._owners[robot])[:3] for robot in self._moved])
+
+    # ------------------------------------------------------------------ growing and shrinking
+    def add(self, space: Space, mean: Any, cov: Any = None) -> int:
+        """Add a block that is independent of all others (`cov` None: known exactly); return its slot."""
+        mean = np.asarray(mean, dtype=np.float64)
+        slot = self._place(space, mean)
+        self._activate(slot, self.active.add(space, mean, cov))
+        return slot
+
+    def augment(self, space: Space, mean: Array, index: Index, G: Array, Q: Array) -> int:
+        """Add a block computed from the rows `index`: P_Lx = G P_x, P_LL = G P G' + Q.  [S] (35)-(38)."""
+        slot = self._place(space, mean)
+        self._activate(slot, self.active.augment(space, mean, index, G, Q))
+        if self._full():
+            self.flush()
+        return slot
+
+    def remove(self, slot: int) -> None:
+        """Marginalise a block out; its slot is free for another of its shape, once no shadow of it is left."""
+        if slot in self._owners:
+            self.active.remove(self._owners.pop(slot))
+            self._at[slot] = -1
+            self._unwatch(slot)
+        space = self.spaces[slot]
+        assert space is not None
+        self._vacate(slot)
+        if slot in self._shadowed:
+            self._free[space.kinds].remove(slot)
+            self._gone.append((slot, space))
+
+    def _activate(self, slot: int, at: int) -> None:
+        self._owners[slot] = self._at[slot] = at
+        self.active.axes = self.axes
+
+    def _first_row(self, dof: int) -> int:
+        """Return where the rows of a new block begin: no block lies in two panels.  Raises MapError if none fits."""
+        first = self.n if self.n % PANEL + dof <= PANEL else (self.n // PANEL + 1) * PANEL
+        self.storage.reserve(first + dof)
+        return first
+
+    def _reserve(self, size: int) -> None:
+        super()._reserve(size)
+        if len(self.blocks) >= len(self._at):
+            self._at = np.concatenate([self._at, np.full(len(self._at), -1)])
+
+    # ------------------------------------------------------------------ moving
+    def predict(self, index: Index, F: Array, Q: Array) -> None:
+        """P <- F P F' + Q, F and Q acting on the rows `index` alone.  [S] (15)-(17)."""
+        self.active.predict(index, F, Q)
+
+    def set_predicted(self, slot: int, mean: Array) -> None:
+        """Write a block's mean after a motion."""
+        self._enter(slot)
+        self.active.set_predicted(self._owners[slot], mean)
+        watch = self._watched.get(slot)
+        if watch is not None:
+            self._unwatch(slot)
+            space = self.spaces[slot]
+            assert space is not None
+            rows = self.rows(slot)[: 2 if space.axes == 1 else 3]
+            self._moving[slot] = rows, watch.per_sigma[: len(rows)]
+
+    # ------------------------------------------------------------------ correcting
+    def opened(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
+        """Return the dense map on which a scan of these blocks is fused, and their slots there: all have entered."""
+        if self._full():
+            self.flush()
+        self._enter(robot)
+        if mount >= 0:
+            self._enter(mount)
+        at = self._at[slots]
+        if len(at) and at.min() < 0:
+            for slot in slots.tolist():
+                self._enter(slot)
+            at = self._at[slots]
+        self._before = {r: self.active.mean(self._owners[r]) for r in (*self._moved, robot)}
+        return self.active, self._owners[robot], self._owners.get(mount, -1), at
+
+    def corrected(self, robot: int, transports: bool) -> None:
+        """Take note that `robot` has corrected what `opened` returned, transporting its covariance or not."""
+        if transports and len(self._A0):
+            s = self.active.x[self._s_x]
+            ds = s - sum(self._moved.values())
+            self._moved[robot] = self._moved.get(robot, 0.0) + ds
+            if len(self._owners) < self._used() and self._far(robot, s):
+                self.flush(robot, ds)
+        if self._job is not None:
+            filled = (self.active.n - self._start) / max(1.0, 0.8 * (self._limit() - self._start))
+            self._job.advance(max(LEAST, filled * self._job.work - self._job.spent))
+            if self._job.done:
+                self._job = None
+
+    def _used(self) -> int:
+        return len(self.spaces) - sum(len(slots) for slots in self._free.values()) - len(self._gone)
+
+    def _enter(self, slot: int) -> None:
+        """Make a block active: augment it from the shadows, and give it a shadow of its own.  O(active^2)."""
+        if slot in self._owners:
+            return
+        space = self.spaces[slot]
+        assert space is not None
+        mean, G, Q = self._preview(slot)
+        if len(self._A0):
+            at = self.active.augment(space, mean, self._resting_rows(), G, Q)
+        else:
+            at = self.active.add(space, mean, Q)
+        self.active.x_first[self.active.numbers(at)] = self.x_first[self.numbers(slot)]
+        self._activate(slot, at)
+        rows = self.active.rows(at)
+        shadow = self.active.add(scalars(len(rows)), np.zeros(len(rows)))
+        s = self.active.rows(shadow)
+        for i, j in zip(rows, s, strict=True):
+            self.active.P[max(i, j), min(i, j)] = 1.0
+        where = self.active.numbers(shadow)
+        self._A0, self._s = np.concatenate([self._A0, self.rows(slot)]), np.concatenate([self._s, s])
+        self._s_x = np.concatenate([self._s_x, np.arange(where.start, where.stop)])
+        for name, moved in self._moved.items():
+            self._moved[name] = np.concatenate([moved, np.zeros(len(s))])
+        self._shadowed.add(slot)
+        self._look_after(slot, space, at, np.diag(Q))
+
+    # ------------------------------------------------------------------ how far the rest has moved
+    def _look_after(self, slot: int, space: Space, at: int, variances: Array) -> None:
+        """Watch those numbers of a block on which its coordinates depend."""
+        x, frozen = self.active.numbers(at).start, self.x[self.numbers(slot)]
+        numbers, weights = [], []
+        for kind, offset, row in space.atoms:
+            if kind in (VECTOR, VECTOR3, DIRECTION) or kind >= HOMOGENEOUS:
+                sigma = math.sqrt(max(0.0, variances[row : row + ERROR_SIZE[kind]].sum()))
+                numbers += range(offset, offset + MEAN_SIZE[kind])
+                weights += [1.0 / sigma if sigma > 0 else 0.0] * int(MEAN_SIZE[kind])
+        if numbers:
+            where = np.array(numbers)
+            self._watched[slot] = Watch(where + x, frozen[where], np.array(weights))
+            self._watch = None
+
+    def _unwatch(self, slot: int) -> None:
+        if self._watched.pop(slot, None) is not None:
+            self._watch = None
+
+    def _far(self, robot: int, s: Array) -> bool:
+        """Return whether the rest has left the place of its coordinates, as told by what has moved in the active map.
+
+        A landmark at rest moves with those that have entered and with where the robots were at the last flush.
+        """
+        turns = self._turn_rows(robot)[-3:] if self.axes > 1 else self._turn_rows(robot)
+        limit = TAU / math.sqrt(max(1e-300, self.active.P[turns, turns].sum()))
+        if self._watch is None and self._watched:
+            self._watch = Watch(*(np.concatenate(parts) for parts in zip(*self._watched.values(), strict=True)))
+        if self._watch is not None and self._watched:
+            at, frozen, per_sigma = self._watch
+            if (np.abs(self.active.x[at] - frozen) * per_sigma).max() > limit:
+                return True
+        return any(
+            (np.abs(self._read(rows, self._A0) @ s) * per_sigma).max() > limit
+            for rows, per_sigma in self._moving.values()
+        )
+
+    # ------------------------------------------------------------------ flushing
+    def _limit(self) -> float:
+        return self.most if self.most is not None else max(240.0, 10.0 * math.sqrt(self.n))
+
+    def _full(self) -> bool:
+        return self.active.n > self._limit() and len(self._owners) > 0
+
+    def finish(self) -> None:
+        """Finish a flush that is under way."""
+        if self._job is not None:
+            self._job.advance(math.inf)
+            self._job = None
+
+    def flush(self, robot: int | None = None, ds: Array | None = None) -> None:
+        """Bring all blocks to rest.  The last correction, ds by `robot`, is applied as the dense filter does."""
+        self.finish()
+        leap = None if robot is None or ds is None else self._leap(robot, ds)
+        P, m = self.active.P, self.active
+        slots = list(self._owners)
+        A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
+        here = np.concatenate([NO_ROWS, *(m.rows(self._owners[slot]) for slot in slots)])
+        where = {row: i for i, row in enumerate(here.tolist())}
+        thetas = [where[row] for robot in self._moved for row in self._turn_rows(robot).tolist()]
+        joint = kernels.submatrix(P, np.concatenate([here, self._s]))
+        n = len(here)
+        S = self._displacements()
+        if leap is not None:
+            S[:, leap.robot] -= leap.ds
+        phase = Phase(
+            self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, np.array(thetas, dtype=np.int64),
+            *reversed(self._gauges()),
+        )  # fmt: skip
+        self._job = Flush(self, self.storage, phase, leap)
+        for slot in slots:
+            at = self._owners[slot]
+            self.x[self.numbers(slot)], self.x_first[self.numbers(slot)] = m.mean(at), m.first(at)
+        for slot, space in self._gone:
+            self._free.setdefault(space.kinds, []).append(slot)
+        self._begin()
+
+    def _leap(self, robot: int, ds: Array) -> Leap:
+        """Return the last correction as one that turns the world."""
+        turns = {r: self._turn(before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
+        column = list(self._moved).index(robot)
+        turn = turns[robot].copy()
+        if self.axes == 6:
+            turn[:3] += np.cross(self._before[robot][:3], turn[3:])
+        return Leap(column, ds, turn, np.concatenate([turns[r] for r in self._moved]))
+
+    def _turn(self, before: Array, after: Array) -> Array:
+        """Return what a correction did to the turn (axes,) of a robot that stood at `before` and stands at `after`."""
+        if self.axes == 1:
+            return np.array([wrap(after[2] - before[2])])
+        turn = log(multiply(after[3:7], conjugate(before[3:7])))
+        if self.axes == 3:
+            return turn
+        return np.concatenate([np.linalg.solve(left_jacobian(turn), after[:3] - before[:3]), turn])
+
+

@@ -1,0 +1,224 @@
+"""The postponed map: equal to the dense one, or to a dense filter that leaves alone what it leaves alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.filter.map import StochasticMap
+from kalmark.filter.postponed import PostponedMap
+
+J = np.array([[0.0, -1.0], [1.0, 0.0]])
+Q, R = np.diag([0.01, 0.0, 0.02]) ** 2, np.diag([0.1, 0.02]) ** 2
+START = (6.0, 0.0, np.pi / 2)
+WORLD = np.random.default_rng(0).uniform(-10, 10, (120, 2))
+
+
+def slam_of(estimator: Any, most: int | None = None, cov: Any = None, names: str = "r") -> km.Slam:
+    """Return a Slam of robots that see range and bearing, its map postponed where `most` says how large it may get."""
+    lidar = km.Mount(km.sensors.RangeBearing(0.1, 0.02))
+    motion = km.motion.Odometry2D(0.01, 0.0, 0.02)
+    robots = [km.Robot(name, motion, START, {"lidar": lidar}, cov) for name in names]
+    slam = km.Slam(robots, km.association.ByIdentity("off"), estimator, map="dense")
+    if most is not None:
+        slam.map = PostponedMap.from_dense(slam.map, most=most)
+    return slam
+
+
+def drive(steps: int, seed: int, reach: float = 4.0, names: str = "r") -> list[Any]:
+    """Return the events of robots that go round among WORLD and see what is near."""
+    rng, events = np.random.default_rng(seed), []
+    truths = {name: np.array(START) for name in names}
+    for t in range(1, steps + 1):
+        for i, name in enumerate(names):
+            u = np.array([0.3, 0.0, 0.05 - 0.1 * i])
+            truths[name] = truth = km.geometry.compose(truths[name], u)[0]
+            events.append(km.Control(t, name, u + rng.normal(size=3) * [0.01, 0, 0.02]))
+            near = np.flatnonzero(np.hypot(*(WORLD - truth[:2]).T) < reach)[:8]
+            y = km.geometry.observe(truth, WORLD[near])[0] + rng.normal(size=(len(near), 2)) * [0.1, 0.02]
+            events.append(km.Scan(t, name, "lidar", np.column_stack([np.abs(y[:, 0]), y[:, 1]]), near.tolist()))
+    return events
+
+
+def differences(a: km.Slam, b: km.Slam) -> tuple[float, float]:
+    """Return the largest difference of two maps' means, and of their covariances in units of the sigmas."""
+    names = [*a.robots, *a.landmarks().ids]
+    x = max(float(np.abs(a.mean(i) - b.mean(i)).max()) for i in names)
+    P = a.covariance(*names)
+    sigma = np.sqrt(np.diag(P))
+    return x, float((np.abs(P - b.covariance(*names)) / np.outer(sigma, sigma)).max())
+
+
+@pytest.mark.parametrize("estimator", [km.estimators.Ekf(), km.estimators.Fej()])
+@pytest.mark.parametrize("names", ["r", "rs"])
+def test_a_postponed_map_equals_the_dense_one_to_1e_8(estimator: Any, names: str) -> None:
+    dense, postponed = slam_of(estimator, names=names), slam_of(estimator, most=60, names=names)
+    flushes = counted(postponed.map)
+    for event in drive(220 // len(names), 1, names=names):
+        for slam in (dense, postponed):
+            slam.process(event)
+    x, P = differences(dense, postponed)
+    assert x < 1e-8
+    assert P < 1e-8
+    assert len(flushes) > 8
+    assert len(postponed.map._owners) < len(dense.landmarks().ids)
+
+
+def counted(map_: Any) -> list[str]:
+    """Return the list to which a map will write what it does: flush, leap, or the slot that enters."""
+    done: list[Any] = []
+    flush, enter = map_.flush, map_._enter
+
+    def flushed(*args: Any) -> None:
+        done.append("leap" if args else "flush")
+        flush(*args)
+
+    def entered(slot: int) -> None:
+        if slot not in map_._owners:
+            done.append(slot)
+        enter(slot)
+
+    map_.flush, map_._enter = flushed, entered
+    return done
+
+
+class Frozen:
+    """The invariant filter, dense, but for this: a landmark at rest only has its error added to it.
+
+    It keeps the coordinates of the error that it had when it came to rest, until it is active again.
+    """
+
+    def __init__(self, P: np.ndarray) -> None:
+        self.x, self.P, self.number = np.array(START), P, {}  # type: ignore[var-annotated]
+        self.rest: dict[int, np.ndarray] = {}  # where landmarks are frozen
+
+    def rows(self, i: int) -> slice:
+        return slice(3 + 2 * self.number[i], 5 + 2 * self.number[i])
+
+    def wake(self, i: int) -> None:
+        """Turn the coordinates of a landmark's error to where it is now."""
+        A = np.eye(len(self.x))
+        A[self.rows(i), 2] = J @ (self.x[self.rows(i)] - self.rest.pop(i))
+        self.P = A @ self.P @ A.T
+
+    def flush(self) -> None:
+        for i in [*self.rest]:
+            self.wake(i)
+        self.rest = {i: self.x[self.rows(i)].copy() for i in self.number}
+
+    def generator(self, x: np.ndarray) -> np.ndarray:
+        g = np.zeros(len(x))
+        g[:2], g[2] = J @ x[:2], 1.0
+        for i in self.number:
+            if i not in self.rest:
+                g[self.rows(i)] = J @ x[self.rows(i)]
+        return g
+
+    def moved(self, d: np.ndarray) -> np.ndarray:
+        x, V = self.x + d, km.geometry.V(d[2])
+        x[:2], x[2] = self.x[:2] + V @ d[:2], km.geometry.wrap(x[2])
+        for i in self.number:
+            if i not in self.rest:
+                x[self.rows(i)] = self.x[self.rows(i)] + V @ d[self.rows(i)]
+        return x
+
+    def predict(self, u: np.ndarray) -> None:
+        F = np.eye(len(self.x))
+        r, F[:3, :3], F_u = km.geometry.compose(self.x[:3], u)
+        self.P = F @ self.P @ F.T
+        self.P[:3, :3] += F_u @ Q @ F_u.T
+        self.x[:3] = r
+
+    def correct(self, y: np.ndarray, ids: list[int]) -> None:
+        d, k = np.zeros(len(self.x)), len(ids)
+        seen = np.concatenate([np.arange(3), *(np.arange(s.start, s.stop) for s in map(self.rows, ids))])
+        for _ in range(6):
+            x, H, z = self.moved(d), np.zeros((2 * k, len(d))), np.zeros(2 * k)
+            for row, i in enumerate(ids):
+                e, E_r, E_l = km.geometry.observe(x[:3], x[self.rows(i)])
+                at = slice(2 * row, 2 * row + 2)
+                H[at, :3], H[at, self.rows(i)], z[at] = E_r, E_l, y[row] - e
+                z[2 * row + 1] = km.geometry.wrap(z[2 * row + 1])
+            H[:, 2] += H @ (self.generator(x) - self.generator(self.x))
+            v, before = z + H @ d, d
+            K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + np.kron(np.eye(k), R))
+            d = K @ v
+            if np.abs(d - before)[seen].max() < 1e-7:
+                break
+        x = self.moved(d)
+        A = np.eye(len(x))
+        A[:, 2] += self.generator(x) - self.generator(self.x)
+        self.x, self.P = x, A @ (self.P - K @ H @ self.P) @ A.T
+
+    def initialize(self, i: int, y: np.ndarray) -> None:
+        n = len(self.x)
+        l, L_r, L_y = km.geometry.inv_observe(self.x[:3], y)
+        G = np.vstack([np.eye(n), np.hstack([L_r, np.zeros((2, n - 3))])])
+        self.P = G @ self.P @ G.T
+        self.P[n:, n:] += L_y @ R @ L_y.T
+        self.x, self.number[i] = np.concatenate([self.x, l]), len(self.number)
+
+
+@pytest.mark.parametrize("noise", [1.0, 4.0])
+def test_the_invariant_form_equals_a_dense_filter_that_freezes_the_same_landmarks(noise: float) -> None:
+    cov = np.diag([0.1, 0.1, 0.05 * noise]) ** 2
+    slam = slam_of(km.estimators.Invariant(), most=60, cov=cov)
+    done, book = counted(slam.map), Frozen(cov)
+    events, leaps = drive(220, 2), 0
+    for t, event in enumerate(events):
+        if noise > 1 and isinstance(event, km.Scan) and t % 80 < 60:
+            continue  # drifting unseen, then a large correction
+        done.clear()
+        report = slam.process(event)
+        if isinstance(event, km.Control):
+            book.predict(event.u)
+            continue
+        assert event.ids is not None
+        slots = {slam.slot(i): i for i in book.number}
+        known = [k for k, i in enumerate(event.ids) if i in book.number]
+        leap = "leap" in done
+        for what in done[: done.index("leap")] if leap else done:
+            if what == "flush":
+                book.flush()
+            elif slots.get(what) in book.rest:
+                book.wake(slots[what])
+        if leap:
+            book.flush()
+            book.rest = {}
+        if known:
+            book.correct(event.y[known], [event.ids[k] for k in known])
+        if leap:
+            book.flush()
+            leaps += 1
+        for k, i in enumerate(event.ids):
+            if k not in known:
+                assert report.observations[k].outcome == "new"
+                book.initialize(i, event.y[k])
+        if done and done[-1] == "flush" and not known:
+            book.flush()
+    order = ["r", *book.number]
+    mean = np.concatenate([slam.mean(i) for i in order])
+    for i in book.rest:
+        if slam.slot(i) in slam.map._owners:
+            raise AssertionError(i)
+    for i in [*book.rest]:
+        book.wake(i)
+    P, sigma = slam.covariance(*order), np.sqrt(np.diag(book.P))
+    np.testing.assert_allclose(mean, book.x, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(P / np.outer(sigma, sigma), book.P / np.outer(sigma, sigma), rtol=0, atol=1e-8)
+    assert leaps > 0 if noise > 1 else leaps == 0
+
+
+def test_a_robot_that_stands_still_learns_nothing_of_its_heading_in_a_postponed_map() -> None:
+    prior = np.radians(20)
+    slam = slam_of(km.estimators.Invariant(), most=12, cov=np.diag([0.5, 0.5, prior]) ** 2)
+    assert isinstance(slam.map, PostponedMap | StochasticMap)
+    rng, near = np.random.default_rng(3), np.argsort(np.hypot(*(WORLD - START[:2]).T))[:12]
+    for t in range(200):
+        ids = rng.choice(near, 4, replace=False)
+        y = km.geometry.observe(np.array(START), WORLD[ids])[0] + rng.normal(size=(4, 2)) * [0.1, 0.02]
+        slam.process(km.Scan(t, "r", "lidar", np.column_stack([np.abs(y[:, 0]), y[:, 1]]), ids.tolist()))
+    assert np.degrees(np.sqrt(slam.covariance("r")[2, 2])) == pytest.approx(20, abs=1e-6)
