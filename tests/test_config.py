@@ -103,7 +103,7 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ("robots.each.sensors=[1]", "robots.each.sensors: got [1], expected a mapping of keys"),
         ("association.type=jcbb", "association.type: got 'jcbb', which is not available yet, expected one of identity"),
         ("association.gate=2", "association.gate: got 2, expected a probability between 0 and 1, off or default"),
-        ("map.type=postponed", "map.type: got 'postponed', which is not available yet, expected one of auto, dense"),
+        ("map.type=sparse", "map.type: got 'sparse', expected one of auto, dense, postponed"),
         ("estimator.iterations=2.5", "estimator.iterations: got 2.5, expected a whole number"),
         ("estimator.iterations=0", "estimator.iterations: got 0, expected a number >= 1"),
         ("log.on_error=skp", "log.on_error: got 'skp', expected one of raise, skip; did you mean skip?"),

@@ -84,7 +84,7 @@ def test_a_bad_event_is_refused_with_one_line_and_changes_nothing(name: str) -> 
     [
         (lambda: km.Slam([]), "at least one robot"),
         (lambda: km.Slam([rover(), rover()]), "given twice"),
-        (lambda: km.Slam([rover()], map="sparse"), "expected 'auto' or 'dense'"),
+        (lambda: km.Slam([rover()], map="sparse"), "expected one of auto, dense, postponed"),
         (lambda: km.Robot("", km.motion.Unicycle()), "name is ''"),
         (lambda: km.Robot("r", km.motion.Unicycle(), start=(0, NAN, 0)), "three finite numbers"),
         (lambda: km.Robot("r", km.motion.Unicycle(), cov=np.diag([1, 1, -1])), "semidefinite"),

@@ -57,9 +57,12 @@ def bits(slam: km.Slam) -> tuple[Any, ...]:
     return means, joint.tobytes(), table.ids, table.observations, m.blocks.tolist(), m.atoms.tolist(), slam.t_ns
 
 
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_robots_in_mid_interval_removed_slots_and_new_names_resume_bit_for_bit(estimator: Any, tmp_path: Path) -> None:
-    straight = head(km.Slam(robots(), km.association.NearestNeighbour(), estimator))
+def test_robots_in_mid_interval_removed_slots_and_new_names_resume_bit_for_bit(
+    estimator: Any, map_: str, tmp_path: Path
+) -> None:
+    straight = head(km.Slam(robots(), km.association.NearestNeighbour(), estimator, map=map_))
     assert straight._errors, "a held control's error is a block of the map"
     assert straight.map._free, "a slot is free"
     straight.save(tmp_path / "map.kmk")

@@ -125,8 +125,8 @@ Estimator = Annotated[
 class MapConfig(Section):
     """How the covariance is kept."""
 
-    type: Literal["auto", "dense"] = "auto"
-    """`dense` keeps the full covariance; `auto` chooses."""
+    type: Literal["auto", "dense", "postponed"] = "auto"
+    """`dense` corrects the whole covariance at once, `postponed` only what is in view, `auto` is dense while small."""
     reparametrize: Linearity = 0.03
     """Inverse-depth and anchored points become Euclidean below this linearity index; or off."""
 

@@ -23,7 +23,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "landmark": ("polar",),
     "association": ("global", "jcbb", "clique", "sample", "jpda", "auto"),
     "estimator": (),
-    "map": ("postponed",),
+    "map": (),
 }
 
 

@@ -16,9 +16,12 @@ import numpy.typing as npt
 from kalmark.errors import ModelError
 from kalmark.filter import corrections
 from kalmark.filter.map import StochasticMap
+from kalmark.filter.postponed import PostponedMap
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+
+Map = StochasticMap | PostponedMap
 
 
 class Correction(NamedTuple):
@@ -39,7 +42,7 @@ class Estimator(Protocol):
     default_gate: ClassVar[float]
 
     def correct(
-        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
+        self, map_: Map, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
         gate: float,
     ) -> Correction:  # fmt: skip
         """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate.
@@ -50,7 +53,7 @@ class Estimator(Protocol):
     def for_fixes(self) -> Estimator:
         """Return the estimator that fuses absolute positions."""
 
-    def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
+    def pose_jacobian(self, map_: Map, robot: int, J: Array) -> Array:
         """Return the Jacobian J (., 3 or more) in the robot's state, taken where this estimator linearises."""
 
 
@@ -62,7 +65,7 @@ class _Estimator:
     transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
 
     def correct(
-        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
+        self, map_: Map, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
         gate: float,
     ) -> Correction:  # fmt: skip
         """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate."""
@@ -80,7 +83,7 @@ class _Estimator:
         """Return the estimator that fuses absolute positions."""
         return self
 
-    def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
+    def pose_jacobian(self, map_: Map, robot: int, J: Array) -> Array:
         """Return J as it is: everything is linearised at the estimate."""
         return J
 
@@ -135,7 +138,7 @@ class Fej(_Estimator):
     def _option(self, map_: StochasticMap) -> Array:
         return map_.x_first
 
-    def pose_jacobian(self, map_: StochasticMap, robot: int, J: Array) -> Array:
+    def pose_jacobian(self, map_: Map, robot: int, J: Array) -> Array:
         """Return J (I + (generator(x) - generator(x_first)) e_theta'): displacements counted from x_first."""
         space = map_.spaces[robot]
         assert space is not None

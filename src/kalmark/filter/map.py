@@ -123,6 +123,14 @@ class StochasticMap(Layout):
         """Return the joint covariance of blocks, in the order given."""
         return kernels.submatrix(self.P, np.concatenate([self.index(s) for s in slots]))
 
+    def means(self, slots: Index, d: int) -> Array:
+        """Return the first d numbers (K, d) of blocks."""
+        return self.x[self.blocks[slots, X_AT][:, None] + np.arange(d)]
+
+    def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
+        """Return a dense map to read these blocks from, and their slots there."""
+        return self, robot, mount, slots
+
     # ------------------------------------------------------------------ growing and shrinking
     def add(self, space: Space, mean: Any, cov: Any = None) -> int:
         """Add a block that is independent of all others (`cov` None: known exactly); return its slot."""

@@ -15,18 +15,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.filter import kernels
+from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Leap, Phase, displaced
 from kalmark.filter.map import Layout, StochasticMap
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
-from kalmark.geometry.spaces import DIRECTION, ERROR_SIZE, HOMOGENEOUS, MEAN_SIZE, VECTOR, VECTOR3, Rn, Space
+from kalmark.geometry.spaces import Rn, Space
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -36,14 +37,6 @@ LEAST = 1e8  # multiplications of a flush to do after each correction
 
 NO_ROWS = np.zeros(0, dtype=np.int64)
 scalars = lru_cache(maxsize=64)(Rn)
-
-
-class Watch(NamedTuple):
-    """Numbers of an active block that tell how far it is from where it was frozen, in sigmas."""
-
-    at: Index
-    frozen: Array
-    per_sigma: Array
 
 
 class PostponedMap(Layout):
@@ -71,12 +64,10 @@ class PostponedMap(Layout):
         self._A0: Index = NO_ROWS  # rows of the storage that have shadows,
         self._s: Index = NO_ROWS  # their shadows' rows in the active map,
         self._s_x: Index = NO_ROWS  # and their numbers
-        self._shadowed: set[int] = set()
+        self._shadows: dict[int, int] = {}  # slots in the active map, by slot: in the order of A0
         self._gone: list[tuple[int, Space]] = []  # removed, their shadows are still here
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
-        self._watched: dict[int, Watch] = {}
-        self._moving: dict[int, tuple[Index, Array]] = {}
-        self._watch: Watch | None = None
+        self._drift = Drift()
         self._before: dict[int, Array] = {}
         self._start = 0
 
@@ -122,8 +113,9 @@ class PostponedMap(Layout):
         starts, place = np.cumsum([0, *(len(r) for r in rows)]), len(extra)
         T, Q = np.zeros((starts[-1], len(index))), np.zeros((starts[-1], starts[-1]))
         resting = [i for i, at in enumerate(ats) if at is None]
-        for i in resting if self._job is not None else ():
-            self._job.know(slots[i])
+        if self._job is not None:
+            for i in resting:
+                self._job.know(slots[i])
         for i, slot in enumerate(slots):
             here = slice(starts[i], starts[i + 1])
             if i in resting:
@@ -135,6 +127,23 @@ class PostponedMap(Layout):
                 place += len(rows[i])
         C = T @ (kernels.submatrix(self.active.P, index) @ T.T) + Q
         return 0.5 * (C + C.T)
+
+    def means(self, slots: Index, d: int) -> Array:
+        """Return the first d numbers (K, d) of blocks."""
+        return np.array([self.mean(slot)[:d] for slot in slots.tolist()]).reshape(len(slots), d)
+
+    def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
+        """Return a dense map to read these blocks from, and their slots there; blocks at rest stay there."""
+        at = self._at[slots]
+        if robot in self._owners and (mount < 0 or mount in self._owners) and (not len(at) or at.min() >= 0):
+            return self.active, self._owners[robot], self._owners.get(mount, -1), at
+        copied, m = dict.fromkeys([robot, *([mount] if mount >= 0 else []), *slots.tolist()]), StochasticMap()
+        for slot in copied:
+            copied[slot] = m.add(self.spaces[slot], self.mean(slot))
+        P = self.covariance(list(copied))
+        m.P[: m.n, : m.n], m.axes = P, self.axes
+        here = np.array([copied[slot] for slot in slots.tolist()], dtype=np.int64)
+        return m, copied[robot], copied.get(mount, -1), here  # type: ignore[return-value]
 
     def _resting_rows(self) -> Index:
         """Return the rows of the active map that blocks at rest depend on: the shadows and the robots' turns."""
@@ -194,11 +203,11 @@ class PostponedMap(Layout):
         if slot in self._owners:
             self.active.remove(self._owners.pop(slot))
             self._at[slot] = -1
-            self._unwatch(slot)
+            self._drift.forget(slot)
         space = self.spaces[slot]
         assert space is not None
         self._vacate(slot)
-        if slot in self._shadowed:
+        if slot in self._shadows:
             self._free[space.kinds].remove(slot)
             self._gone.append((slot, space))
 
@@ -226,13 +235,7 @@ class PostponedMap(Layout):
         """Write a block's mean after a motion."""
         self._enter(slot)
         self.active.set_predicted(self._owners[slot], mean)
-        watch = self._watched.get(slot)
-        if watch is not None:
-            self._unwatch(slot)
-            space = self.spaces[slot]
-            assert space is not None
-            rows = self.rows(slot)[: 2 if space.axes == 1 else 3]
-            self._moving[slot] = rows, watch.per_sigma[: len(rows)]
+        self.take_as_moving(slot)
 
     # ------------------------------------------------------------------ correcting
     def opened(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
@@ -285,50 +288,38 @@ class PostponedMap(Layout):
         s = self.active.rows(shadow)
         for i, j in zip(rows, s, strict=True):
             self.active.P[max(i, j), min(i, j)] = 1.0
-        where = self.active.numbers(shadow)
-        self._A0, self._s = np.concatenate([self._A0, self.rows(slot)]), np.concatenate([self._s, s])
-        self._s_x = np.concatenate([self._s_x, np.arange(where.start, where.stop)])
         for name, moved in self._moved.items():
             self._moved[name] = np.concatenate([moved, np.zeros(len(s))])
-        self._shadowed.add(slot)
-        self._look_after(slot, space, at, np.diag(Q))
+        self.cast_shadow(slot, shadow)
+        self.look_after(slot)
 
-    # ------------------------------------------------------------------ how far the rest has moved
-    def _look_after(self, slot: int, space: Space, at: int, variances: Array) -> None:
-        """Watch those numbers of a block on which its coordinates depend."""
-        x, frozen = self.active.numbers(at).start, self.x[self.numbers(slot)]
-        numbers, weights = [], []
-        for kind, offset, row in space.atoms:
-            if kind in (VECTOR, VECTOR3, DIRECTION) or kind >= HOMOGENEOUS:
-                sigma = math.sqrt(max(0.0, variances[row : row + ERROR_SIZE[kind]].sum()))
-                numbers += range(offset, offset + MEAN_SIZE[kind])
-                weights += [1.0 / sigma if sigma > 0 else 0.0] * int(MEAN_SIZE[kind])
-        if numbers:
-            where = np.array(numbers)
-            self._watched[slot] = Watch(where + x, frozen[where], np.array(weights))
-            self._watch = None
+    def cast_shadow(self, slot: int, at: int) -> None:
+        """Take a block of the active map as the shadow of a slot."""
+        self._shadows[slot] = at
+        where = self.active.numbers(at)
+        self._A0 = np.concatenate([self._A0, self.rows(slot)])
+        self._s = np.concatenate([self._s, self.active.rows(at)])
+        self._s_x = np.concatenate([self._s_x, np.arange(where.start, where.stop)])
 
-    def _unwatch(self, slot: int) -> None:
-        if self._watched.pop(slot, None) is not None:
-            self._watch = None
+    def look_after(self, slot: int) -> None:
+        """Watch how far an active block with a shadow goes from where it was at rest."""
+        space, at = self.spaces[slot], self._owners.get(slot)
+        if space is not None and at is not None:
+            rows = self.rows(slot)
+            variances = np.diag(self._read(rows, rows))
+            self._drift.watch(slot, space, self.active.numbers(at).start, self.x[self.numbers(slot)], variances)
+
+    def take_as_moving(self, slot: int) -> None:
+        """Take note that an active block moves by itself."""
+        space = self.spaces[slot]
+        assert space is not None
+        self._drift.moves(slot, self.rows(slot)[: 2 if space.axes == 1 else 3])
 
     def _far(self, robot: int, s: Array) -> bool:
-        """Return whether the rest has left the place of its coordinates, as told by what has moved in the active map.
-
-        A landmark at rest moves with those that have entered and with where the robots were at the last flush.
-        """
+        """Return whether the rest has moved too far for the coordinates in which its errors were left."""
         turns = self._turn_rows(robot)[-3:] if self.axes > 1 else self._turn_rows(robot)
         limit = TAU / math.sqrt(max(1e-300, self.active.P[turns, turns].sum()))
-        if self._watch is None and self._watched:
-            self._watch = Watch(*(np.concatenate(parts) for parts in zip(*self._watched.values(), strict=True)))
-        if self._watch is not None and self._watched:
-            at, frozen, per_sigma = self._watch
-            if (np.abs(self.active.x[at] - frozen) * per_sigma).max() > limit:
-                return True
-        return any(
-            (np.abs(self._read(rows, self._A0) @ s) * per_sigma).max() > limit
-            for rows, per_sigma in self._moving.values()
-        )
+        return self._drift.is_beyond(limit, self.active.x, lambda rows: self._read(rows, self._A0) @ s)
 
     # ------------------------------------------------------------------ flushing
     def _limit(self) -> float:
@@ -340,28 +331,27 @@ class PostponedMap(Layout):
     def finish(self) -> None:
         """Finish a flush that is under way."""
         if self._job is not None:
-            self._job.advance(math.inf)
+            self._job.advance(1e300)
             self._job = None
 
     def flush(self, robot: int | None = None, ds: Array | None = None) -> None:
         """Bring all blocks to rest.  The last correction, ds by `robot`, is applied as the dense filter does."""
         self.finish()
         leap = None if robot is None or ds is None else self._leap(robot, ds)
-        P, m = self.active.P, self.active
+        m = self.active
         slots = list(self._owners)
         A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
         here = np.concatenate([NO_ROWS, *(m.rows(self._owners[slot]) for slot in slots)])
         where = {row: i for i, row in enumerate(here.tolist())}
         thetas = [where[row] for robot in self._moved for row in self._turn_rows(robot).tolist()]
-        joint = kernels.submatrix(P, np.concatenate([here, self._s]))
+        joint = kernels.submatrix(m.P, np.concatenate([here, self._s]))
         n = len(here)
         S = self._displacements()
         if leap is not None:
             S[:, leap.robot] -= leap.ds
-        phase = Phase(
-            self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, np.array(thetas, dtype=np.int64),
-            *reversed(self._gauges()),
-        )  # fmt: skip
+        axes, origins = self._gauges()
+        turns = np.array(thetas, dtype=np.int64)
+        phase = Phase(self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, turns, origins, axes)
         self._job = Flush(self, self.storage, phase, leap)
         for slot in slots:
             at = self._owners[slot]
@@ -387,5 +377,3 @@ class PostponedMap(Layout):
         if self.axes == 3:
             return turn
         return np.concatenate([np.linalg.solve(left_jacobian(turn), after[:3] - before[:3]), turn])
-
-

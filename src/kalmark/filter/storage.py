@@ -1,4 +1,4 @@
-"""A large symmetric matrix in panels: the covariance of a map at rest, only its lower triangle, growing without a pause.
+"""A large symmetric matrix in panels: the covariance at rest, only its lower triangle, growing without a pause.
 
 A panel is PANEL rows, as long as its last row.  A new panel moves nothing that is there; the matrix takes n^2 / 2
 numbers.  Kept in float32 it takes half of that; all arithmetic is in float64 all the same.

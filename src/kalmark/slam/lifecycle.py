@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.filter.map import StochasticMap
+from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.spaces import POINT3
 from kalmark.models.landmarks import Point3D
 from kalmark.slam.ends import extended_ends
@@ -16,6 +18,14 @@ from kalmark.slam.scene import View
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
+
+DENSE = 80  # landmarks up to which the dense map is faster
+
+
+def let_grow(slam: Slam) -> None:
+    """Postpone corrections from so many landmarks on that it pays."""
+    if slam.map_type == "auto" and isinstance(slam.map, StochasticMap) and len(slam.members.kinds) > DENSE:
+        slam.map = PostponedMap.from_dense(slam.map)
 
 
 def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:
@@ -27,7 +37,7 @@ def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> 
             continue
         slot = members.slots[name]
         l, index = map_.mean(slot)[None], map_.index(slot)
-        sigma = np.sqrt(np.maximum(map_.P[index[-1:], index[-1]], 0.0))
+        sigma = np.sqrt(np.maximum(map_.covariance([slot])[-1, -1:], 0.0))
         T = view.pose(map_, members.slots[robot])
         if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < slam.reparametrize:
             p, P_l = kind.to_point(l)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from kalmark.errors import ModelError
 from kalmark.filter.corrections import innovation, observed_block
-from kalmark.filter.map import X_AT, StochasticMap
+from kalmark.filter.estimators import Map
 from kalmark.models import landmarks as kinds
 from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D, Tag
 from kalmark.models.observe import composed, inverse_expectation, linearize, view_of
@@ -25,6 +25,8 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 NOTHING = np.zeros((0, 0, 0))
+
+AT_ONCE = 32  # landmarks whose joint covariance is looked at
 
 ROBOT = "robot"
 ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one view applies to
@@ -87,56 +89,59 @@ class View:
             return int(self.sensor.noise(np.zeros((1, len(self.sensor.columns)))).shape[1])
         return len(self.sensor.angular)
 
-    def head(self, map_: StochasticMap, robot: int) -> Array:
+    def head(self, map_: Map, robot: int) -> Array:
         """Return the robot's pose, followed by the mount's if it is in the map."""
         pose = map_.mean(robot)[: len(self.at)]
         return pose if self.mount < 0 else np.concatenate([pose, map_.mean(self.mount)])
 
-    def head_index(self, map_: StochasticMap, robot: int) -> Index:
+    def head_index(self, map_: Map, robot: int) -> Index:
         """Return the rows of the robot's pose and, if it is in the map, of the mount."""
         pose = map_.index(robot)[: 3 if len(self.at) == 3 else 6]
         return pose if self.mount < 0 else np.concatenate([pose, map_.index(self.mount)])
 
-    def pose(self, map_: StochasticMap, robot: int) -> Array:
+    def pose(self, map_: Map, robot: int) -> Array:
         """Return the sensor's pose T in the map's frame."""
         head = self.head(map_, robot)
         size = len(self.at)
         return composed(head[:size], head[size:] if len(head) > size else self.at)[0]
 
-    def in_sight(self, map_: StochasticMap, robot: int, look: Look, slots: list[int], ends: list[Any]) -> Index:
+    def in_sight(self, map_: Map, robot: int, look: Look, slots: list[int], ends: list[Any]) -> Index:
         """Return which of the blocks `slots` the sensor should see now; `ends` are those of the segments of lines."""
-        T, l = self.pose(map_, robot), means(map_, np.array(slots), look.d)
+        T, l = self.pose(map_, robot), map_.means(np.array(slots), look.d)
         sensor: Any = self.sensor
         if not hasattr(look.landmark, "endpoints"):
             return np.flatnonzero(sensor.sees(look.landmark.seen_from(T, l)[0]))
         p, _ = look.landmark.endpoints(l, np.array(ends))
         return np.flatnonzero(sensor.sees_segments(T, p[:, 0], p[:, 1])[0])
 
-    def noise(self, map_: StochasticMap, robot: int, look: Look, slots: Index, R: Array, event: Scan) -> Array:
+    def noise(self, map_: Map, robot: int, look: Look, slots: Index, R: Array, event: Scan) -> Array:
         """Return the noise of observations of the blocks `slots`: R, unless it depends on where they are  [F]."""
         if self.noise_at is None or event.cov is not None:
             return R
-        return self.noise_at(look.landmark.seen_from(self.pose(map_, robot), means(map_, slots, look.d))[0])
+        return self.noise_at(look.landmark.seen_from(self.pose(map_, robot), map_.means(slots, look.d))[0])
 
-    def predict(
-        self, map_: StochasticMap, robot: int, look: Look, slots: Index, y: Array, R: Array
-    ) -> tuple[Array, Array]:
+    def predict(self, map_: Map, robot: int, look: Look, slots: Index, y: Array, R: Array) -> tuple[Array, Array]:
         """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
-        index, _, mean = observed_block(map_.x, map_.blocks, map_.atoms, robot, self.mount, slots, look.d)
+        if len(slots) > AT_ONCE:  # an excerpt is dense
+            cuts = [slice(i, i + AT_ONCE) for i in range(0, len(slots), AT_ONCE)]
+            parts = [self.predict(map_, robot, look, slots[cut], y[cut], R[cut]) for cut in cuts]
+            return np.concatenate([Z for Z, _ in parts]), np.concatenate([d2 for _, d2 in parts])
+        m, robot, mount, slots = map_.excerpt(robot, self.mount, slots)
+        index, _, mean = observed_block(m.x, m.blocks, m.atoms, robot, mount, slots, look.d)
         head = len(mean) - look.d * len(slots)
         _, z, E_h, E_l = linearize(look.view, mean[:head], mean[head:].reshape(len(slots), look.d), y)
-        Z, d2, _ = innovation(map_.P, index, E_h, E_l, R, z)
+        Z, d2, _ = innovation(m.P, index, E_h, E_l, R, z)
         return Z, d2
 
     def information(
-        self, map_: StochasticMap, robot: int, look: Look, slots: Index, event: Scan, rows: list[int], R: Array
+        self, map_: Map, robot: int, look: Look, slots: Index, event: Scan, rows: list[int], R: Array
     ) -> Array:
         """Return how much the observations `rows` tell of the blocks `slots`: log |Z| / |R| (K,), -inf if unknown."""
         noise = self.noise(map_, robot, look, slots, R, event)
         Z, _ = self.predict(map_, robot, look, slots, event.y[rows], noise)
         return np.nan_to_num(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(noise)[1], nan=-np.inf)
 
-    def explain(self, map_: StochasticMap, robot: int, event: Scan, k: int, R: Array) -> tuple[Array, Array, Array]:
+    def explain(self, map_: Map, robot: int, event: Scan, k: int, R: Array) -> tuple[Array, Array, Array]:
         """Return the landmark (n,) that explains the k-th observation, whose noise is R, and how it came about.
 
         L_h (., 3 or more) with respect to the head, and Q = L_y R L_y' + prior.  [S] (32)-(35).
@@ -155,11 +160,6 @@ class View:
             )
         L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
         return l[0], L_h, L_y[0] @ R @ L_y[0].T + prior[0]
-
-
-def means(map_: StochasticMap, slots: Index, d: int) -> Array:
-    """Return the first d numbers (K, d) of the blocks `slots`."""
-    return map_.x[map_.blocks[slots, X_AT][:, None] + np.arange(d)]
 
 
 def _natural(mount: Mount) -> Landmark:

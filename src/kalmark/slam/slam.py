@@ -21,6 +21,7 @@ from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.filter.estimators import Estimator, Invariant
 from kalmark.filter.kernels import all_finite
 from kalmark.filter.map import StochasticMap
+from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.spaces import MOUNTS, Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
@@ -38,6 +39,7 @@ from kalmark.slam.scene import Look, Scene, View
 Array = npt.NDArray[np.float64]
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+MAPS: dict[str, Any] = {"auto": StochasticMap, "dense": StochasticMap, "postponed": PostponedMap}
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
@@ -46,7 +48,8 @@ class Slam:
 
     `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
     what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
-    `reparametrize` (None: never).  Events must come in the order of their times.
+    `reparametrize` (None: never).  `map` is "dense", "postponed" (docs/postponed.md), or "auto": dense while small.
+    Events must come in the order of their times.
     """
 
     def __init__(
@@ -58,13 +61,14 @@ class Slam:
         map: str = "auto",
         reparametrize: float | None = LINEAR,
     ) -> None:
-        if map not in ("auto", "dense"):
-            raise ModelError(f"map is {map!r}, expected 'auto' or 'dense'")
+        if map not in MAPS:
+            raise ModelError(f"map is {map!r}, expected one of {', '.join(MAPS)}")
         self.robots: dict[str, Robot] = {}
         self.association: Association = association or ByIdentity()
         self.estimator: Estimator = estimator or Invariant()
         self.t_ns: int | None = None
-        self.map = StochasticMap()
+        self.map_type = map
+        self.map: StochasticMap | PostponedMap = MAPS[map]()
         self.landmark_type = landmarks
         self.reparametrize = reparametrize
         self.members = Members(self.robots)
@@ -217,6 +221,7 @@ class Slam:
         for k in new:
             name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
             outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
+        lifecycle.let_grow(self)
         report.observations = tuple(outcomes)  # type: ignore[arg-type]
         return report
 
@@ -356,6 +361,7 @@ class Slam:
             cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         self.members.slots[name] = self.map.add(kind.space, mean, cov)
         self.members.kinds[name] = kind
+        lifecycle.let_grow(self)
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""

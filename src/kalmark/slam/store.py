@@ -1,6 +1,5 @@
 """A Slam on disk: one zip of arrays, a JSON description and their checksums, never pickle: loading runs nothing of it.
-
-The tables of the map are not written but built anew from the list of its blocks, so none can point outside its arrays.
+`store_map` has the part that is the map.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from kalmark.errors import KalmarkError, MapError
 from kalmark.filter.estimators import Estimator
-from kalmark.filter.map import StochasticMap
 from kalmark.geometry.spaces import MOUNTS, Rn, Space
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import Association
@@ -27,6 +26,7 @@ from kalmark.slam.describe import State, described, landmark_type, restored, rob
 from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
+from kalmark.slam.store_map import map_arrays, map_described, map_restored
 
 Array = npt.NDArray[np.float64]
 
@@ -54,9 +54,7 @@ def save(slam: Slam, path: Path) -> None:
 
 
 def _state(slam: Slam) -> State:
-    m, type_ = slam.map, getattr(slam, "landmark_type", None)
-    removed = {slot: kinds for kinds, slots in m._free.items() for slot in slots}
-    spaces = [Space("removed", removed[i]) if space is None else space for i, space in enumerate(m.spaces)]
+    type_ = getattr(slam, "landmark_type", None)
     return {
         "kalmark": VERSION,
         "robots": [robot_described(r) for r in slam.robots.values()],
@@ -64,9 +62,6 @@ def _state(slam: Slam) -> State:
         "estimator": described(slam.estimator),
         "landmarks": None if type_ is None else described(type_),
         "t_ns": slam.t_ns,
-        "capacity": len(m.x),
-        "blocks": [[space.name, list(space.kinds)] for space in spaces],
-        "free": list(removed),  # of each shape the last removed is the first to be filled again
         "slots": [[_id(name), slot] for name, slot in slam.members.slots.items()],
         "kinds": [[_id(name), described(kind)] for name, kind in slam.members.kinds.items()],
         "reparametrize": slam.reparametrize,
@@ -76,7 +71,9 @@ def _state(slam: Slam) -> State:
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
         "unnamed": slam.members.unnamed,
-    }
+        "map": slam.map_type,
+        "postponed": None,
+    } | map_described(slam.map)
 
 
 def _id(name: Any) -> Any:
@@ -94,10 +91,7 @@ def _item(value: Any) -> Any:
 
 
 def _arrays(slam: Slam) -> Iterator[tuple[str, Array]]:
-    m = slam.map
-    yield "x", m.x[: m.x_n]
-    yield "x_first", m.x_first[: m.x_n]
-    yield "P", m.P[: m.n, : m.n][np.tril_indices(m.n)]
+    yield from map_arrays(slam.map)
     for i, drive in enumerate(slam._drives.values()):
         if drive.u is not None and drive.N is not None:
             yield f"u{i}", drive.u
@@ -130,6 +124,7 @@ def load(
             association or restored("association", state["association"], "association", "association"),
             estimator or restored("estimator", state["estimator"], "estimator", "estimator"),
             landmark_type(state, landmarks),
+            map=state["map"],
             reparametrize=_threshold(state["reparametrize"]),
         )
         _fill(slam, state, members, landmarks)
@@ -168,7 +163,7 @@ def _array(members: dict[str, bytes], name: str, shape: tuple[int, ...]) -> Arra
 
 
 def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark | None) -> None:
-    slam.map = _map(state, members)
+    slam.map = map_restored(state, partial(_array, members))
     own = [view.landmark for view in slam._views.values()] + ([] if given is None else [given])
     slam.members.kinds = {i: _kind(i, d, own) for i, d in state["kinds"]}
     slam.members.slots, slam._errors = dict(map(tuple, state["slots"])), dict(state["errors"])
@@ -184,26 +179,6 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
         drive.t_ns, drive.fresh, k = _time(t_ns), bool(fresh), len(drive.motion.columns)
         if f"u{i}.npy" in members:
             drive.u, drive.N = _array(members, f"u{i}", (k,)), _array(members, f"N{i}", (k, k))
-
-
-def _map(state: State, members: dict[str, bytes]) -> StochasticMap:
-    """Build the map again block by block, then remove what was removed: its tables fit each other by construction."""
-    spaces = [Space(str(name), tuple(kinds)) for name, kinds in state["blocks"]]
-    n, x_n, capacity = sum(s.dof for s in spaces), sum(s.size for s in spaces), state["capacity"]
-    if type(capacity) is not int or not max(n, x_n) <= capacity <= max(1024, 2 * n, 2 * x_n):
-        raise MapError(f"capacity is {capacity!r}, expected at least {max(n, x_n)} for the blocks of the map")
-    m = StochasticMap(capacity)
-    x, x_first, P = _array(members, "x", (x_n,)), _array(members, "x_first", (x_n,)), n * (n + 1) // 2
-    lower = _array(members, "P", (P,))
-    for space in spaces:
-        m.add(space, np.zeros(space.size))
-    for slot in state["free"]:
-        if _count(slot, "removed slot") >= len(spaces) or m.spaces[slot] is None:
-            raise MapError(f"removed slot is {slot}, expected each one of {len(spaces)} once")
-        m.remove(slot)
-    m.x[:x_n], m.x_first[:x_n] = x, x_first
-    m.P[:n, :n][np.tril_indices(n)] = lower
-    return m
 
 
 def _kind(name: Id, description: State, own: list[Landmark]) -> Landmark:
