@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.compiled import compiled
 from kalmark.geometry.spaces import DIRECTION, ERROR_SIZE, HOMOGENEOUS, MEAN_SIZE, VECTOR, VECTOR3, Space
 
 Array = npt.NDArray[np.float64]
@@ -27,6 +28,15 @@ class Watch(NamedTuple):
     per_sigma: Array
 
 
+@compiled
+def farthest(x: Array, at: Index, frozen: Array, per_sigma: Array) -> float:
+    """Return how far the numbers `at` are from where they were, in sigmas."""
+    most = 0.0
+    for i in range(len(at)):
+        most = max(most, abs(x[at[i]] - frozen[i]) * per_sigma[i])
+    return most
+
+
 class Drift:
     """Watches the blocks that have entered."""
 
@@ -34,6 +44,7 @@ class Drift:
         self._standing: dict[int, Watch] = {}
         self._moving: dict[int, tuple[Index, Array]] = {}  # of robots, rows of their positions, and one over the sigmas
         self._all: Watch | None = None
+        self._rest: dict[int, Array] = {}  # of moving robots, their covariance with the blocks that have entered
 
     def watch(self, slot: int, space: Space, at: int, frozen: Array, variances: Array) -> None:
         """Watch those numbers of a block, `at` and further in the active map, on which its coordinates depend."""
@@ -66,15 +77,20 @@ class Drift:
             self.forget(slot)
             self._moving[slot] = rows, watch.per_sigma[: len(rows)]
 
-    def is_beyond(self, limit: float, x: Array, displacement: Callable[[Index], Array]) -> bool:
+    def is_beyond(self, limit: float, x: Array, s: Array, read: Callable[[Index], Array]) -> bool:
         """Return whether a block is farther than `limit` sigmas from where it was.
 
-        x is the mean of the active map; `displacement` tells how far rows at rest have moved.
+        x is the mean of the active map, s that of its shadows; `read` returns rows' covariance (., s) at rest.
         """
         if self._all is None and self._standing:
             self._all = Watch(*(np.concatenate(parts) for parts in zip(*self._standing.values(), strict=True)))
         if self._all is not None and self._standing:
-            at, frozen, per_sigma = self._all
-            if (np.abs(x[at] - frozen) * per_sigma).max() > limit:
+            if farthest(x, *self._all) > limit:
                 return True
-        return any((np.abs(displacement(rows)) * w).max() > limit for rows, w in self._moving.values())
+        for slot, (rows, per_sigma) in self._moving.items():
+            G = self._rest.get(slot)
+            if G is None or G.shape[1] != len(s):
+                G = self._rest[slot] = read(rows)
+            if (np.abs(G @ s) * per_sigma).max() > limit:
+                return True
+        return False

@@ -319,7 +319,7 @@ class PostponedMap(Layout):
         """Return whether the rest has moved too far for the coordinates in which its errors were left."""
         turns = self._turn_rows(robot)[-3:] if self.axes > 1 else self._turn_rows(robot)
         limit = TAU / math.sqrt(max(1e-300, self.active.P[turns, turns].sum()))
-        return self._drift.is_beyond(limit, self.active.x, lambda rows: self._read(rows, self._A0) @ s)
+        return self._drift.is_beyond(limit, self.active.x, s, lambda rows: self._read(rows, self._A0))
 
     # ------------------------------------------------------------------ flushing
     def _limit(self) -> float:
