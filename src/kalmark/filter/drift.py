@@ -84,9 +84,8 @@ class Drift:
         """
         if self._all is None and self._standing:
             self._all = Watch(*(np.concatenate(parts) for parts in zip(*self._standing.values(), strict=True)))
-        if self._all is not None and self._standing:
-            if farthest(x, *self._all) > limit:
-                return True
+        if self._all is not None and self._standing and farthest(x, *self._all) > limit:
+            return True
         for slot, (rows, per_sigma) in self._moving.items():
             G = self._rest.get(slot)
             if G is None or G.shape[1] != len(s):
