@@ -37,7 +37,8 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
         "landmarks": _build(config, ("landmarks",), config.landmarks, robots[0].motion.space.world),
     }
     try:
-        return Slam(robots, **types, map=config.map.type, reparametrize=config.map.linearity)
+        m = config.map
+        return Slam(robots, **types, map=m.type, numbers=m.numbers, reparametrize=m.linearity)
     except ModelError as error:
         raise config.error(("robots",), str(error)) from None
 

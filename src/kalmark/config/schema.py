@@ -127,6 +127,8 @@ class MapConfig(Section):
 
     type: Literal["auto", "dense", "postponed"] = "auto"
     """`dense` corrects the whole covariance at once, `postponed` only what is in view, `auto` is dense while small."""
+    numbers: Literal["float64", "float32"] = "float64"
+    """In what a postponed map keeps what is at rest; `float32` takes half the memory."""
     reparametrize: Linearity = 0.03
     """Inverse-depth and anchored points become Euclidean below this linearity index; or off."""
 

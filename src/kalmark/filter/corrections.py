@@ -185,7 +185,7 @@ def iterate(
         _e, z, E_r, E_l = linearize(view, x_j[:head], x_j[head:].reshape(k, d), y)
         H = stacked(E_r, E_l)
         carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
-        H[:, theta : theta + axes] += H @ (generator(table, x_j, len(P_ss), axes, x_j[:3]) - turned)
+        H[:, theta : theta + axes] += H @ (generator(table, x_j, len(P_ss), axes, mean[:3]) - turned)
         v = z.ravel() + H @ correction
         HP = sparse_product(H, P_ss, h, k)
         Z = sparse_product(H, HP.T.copy(), h, k)
@@ -245,8 +245,8 @@ def invariant(
     baselines = (depths, s, S, spread(P, rows, S, depths))
     correction = fuse(P, n, index, H, M, v)
     retract(atoms, x, correction, gauge(mean, correction[index], pose, axes))
-    at, theta = blocks[robot, 0], index[(3 if pose == 3 else 6) - axes]
-    transport(P, generator(atoms, x, n, axes, x[at : at + 3]) - before, theta)
+    theta = index[(3 if pose == 3 else 6) - axes]
+    transport(P, generator(atoms, x, n, axes, mean[:3]) - before, theta)
     if len(depths):
         s_now, S_now = sensor_at(view, observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2])
         retract_parallax(x, x_before, baselines, correction, correction[rows], s_now)

@@ -65,6 +65,10 @@ class Drift:
         """The blocks that move by themselves."""
         return [*self._moving]
 
+    def stands(self, slot: int) -> bool:
+        """Return whether a block is watched that has not moved by itself."""
+        return slot in self._standing
+
     def forget(self, slot: int) -> None:
         """Watch a block no longer."""
         if self._standing.pop(slot, None) is not None:
@@ -77,10 +81,11 @@ class Drift:
             self.forget(slot)
             self._moving[slot] = rows, watch.per_sigma[: len(rows)]
 
-    def is_beyond(self, limit: float, x: Array, s: Array, read: Callable[[Index], Array]) -> bool:
+    def is_beyond(self, limit: float, x: Array, s: Array, read: Callable[[Index, int], Array]) -> bool:
         """Return whether a block is farther than `limit` sigmas from where it was.
 
-        x is the mean of the active map, s that of its shadows; `read` returns rows' covariance (., s) at rest.
+        x is the mean of the active map, s that of its shadows; `read` returns rows' covariance at rest with the shadows
+        from a first one on.
         """
         if self._all is None and self._standing:
             self._all = Watch(*(np.concatenate(parts) for parts in zip(*self._standing.values(), strict=True)))
@@ -88,8 +93,10 @@ class Drift:
             return True
         for slot, (rows, per_sigma) in self._moving.items():
             G = self._rest.get(slot)
-            if G is None or G.shape[1] != len(s):
-                G = self._rest[slot] = read(rows)
+            if G is None:
+                G = self._rest[slot] = read(rows, 0)
+            elif G.shape[1] < len(s):
+                G = self._rest[slot] = np.hstack([G, read(rows, G.shape[1])])
             if (np.abs(G @ s) * per_sigma).max() > limit:
                 return True
         return False

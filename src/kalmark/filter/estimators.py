@@ -70,7 +70,7 @@ class _Estimator:
     ) -> Correction:  # fmt: skip
         """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate."""
         run = type(self).compiled if isinstance(view, tuple) else type(self).source
-        m, *here = map_.opened(robot, mount, slots)
+        m, *here = map_.opened(robot, mount, slots, self.transports)
         scan = (*here, d, y, R, gate)
         done = Correction(*run(view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, self._option(m)))
         map_.corrected(robot, self.transports)

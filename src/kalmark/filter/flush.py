@@ -51,14 +51,15 @@ def turned(atoms: Table, x: Array, d: Array, turn: Array, axes: int, origin: Arr
 def fill(panel: Stored, first: int, last: int, A: Index, where: Index, V: Array, P_AA: Array) -> None:
     """Write the covariances of the active blocks into the rows first..last of a panel."""
     for i in range(first, last):
-        row = panel[i - first]
         if where[i] < 0:
             for c in range(len(A)):
                 if A[c] < i:
-                    row[A[c]] = V[i, c]
-            continue
-        for j in range(i + 1):
-            row[j] = V[j, where[i]] if where[j] < 0 else P_AA[where[i], where[j]]
+                    panel[i - first, A[c]] = V[i, c]
+    for start in range(0, last, 64):  # of V, that much is in the processor's cache
+        for i in range(max(first, start), last):
+            if where[i] >= 0:
+                for j in range(start, min(i + 1, start + 64)):
+                    panel[i - first, j] = V[j, where[i]] if where[j] < 0 else P_AA[where[i], where[j]]
 
 
 @compiled
@@ -131,9 +132,11 @@ class Flush:
         self.V = np.zeros((self.n, len(phase.A)))
         self.known = self.where >= 0
         self.panel = self.column = 0
-        self.cost = 2 * PANEL * max(self.R.shape[1], 1)  # of a column of a panel
-        self.work = self.cost * sum(min(k + PANEL, self.n) for k in range(0, self.n, PANEL))
-        self.spent = 0
+        self.cost = PANEL * max(1, self.R.shape[1])  # of a column of a panel, in multiplications
+        self.aside = 10 * PANEL  # of what else there is to do for it
+        panels = range(0, self.n, PANEL)
+        self.work = sum((self.cost + self.aside) * min(k + PANEL, self.n) + self.aside * self.n for k in panels)
+        self.spent = 0.0
 
     @property
     def done(self) -> bool:
@@ -141,24 +144,26 @@ class Flush:
         return self.panel * PANEL >= self.n
 
     def advance(self, work: float) -> None:
-        """Do so many multiplications, at least a panel's worth of one tile."""
-        while work > 0 and not self.done:
+        """Do so much work, in multiplications: at least a panel's beginning, its end, or one tile of it."""
+        until = self.spent + work
+        while self.spent < until and not self.done:
             first = self.panel * PANEL
             last = min(first + PANEL, self.n)
+            if self.column == last:
+                rows = self.storage.panels[self.panel]
+                fill(rows, first, last, self.phase.A, self.where, self.V, self.phase.P_AA)
+                self.panel, self.column, self.spent = self.panel + 1, 0, self.spent + self.aside * last
+                continue
             if self.column == 0:
                 self._know_panel(first, last)
-            end = min(last, self.column + PANEL * max(1, int(work // (self.cost * PANEL))))
+                self.spent += self.aside * self.n
+            end = min(last, self.column + PANEL * max(1, int((until - self.spent) // (self.cost * PANEL))))
             if self.R.shape[1]:
                 W, m = self.R[first:last, : self.q], len(self.phase.thetas)
                 L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
                 subtract(self.storage.panels[self.panel][: last - first], L, self.R, self.column, end)
-            work -= self.cost * (end - self.column)
             self.spent += self.cost * (end - self.column)
             self.column = end
-            if end == last:
-                rows = self.storage.panels[self.panel]
-                fill(rows, first, last, self.phase.A, self.where, self.V, self.phase.P_AA)
-                self.panel, self.column = self.panel + 1, 0
 
     def read(self, rows: Index, columns: Index) -> Array:
         """Return elements as they will be when all is done; all rows must be known."""

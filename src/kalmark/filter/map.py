@@ -176,7 +176,7 @@ class StochasticMap(Layout):
         self.x[where] = self.x_first[where] = mean
 
     # ------------------------------------------------------------------ correcting
-    def opened(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
+    def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> tuple[StochasticMap, int, int, Index]:
         """Return the dense map on which a scan of these blocks is fused, and their slots there."""
         return self, robot, mount, slots
 

@@ -27,13 +27,16 @@ from kalmark.filter.map import Layout, StochasticMap
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
-from kalmark.geometry.spaces import Rn, Space
+from kalmark.geometry.spaces import RHO, Rn, Space
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
-LEAST = 1e8  # multiplications of a flush to do after each correction
+SLICE = 1e8  # multiplications of a flush to do after a correction, some 5 ms
+DEAR = 80.0  # multiplications of a flush that take as long as a correction of one more element of the active map
+START = 5e7  # multiplications that take as long as to begin a flush
+MOST = 1000  # rows of the active map, besides those it began with
 
 NO_ROWS = np.zeros(0, dtype=np.int64)
 scalars = lru_cache(maxsize=64)(Rn)
@@ -43,7 +46,8 @@ class PostponedMap(Layout):
     """The joint Gaussian of all blocks, of which a few are active and the others at rest.
 
     Slots are the same for a whole life.  `index` and `predict` speak of rows of the active map: an index holds until
-    the next correction.  `most` limits the rows of the active map, shadows included; by default it grows with the map.
+    the next correction.  `most` limits the rows of the active map, shadows included; by default a phase ends when its
+    corrections have cost more than its flush.
     """
 
     def __init__(self, storage: Triangle | None = None, most: int | None = None) -> None:
@@ -52,7 +56,7 @@ class PostponedMap(Layout):
         self.most = most
         self._at: Index = np.full(64, -1)  # slot in the active map, -1 at rest
         self._job: Flush | None = None
-        self._spent = 0.0  # work on the storage that is asked for
+        self._anchored: set[int] = set()  # blocks with inverse distances
         super().__init__()
         self._begin()
 
@@ -69,7 +73,8 @@ class PostponedMap(Layout):
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
         self._drift = Drift()
         self._before: dict[int, Array] = {}
-        self._start = 0
+        self._begun = 0  # rows of the active map when it was first corrected
+        self._paid = 0  # elements that have been corrected besides those
 
     @classmethod
     def from_dense(cls, dense: StochasticMap, storage: Triangle | None = None, most: int | None = None) -> PostponedMap:
@@ -211,6 +216,16 @@ class PostponedMap(Layout):
             self._free[space.kinds].remove(slot)
             self._gone.append((slot, space))
 
+    def _place(self, space: Space, mean: Array) -> int:
+        slot = super()._place(space, mean)
+        if RHO in space.kinds:
+            self._anchored.add(slot)
+        return slot
+
+    def _vacate(self, slot: int) -> None:
+        super()._vacate(slot)
+        self._anchored.discard(slot)
+
     def _activate(self, slot: int, at: int) -> None:
         self._owners[slot] = self._at[slot] = at
         self.active.axes = self.axes
@@ -235,13 +250,19 @@ class PostponedMap(Layout):
         """Write a block's mean after a motion."""
         self._enter(slot)
         self.active.set_predicted(self._owners[slot], mean)
-        self.take_as_moving(slot)
+        if self._drift.stands(slot):
+            self.take_as_moving(slot)
 
     # ------------------------------------------------------------------ correcting
-    def opened(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
-        """Return the dense map on which a scan of these blocks is fused, and their slots there: all have entered."""
+    def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> tuple[StochasticMap, int, int, Index]:
+        """Return the dense map on which a scan of these blocks is fused, and their slots there: all have entered.
+
+        So have all inverse distances where a correction transports: theirs is more than the turn of the world.
+        """
         if self._full():
             self.flush()
+        for slot in self._anchored if transports else ():
+            self._enter(slot)
         self._enter(robot)
         if mount >= 0:
             self._enter(mount)
@@ -261,11 +282,19 @@ class PostponedMap(Layout):
             self._moved[robot] = self._moved.get(robot, 0.0) + ds
             if len(self._owners) < self._used() and self._far(robot, s):
                 self.flush(robot, ds)
+        self._begun = self._begun or self.active.n
+        self._paid += self.active.n**2 - self._begun**2
         if self._job is not None:
-            filled = (self.active.n - self._start) / max(1.0, 0.8 * (self._limit() - self._start))
-            self._job.advance(max(LEAST, filled * self._job.work - self._job.spent))
-            if self._job.done:
-                self._job = None
+            self._pace(self._job)
+
+    def _pace(self, job: Flush) -> None:
+        """Do a slice of a flush, so that it will be over before the next one."""
+        progress = self._progress()
+        due = min(1.0, progress / 0.8) * job.work - job.spent
+        if due > 0:
+            job.advance(min(due, SLICE * max(1.0, 32.0 * (progress - 1.0))))
+        if job.done:
+            self._job = None
 
     def _used(self) -> int:
         return len(self.spaces) - sum(len(slots) for slots in self._free.values()) - len(self._gone)
@@ -319,14 +348,20 @@ class PostponedMap(Layout):
         """Return whether the rest has moved too far for the coordinates in which its errors were left."""
         turns = self._turn_rows(robot)[-3:] if self.axes > 1 else self._turn_rows(robot)
         limit = TAU / math.sqrt(max(1e-300, self.active.P[turns, turns].sum()))
-        return self._drift.is_beyond(limit, self.active.x, s, lambda rows: self._read(rows, self._A0))
+        return self._drift.is_beyond(limit, self.active.x, s, lambda rows, i: self._read(rows, self._A0[i:]))
 
     # ------------------------------------------------------------------ flushing
-    def _limit(self) -> float:
-        return self.most if self.most is not None else max(240.0, 10.0 * math.sqrt(self.n))
+    def _progress(self) -> float:
+        """Return how far the phase is: at 1 it is time for a flush, at 2 it is high time."""
+        grown = self.active.n - self._begun
+        if self.most is not None:
+            return self.active.n / self.most
+        paid = DEAR * self._paid / (START + len(self._A0) * float(self.n) ** 2)
+        return max(paid, grown / min(MOST, 120.0 + self.n ** (2 / 3)))
 
     def _full(self) -> bool:
-        return self.active.n > self._limit() and len(self._owners) > 0
+        progress = self._progress()
+        return bool(self._owners) and progress > (1.0 if self._job is None else 2.0)
 
     def finish(self) -> None:
         """Finish a flush that is under way."""

@@ -24,7 +24,8 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Stored = npt.NDArray[Any]  # float64 or float32
 
-PANEL = 64
+PANEL = 128
+FLUSH = 16_000  # bytes a row that a flush may need while it is under way
 
 llvmlite.binding.add_symbol("kalmark_dgemm", get_cython_function_address("scipy.linalg.cython_blas", "dgemm"))
 _dgemm = types.ExternalFunction("kalmark_dgemm", types.void(*[types.intp] * 13))
@@ -122,10 +123,10 @@ class Triangle:
         more = PANEL * PANEL * (k + 1) * self.like.itemsize
         if self.limit_bytes is not None:
             left = self.limit_bytes - self.nbytes
-        elif k % 8 or more < 1 << 20:  # the question costs more than a small panel
+        elif k % 4 or more < 1 << 20:  # the question costs more than a small panel
             return
         else:
-            left = available_bytes() - 8 * more
+            left = available_bytes() - 4 * more - FLUSH * k * PANEL
         if more > left:
             raise MapError(
                 f"the map is full: {k * PANEL} rows take {self.nbytes / 2**30:.1f} GiB, "

@@ -6,26 +6,46 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
+from kalmark.errors import ModelError
+from kalmark.filter.estimators import Map
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.postponed import PostponedMap
-from kalmark.geometry.spaces import POINT3
+from kalmark.filter.storage import Triangle
+from kalmark.geometry.spaces import POINT3, RHO
 from kalmark.models.landmarks import Point3D
+from kalmark.slam.association import Decision
 from kalmark.slam.ends import extended_ends
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation
-from kalmark.slam.scene import View
+from kalmark.slam.scene import Look, View
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
+Array = npt.NDArray[np.float64]
+
 DENSE = 80  # landmarks up to which the dense map is faster
+MAPS = ("auto", "dense", "postponed")
+NUMBERS: dict[str, Any] = {"float64": np.float64, "float32": np.float32}
+
+
+def new_map(type_: str, numbers: str) -> Map:
+    """Return an empty map of a type; `numbers` are those in which a postponed one keeps what is at rest."""
+    for what, value, known in (("map", type_, MAPS), ("numbers", numbers, NUMBERS)):
+        if value not in known:
+            raise ModelError(f"{what} is {value!r}, expected one of {', '.join(known)}")
+    return PostponedMap(Triangle(NUMBERS[numbers])) if type_ == "postponed" else StochasticMap()
 
 
 def let_grow(slam: Slam) -> None:
-    """Postpone corrections from so many landmarks on that it pays."""
-    if slam.map_type == "auto" and isinstance(slam.map, StochasticMap) and len(slam.members.kinds) > DENSE:
-        slam.map = PostponedMap.from_dense(slam.map)
+    """Postpone corrections from so many landmarks on that it pays; inverse distances are not postponed."""
+    kinds = slam.members.kinds
+    if slam.map_type != "auto" or not isinstance(slam.map, StochasticMap) or len(kinds) <= DENSE:
+        return
+    if sum(RHO not in kind.space.kinds for kind in kinds.values()) > DENSE:
+        slam.map = PostponedMap.from_dense(slam.map, Triangle(NUMBERS[slam.numbers]))
 
 
 def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:
@@ -76,3 +96,19 @@ def give_up(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation]
             if reason:
                 slam.remove(name)
                 yield name, reason
+
+
+def leave_out(
+    slam: Slam, view: View, event: Scan, groups: list[tuple[Look, list[int]]], decisions: Sequence[Decision], R: Array
+) -> list[int]:
+    """Take out of the groups of observations what is not worth a correction and return it."""
+    robot, order, told = slam.members.slots[event.robot], [], []
+    for look, rows in groups:
+        slots = slam.members.slots_of([decisions[k][0] for k in rows])
+        order += rows
+        told += view.information(slam.map, robot, look, slots, event, rows, R[rows]).tolist()
+    worth = view.attention.worth_a_correction(np.array(told))
+    least = [k for k, good in zip(order, worth, strict=True) if not good]
+    for _, rows in groups:
+        rows[:] = [k for k in rows if k not in least]
+    return least

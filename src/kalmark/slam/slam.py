@@ -18,10 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
-from kalmark.filter.estimators import Estimator, Invariant
+from kalmark.filter.estimators import Estimator, Invariant, Map
 from kalmark.filter.kernels import all_finite
-from kalmark.filter.map import StochasticMap
-from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.spaces import MOUNTS, Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
@@ -34,12 +32,11 @@ from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, secon
 from kalmark.slam.members import Members
 from kalmark.slam.report import LandmarkTable, Observation, Report, judged
 from kalmark.slam.robot import Robot, mount_name
-from kalmark.slam.scene import Look, Scene, View
+from kalmark.slam.scene import Scene, View
 
 Array = npt.NDArray[np.float64]
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
-MAPS: dict[str, Any] = {"auto": StochasticMap, "dense": StochasticMap, "postponed": PostponedMap}
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
@@ -48,8 +45,9 @@ class Slam:
 
     `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
     what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
-    `reparametrize` (None: never).  `map` is "dense", "postponed" (docs/postponed.md), or "auto": dense while small.
-    Events must come in the order of their times.
+    `reparametrize` (None: never).  `map` is "dense", "postponed" (docs/postponed.md), or "auto": dense while small;
+    `numbers` ("float64", "float32") are those in which a postponed one keeps what is at rest.  Events must come in the
+    order of their times.
     """
 
     def __init__(
@@ -60,15 +58,14 @@ class Slam:
         landmarks: Landmark | None = None,
         map: str = "auto",
         reparametrize: float | None = LINEAR,
+        numbers: str = "float64",
     ) -> None:
-        if map not in MAPS:
-            raise ModelError(f"map is {map!r}, expected one of {', '.join(MAPS)}")
         self.robots: dict[str, Robot] = {}
         self.association: Association = association or ByIdentity()
         self.estimator: Estimator = estimator or Invariant()
         self.t_ns: int | None = None
-        self.map_type = map
-        self.map: StochasticMap | PostponedMap = MAPS[map]()
+        self.map_type, self.numbers = map, numbers
+        self.map: Map = lifecycle.new_map(map, numbers)
         self.landmark_type = landmarks
         self.reparametrize = reparametrize
         self.members = Members(self.robots)
@@ -208,7 +205,6 @@ class Slam:
         report = Report(event, event.y)
         known = [k for k, (name, _) in enumerate(decisions) if self.members.known_to(view, event.robot, name)]
         outcomes: list[Observation | None] = [None] * len(decisions)
-        report.blank(view.dof)
         for seen in self._correct(event, report, view, known, ids, decisions, R):
             outcomes[seen.index] = seen
         matched = [o for o in outcomes if o is not None]
@@ -234,11 +230,13 @@ class Slam:
         robot = self.members.slots[event.robot]
         groups = [(look, [known[i] for i in rows]) for look, rows in self.members.by_look(view, names)]
         if view.attention.updates is not None and len(known) > view.attention.updates:
-            for k in self._least(event, view, groups, decisions, R):
+            for k in lifecycle.leave_out(self, view, event, groups, decisions, R):
                 reason = f"not among the {view.attention.updates} that tell most"
                 yield Observation(k, ids[k], "ignored", decisions[k][0], None, reason)  # type: ignore[arg-type]
         if view.attention.sequential:
             groups = [(look, [k]) for look, rows in groups for k in rows]
+        if len(groups) != 1 or len(groups[0][1]) < len(report.y):
+            report.blank(view.dof)
         for look, rows in groups:
             if not rows:
                 continue
@@ -252,21 +250,6 @@ class Slam:
             for k, d2, fused in zip(rows, done.d2.tolist(), done.fused.tolist(), strict=True):
                 self.members.count(decisions[k][0], fused)
                 yield judged(k, ids[k], decisions[k][0], d2, fused, view.gate)
-
-    def _least(
-        self, event: Scan, view: View, groups: list[tuple[Look, list[int]]], decisions: Sequence[Decision], R: Array
-    ) -> list[int]:
-        """Take out of the groups what is not worth a correction and return it."""
-        robot, order, told = self.members.slots[event.robot], [], []
-        for look, rows in groups:
-            slots = self.members.slots_of([decisions[k][0] for k in rows])
-            order += rows
-            told += view.information(self.map, robot, look, slots, event, rows, R[rows]).tolist()
-        worth = view.attention.worth_a_correction(np.array(told))
-        least = [k for k, good in zip(order, worth, strict=True) if not good]
-        for _, rows in groups:
-            rows[:] = [k for k in rows if k not in least]
-        return least
 
     def _starts(
         self, view: View, new: list[int], known: list[int], y: Array, decisions: Sequence[Decision]
@@ -299,7 +282,11 @@ class Slam:
         if name is NEW:
             name = self.members.new_name()
         G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
-        self.members.start(name, self.map.augment(view.landmark.space, l, index, G, Q), view.landmark)
+        try:
+            slot = self.map.augment(view.landmark.space, l, index, G, Q)
+        except MapError as full:
+            return Observation(k, id_, "ignored", None, None, str(full))
+        self.members.start(name, slot, view.landmark)
         return Observation(k, id_, "new", name, None, reason)
 
     def _healthy(self, healthy: bool, event: Event) -> None:

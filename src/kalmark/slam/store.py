@@ -30,7 +30,7 @@ from kalmark.slam.store_map import map_arrays, map_described, map_restored
 
 Array = npt.NDArray[np.float64]
 
-VERSION = 4
+VERSION = 5
 DESCRIPTION, SUMS = "slam.json", "sha256"
 
 
@@ -72,6 +72,7 @@ def _state(slam: Slam) -> State:
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
         "unnamed": slam.members.unnamed,
         "map": slam.map_type,
+        "numbers": slam.numbers,
         "postponed": None,
     } | map_described(slam.map)
 
@@ -125,6 +126,7 @@ def load(
             estimator or restored("estimator", state["estimator"], "estimator", "estimator"),
             landmark_type(state, landmarks),
             map=state["map"],
+            numbers=state["numbers"],
             reparametrize=_threshold(state["reparametrize"]),
         )
         _fill(slam, state, members, landmarks)

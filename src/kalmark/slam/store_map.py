@@ -18,11 +18,10 @@ from kalmark.filter.postponed import PostponedMap
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import Space
 from kalmark.slam.describe import State
+from kalmark.slam.lifecycle import NUMBERS
 
 Array = npt.NDArray[np.float64]
 Read = Callable[[str, tuple[int, ...]], Array]  # a name and the shape expected
-
-DTYPES = {"float64": np.float64, "float32": np.float32}
 
 
 def map_described(m: Map) -> State:
@@ -40,6 +39,7 @@ def map_described(m: Map) -> State:
             "gone": [[slot, space.name, list(space.kinds)] for slot, space in m._gone],
             "moved": list(m._moved),
             "moving": list(m._drift.moving),
+            "costs": [m._begun, m._paid],
         }
     return state
 
@@ -104,7 +104,7 @@ def _removed(m: Layout, slot: Any) -> int:
 
 
 def _postponed(state: State, phase: State, read: Read) -> PostponedMap:
-    dtype, most, limit = DTYPES[phase["numbers"]], phase["most"], phase["limit_bytes"]
+    dtype, most, limit = NUMBERS[phase["numbers"]], phase["most"], phase["limit_bytes"]
     for what, value in (("most", most), ("limit_bytes", limit)):
         if value is not None and (type(value) is not int or value < 0):
             raise MapError(f"{what} is {value!r}, expected a whole number or none")
@@ -160,3 +160,4 @@ def _activate(m: PostponedMap, active: StochasticMap, phase: State, read: Read) 
         if space is None or space.kinds[:1] not in ((1,), (4,)) or space.dof < 3:
             raise MapError(f"slot {robot!r} is no robot in the active map")
         m._moved[robot] = read(f"moved{i}", (len(m._A0),))
+    m._begun, m._paid = map(int, phase["costs"])
