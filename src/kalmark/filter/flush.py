@@ -13,12 +13,14 @@ import numpy.typing as npt
 from scipy.linalg.lapack import dpstrf
 
 from kalmark.compiled import compiled
-from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, X_AT, X_SIZE, Layout
+from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, Layout
 from kalmark.filter.storage import PANEL, Stored, Triangle, subtract
 from kalmark.geometry.spaces import Table, generator, retract
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+
+ROWS = 16  # to write at once: memory is used for the first time then
 
 
 @compiled
@@ -48,15 +50,16 @@ def turned(atoms: Table, x: Array, d: Array, turn: Array, axes: int, origin: Arr
 
 
 @compiled
-def fill(panel: Stored, first: int, last: int, A: Index, where: Index, V: Array, P_AA: Array) -> None:
-    """Write the covariances of the active blocks into the rows first..last of a panel."""
-    for i in range(first, last):
+def fill(panel: Stored, begin: int, end: int, A: Index, where: Index, V: Array, P_AA: Array) -> None:
+    """Write the covariances of the active blocks into the rows begin..end of the matrix, all of one panel."""
+    first = begin // PANEL * PANEL
+    for i in range(begin, end):
         if where[i] < 0:
             for c in range(len(A)):
                 if A[c] < i:
                     panel[i - first, A[c]] = V[i, c]
-    for start in range(0, last, 64):  # of V, that much is in the processor's cache
-        for i in range(max(first, start), last):
+    for start in range(0, end, 64):  # of V, that much is in the processor's cache
+        for i in range(max(begin, start), end):
             if where[i] >= 0:
                 for j in range(start, min(i + 1, start + 64)):
                     panel[i - first, j] = V[j, where[i]] if where[j] < 0 else P_AA[where[i], where[j]]
@@ -131,7 +134,8 @@ class Flush:
         self.R = np.zeros((self.n, self.q + 2 * len(phase.thetas)))
         self.V = np.zeros((self.n, len(phase.A)))
         self.known = self.where >= 0
-        self.panel = self.column = 0
+        self.resting = _in_use(map_, self.n) & (self.where < 0)
+        self.panel = self.column = self.row = 0
         self.cost = PANEL * max(1, self.R.shape[1])  # of a column of a panel, in multiplications
         self.aside = 10 * PANEL  # of what else there is to do for it
         panels = range(0, self.n, PANEL)
@@ -144,26 +148,30 @@ class Flush:
         return self.panel * PANEL >= self.n
 
     def advance(self, work: float) -> None:
-        """Do so much work, in multiplications: at least a panel's beginning, its end, or one tile of it."""
+        """Do so much work, in multiplications: at least one step of it."""
         until = self.spent + work
         while self.spent < until and not self.done:
-            first = self.panel * PANEL
-            last = min(first + PANEL, self.n)
-            if self.column == last:
-                rows = self.storage.panels[self.panel]
-                fill(rows, first, last, self.phase.A, self.where, self.V, self.phase.P_AA)
-                self.panel, self.column, self.spent = self.panel + 1, 0, self.spent + self.aside * last
-                continue
-            if self.column == 0:
-                self._know_panel(first, last)
-                self.spent += self.aside * self.n
-            end = min(last, self.column + PANEL * max(1, int((until - self.spent) // (self.cost * PANEL))))
-            if self.R.shape[1]:
-                W, m = self.R[first:last, : self.q], len(self.phase.thetas)
-                L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
-                subtract(self.storage.panels[self.panel][: last - first], L, self.R, self.column, end)
-            self.spent += self.cost * (end - self.column)
-            self.column = end
+            self.spent += self._step(int((until - self.spent) // (self.cost * PANEL)))
+
+    def _step(self, tiles: int) -> int:
+        """Update some tiles of a panel or, when it is done, write some rows of the active blocks; return the work."""
+        first = self.panel * PANEL
+        last = min(first + PANEL, self.n)
+        panel = self.storage.panels[self.panel]
+        if self.column == last or not self.resting[first:last].any():
+            begin, self.row = self.row, min(self.row + ROWS, last)
+            fill(panel, begin, self.row, self.phase.A, self.where, self.V, self.phase.P_AA)
+            if self.row == last:
+                self.panel, self.column = self.panel + 1, 0
+            return self.aside * last * ROWS // PANEL
+        if self.column == 0:
+            self._know_panel(first, last)
+        start, self.column = self.column, min(last, self.column + PANEL * max(1, tiles))
+        if self.R.shape[1]:
+            W, m = self.R[first:last, : self.q], len(self.phase.thetas)
+            L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
+            subtract(panel[: last - first], L, self.R, start, self.column)
+        return self.cost * (self.column - start) + (0 if start else self.aside * self.n)
 
     def read(self, rows: Index, columns: Index) -> Array:
         """Return elements as they will be when all is done; all rows must be known."""
@@ -210,6 +218,13 @@ class Flush:
             if self.where[block[P_AT]] < 0:
                 here = slice(block[X_AT], block[X_AT] + block[X_SIZE])
                 self.map.x[here] = x[here.start - where.start : here.stop - where.start]
+
+
+def _in_use(map_: Layout, n: int) -> npt.NDArray[np.bool_]:
+    """Return which of the rows belong to blocks: none lies in two panels, which leaves some over."""
+    first, sizes = map_.blocks[:, P_AT], map_.blocks[:, P_SIZE]
+    edges = np.bincount(first, minlength=n + 1) - np.bincount(first + sizes, minlength=n + 1)
+    return np.cumsum(edges[:n]) > 0
 
 
 def _root(Psi: Array, variances: Array) -> Array:
