@@ -10,6 +10,7 @@ import pytest
 import kalmark as km
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.postponed import PostponedMap
+from kalmark.filter.storage import PANEL, Triangle
 
 J = np.array([[0.0, -1.0], [1.0, 0.0]])
 Q, R = np.diag([0.01, 0.0, 0.02]) ** 2, np.diag([0.1, 0.02]) ** 2
@@ -221,3 +222,39 @@ def test_a_robot_that_stands_still_learns_nothing_of_its_heading_in_a_postponed_
         y = km.geometry.observe(np.array(START), WORLD[ids])[0] + rng.normal(size=(4, 2)) * [0.1, 0.02]
         slam.process(km.Scan(t, "r", "lidar", np.column_stack([np.abs(y[:, 0]), y[:, 1]]), ids.tolist()))
     assert np.degrees(np.sqrt(slam.covariance("r")[2, 2])) == pytest.approx(20, abs=1e-6)
+
+
+def without(event: Any, left_out: set[Any]) -> Any:
+    """Return an event without the sightings of some landmarks."""
+    if isinstance(event, km.Control):
+        return event
+    kept = [k for k, i in enumerate(event.ids) if i not in left_out]
+    return km.Scan(event.t_s, event.robot, event.sensor, event.y[kept], [event.ids[k] for k in kept])
+
+
+def test_a_landmark_that_does_not_fit_is_ignored_with_a_reason_and_all_else_goes_on() -> None:
+    slams = [slam_of(km.estimators.Ekf(), most=60, names="rs") for _ in range(2)]
+    slams[0].map.storage.limit_bytes = PANEL * PANEL * 8  # type: ignore[union-attr]
+    reasons = set()
+    for event in drive(220, 4, names="rs"):
+        full = slams[0].process(event)
+        reasons |= {seen.reason for seen in full.observations if seen.outcome == "ignored"}
+        left_out = {seen.id for seen in full.observations if seen.outcome == "ignored"}
+        slams[1].process(without(event, left_out))
+    assert len(slams[0].landmarks().ids) == (PANEL - 6) // 2
+    assert [r.startswith("the map is full: 128 rows take") for r in reasons] == [True]
+    assert max(differences(*slams)) < 1e-9
+    with pytest.raises(km.KalmarkError, match="the map is full"):
+        slams[0].add_landmark("surveyed", (1.0, 2.0))
+
+
+def test_float32_keeps_what_is_at_rest_to_its_precision_in_half_the_memory() -> None:
+    slams = [slam_of(km.estimators.Ekf()) for _ in range(2)]
+    for slam, numbers in zip(slams, (np.float64, np.float32), strict=True):
+        slam.map = PostponedMap.from_dense(slam.map, Triangle(numbers), most=60)  # type: ignore[arg-type]
+        for event in drive(220, 1):
+            slam.process(event)
+    x, P = differences(*slams)
+    assert 0 < x < 1e-4
+    assert 0 < P < 1e-4
+    assert slams[1].map.storage.nbytes * 2 == slams[0].map.storage.nbytes  # type: ignore[union-attr]

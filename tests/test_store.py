@@ -351,7 +351,7 @@ TABLES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "another model": (lambda d: d["estimator"].update(type="StochasticMap"), "expected one of kalmark's"),
     "a time that is none": (lambda d: d.update(t_ns="now"), "t_ns is 'now'"),
     "a missing table": (lambda d: d.pop("seen"), "KeyError: 'seen', expected a map written by save"),
-    "an old version": (lambda d: d.update(kalmark=1), "version is 1, expected 4"),
+    "an old version": (lambda d: d.update(kalmark=1), "version is 1, expected 5"),
 }
 
 

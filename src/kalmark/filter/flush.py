@@ -20,7 +20,8 @@ from kalmark.geometry.spaces import Table, generator, retract
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-ROWS = 16  # to write at once: memory is used for the first time then
+ROWS = 16  # of the active blocks, to write at once
+FRESH = 100  # multiplications that take as long as to write a number there: memory is used for the first time
 
 
 @compiled
@@ -54,15 +55,13 @@ def fill(panel: Stored, begin: int, end: int, A: Index, where: Index, V: Array, 
     """Write the covariances of the active blocks into the rows begin..end of the matrix, all of one panel."""
     first = begin // PANEL * PANEL
     for i in range(begin, end):
-        if where[i] < 0:
-            for c in range(len(A)):
-                if A[c] < i:
-                    panel[i - first, A[c]] = V[i, c]
-    for start in range(0, end, 64):  # of V, that much is in the processor's cache
-        for i in range(max(begin, start), end):
-            if where[i] >= 0:
-                for j in range(start, min(i + 1, start + 64)):
-                    panel[i - first, j] = V[j, where[i]] if where[j] < 0 else P_AA[where[i], where[j]]
+        row, own = panel[i - first], where[i]
+        if own >= 0:
+            for j in range(i + 1):
+                row[j] = V[own, j]
+        for c in range(len(A)):
+            if A[c] <= i:
+                row[A[c]] = V[c, i] if own < 0 else P_AA[own, c]
 
 
 @compiled
@@ -78,9 +77,9 @@ def corrected(
             if i // PANEL < panel:
                 continue
             if where[i] >= 0:
-                C[a, b] = P_AA[where[i], where[j]] if where[j] >= 0 else V[j, where[i]]
+                C[a, b] = P_AA[where[i], where[j]] if where[j] >= 0 else V[where[i], j]
             elif where[j] >= 0:
-                C[a, b] = V[i, where[j]]
+                C[a, b] = V[where[j], i]
             elif i // PANEL > panel or j >= column:
                 s = 0.0
                 for c in range(q):
@@ -132,14 +131,15 @@ class Flush:
         self.L = _root(phase.Psi, storage.diagonal(phase.A0))
         self.q = self.L.shape[1]
         self.R = np.zeros((self.n, self.q + 2 * len(phase.thetas)))
-        self.V = np.zeros((self.n, len(phase.A)))
+        self.V = np.zeros((len(phase.A), self.n))
         self.known = self.where >= 0
         self.resting = _in_use(map_, self.n) & (self.where < 0)
         self.panel = self.column = self.row = 0
         self.cost = PANEL * max(1, self.R.shape[1])  # of a column of a panel, in multiplications
-        self.aside = 10 * PANEL  # of what else there is to do for it
+        self.aside = 10 * PANEL  # to begin a panel, for each row there is
         panels = range(0, self.n, PANEL)
-        self.work = sum((self.cost + self.aside) * min(k + PANEL, self.n) + self.aside * self.n for k in panels)
+        self.work = sum(self.cost * min(k + PANEL, self.n) + self.aside * self.n for k in panels)
+        self.work += FRESH * int(phase.A.sum())
         self.spent = 0.0
 
     @property
@@ -163,7 +163,7 @@ class Flush:
             fill(panel, begin, self.row, self.phase.A, self.where, self.V, self.phase.P_AA)
             if self.row == last:
                 self.panel, self.column = self.panel + 1, 0
-            return self.aside * last * ROWS // PANEL
+            return FRESH * last * int((self.where[begin : self.row] >= 0).sum())
         if self.column == 0:
             self._know_panel(first, last)
         start, self.column = self.column, min(last, self.column + PANEL * max(1, tiles))
@@ -192,7 +192,7 @@ class Flush:
         self._know(*np.searchsorted(starts, [first, last]))
 
     def _know(self, slot: int, end: int) -> None:
-        """Work out the means of the blocks slot..end, their rows of R = [W, w, a], and their covariances V with A."""
+        """Work out the means of the blocks slot..end, their rows of R = [W, w, a], and their covariances V' with A."""
         p, blocks = self.phase, self.map.blocks[slot:end]
         if len(blocks) == 0:
             return
@@ -212,7 +212,7 @@ class Flush:
         w = V[:, p.thetas] + a @ (0.5 * p.P_AA[np.ix_(p.thetas, p.thetas)])
         new = ~self.known[rows]
         self.R[rows[new]] = np.hstack([G @ self.L, w, a])[new]
-        self.V[rows[new]] = (V + a @ p.P_AA[p.thetas])[new]
+        self.V[:, rows[new]] = (V + a @ p.P_AA[p.thetas])[new].T
         self.known[rows] = True
         for block in blocks:
             if self.where[block[P_AT]] < 0:

@@ -290,7 +290,7 @@ class PostponedMap(Layout):
     def _pace(self, job: Flush) -> None:
         """Do a slice of a flush, so that it will be over before the next one."""
         progress = self._progress()
-        due = min(1.0, progress / 0.8) * job.work - job.spent
+        due = progress / 0.8 * job.work - job.spent if progress < 0.8 else math.inf
         if due > 0:
             job.advance(min(due, SLICE * max(1.0, 32.0 * (progress - 1.0))))
         if job.done:
