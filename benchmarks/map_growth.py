@@ -17,6 +17,7 @@ memory      of the covariance, each landmark pair, measured at 4,000 and 12,000 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import platform
@@ -112,6 +113,7 @@ def postponed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
     """Return the figures of a mission with the map that Slam chooses, and where it ended."""
     field = Field(side)
     slam, steps = field.slam(), field.mission()
+    gc.freeze()  # the log made beforehand is none of the collector's business
     wall = time.perf_counter()
     spent = take(slam, steps)
     row: dict[str, Any] = {

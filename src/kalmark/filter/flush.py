@@ -57,11 +57,12 @@ def fill(panel: Stored, begin: int, end: int, A: Index, where: Index, V: Array, 
     for i in range(begin, end):
         row, own = panel[i - first], where[i]
         if own >= 0:
-            for j in range(i + 1):
-                row[j] = V[own, j]
+            for k in range(i // PANEL + 1):
+                for j in range(k * PANEL, min(i + 1, (k + 1) * PANEL)):
+                    row[j] = V[k, own, j - k * PANEL]
         for c in range(len(A)):
             if A[c] <= i:
-                row[A[c]] = V[c, i] if own < 0 else P_AA[own, c]
+                row[A[c]] = V[i // PANEL, c, i % PANEL] if own < 0 else P_AA[own, c]
 
 
 @compiled
@@ -77,9 +78,9 @@ def corrected(
             if i // PANEL < panel:
                 continue
             if where[i] >= 0:
-                C[a, b] = P_AA[where[i], where[j]] if where[j] >= 0 else V[where[i], j]
+                C[a, b] = P_AA[where[i], where[j]] if where[j] >= 0 else V[j // PANEL, where[i], j % PANEL]
             elif where[j] >= 0:
-                C[a, b] = V[where[j], i]
+                C[a, b] = V[i // PANEL, where[j], i % PANEL]
             elif i // PANEL > panel or j >= column:
                 s = 0.0
                 for c in range(q):
@@ -131,7 +132,7 @@ class Flush:
         self.L = _root(phase.Psi, storage.diagonal(phase.A0))
         self.q = self.L.shape[1]
         self.R = np.zeros((self.n, self.q + 2 * len(phase.thetas)))
-        self.V = np.zeros((len(phase.A), self.n))
+        self.V = np.zeros((len(range(0, self.n, PANEL)), len(phase.A), PANEL))  # one panel's memory after the other
         self.known = self.where >= 0
         self.resting = _in_use(map_, self.n) & (self.where < 0)
         self.panel = self.column = self.row = 0
@@ -212,7 +213,8 @@ class Flush:
         w = V[:, p.thetas] + a @ (0.5 * p.P_AA[np.ix_(p.thetas, p.thetas)])
         new = ~self.known[rows]
         self.R[rows[new]] = np.hstack([G @ self.L, w, a])[new]
-        self.V[:, rows[new]] = (V + a @ p.P_AA[p.thetas])[new].T
+        panel = first // PANEL
+        self.V[panel][:, rows[new] - panel * PANEL] = (V + a @ p.P_AA[p.thetas])[new].T
         self.known[rows] = True
         for block in blocks:
             if self.where[block[P_AT]] < 0:
