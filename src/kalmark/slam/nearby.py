@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from kalmark.filter.map import X_AT, StochasticMap
+from kalmark.filter.map import X_AT
 from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
 from kalmark.slam.events import Id
@@ -44,32 +44,36 @@ class Nearby:
 
     def pairs(self, slam: Slam, kinds: frozenset[str], p: Array) -> tuple[Index, list[Id]]:
         """Return observations (their numbers) and landmarks of `kinds` that may belong together; p (K, 2 or 3)."""
-        slots, places = slam.map.awake(p.shape[1])
-        if not isinstance(slam.map, StochasticMap):
-            resting = self._at_rest(slam.map, slam.members, p)
-            slots = np.concatenate([slots, resting])
-            places = np.vstack([places, slam.map.places(resting, p.shape[1])])
-        names, all_kinds = slam.members.names, slam.members.kinds
-        named = [names.get(slot) for slot in slots.tolist()]
-        use = [i for i, name in enumerate(named) if name is not None and all_kinds[name].kind in kinds]
-        gaps = np.linalg.norm(p[:, None] - places[use], axis=2)
-        if len(use) > NEAREST:
+        map_, names, all_kinds = slam.map, slam.members.names, slam.members.kinds
+        slots, places = map_.awake(p.shape[1])
+        use = [i for i, s in enumerate(slots.tolist()) if s in names and all_kinds[names[s]].kind in kinds]
+        slots, gaps = slots[use], np.linalg.norm(p[:, None] - places[use], axis=2)
+        if isinstance(map_, PostponedMap):
+            reach = FARTHER * gaps.min(axis=1, initial=np.inf)
+            resting = self._at_rest(map_, slam.members, p, reach)
+            resting = resting[[all_kinds[names[s]].kind in kinds for s in resting.tolist()]]
+            if len(resting):
+                more = np.linalg.norm(p[:, None] - map_.places(resting, p.shape[1]), axis=2)
+                slots, gaps = np.concatenate([slots, resting]), np.hstack([gaps, more])
+        if len(slots) > NEAREST:
             near = np.argpartition(gaps, NEAREST - 1, axis=1)[:, :NEAREST]
+            gaps = np.take_along_axis(gaps, near, axis=1)
+            slots = slots[near]
         else:
-            near = np.tile(np.arange(len(use)), (len(p), 1))
-        gap = np.take_along_axis(gaps, near, axis=1)
-        rows, columns = np.nonzero(gap <= FARTHER * gap.min(axis=1, keepdims=True, initial=np.inf))
-        return rows, [named[use[i]] for i in near[rows, columns].tolist()]
+            slots = np.tile(slots, (len(p), 1))
+        rows, columns = np.nonzero(gaps <= FARTHER * gaps.min(axis=1, keepdims=True, initial=np.inf))
+        return rows, [names[s] for s in slots[rows, columns].tolist()]
 
-    def _at_rest(self, map_: PostponedMap, members: Members, p: Array) -> Index:
-        """Return the slots of the blocks at rest that were nearest to p when they came to rest."""
-        p = p[np.isfinite(p).all(axis=1)]
+    def _at_rest(self, map_: PostponedMap, members: Members, p: Array, reach: Array) -> Index:
+        """Return the slots of the blocks at rest that were nearest to p, within reach, when they came to rest."""
         if map_.phase != self._phase:
             placed = [slot for slot, name in members.names.items() if has_place(members.kinds[name].space)]
             self._slots, self._phase = np.array(placed, dtype=np.int64), map_.phase
             places = map_.x[map_.blocks[self._slots, X_AT][:, None] + np.arange(p.shape[1])]
             self._tree = cKDTree(places) if placed else None
-        if self._tree is None or len(p) == 0:
+        known = np.isfinite(p).all(axis=1)
+        if self._tree is None or not known.any():
             return self._slots[:0]
-        slots = self._slots[np.unique(self._tree.query(p, min(AT_REST, len(self._slots)))[1])]
-        return slots[map_.is_at_rest(slots)]
+        gaps, found = self._tree.query(p[known], np.arange(1, 1 + min(AT_REST, len(self._slots))))
+        slots = self._slots[np.asarray(found)[gaps <= reach[known, None]]]
+        return np.unique(slots[map_.is_at_rest(slots)])
