@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench bench-peers clean
 
 demo: $(VENV)/base.stamp
 	$(BIN)/kalmark demo
@@ -18,6 +18,9 @@ lint: $(VENV)/test.stamp
 
 bench: $(VENV)/bench.stamp
 	$(BIN)/python benchmarks/step.py
+
+bench-peers: $(VENV)/bench.stamp
+	$(BIN)/python benchmarks/peers.py
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

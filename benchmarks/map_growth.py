@@ -33,68 +33,13 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy
-from scipy.spatial import cKDTree
+from field import ODOMETRY, SIGHT, Field, Step
 
 import kalmark as km
 from kalmark.filter import kernels
 from kalmark.filter.postponed import PostponedMap
 
-SPACING_M, LANE_M, STEP_M, REACH_M, VIEW = 2.0, 6.0, 0.2, 4.0, 10
-ODOMETRY, SIGHT = np.array([0.01, 0.0, 0.02]), np.array([0.1, 0.02])
 GIB = 2.0**30
-Step = tuple[km.Control, km.Scan]
-
-
-class Field:
-    """A field of landmarks and a robot's true pose in it; makes the events of its way."""
-
-    def __init__(self, side: int) -> None:
-        self.rng, self.side = np.random.default_rng(0), side
-        corners = (np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2) + 0.5) * SPACING_M
-        self.landmarks = corners + self.rng.uniform(-0.5, 0.5, corners.shape)
-        self.tree, self.t = cKDTree(self.landmarks), 0
-        self.truth = self.start = np.array([0.0, LANE_M / 2, 0.0])
-
-    def step(self, u: Any, most: int | None = None) -> Step:
-        """Move by u and look around: at all landmarks in reach or at the nearest ones."""
-        self.truth, self.t = km.geometry.compose(self.truth, np.array(u, dtype=float))[0], self.t + 1
-        near = self.tree.query(self.truth[:2], most)[1] if most else self.tree.query_ball_point(self.truth[:2], REACH_M)
-        ids = sorted(int(i) for i in near)
-        y = km.geometry.observe(self.truth, self.landmarks[ids])[0] if ids else np.zeros((0, 2))
-        y = y + self.rng.normal(size=y.shape) * SIGHT
-        y[:, 0] = np.abs(y[:, 0])
-        control = km.Control(self.t, "r", np.array(u) + self.rng.normal(size=3) * ODOMETRY)
-        return control, km.Scan(self.t, "r", "lidar", y, ids)
-
-    def mission(self) -> list[Step]:
-        """Return lanes to and fro, joined by half circles."""
-        length = self.side * SPACING_M
-        lanes, turn = int(np.ceil(length / LANE_M)), int(np.ceil(np.pi * LANE_M / 2 / STEP_M))
-        steps = []
-        for lane in range(lanes):
-            steps += [self.step((STEP_M, 0, 0)) for _ in range(int(length / STEP_M))]
-            bend = (np.pi * LANE_M / 2 / turn, 0, (-1) ** lane * np.pi / turn)
-            steps += [self.step(bend) for _ in range(turn if lane < lanes - 1 else 0)]
-        return steps
-
-    def circle(self, count: int) -> list[Step]:
-        """Return steps round a small circle."""
-        return [self.step((0.1, 0, 0.1), VIEW) for _ in range(count)]
-
-    def rush(self, count: int) -> list[Step]:
-        """Return steps so long that what is in view is never what was, to and fro through the field."""
-        steps, heading = [], 0.0
-        for _ in range(count):
-            p = self.truth[:2] + 10 * np.array([np.cos(self.truth[2]), np.sin(self.truth[2])])
-            heading = 2.0 if (p < REACH_M).any() or (p > self.side * SPACING_M - REACH_M).any() else 0.0
-            steps.append(self.step((0.0 if heading else 10.0, 0, heading), VIEW))
-        return steps
-
-    def slam(self, map_: str = "auto") -> km.Slam:
-        """Return the Slam of a robot at the start."""
-        lidar = km.Mount(km.sensors.RangeBearing(*SIGHT))
-        robot = km.Robot("r", km.motion.Odometry2D(*ODOMETRY), self.start, {"lidar": lidar})
-        return km.Slam([robot], km.association.ByIdentity("off"), map=map_)
 
 
 def take(slam: km.Slam, steps: Iterable[Step]) -> np.ndarray:
@@ -111,7 +56,7 @@ def take(slam: km.Slam, steps: Iterable[Step]) -> np.ndarray:
 
 def postponed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
     """Return the figures of a mission with the map that Slam chooses, and where it ended."""
-    field = Field(side)
+    field = Field(side, side)
     slam, steps = field.slam(), field.mission()
     gc.freeze()  # the log made beforehand is none of the collector's business
     wall = time.perf_counter()
@@ -151,7 +96,7 @@ def memory(count: int, numbers: str) -> dict[str, float]:
     def resident() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
-    field = Field(4)
+    field = Field(4, 4)
     lidar = km.Mount(km.sensors.RangeBearing(*SIGHT))
     robot = km.Robot("r", km.motion.Odometry2D(*ODOMETRY), field.start, {"lidar": lidar})
     slam = km.Slam([robot], km.association.ByIdentity("off"), map="postponed", numbers=numbers)

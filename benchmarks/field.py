@@ -1,0 +1,77 @@
+"""A field of landmarks and a robot that mows it: the log that benchmarks of large maps share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+import kalmark as km
+
+SPACING_M, LANE_M, STEP_M, REACH_M, VIEW = 2.0, 6.0, 0.2, 4.0, 10
+ODOMETRY, SIGHT = np.array([0.01, 0.0, 0.02]), np.array([0.1, 0.02])
+Step = tuple[km.Control, km.Scan]
+
+
+class Field:
+    """A field of landmarks, 2 m apart, and a robot's true pose in it; makes the events of its way."""
+
+    def __init__(self, columns: int, rows: int) -> None:
+        self.rng, self.columns, self.rows = np.random.default_rng(0), columns, rows
+        grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
+        corners = (grid.reshape(-1, 2) + 0.5) * SPACING_M
+        self.landmarks = corners + self.rng.uniform(-0.5, 0.5, corners.shape)
+        self.tree, self.t = cKDTree(self.landmarks), 0
+        self.truth = self.start = np.array([0.0, LANE_M / 2, 0.0])
+
+    def step(self, u: Any, most: int | None = None) -> Step:
+        """Move by u and look around: at all landmarks in reach or at the nearest ones."""
+        self.truth, self.t = km.geometry.compose(self.truth, np.array(u, dtype=float))[0], self.t + 1
+        near = self.tree.query(self.truth[:2], most)[1] if most else self.tree.query_ball_point(self.truth[:2], REACH_M)
+        ids = sorted(int(i) for i in near)
+        y = km.geometry.observe(self.truth, self.landmarks[ids])[0] if ids else np.zeros((0, 2))
+        y = y + self.rng.normal(size=y.shape) * SIGHT
+        y[:, 0] = np.abs(y[:, 0])
+        control = km.Control(self.t, "r", np.array(u) + self.rng.normal(size=3) * ODOMETRY)
+        return control, km.Scan(self.t, "r", "lidar", y, ids)
+
+    def mission(self, step_m: float = STEP_M) -> list[Step]:
+        """Return lanes to and fro, joined by half circles."""
+        length = self.columns * SPACING_M
+        lanes, turn = int(np.ceil(self.rows * SPACING_M / LANE_M)), int(np.ceil(np.pi * LANE_M / 2 / step_m))
+        steps = []
+        for lane in range(lanes):
+            steps += [self.step((step_m, 0, 0)) for _ in range(int(length / step_m))]
+            bend = (np.pi * LANE_M / 2 / turn, 0, (-1) ** lane * np.pi / turn)
+            steps += [self.step(bend) for _ in range(turn if lane < lanes - 1 else 0)]
+        return steps
+
+    def back(self, step_m: float = STEP_M) -> list[Step]:
+        """Return a turn on the spot and the way back to the middle of the lane."""
+        about = [self.step((0, 0, np.pi / 4)) for _ in range(4)]
+        return about + [self.step((step_m, 0, 0)) for _ in range(int(self.columns * SPACING_M / 2 / step_m))]
+
+    def circle(self, count: int, step_m: float = 0.1, radius_m: float = 1.0, view: int = VIEW) -> list[Step]:
+        """Return steps round a circle, anticlockwise or, with a negative radius, clockwise."""
+        return [self.step((step_m, 0, step_m / radius_m), view) for _ in range(count)]
+
+    def rush(self, count: int) -> list[Step]:
+        """Return steps so long that what is in view is never what was, to and fro through a square field."""
+        steps, heading, side = [], 0.0, self.columns * SPACING_M
+        for _ in range(count):
+            p = self.truth[:2] + 10 * np.array([np.cos(self.truth[2]), np.sin(self.truth[2])])
+            heading = 2.0 if (p < REACH_M).any() or (p > side - REACH_M).any() else 0.0
+            steps.append(self.step((0.0 if heading else 10.0, 0, heading), VIEW))
+        return steps
+
+    def slam(self, map_: str = "auto") -> km.Slam:
+        """Return the Slam of a robot at the start."""
+        return new_slam(self.start, map_)
+
+
+def new_slam(start: Any, map_: str = "auto") -> km.Slam:
+    """Return the Slam that is timed."""
+    lidar = km.Mount(km.sensors.RangeBearing(*SIGHT))
+    robot = km.Robot("r", km.motion.Odometry2D(*ODOMETRY), start, {"lidar": lidar})
+    return km.Slam([robot], km.association.ByIdentity("off"), map=map_)
