@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench bench-peers clean
+.PHONY: demo test lint bench bench-peers bench-growth clean
 
 demo: $(VENV)/base.stamp
 	$(BIN)/kalmark demo
@@ -21,6 +21,9 @@ bench: $(VENV)/bench.stamp
 
 bench-peers: $(VENV)/bench.stamp
 	$(BIN)/python benchmarks/peers.py
+
+bench-growth: $(VENV)/base.stamp
+	$(BIN)/python benchmarks/map_growth.py
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

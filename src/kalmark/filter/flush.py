@@ -20,8 +20,8 @@ from kalmark.geometry.spaces import Table, generator, retract
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-ROWS = 16  # of the active blocks, to write at once
-FRESH = 100  # multiplications that take as long as to write a number there: memory is used for the first time
+ROWS = 8  # of the active blocks, to write at once
+FRESH = 400  # multiplications that take as long as to write a number there: memory is used for the first time
 
 
 @compiled

@@ -33,7 +33,7 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
-SLICE = 1e8  # multiplications of a flush to do after a correction, some 5 ms
+SLICE = 7e7  # multiplications of a flush to do after a correction, some 4 ms
 DEAR = 80.0  # multiplications of a flush that take as long as a correction of one more element of the active map
 START = 5e7  # multiplications that take as long as to begin a flush
 MOST = 1000  # rows of the active map, besides those it began with
