@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from kalmark.filter.map import X_AT
 from kalmark.filter.postponed import PostponedMap
@@ -18,6 +17,8 @@ from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
 from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
     from kalmark.slam.members import Members
     from kalmark.slam.slam import Slam
 
@@ -67,6 +68,8 @@ class Nearby:
     def _at_rest(self, map_: PostponedMap, members: Members, p: Array, reach: Array) -> Index:
         """Return the slots of the blocks at rest that were nearest to p, within reach, when they came to rest."""
         if map_.phase != self._phase:
+            from scipy.spatial import cKDTree
+
             placed = [slot for slot, name in members.names.items() if has_place(members.kinds[name].space)]
             self._slots, self._phase = np.array(placed, dtype=np.int64), map_.phase
             places = map_.x[map_.blocks[self._slots, X_AT][:, None] + np.arange(p.shape[1])]

@@ -1,0 +1,43 @@
+"""Calls by address: from compiled code and from Python, what comes back and what goes wrong."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from kalmark.compiled import address_of, by_address, signature_of
+
+SUM = signature_of("f8(f8[::1])")
+call = by_address(SUM)
+
+
+@numba.njit
+def positive_sum(a: np.ndarray) -> float:
+    if a[0] < 0:
+        raise ValueError("negative")
+    return a.sum()
+
+
+@numba.njit
+def twice(address: int, a: np.ndarray) -> float:
+    return 2 * call(address, (a,))
+
+
+@numba.njit
+def count(a: np.ndarray) -> int:
+    return len(a)
+
+
+def test_compiled_code_and_python_call_the_same_function_and_get_its_errors() -> None:
+    address = address_of(positive_sum, SUM)
+    assert twice(address, np.ones(3)) == 6.0
+    assert call(address, (np.ones(3),)) == 3.0
+    for caller in (lambda a: twice(address, a), lambda a: call(address, (a,))):
+        with pytest.raises(ValueError, match="negative"):
+            caller(-np.ones(3))
+
+
+def test_a_function_that_returns_something_else_has_no_address_to_be_called_by() -> None:
+    with pytest.raises(TypeError, match="returns int64, expected float64"):
+        address_of(count, SUM)
