@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg.lapack import dpstrf
 
 from kalmark.compiled import compiled
 from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, Layout
@@ -231,6 +230,8 @@ def _in_use(map_: Layout, n: int) -> npt.NDArray[np.bool_]:
 
 def _root(Psi: Array, variances: Array) -> Array:
     """Return L (n, rank) with L L' = Psi, by pivoted Cholesky of Psi in units of the blocks' sigmas."""
+    from scipy.linalg.lapack import dpstrf
+
     sigma = np.sqrt(np.maximum(variances, 0.0))
     scaled = Psi * sigma[:, None] * sigma
     if not len(Psi) or not scaled.any():
