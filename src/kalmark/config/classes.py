@@ -50,6 +50,8 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "homogeneous_line": landmarks.HomogeneousLine,
     "identity": association.ByIdentity,
     "nearest": association.NearestNeighbour,
+    "global": association.GlobalAssignment,
+    "jcbb": association.JointCompatibility,
     "ekf": estimators.Ekf,
     "invariant": estimators.Invariant,
     "fej": estimators.Fej,

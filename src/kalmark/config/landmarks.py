@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Tag
+from pydantic import Discriminator, Field, Tag
 
 from kalmark.config.sections import Gate, NotNegative, Number, Probability, Section, type_or
 
@@ -131,17 +131,37 @@ class IdentityAssociation(Section):
     """Refuse observations outside this probability; or off, or default."""
 
 
-class NearestAssociation(Section):
-    """The nearest landmark by Mahalanobis distance, inside its gate."""
-
-    type: Literal["nearest"] = "nearest"
+class _GatedAssociation(Section):
     gate: Probability = 0.99
     """Pair an observation with a landmark inside this probability."""
     new_gate: Probability = 0.99999
     """Beyond this probability from every landmark it is a new one; in between it is left alone."""
 
 
+class NearestAssociation(_GatedAssociation):
+    """The nearest landmark by Mahalanobis distance, inside its gate."""
+
+    type: Literal["nearest"] = "nearest"
+
+
+class GlobalAssociation(_GatedAssociation):
+    """The pairs of the whole scan whose squared Mahalanobis distances add up to the least."""
+
+    type: Literal["global"] = "global"
+
+
+class JointAssociation(_GatedAssociation):
+    """The largest set of pairs that fit together (JCBB): for a pose known worse than landmarks are apart."""
+
+    type: Literal["jcbb"] = "jcbb"
+    most_nodes: Annotated[int, Field(ge=1)] = 20_000
+    """Nodes of the search after which the best so far is taken."""
+
+
 Association = Annotated[
-    Annotated[IdentityAssociation, Tag("identity")] | Annotated[NearestAssociation, Tag("nearest")],
+    Annotated[IdentityAssociation, Tag("identity")]
+    | Annotated[NearestAssociation, Tag("nearest")]
+    | Annotated[GlobalAssociation, Tag("global")]
+    | Annotated[JointAssociation, Tag("jcbb")],
     Discriminator(type_or("identity")),
 ]

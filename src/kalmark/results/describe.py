@@ -44,6 +44,8 @@ TYPES = {
     "PointSignature2D": "point_signature",
     "ByIdentity": "identity",
     "NearestNeighbour": "nearest",
+    "GlobalAssignment": "global",
+    "JointCompatibility": "jcbb",
     "Ekf": "ekf",
     "Invariant": "invariant",
     "Fej": "fej",

@@ -25,9 +25,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-NEAREST = 4  # of so many, the nearest to where an observation seems to come from, one is the landmark if any is
+TINY_M = 1e-9
 AT_REST = 8  # looked up in the tree: their means have moved on by what is pending
-FARTHER = 10.0  # than the nearest, so many times: out of the question
 
 
 def has_place(space: Space) -> bool:
@@ -43,29 +42,33 @@ class Nearby:
         self._slots: Index = np.zeros(0, dtype=np.int64)  # of the places in the tree
         self._phase = -1
 
-    def pairs(self, slam: Slam, kinds: frozenset[str], p: Array) -> tuple[Index, list[Id]]:
+    def pairs(
+        self, slam: Slam, kinds: frozenset[str], p: Array, nearest: int, farther: float
+    ) -> tuple[Index, list[Id]]:
         """Return observations (their numbers) and landmarks of `kinds` that may belong together; p (K, 2 or 3)."""
         map_, names, all_kinds = slam.map, slam.members.names, slam.members.kinds
         slots, places = map_.awake(p.shape[1])
         use = [i for i, s in enumerate(slots.tolist()) if s in names and all_kinds[names[s]].kind in kinds]
         slots, gaps = slots[use], np.linalg.norm(p[:, None] - places[use], axis=2)
         if isinstance(map_, PostponedMap):
-            reach = FARTHER * gaps.min(axis=1, initial=np.inf)
-            resting = self._at_rest(map_, slam.members, p, reach)
-            resting = resting[[all_kinds[names[s]].kind in kinds for s in resting.tolist()]]
+            reach = farther * np.maximum(gaps.min(axis=1, initial=np.inf), TINY_M)
+            resting = self._at_rest(map_, slam.members, p, reach, max(AT_REST, nearest))
+            resting = resting[[s in names and all_kinds[names[s]].kind in kinds for s in resting.tolist()]]
             if len(resting):
                 more = np.linalg.norm(p[:, None] - map_.places(resting, p.shape[1]), axis=2)
                 slots, gaps = np.concatenate([slots, resting]), np.hstack([gaps, more])
-        if len(slots) > NEAREST:
-            near = np.argpartition(gaps, NEAREST - 1, axis=1)[:, :NEAREST]
+        if len(slots) > nearest:
+            near = np.argpartition(gaps, nearest - 1, axis=1)[:, :nearest]
             gaps = np.take_along_axis(gaps, near, axis=1)
             slots = slots[near]
         else:
             slots = np.tile(slots, (len(p), 1))
-        rows, columns = np.nonzero(gaps <= FARTHER * gaps.min(axis=1, keepdims=True, initial=np.inf))
+        rows, columns = np.nonzero(
+            gaps <= farther * np.maximum(gaps.min(axis=1, keepdims=True, initial=np.inf), TINY_M)
+        )
         return rows, [names[s] for s in slots[rows, columns].tolist()]
 
-    def _at_rest(self, map_: PostponedMap, members: Members, p: Array, reach: Array) -> Index:
+    def _at_rest(self, map_: PostponedMap, members: Members, p: Array, reach: Array, count: int) -> Index:
         """Return the slots of the blocks at rest that were nearest to p, within reach, when they came to rest."""
         if map_.phase != self._phase:
             from scipy.spatial import cKDTree
@@ -77,6 +80,6 @@ class Nearby:
         known = np.isfinite(p).all(axis=1)
         if self._tree is None or not known.any():
             return self._slots[:0]
-        gaps, found = self._tree.query(p[known], np.arange(1, 1 + min(AT_REST, len(self._slots))))
+        gaps, found = self._tree.query(p[known], np.arange(1, 1 + min(count, len(self._slots))))
         slots = self._slots[np.asarray(found)[gaps <= reach[known, None]]]
         return np.unique(slots[map_.is_at_rest(slots)])

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import ModelError
-from kalmark.filter.corrections import innovation, observed_block
+from kalmark.filter import kernels
+from kalmark.filter.corrections import add_blocks, innovation, observed_block
 from kalmark.filter.estimators import Map
 from kalmark.models import landmarks as kinds
 from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D, Tag
@@ -236,15 +237,16 @@ class Scene:
         """Return the size p of one innovation."""
         return self._view.dof
 
-    def candidates(self) -> list[Id]:
+    def candidates(self, nearest: int, farther: float) -> list[Id]:
         """Return the ids of the landmarks that this sensor could have seen where these observations seem to come from.
 
-        A sensor that does not tell where its measurements come from could have seen any.
+        That is the `nearest` ones to each place, but none so many times `farther` than the nearest.  A sensor that does
+        not tell where its measurements come from could have seen any.
         """
         places = self._view.places(self._slam.map, self._slam.members.slots[self._event.robot], self._event.y)
         if places is None:
             return self._slam.members.in_reach(self._view)
-        self._pairs = self._slam.nearby.pairs(self._slam, frozenset(self._view.looks), places)
+        self._pairs = self._slam.nearby.pairs(self._slam, frozenset(self._view.looks), places, nearest, farther)
         return list(dict.fromkeys(self._pairs[1]))
 
     def distances(self, candidates: list[Id]) -> Array:
@@ -262,6 +264,33 @@ class Scene:
             R = view.noise(map_, robot, look, slots, self._R[k], event)
             d2[k, c] = view.predict(map_, robot, look, slots, event.y[k], R)[1]
         return d2
+
+    def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
+        """Return the innovations z (M, p) of M pairs of an observation and a landmark, and their Z (M p, M p).
+
+        The noise of an observation is in the blocks of its pairs, not between them: only one of them can be right.
+        """
+        view, event, p = self._view, self._event, self._view.dof
+        slots = self._slam.members.slots_of(names)
+        m, robot, mount, here = self._slam.map.excerpt(self._slam.members.slots[event.robot], view.mount, slots)
+        z, R, H, at = np.empty((len(rows), p)), np.empty((len(rows), p, p)), [], []
+        for look, which in self._slam.members.by_look(view, names):
+            index, _, mean = observed_block(m.x, m.blocks, m.atoms, robot, mount, here[which], look.d)
+            head = len(mean) - look.d * len(which)
+            l = mean[head:].reshape(len(which), look.d)
+            _, z[which], E_h, E_l = linearize(look.view, mean[:head], l, event.y[rows[which]])
+            R[which] = view.noise(self._slam.map, robot, look, slots[which], self._R[rows[which]], event)
+            H += [(i, E_h[k], E_l[k]) for k, i in enumerate(which)]
+            h, d = E_h.shape[2], E_l.shape[2]
+            at += [np.concatenate([index[:h], index[h + k * d : h + (k + 1) * d]]) for k in range(len(which))]
+        index = np.concatenate(at)
+        S, starts = kernels.submatrix(m.P, index), np.cumsum([0, *(len(a) for a in at)])
+        J = np.zeros((z.size, len(index)))
+        for (i, E_h, E_l), start, end in zip(H, starts[:-1], starts[1:], strict=True):
+            J[i * p : (i + 1) * p, start:end] = np.hstack([E_h, E_l])
+        Z = J @ S @ J.T
+        add_blocks(Z, R)
+        return z, Z
 
     def _near(self, candidates: list[Id]) -> tuple[Index, Index]:
         """Return the observations and the numbers of candidates that are near each other."""
