@@ -263,3 +263,13 @@ def test_float32_keeps_what_is_at_rest_to_its_precision_in_half_the_memory() -> 
     assert 0 < x < 1e-4
     assert 0 < P < 1e-4
     assert slams[1].map.storage.nbytes * 2 == slams[0].map.storage.nbytes  # type: ignore[union-attr]
+
+
+def test_a_map_known_beforehand_comes_to_rest_as_it_is_read_in() -> None:
+    slam = km.Slam(slam_of(EKF).robots.values(), map="postponed")
+    assert isinstance(slam.map, PostponedMap)
+    for i in range(400):
+        slam.add_landmark(i, (float(i), 1.0), np.diag([0.01, 0.02]))
+        assert slam.map.active.n < 450
+    np.testing.assert_array_equal(slam.covariance(7, 399), np.diag([0.01, 0.02, 0.01, 0.02]))
+    np.testing.assert_array_equal(slam.mean(7), [7.0, 1.0])

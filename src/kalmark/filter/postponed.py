@@ -209,7 +209,12 @@ class PostponedMap(Layout):
 
     # ------------------------------------------------------------------ growing and shrinking
     def add(self, space: Space, mean: Any, cov: Any = None) -> int:
-        """Add a block that is independent of all others (`cov` None: known exactly); return its slot."""
+        """Add a block that is independent of all others (`cov` None: known exactly); return its slot.
+
+        An index from before holds no longer.
+        """
+        if self._full():
+            self.flush()
         mean = np.asarray(mean, dtype=np.float64)
         slot = self._place(space, mean)
         self._activate(slot, self.active.add(space, mean, cov))

@@ -185,7 +185,7 @@ class Slam:
         if error is None and part.N.any() and not (part.first and part.last):
             error = self._errors[name] = self.map.add(Rn(len(u)), np.zeros(len(u)), part.N)
         if error is not None:  # the control's error is a block of the map, common to all parts of its interval
-            index = np.concatenate([index, self.map.index(error)])
+            index = np.concatenate([self.map.index(slot), self.map.index(error)])
             F = np.block([[F, R_u], [np.zeros((len(u), len(F))), np.eye(len(u))]])
             Q = np.zeros((len(index), len(index)))
         D = motion.diffusion(part.u, part.dt_s)
