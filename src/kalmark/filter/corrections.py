@@ -133,15 +133,14 @@ def sparse_product(H: Array, S: Array, head: int, k: int) -> Array:
     """Return H S, H being zero but in the columns of the head and, for each of K observations, of its landmark."""
     q, n = len(H) // k, S.shape[1]
     d = (H.shape[1] - head) // k
-    out = np.empty((len(H), n))
+    out = np.zeros((len(H), n))
     for r in range(len(H)):
-        own = head + r // q * d
-        row = H[r, 0] * S[0]
-        for c in range(1, head):
-            row += H[r, c] * S[c]
-        for c in range(own, own + d):
-            row += H[r, c] * S[c]
-        out[r] = row
+        own = r // q * d
+        for i in range(head + d):
+            c = i if i < head else own + i
+            h = H[r, c]
+            for j in range(n):
+                out[r, j] += h * S[c, j]
     return out
 
 
