@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.gaussian import gate
 from kalmark.slam.joint import best_matching
+from kalmark.slam.scene import Scene
 
 METHODS = (
     km.association.NearestNeighbour(),
@@ -93,6 +95,25 @@ def test_branch_and_bound_finds_what_a_look_at_all_matchings_finds() -> None:
             if fits and (len(used), -d2) > (best[0], -best[1]):
                 best = (len(used), d2)
         assert (chosen >= 0).sum() == best[0]
+
+
+def test_what_is_asked_jointly_is_the_same_of_a_postponed_map_and_of_a_dense_one() -> None:
+    points, asked = np.random.default_rng(4).uniform(2, 8, (6, 2)), []
+    for map_ in ("dense", "postponed"):
+        laser = km.Mount(km.sensors.RangeBearing(0.05, 0.01, sigma_range_rel=0.2))  # its noise depends on the place
+        robot = km.Robot("r", km.motion.Odometry2D(), cov=0.01 * np.eye(3), sensors={"l": laser})
+        slam = km.Slam([robot], map=map_)
+        for i, point in enumerate(points):
+            slam.add_landmark(i, point, 0.01 * np.eye(2))
+        if isinstance(slam.map, PostponedMap):
+            slam.map.flush()
+            slam.map.index(slam.slot(3))  # awake, and not in the place it had
+            slam.map.index(slam.slot("r"))
+        view, scan = slam._views["r", "l"], km.Scan(1, "r", "l", km.geometry.observe(ORIGIN, points)[0])
+        scene = Scene(slam, view, scan, (None,) * 6, np.zeros((6, 2, 2)))
+        asked.append(scene.jointly(np.array([3, 3, 0]), [3, 4, 3]))
+    np.testing.assert_allclose(asked[0][0], asked[1][0], atol=1e-12)
+    np.testing.assert_allclose(asked[0][1], asked[1][1], atol=1e-12)
 
 
 def prefix_fits(used: list[int], z: np.ndarray, Z: np.ndarray, gates: np.ndarray) -> bool:

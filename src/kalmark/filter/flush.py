@@ -14,6 +14,8 @@ import numpy.typing as npt
 from kalmark.compiled import compiled
 from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, Layout
 from kalmark.filter.storage import PANEL, Stored, Triangle, subtract
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
 from kalmark.geometry.spaces import Table, generator, retract
 
 Array = npt.NDArray[np.float64]
@@ -120,6 +122,25 @@ class Leap:
     turns: Array
 
 
+def leap_of(robot: int, ds: Array, moved: dict[int, tuple[Array, Array]], robots: list[int], axes: int) -> Leap:
+    """Return a robot's last correction as one that turns the world; `moved` has the means before and after it."""
+    turns = {r: _turn(before, after, axes) for r, (before, after) in moved.items()}
+    turn = turns[robot].copy()
+    if axes == 6:
+        turn[:3] += np.cross(moved[robot][0][:3], turn[3:])
+    return Leap(robots.index(robot), ds, turn, np.concatenate([turns[r] for r in robots]))
+
+
+def _turn(before: Array, after: Array, axes: int) -> Array:
+    """Return what a correction did to the turn (axes,) of a robot that stood at `before` and stands at `after`."""
+    if axes == 1:
+        return np.array([wrap(after[2] - before[2])])
+    turn = log(multiply(after[3:7], conjugate(before[3:7])))
+    if axes == 3:
+        return turn
+    return np.concatenate([np.linalg.solve(left_jacobian(turn), after[:3] - before[:3]), turn])
+
+
 class Flush:
     """P_BB <- P_BB - W W', P_AB, P_AA and the means, in slices."""
 
@@ -148,7 +169,9 @@ class Flush:
         return self.panel * PANEL >= self.n
 
     def advance(self, work: float) -> None:
-        """Do so much work, in multiplications: at least one step of it."""
+        """Do so much work, in multiplications: of some work at least one step."""
+        if work <= 0:
+            return
         until = self.spent + work
         while self.spent < until and not self.done:
             self.spent += self._step(int((until - self.spent) // (self.cost * PANEL)))

@@ -22,21 +22,16 @@ import numpy.typing as npt
 
 from kalmark.filter import kernels
 from kalmark.filter.drift import Drift
-from kalmark.filter.flush import Flush, Leap, Phase, displaced
+from kalmark.filter.flush import Flush, Phase, displaced, leap_of
 from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
+from kalmark.filter.pace import Pace
 from kalmark.filter.storage import PANEL, Triangle
-from kalmark.geometry.angles import wrap
-from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
 from kalmark.geometry.spaces import RHO, Rn, Space
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
-SLICE = 7e7  # multiplications of a flush to do after a correction, some 4 ms
-DEAR = 80.0  # multiplications of a flush that take as long as a correction of one more element of the active map
-START = 5e7  # multiplications that take as long as to begin a flush
-MOST = 1000  # rows of the active map, besides those it began with
 
 NO_ROWS = np.zeros(0, dtype=np.int64)
 scalars = lru_cache(maxsize=64)(Rn)
@@ -75,8 +70,7 @@ class PostponedMap(Layout):
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
         self._drift = Drift()
         self._before: dict[int, Array] = {}
-        self._begun = 0  # rows of the active map when it was first corrected
-        self._paid = 0  # elements that have been corrected besides those
+        self._pace = Pace(self.most)
 
     @classmethod
     def from_dense(cls, dense: StochasticMap, storage: Triangle | None = None, most: int | None = None) -> PostponedMap:
@@ -307,19 +301,10 @@ class PostponedMap(Layout):
             self._moved[robot] = self._moved.get(robot, 0.0) + ds
             if len(self._owners) < self._used() and self._far(robot, s):
                 self.flush(robot, ds)
-        self._begun = self._begun or self.active.n
-        self._paid += self.active.n**2 - self._begun**2
+        self._pace.count(self.active.n)
         if self._job is not None:
-            self._pace(self._job)
-
-    def _pace(self, job: Flush) -> None:
-        """Do a slice of a flush, so that it will be over before the next one."""
-        progress = self._progress()
-        due = progress / 0.8 * job.work - job.spent if progress < 0.8 else math.inf
-        if due > 0:
-            job.advance(min(due, SLICE * max(1.0, 32.0 * (progress - 1.0))))
-        if job.done:
-            self._job = None
+            self._job.advance(self._pace.due(self._progress(), self._job.spent, self._job.work))
+            self._job = None if self._job.done else self._job
 
     def _used(self) -> int:
         return len(self.spaces) - sum(len(slots) for slots in self._free.values()) - len(self._gone)
@@ -377,16 +362,10 @@ class PostponedMap(Layout):
 
     # ------------------------------------------------------------------ flushing
     def _progress(self) -> float:
-        """Return how far the phase is: at 1 it is time for a flush, at 2 it is high time."""
-        grown = self.active.n - self._begun
-        if self.most is not None:
-            return self.active.n / self.most
-        paid = DEAR * self._paid / (START + len(self._A0) * float(self.n) ** 2)
-        return max(paid, grown / min(MOST, 120.0 + self.n ** (2 / 3)))
+        return self._pace.progress(self.active.n, len(self._A0), self.n)
 
     def _full(self) -> bool:
-        progress = self._progress()
-        return bool(self._owners) and progress > (1.0 if self._job is None else 2.0)
+        return bool(self._owners) and self._progress() > (1.0 if self._job is None else 2.0)
 
     def finish(self) -> None:
         """Finish a flush that is under way."""
@@ -397,7 +376,10 @@ class PostponedMap(Layout):
     def flush(self, robot: int | None = None, ds: Array | None = None) -> None:
         """Bring all blocks to rest.  The last correction, ds by `robot`, is applied as the dense filter does."""
         self.finish()
-        leap = None if robot is None or ds is None else self._leap(robot, ds)
+        leap = None
+        if robot is not None and ds is not None:
+            went = {r: (before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
+            leap = leap_of(robot, ds, went, list(self._moved), self.axes)
         m = self.active
         slots = list(self._owners)
         A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
@@ -405,11 +387,9 @@ class PostponedMap(Layout):
         where = {row: i for i, row in enumerate(here.tolist())}
         thetas = [where[row] for robot in self._moved for row in self._turn_rows(robot).tolist()]
         joint = kernels.submatrix(m.P, np.concatenate([here, self._s]))
-        n = len(here)
-        S = self._displacements()
+        n, S, (axes, origins) = len(here), self._displacements(), self._gauges()
         if leap is not None:
             S[:, leap.robot] -= leap.ds
-        axes, origins = self._gauges()
         turns = np.array(thetas, dtype=np.int64)
         phase = Phase(self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, turns, origins, axes)
         self._job = Flush(self, self.storage, phase, leap)
@@ -419,21 +399,3 @@ class PostponedMap(Layout):
         for slot, space in self._gone:
             self._free.setdefault(space.kinds, []).append(slot)
         self._begin()
-
-    def _leap(self, robot: int, ds: Array) -> Leap:
-        """Return the last correction as one that turns the world."""
-        turns = {r: self._turn(before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
-        column = list(self._moved).index(robot)
-        turn = turns[robot].copy()
-        if self.axes == 6:
-            turn[:3] += np.cross(self._before[robot][:3], turn[3:])
-        return Leap(column, ds, turn, np.concatenate([turns[r] for r in self._moved]))
-
-    def _turn(self, before: Array, after: Array) -> Array:
-        """Return what a correction did to the turn (axes,) of a robot that stood at `before` and stands at `after`."""
-        if self.axes == 1:
-            return np.array([wrap(after[2] - before[2])])
-        turn = log(multiply(after[3:7], conjugate(before[3:7])))
-        if self.axes == 3:
-            return turn
-        return np.concatenate([np.linalg.solve(left_jacobian(turn), after[:3] - before[:3]), turn])

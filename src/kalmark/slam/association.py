@@ -39,7 +39,7 @@ class Query(Protocol):
 
     ids: tuple[Id | None, ...]
 
-    def candidates(self, nearest: int, farther: float) -> list[Id]:
+    def candidates(self, nearest: int = 4, farther: float = 10.0) -> list[Id]:
         """Return the landmarks this sensor could have seen: of each place the nearest ones, none so much farther."""
 
     def distances(self, candidates: list[Id]) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import ModelError
+from kalmark.errors import MapError, ModelError
 from kalmark.filter.estimators import Map
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.postponed import PostponedMap
@@ -48,7 +48,10 @@ def let_grow(slam: Slam) -> None:
 
 
 def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:
-    """Make Euclidean points of those whose depth has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4."""
+    """Make Euclidean points of those whose depth has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4.
+
+    Where the map has no room for another block, they stay what they are.
+    """
     map_, members = slam.map, slam.members
     for name in names if slam.reparametrize is not None else ():
         kind: Any = members.kinds.get(name)  # type: ignore[arg-type]
@@ -60,7 +63,11 @@ def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> 
         T = view.pose(map_, members.slots[robot])
         if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < slam.reparametrize:
             p, P_l = kind.to_point(l)
-            members.place(name, map_.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3))), Point3D())
+            try:
+                place = map_.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3)))
+            except MapError:
+                return
+            members.place(name, place, Point3D())
             map_.remove(slot)
 
 

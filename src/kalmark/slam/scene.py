@@ -237,7 +237,7 @@ class Scene:
         """Return the size p of one innovation."""
         return self._view.dof
 
-    def candidates(self, nearest: int, farther: float) -> list[Id]:
+    def candidates(self, nearest: int = 4, farther: float = 10.0) -> list[Id]:
         """Return the ids of the landmarks that this sensor could have seen where these observations seem to come from.
 
         That is the `nearest` ones to each place, but none so many times `farther` than the nearest.  A sensor that does
@@ -271,15 +271,16 @@ class Scene:
         The noise of an observation is in the blocks of its pairs, not between them: only one of them can be right.
         """
         view, event, p = self._view, self._event, self._view.dof
+        map_, robot = self._slam.map, self._slam.members.slots[event.robot]
         slots = self._slam.members.slots_of(names)
-        m, robot, mount, here = self._slam.map.excerpt(self._slam.members.slots[event.robot], view.mount, slots)
+        m, robot_here, mount, here = map_.excerpt(robot, view.mount, slots)
         z, R, H, at = np.empty((len(rows), p)), np.empty((len(rows), p, p)), [], []
         for look, which in self._slam.members.by_look(view, names):
-            index, _, mean = observed_block(m.x, m.blocks, m.atoms, robot, mount, here[which], look.d)
+            index, _, mean = observed_block(m.x, m.blocks, m.atoms, robot_here, mount, here[which], look.d)
             head = len(mean) - look.d * len(which)
             l = mean[head:].reshape(len(which), look.d)
             _, z[which], E_h, E_l = linearize(look.view, mean[:head], l, event.y[rows[which]])
-            R[which] = view.noise(self._slam.map, robot, look, slots[which], self._R[rows[which]], event)
+            R[which] = view.noise(map_, robot, look, slots[which], self._R[rows[which]], event)
             H += [(i, E_h[k], E_l[k]) for k, i in enumerate(which)]
             h, d = E_h.shape[2], E_l.shape[2]
             at += [np.concatenate([index[:h], index[h + k * d : h + (k + 1) * d]]) for k in range(len(which))]

@@ -39,7 +39,7 @@ def map_described(m: Map) -> State:
             "gone": [[slot, space.name, list(space.kinds)] for slot, space in m._gone],
             "moved": list(m._moved),
             "moving": list(m._drift.moving),
-            "costs": [m._begun, m._paid],
+            "costs": [m._pace.begun, m._pace.paid],
         }
     return state
 
@@ -160,4 +160,4 @@ def _activate(m: PostponedMap, active: StochasticMap, phase: State, read: Read) 
         if space is None or space.kinds[:1] not in ((1,), (4,)) or space.dof < 3:
             raise MapError(f"slot {robot!r} is no robot in the active map")
         m._moved[robot] = read(f"moved{i}", (len(m._A0),))
-    m._begun, m._paid = map(int, phase["costs"])
+    m._pace.begun, m._pace.paid = map(int, phase["costs"])
