@@ -39,7 +39,7 @@ def seen_from(truth: np.ndarray, points: np.ndarray, cov: np.ndarray, method: ob
 def test_where_the_pose_is_clear_every_way_finds_the_landmarks_and_what_is_new(method: object) -> None:
     points = np.random.default_rng(0).uniform(-8, 8, (12, 2))
     robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.Position2D(0.02))})
-    slam = km.Slam([robot], method)  # type: ignore[arg-type]
+    slam = km.Slam([robot], method, upkeep=km.Upkeep(confirm=1))  # type: ignore[arg-type]
     for i, point in enumerate(points[:-1]):
         slam.add_landmark(i, point, 1e-4 * np.eye(2))
     report = slam.process(km.Scan(1, "r", "s", points[[3, 11, 5]], ids=[None, None, 5]))

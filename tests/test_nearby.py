@@ -9,6 +9,7 @@ import kalmark as km
 from kalmark.slam.scene import View
 
 SPACING = 2.0
+ONCE = km.Upkeep(confirm=1)  # a sighting is a landmark
 
 
 def garden(side: int) -> np.ndarray:
@@ -52,7 +53,7 @@ def test_a_landmark_that_is_only_looked_at_stays_at_rest() -> None:
     rng, points = np.random.default_rng(3), garden(10)
     lidar = km.Mount(km.sensors.RangeBearing(0.02, 0.01))
     robot = km.Robot("r", km.motion.Odometry2D(0.01, 0.01, 0.01), start=(9.0, 9.0, 0.0), sensors={"lidar": lidar})
-    slam = km.Slam([robot], km.association.NearestNeighbour(new_gate=0.9999), map="postponed")
+    slam = km.Slam([robot], km.association.NearestNeighbour(new_gate=0.9999), map="postponed", upkeep=ONCE)
     for i, point in enumerate(points):
         slam.add_landmark(i, point, 1e-4 * np.eye(2))
     slam.map.flush()

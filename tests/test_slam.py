@@ -203,7 +203,7 @@ def test_a_signature_is_mapped_and_told() -> None:
 
 
 def test_nearest_neighbour_names_new_landmarks_and_finds_them_again() -> None:
-    slam = km.Slam([rover()], km.association.NearestNeighbour())
+    slam = km.Slam([rover()], km.association.NearestNeighbour(), upkeep=km.Upkeep(confirm=1))
     first = slam.process(km.Scan(0, "rover", "lidar", [[2.0, 0.3], [3.0, -1.0]]))
     assert [(o.outcome, o.landmark) for o in first.observations] == [("new", "u1"), ("new", "u2")]
     again = slam.process(km.Scan(1, "rover", "lidar", [[3.05, -1.0], [2.0, 0.31], [2.0, 2.5], [2.5, 0.3]]))

@@ -62,7 +62,9 @@ def bits(slam: km.Slam) -> tuple[Any, ...]:
 def test_robots_in_mid_interval_removed_slots_and_new_names_resume_bit_for_bit(
     estimator: Any, map_: str, tmp_path: Path
 ) -> None:
-    straight = head(km.Slam(robots(), km.association.NearestNeighbour(), estimator, map=map_))
+    straight = head(
+        km.Slam(robots(), km.association.NearestNeighbour(), estimator, map=map_, upkeep=km.Upkeep(confirm=1))
+    )
     assert straight._errors, "a held control's error is a block of the map"
     assert straight.map._free, "a slot is free"
     straight.save(tmp_path / "map.kmk")

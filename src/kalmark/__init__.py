@@ -29,12 +29,13 @@ if TYPE_CHECKING:
     from kalmark.slam.report import Observation, Report
     from kalmark.slam.robot import Mount, Robot
     from kalmark.slam.slam import Slam
+    from kalmark.slam.upkeep import Upkeep
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Attention", "Control", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run", "Scan",
-    "Slam", "association", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise", "record",
+    "Slam", "Upkeep", "association", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise", "record",
     "sensors",
 ]  # fmt: skip
 
@@ -58,6 +59,7 @@ _NAMES = {
     "Run": "kalmark.results.run",
     "Scan": "kalmark.slam.events",
     "Slam": "kalmark.slam.slam",
+    "Upkeep": "kalmark.slam.upkeep",
     "open_log": "kalmark.logs",
     "pointwise": "kalmark.models.pointwise",
     "record": "kalmark.results.record",

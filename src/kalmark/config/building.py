@@ -22,6 +22,7 @@ from kalmark.slam.attention import Attention
 from kalmark.slam.events import Scan
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
+from kalmark.slam.upkeep import Upkeep
 
 
 def build_slam(config: Config, log: Log | None = None) -> Slam:
@@ -38,7 +39,8 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
     }
     try:
         m = config.map
-        return Slam(robots, **types, map=m.type, numbers=m.numbers, reparametrize=m.linearity)
+        kept = Upkeep(**config.upkeep.model_dump())
+        return Slam(robots, **types, map=m.type, numbers=m.numbers, reparametrize=m.linearity, upkeep=kept)
     except ModelError as error:
         raise config.error(("robots",), str(error)) from None
 
@@ -133,6 +135,8 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
     }
     if sensor.attention is not None:
         own["attention"] = Attention(**sensor.attention.model_dump())
+    if sensor.upkeep is not None:
+        own["upkeep"] = Upkeep(**sensor.upkeep.model_dump())
     try:
         return Mount(_build(config, path, sensor), at=pose_of(sensor.mount), **own)
     except ModelError as error:

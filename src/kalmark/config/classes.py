@@ -57,7 +57,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "fej": estimators.Fej,
 }
 IN_SPACE: dict[str, Callable[..., Any]] = {"point": landmarks.Point3D}
-MOUNTED = frozenset({"mount", "landmark", "association", "attention", "detector"})
+MOUNTED = frozenset({"mount", "landmark", "association", "attention", "upkeep", "detector"})
 
 
 def model_of(section: Section, world: str = "plane") -> Any:

@@ -86,6 +86,7 @@ def page() -> str:
     parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in space", mounting.SpaceMountConfig)]
     parts += [_choice("`landmarks`, and `landmark` of a sensor", landmarks.Landmark, "landmark")]
     parts += [_choice("`association`, also of a sensor", landmarks.Association, "association")]
+    parts += [_section("`upkeep`, also of a sensor", mounting.UpkeepConfig)]
     parts += [_choice("`estimator`", schema.Estimator, "estimator")]
     parts += [_section("`map`", schema.MapConfig) + _later("map")]
     return "\n".join(parts)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from kalmark.config.landmarks import Association, Landmark
-from kalmark.config.sections import Limit, NotNegative, Number, Reserved, Section, Sigmas
+from kalmark.config.sections import Limit, NotNegative, Number, Reserved, Section, Sigmas, expected
 
 Most = Annotated[int, Field(ge=0)] | None
 Count = Annotated[int, Field(ge=1)]
@@ -124,6 +124,21 @@ class AttentionConfig(Section):
     """Give up landmarks that are not found again."""
 
 
+class UpkeepConfig(Section):
+    """What makes a landmark of sightings without an id: docs/association.md."""
+
+    confirm: Count = 3
+    """A tentative landmark becomes one when it was seen so often; 1: at its first sighting."""
+    within: Count = 10
+    """It is dropped if that did not happen in so many scans in which it was in view."""
+
+    @model_validator(mode="after")
+    def _can_be(self) -> UpkeepConfig:
+        if self.within < self.confirm:
+            raise expected(f"at least confirm, {self.confirm}", "within")
+        return self
+
+
 class Mounted(Section):
     """What every sensor has, whatever its type; and a `mount`, see below."""
 
@@ -133,6 +148,8 @@ class Mounted(Section):
     """Association of this sensor; the configuration's `association` if absent."""
     attention: AttentionConfig | None = None
     """Which landmarks of a scan to take; all if absent."""
+    upkeep: UpkeepConfig | None = None
+    """What makes a landmark; the configuration's `upkeep` if absent."""
     detector: Reserved = None
     """Reserved: how landmarks are found in raw data."""
 

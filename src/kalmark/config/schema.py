@@ -9,7 +9,7 @@ from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
 from kalmark.config.landmarks import Association, IdentityAssociation, Landmark
 from kalmark.config.models import Motion, PlaneSensor, SpaceSensor, UnicycleMotion, world_of
-from kalmark.config.mounting import VELOCITY, SpaceStartConfig, StartConfig
+from kalmark.config.mounting import VELOCITY, SpaceStartConfig, StartConfig, UpkeepConfig
 from kalmark.config.sections import Linearity, NotNegative, Number, Positive, RobotName, Section, expected, type_or
 from kalmark.errors import ConfigError
 
@@ -159,6 +159,8 @@ class Config(Section):
     """Landmark type; what fits each sensor if absent."""
     association: Association = IdentityAssociation()
     """Which landmark was that."""
+    upkeep: UpkeepConfig = UpkeepConfig()
+    """What makes a landmark of sightings without an id."""
     estimator: Estimator = InvariantEstimator()
     """Filter."""
     map: MapConfig = MapConfig()

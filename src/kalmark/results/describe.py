@@ -90,8 +90,13 @@ def describe(slam: Any, log: Any = None) -> dict[str, Any]:
         value = getattr(slam, key, None)
         if value is not None and not callable(value):
             out[key] = model(value)
+    out["upkeep"] = _keys(slam.upkeep)
     out["estimator"] = model(slam.estimator)
     return out
+
+
+def _keys(value: Any) -> dict[str, Any]:
+    return {key: value for key, value in model(value).items() if key != "type"}
 
 
 def _robot(robot: Any) -> dict[str, Any]:
@@ -108,7 +113,9 @@ def _robot(robot: Any) -> dict[str, Any]:
                 sensor[part] = model(getattr(mount, part))
         attention = getattr(mount, "attention", None)
         if attention is not None and attention != type(attention)():
-            sensor["attention"] = {key: value for key, value in model(attention).items() if key != "type"}
+            sensor["attention"] = _keys(attention)
+        if getattr(mount, "upkeep", None) is not None:
+            sensor["upkeep"] = _keys(mount.upkeep)
         if getattr(mount, "cov", None) is not None:
             sensor["mount"] = at | _sigmas(mount.cov)
         out["sensors"][name] = sensor

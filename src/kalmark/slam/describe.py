@@ -12,7 +12,7 @@ from kalmark.errors import MapError
 from kalmark.filter import estimators
 from kalmark.models import landmarks, motion, sensors
 from kalmark.models.protocols import Landmark
-from kalmark.slam import association, attention
+from kalmark.slam import association, attention, upkeep
 from kalmark.slam.robot import Mount, Robot
 
 State = dict[str, Any]
@@ -24,6 +24,7 @@ MODULES = {
     "estimator": (estimators, "correct"),
     "association": (association, "associate"),
     "attention": (attention, "hopeless"),
+    "upkeep": (upkeep, "hopeless"),
 }
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 
@@ -80,6 +81,7 @@ def robot_described(robot: Robot) -> State:
                 "association": None if mount.association is None else described(mount.association),
                 "detector": mount.detector is not None,
                 "attention": described(mount.attention),
+                "upkeep": None if mount.upkeep is None else described(mount.upkeep),
                 "cov": None if mount.cov is None else np.asarray(mount.cov).tolist(),
             },
         ]
@@ -99,8 +101,9 @@ def _robot_restored(d: State) -> Robot:
         landmark = m["landmark"] and restored("landmark", m["landmark"], f"{what}: landmark", "robots")
         paired = m["association"] and restored("association", m["association"], f"{what}: association", "robots")
         budget = restored("attention", m["attention"], f"{what}: attention", "robots")
+        cleaned = m.get("upkeep") and restored("upkeep", m["upkeep"], f"{what}: upkeep", "robots")
         sensor = restored("sensor", m["sensor"], what, "robots")
-        mounts[name] = Mount(sensor, m["at"], landmark, paired, None, budget, m["cov"])
+        mounts[name] = Mount(sensor, m["at"], landmark, paired, None, budget, m["cov"], cleaned)
     return Robot(d["name"], restored("motion", d["motion"], f"{who}: motion", "robots"), d["start"], mounts, d["cov"])
 
 

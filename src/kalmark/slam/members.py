@@ -14,6 +14,7 @@ from kalmark.slam.doubts import Doubts
 from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot
 from kalmark.slam.scene import ROBOT, Look, View
+from kalmark.slam.tentative import Tentative
 
 Array = npt.NDArray[np.float64]
 
@@ -22,7 +23,8 @@ class Members:
     """The names of the map's blocks: `slots` of all of them, `kinds` of the landmarks alone, and their `names` by slot.
 
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
-    found.  `ends` are the abscissas (2,) of the segments seen of lines, `doubts` what waits to become a landmark.
+    found.  `ends` are the abscissas (2,) of the segments seen of lines, `doubts` and `tentative` what waits to become a
+    landmark: without a block, and with one.
     """
 
     def __init__(self, robots: Mapping[str, Robot]) -> None:
@@ -34,6 +36,7 @@ class Members:
         self.searched: dict[Id, list[int]] = {}
         self.ends: dict[Id, Array] = {}
         self.doubts = Doubts()
+        self.tentative: dict[Id, Tentative] = {}
         self.unnamed = 0
 
     def slot(self, name: Id) -> int:
@@ -75,7 +78,7 @@ class Members:
         while True:
             self.unnamed += 1
             name = f"u{self.unnamed}"
-            if name not in self.slots:
+            if name not in self.slots and name not in self.tentative:
                 return name
 
     def in_reach(self, view: View) -> list[Id]:

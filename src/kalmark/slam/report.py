@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.filter.estimators import Correction
 from kalmark.slam.events import Event, Id, seconds
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
 
@@ -45,7 +48,7 @@ class Report:
 
     `y` and the expectation `e` are (K, m), the innovation `z` (K, p) and its covariance `Z` (K, p, p), with p = m but
     for sensors that measure more than can be innovated; rows of observations that were not compared with a landmark
-    are NaN.  `removed` are landmarks given up, each with the reason.
+    are NaN.  `removed` are landmarks given up and tentative ones dropped, each with the reason.
     """
 
     __slots__ = ("Z", "e", "event", "observations", "removed", "y", "z")
@@ -110,6 +113,14 @@ class LandmarkTable:
     means: list[Array]
     covariances: list[Array]
     observations: list[int]
+
+    @classmethod
+    def of(cls, slam: Slam) -> LandmarkTable:
+        """Return the landmarks of a map."""
+        kinds, seen = slam.members.kinds, slam.members.seen
+        ids = list(kinds)
+        columns = ([kinds[i].kind for i in ids], [slam.mean(i) for i in ids], [slam.covariance(i) for i in ids])
+        return cls(ids, *columns, [seen.get(i, 0) for i in ids])
 
     def __len__(self) -> int:
         return len(self.ids)

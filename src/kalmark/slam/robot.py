@@ -16,6 +16,7 @@ from kalmark.slam.association import Association
 from kalmark.slam.attention import EVERYTHING, Attention
 from kalmark.slam.checks import covariance, instance
 from kalmark.slam.events import Scan, finite, shown
+from kalmark.slam.upkeep import Upkeep
 
 Array = npt.NDArray[np.float64]
 
@@ -47,9 +48,9 @@ class Mount:
     """A sensor and where it sits in the robot's frame: `at` = (x, y, heading), m and rad, or (x, y, z, qx, qy, qz, qw).
 
     `landmark` is the type of landmark this sensor starts and `association` its own, if not the slam's.  `detector`
-    turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans.  With `cov`, (3, 3)
-    or (6, 6) in the robot's frame, the mount is uncertain: a block of the map, called "robot.sensor", that calibrates
-    itself.
+    turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
+    and unmakes a landmark, if not the slam's.  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is
+    uncertain: a block of the map, called "robot.sensor", that calibrates itself.
     """
 
     sensor: Sensor
@@ -59,12 +60,15 @@ class Mount:
     detector: Callable[[Scan], Scan] | None = None
     attention: Attention = EVERYTHING
     cov: Any = None
+    upkeep: Upkeep | None = None
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
         if self.landmark is not None:
             instance(self.landmark, Landmark, "Mount: landmark", "a landmark model")
         instance(self.attention, Attention, "Mount: attention", "an Attention")
+        if self.upkeep is not None:
+            instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")
         object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
 
     def covariance(self, dof: int, what: str) -> Array | None:

@@ -74,6 +74,7 @@ class View:
         slam.refuse_other_world(type(self.sensor).__name__, getattr(self.sensor, "world", ""))
         slam.refuse_other_world(self.landmark.kind, self.landmark.space.world)
         self.association = mount.association or slam.association
+        self.upkeep = mount.upkeep or slam.upkeep
         self.looks = self._looks()
         self._refuse_misfit()
         self.dof = self._dof()

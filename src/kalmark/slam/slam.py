@@ -24,7 +24,7 @@ from kalmark.geometry.spaces import MOUNTS, Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
-from kalmark.slam import budget, lifecycle
+from kalmark.slam import budget, lifecycle, tentative
 from kalmark.slam.approach import approach
 from kalmark.slam.association import NEW, Association, ByIdentity, Decision
 from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
@@ -36,6 +36,7 @@ from kalmark.slam.nearby import Nearby
 from kalmark.slam.report import LandmarkTable, Observation, Report, judged
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.scene import Scene, View
+from kalmark.slam.upkeep import CAREFUL, Upkeep
 
 Array = npt.NDArray[np.float64]
 
@@ -49,8 +50,8 @@ class Slam:
     `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
     what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
     `reparametrize` (None: never).  `map` is "dense", "postponed" (docs/postponed.md), or "auto": dense while small;
-    `numbers` ("float64", "float32") are those in which a postponed one keeps what is at rest.  Events must come in the
-    order of their times.
+    `numbers` ("float64", "float32") are those in which a postponed one keeps what is at rest.  `upkeep` says when a
+    sighting without an id becomes a landmark (docs/association.md).  Events must come in the order of their times.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Slam:
         map: str = "auto",
         reparametrize: float | None = LINEAR,
         numbers: str = "float64",
+        upkeep: Upkeep = CAREFUL,
     ) -> None:
         self.robots: dict[str, Robot] = {}
         self.association: Association = association or ByIdentity()
@@ -69,7 +71,7 @@ class Slam:
         self.t_ns: int | None = None
         self.map_type, self.numbers = map, numbers
         self.map: Map = lifecycle.new_map(map, numbers)
-        self.landmark_type = landmarks
+        self.landmark_type, self.upkeep = landmarks, upkeep
         self.reparametrize = reparametrize
         self.members, self.nearby = Members(self.robots), Nearby()
         self._drives: dict[str, Drive] = {}
@@ -137,7 +139,7 @@ class Slam:
         self._advance(event.robot)
         count = len(event.y)
         if count == 0:
-            return Report(event)
+            return tentative.dropped(self, view, event, Report(event))
         ids = event.ids or (None,) * count
         for i in ids:
             if i in self.robots:
@@ -216,13 +218,27 @@ class Slam:
         if view.attention.delete:
             report.removed = tuple(lifecycle.give_up(self, view, event, matched))
         new = [k for k, outcome in enumerate(outcomes) if outcome is None]
+        for k, seen in self._sight(event, report, view, new, ids, decisions, R):
+            outcomes[k] = seen
+        new = [k for k in new if outcomes[k] is None]
         reasons = budget.starts(self, view, new, known, event.y, decisions)
         for k in new:
             name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
             outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
         lifecycle.let_grow(self)
         report.observations = tuple(outcomes)  # type: ignore[arg-type]
-        return report
+        return tentative.dropped(self, view, event, report)
+
+    def _sight(
+        self, event: Scan, report: Report, view: View, new: list[int], ids: tuple[Id | None, ...],
+        decisions: Sequence[Decision], R: Array,
+    ) -> Iterator[tuple[int, Observation]]:  # fmt: skip
+        """Count the sightings of tentative landmarks; fuse those that confirm one."""
+        seen, confirmed = tentative.sightings(self, view, event, new, decisions, R)
+        yield from seen.items()
+        told = [confirmed.get(k, decision) for k, decision in enumerate(decisions)]
+        for done in self._correct(event, report, view, list(confirmed), ids, told, R) if confirmed else ():
+            yield done.index, done._replace(outcome="new", reason=told[done.index][1])
 
     def _correct(
         self, event: Scan, report: Report, view: View, known: list[int], ids: tuple[Id | None, ...],
@@ -238,7 +254,7 @@ class Slam:
                 yield Observation(k, ids[k], "ignored", decisions[k][0], None, reason)  # type: ignore[arg-type]
         if view.attention.sequential:
             groups = [(look, [k]) for look, rows in groups for k in rows]
-        if len(groups) != 1 or len(groups[0][1]) < len(report.y):
+        if not len(report.e) and (len(groups) != 1 or len(groups[0][1]) < len(report.y)):
             report.blank(view.dof)
         for look, rows in groups:
             if not rows:
@@ -278,13 +294,14 @@ class Slam:
             return Observation(k, id_, "ignored", None, None, found)
         if not (np.isfinite(l).all() and np.isfinite(L_h).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
-        if name is NEW:
-            name = self.members.new_name()
+        unproven, name = name is NEW and view.upkeep.confirm > 1, self.members.new_name() if name is NEW else name
         G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
         try:
             slot = self.map.augment(view.landmark.space, l, index, G, Q)
         except MapError as full:
             return Observation(k, id_, "ignored", None, None, str(full))
+        if unproven:
+            return tentative.started(self, view, k, name, slot, reason)
         self.members.start(name, slot, view.landmark)
         return Observation(k, id_, "new", name, None, reason)
 
@@ -303,14 +320,7 @@ class Slam:
 
     def landmarks(self) -> LandmarkTable:
         """Return ids, kinds, means, covariances and numbers of observations of all landmarks."""
-        ids, kinds, seen = list(self.members.kinds), self.members.kinds, self.members.seen
-        return LandmarkTable(
-            ids=ids,
-            kinds=[kinds[i].kind for i in ids],
-            means=[self.mean(i) for i in ids],
-            covariances=[self.covariance(i) for i in ids],
-            observations=[seen.get(i, 0) for i in ids],
-        )
+        return LandmarkTable.of(self)
 
     def refuse_other_world(self, what: str, world: str) -> None:
         """Refuse what lives in the plane among robots that move in space, and the other way round."""

@@ -28,10 +28,13 @@ from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
 from kalmark.slam.store_map import map_arrays, map_described, map_restored
+from kalmark.slam.tentative import Tentative
+from kalmark.slam.upkeep import CAREFUL
 
 Array = npt.NDArray[np.float64]
 
-VERSION = 5
+VERSION = 6
+READABLE = (5, 6)  # 5: before there were tentative landmarks
 DESCRIPTION, SUMS = "slam.json", "sha256"
 
 
@@ -62,6 +65,7 @@ def _state(slam: Slam) -> State:
         "association": described(slam.association),
         "estimator": described(slam.estimator),
         "landmarks": None if type_ is None else described(type_),
+        "upkeep": described(slam.upkeep),
         "t_ns": slam.t_ns,
         "slots": [[_id(name), slot] for name, slot in slam.members.slots.items()],
         "kinds": [[_id(name), described(kind)] for name, kind in slam.members.kinds.items()],
@@ -69,6 +73,9 @@ def _state(slam: Slam) -> State:
         "searched": [[_id(name), counts] for name, counts in slam.members.searched.items()],
         "ends": [[_id(name), t.tolist()] for name, t in slam.members.ends.items()],
         "doubts": [[_id(i), d.poses.tolist(), d.evidence, d.t_ns] for i, d in slam.members.doubts.open.items()],
+        "tentative": [
+            [name, t.slot, described(t.kind), t.hits, t.chances, t.unseen] for name, t in slam.members.tentative.items()
+        ],
         "seen": [[_id(name), count] for name, count in slam.members.seen.items()],
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
@@ -130,6 +137,7 @@ def load(
             map=state["map"],
             numbers=state["numbers"],
             reparametrize=_threshold(state["reparametrize"]),
+            upkeep=restored("upkeep", state["upkeep"], "upkeep", "upkeep") if "upkeep" in state else CAREFUL,
         )
         _fill(slam, state, members, landmarks)
     except KalmarkError as error:
@@ -146,8 +154,8 @@ def _read(path: Path) -> tuple[State, dict[str, bytes]]:
     """Return the description and the arrays' files, their checksums compared."""
     with zipfile.ZipFile(path) as archive:
         state = json.loads(archive.read(DESCRIPTION))
-        if state.get("kalmark") != VERSION:
-            raise MapError(f"version is {state.get('kalmark')!r}, expected {VERSION}")
+        if state.get("kalmark") not in READABLE:
+            raise MapError(f"version is {state.get('kalmark')!r}, expected {' or '.join(map(str, READABLE))}")
         sums = {name: sum_ for sum_, name in map(str.split, archive.read(SUMS).decode().splitlines())}
         members = {name: archive.read(name) for name in {DESCRIPTION, *sums}}
     for name, data in members.items():
@@ -178,6 +186,7 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.searched = {i: [_count(n, f"searches of {i!r}") for n in counts] for i, counts in state["searched"]}
     slam.members.ends = {i: np.array(t, dtype=np.float64).reshape(2) for i, t in state["ends"]}
     slam.members.doubts.open = {i: _doubt(i, *rest) for i, *rest in state["doubts"]}
+    slam.members.tentative = {i: _tentative(i, own, *rest) for i, *rest in state.get("tentative", ())}
     slam.members.unnamed = _count(state["unnamed"], "unnamed")
     slam.t_ns = _time(state["t_ns"])
     _check_owners(slam)
@@ -209,6 +218,7 @@ def _check_owners(slam: Slam) -> None:
     ):
         raise MapError("the slots' names are not those of the robots and landmarks")
     owners = [(f"{name!r}", slot, spaces[name]) for name, slot in slam.members.slots.items()]
+    owners += [(f"tentative {name!r}", t.slot, t.kind.space) for name, t in slam.members.tentative.items()]
     for name, slot in slam._errors.items():
         owners.append((f"the error of {name!r}", slot, Rn(len(slam.robots[name].motion.columns))))
     used = [i for i, space in enumerate(slam.map.spaces) if space is not None]
@@ -225,6 +235,11 @@ def _doubt(name: Id, poses: Any, evidence: Any, t_ns: Any) -> Doubt:
     if found.shape != (2, 7) or not np.isfinite(found).all() or not isinstance(evidence, float):
         raise MapError(f"the doubt about {name!r} is {poses!r} by {evidence!r}, expected two poses and a number")
     return Doubt(found, evidence, _count(t_ns, f"the time of the doubt about {name!r}"))
+
+
+def _tentative(name: Id, own: list[Landmark], slot: Any, kind: State, *counts: Any) -> Tentative:
+    hits, chances, unseen = (_count(n, f"sightings of the tentative {name!r}") for n in counts)
+    return Tentative(_count(slot, f"slot of the tentative {name!r}"), _kind(name, kind, own), hits, chances, unseen)
 
 
 def _count(value: Any, what: str) -> int:

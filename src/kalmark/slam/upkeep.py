@@ -1,0 +1,39 @@
+"""How a map keeps itself clean: when a sighting becomes a landmark, when a landmark goes, when two are one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kalmark.errors import ModelError
+
+
+@dataclass(frozen=True)
+class Upkeep:
+    """What makes a landmark one, and what makes it go.
+
+    An observation without an id that belongs to no landmark starts a *tentative* one, which becomes a landmark when it
+    was seen `confirm` times within `within` scans in which it was in the sensor's view, and is dropped when that cannot
+    be any more.  With `confirm` 1 it is one at once.
+    """
+
+    confirm: int = 3
+    within: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("confirm", "within"):
+            value = getattr(self, name)
+            if type(value) is not int or value < 1:
+                raise ModelError(f"Upkeep: {name} is {value!r}, expected a whole number of at least 1")
+        if self.within < self.confirm:
+            raise ModelError(f"Upkeep: within is {self.within}, expected at least confirm, {self.confirm}")
+
+    def confirms(self, hits: int) -> bool:
+        """Return whether a tentative landmark seen so often is one."""
+        return hits >= self.confirm
+
+    def hopeless(self, hits: int, chances: int) -> bool:
+        """Return whether a tentative landmark seen in `hits` of `chances` scans cannot become one any more."""
+        return hits + max(self.within - chances, 0) < self.confirm
+
+
+CAREFUL = Upkeep()
