@@ -55,5 +55,6 @@ def open_config_log(config: Config, log_path: str | Path | None = None) -> Log:
         from_s=log.from_s,
         to_s=log.to_s,
         on_error=log.on_error,
+        ids=log.ids,
         **log.options(),
     )

@@ -29,6 +29,8 @@ class LogConfig(Section):
     """End here, counted from the first event of the log."""
     on_error: Literal["raise", "skip"] = "raise"
     """What to do with bad input: refuse, or leave out."""
+    ids: Literal["given", "hidden"] = "given"
+    """`hidden`: the filter is not told which landmark is which; the summary says how often it was wrong."""
     r_max: Positive | None = None
     """lost_in_the_woods: drop observations beyond this range."""
     bearing_shift_s: Number | None = None
@@ -56,7 +58,7 @@ class LogConfig(Section):
 
     def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""
-        common = {"path", "format", "robots", "from_s", "to_s", "on_error"}
+        common = {"path", "format", "robots", "from_s", "to_s", "on_error", "ids"}
         return self.model_dump(exclude=common, exclude_none=True)
 
 

@@ -14,6 +14,7 @@ from kalmark.errors import LogError
 from kalmark.logs.dlr import DLR
 from kalmark.logs.download import find_data
 from kalmark.logs.freiburg import FREIBURG
+from kalmark.logs.hidden import hide_ids
 from kalmark.logs.kitti_stereo import KITTI_STEREO
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
@@ -52,12 +53,14 @@ def open_log(
     from_s: float | None = None,
     to_s: float | None = None,
     on_error: Literal["raise", "skip"] = "raise",
+    ids: Literal["given", "hidden"] = "given",
     **options: Any,
 ) -> Log:
     """Read the log at `path`, a folder or file of any known format.
 
     `robots` keeps some robots (names, or MRCLAM's numbers), `from_s` and `to_s` the events between these seconds
-    from the log's first event.  With `on_error="skip"` bad rows are left out and listed in `log.skipped`.
+    from the log's first event.  With `on_error="skip"` bad rows are left out and listed in `log.skipped`.  With
+    `ids="hidden"` no scan says which landmark is which; `log.true_ids` does.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
     Raises LogError, with ``file:line:`` for a bad row.
     """
@@ -72,7 +75,8 @@ def open_log(
             )
     request = Request(robot_names(robots, entry), refuse, skipped)
     log = entry.read(found, request, **options)
-    return between(keep_robots(log, request), from_s, to_s)
+    log = between(keep_robots(log, request), from_s, to_s)
+    return hide_ids(log) if choice(ids, "ids", ("given", "hidden")) == "hidden" else log
 
 
 def recognise(path: Path, format: str | None) -> tuple[Format, Path]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from kalmark.errors import LogError
 from kalmark.geometry.angles import wrap
-from kalmark.slam.events import Event, Id
+from kalmark.slam.events import Event, Id, Scan
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -115,7 +115,7 @@ class Log:
     (by robot) and `sensor_columns` (by robot and sensor) name what the numbers of a control and an observation are.
     `describes` is what the source itself says of the rig, its calibration, mounts, noise and start, in the shape of
     a configuration, which may overrule it.  `reference` has figures of other programs on this log, by program, named
-    as in ``summary.json``.
+    as in ``summary.json``.  `true_ids` has the landmarks of scans whose ids are hidden, to score the association.
     """
 
     name: str
@@ -131,6 +131,7 @@ class Log:
     sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
     describes: dict[str, Any] = field(default_factory=dict)
     reference: dict[str, dict[str, float]] = field(default_factory=dict)
+    true_ids: dict[Scan, tuple[Id | None, ...]] = field(default_factory=dict)
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self.events)

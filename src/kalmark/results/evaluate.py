@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from kalmark.results.calibration import mount_figures
 from kalmark.results.consistency import diverged, nees, nis, pose_error
 from kalmark.results.history import Array, History, Ints
 from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.scoring import association_figures, best_known
 from kalmark.results.shapes import EUCLIDEAN, LINE
 from kalmark.results.truth import Fixes, Truth, fitted
 from kalmark.results.warnings import fix_nis_per_dof, warnings
@@ -54,7 +56,9 @@ def evaluate(run: Run) -> dict[str, Any]:
     if run.stopped:
         summary["stopped"] = run.stopped
     summary["robots"] = robots
-    summary |= landmark_figures(run.landmarks, run.truth) | line_figures(run.landmarks, run.truth)
+    landmarks = known_landmarks(run)
+    summary |= association_figures(history, run.landmarks.ids)
+    summary |= landmark_figures(landmarks, run.truth) | line_figures(landmarks, run.truth)
     if not np.isnan(history.left_px).all():
         summary["corner_rms_px"] = float(np.sqrt(np.nanmean(history.left_px**2)))
     if history.mounts:
@@ -101,6 +105,12 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
         "path_m": path_m,
         "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, path_m),
     }
+
+
+def known_landmarks(run: Run) -> MapLandmarks:
+    """Return the map at the end with the log's names, where the filter was not told them."""
+    names = best_known(run.history, run.landmarks.ids, run.landmarks.observations)
+    return replace(run.landmarks, ids=[names.get(i, i) for i in run.landmarks.ids])
 
 
 def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:

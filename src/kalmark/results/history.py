@@ -75,10 +75,11 @@ class History:
     """A run's steps (S of them) and observations (O of them).
 
     Steps: time, robot, its mean (S, n) and covariance (S, q, q) after the scan, and the wall time in microseconds.
-    Observations: `step` is the row of the step, `id` and `landmark` are texts ("" for none), `kind` is that of the
-    landmark after the scan, `d2` is NaN where there is none; measured `y` and expected `e` (O, m), innovation `z`
-    (O, p) and its covariance `Z` (O, p, p).  All are padded with NaN where robots or sensors differ in size.  `left_px`
-    (O,) is what the corners of tags are off by after the scan (`kalmark.results.corners`).
+    Observations: `step` is the row of the step, `id`, `landmark` and `true_id`, what the log knows and the filter may
+    not, are texts ("" for none), `kind` is that of the landmark after the scan, `d2` is NaN where there is none;
+    measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
+    NaN where robots or sensors differ in size.  `left_px` (O,) is what the corners of tags are off by after the scan
+    (`kalmark.results.corners`).
     """
 
     t_ns: Ints
@@ -105,6 +106,7 @@ class History:
     left_px: Array = field(default_factory=lambda: np.empty(0))
     cameras: tuple[Camera, ...] = ()
     mounts: tuple[Mounted, ...] = ()
+    true_id: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
 
     @property
     def in_space(self) -> bool:
@@ -137,7 +139,7 @@ class History:
         """Return everything as named arrays, those of the contract (t in seconds) first."""
         named = {"t": self.t_ns * 1e-9} | {key: getattr(self, key) for key in ("robot", "mean", "covariance")}
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
-        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px")}
+        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px", "true_id")}
         return (
             named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._sensor_arrays()
         )
@@ -170,7 +172,7 @@ class History:
         rows = zip(*(named.get(key, ()) for key in keys), strict=True)
         mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P), _cut(C)) for name, mean, P, C in rows)
         columns = {key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)}
-        columns |= {"kind": kind, "left_px": left}
+        columns |= {"kind": kind, "left_px": left, "true_id": named.get("true_id", named["id"])}
         return cls(**columns, maps=maps, starts=starts, inputs=inputs, cameras=cameras, mounts=mounts)
 
 

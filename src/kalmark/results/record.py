@@ -15,7 +15,7 @@ from kalmark.logs.start import begins_at
 from kalmark.results.cameras import cameras, mounts
 from kalmark.results.corners import left_px
 from kalmark.results.describe import describe, plain
-from kalmark.results.history import Array, History, MapSnapshot, Start, padded, texts
+from kalmark.results.history import Array, History, MapSnapshot, Start, Texts, padded, texts
 from kalmark.results.inputs import Controlled, Inputs, UsedFix
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
@@ -137,7 +137,7 @@ class _Recorder:
         """Return the run made of what was gathered."""
         if self.reports and (not self.maps or self.maps[-1].step < len(self.reports) - 1):
             self.maps.append(self._snapshot())
-        history = self._history()
+        history = self._history(log)
         return Run(
             history=history,
             config=dict(config) if config is not None else describe(self.slam, log),
@@ -156,7 +156,14 @@ class _Recorder:
             reference=plain(getattr(log, "reference", None) or {}),
         )
 
-    def _history(self) -> History:
+    def _true_ids(self, log: Any) -> Texts:
+        """Return the id the log has of each observation, whether the filter was told or not; "" where it has none."""
+        hidden = getattr(log, "true_ids", {})
+        told = [hidden.get(scan, scan.ids) for scan in self.scans]
+        pairs = zip(told, self.reports, strict=True)
+        return texts([None if ids is None else ids[o.index] for ids, report in pairs for o in report.observations])
+
+    def _history(self, log: Any) -> History:
         steps = self.reports
         seen = [
             (s, scan, o)
@@ -192,4 +199,5 @@ class _Recorder:
             left_px=np.concatenate([np.empty(0), *self.left]),
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),
+            true_id=self._true_ids(log),
         )

@@ -1,0 +1,57 @@
+"""How often an observation was taken for another landmark's, where the log knows better than the filter was told."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from typing import Any
+
+import numpy as np
+
+from kalmark.results.history import History, as_id
+from kalmark.slam.events import Id
+
+FUSED = ("associated", "new")
+
+
+def known_as(history: History) -> dict[str, str]:
+    """Return what the log calls each landmark that the filter named: what most observations fused with it are."""
+    seen: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    mine = np.isin(history.outcome, FUSED) & (history.true_id != "") & (history.id == "")
+    for landmark, true in zip(history.landmark[mine].tolist(), history.true_id[mine].tolist(), strict=True):
+        seen[landmark][true] += 1
+    return {landmark: counts.most_common(1)[0][0] for landmark, counts in seen.items()}
+
+
+def best_known(history: History, ids: list[Id], observations: list[int]) -> dict[Id, Id]:
+    """Return the log's name of each landmark of a map that has one; of several of one name the most seen has it."""
+    names = known_as(history)
+    taken: dict[str, tuple[int, Id]] = {}
+    for i, count in zip(ids, observations, strict=True):
+        name = names.get(str(i))
+        if name is not None and (name not in taken or count > taken[name][0]):
+            taken[name] = count, i
+    return {i: as_id(name) for name, (_, i) in taken.items()}
+
+
+def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]:
+    """Return the figures of an association without ids, {} if the filter was told all the log knows.
+
+    `wrong` counts the fused observations whose id is not that of most of their landmark, of `judged`; `duplicates` are
+    the landmarks beyond one for each id; `nameless` observations have no id in the log either (spurious ones, where it
+    marks them), and `nameless_fused` says how many of them were fused all the same.
+    """
+    hidden = (history.id == "") & (history.true_id != "")
+    if not hidden.any():
+        return {}
+    names, fused = known_as(history), np.isin(history.outcome, FUSED)
+    judged = fused & hidden
+    own = [names[landmark] for landmark in history.landmark[judged].tolist()]
+    nameless = history.true_id == ""
+    kept = [names[str(i)] for i in landmarks if str(i) in names]
+    return {
+        "wrong": int(np.sum(history.true_id[judged] != np.array(own, dtype=np.str_))),
+        "judged": int(judged.sum()),
+        "duplicates": len(kept) - len(set(kept)),
+        "nameless": int(nameless.sum()),
+        "nameless_fused": int((nameless & fused).sum()),
+    }
