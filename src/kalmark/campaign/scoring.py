@@ -131,7 +131,7 @@ class _Scorer:
             dof = slam.robots[name].motion.space.dof
             judged[name] = errors.robot(mean, self._state(name, k), turn, coordinates, dof)
         mounts: dict[Id, Judged] = {
-            name: errors.mount(slam.mean(name), truth) for name, (_, truth) in self.uncertain.items()
+            name: errors.mount(slam.mean(name)[: len(truth)], truth) for name, (_, truth) in self.uncertain.items()
         }
         landmarks: dict[Id, Judged] = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
         self._score_landmarks(landmarks, row, k)
@@ -172,7 +172,8 @@ class _Scorer:
     def _score_mounts(self, mounts: dict[str, Judged], row: int, k: int) -> None:
         if not mounts:
             return
-        value = [nees(j.own, self.slam.covariance(name)) for name, j in mounts.items()]
+        dof = len(next(iter(mounts.values())).own)
+        value = [nees(j.own, self.slam.covariance(name)[:dof, :dof]) for name, j in mounts.items()]
         if np.isfinite(value).any():
             self.series["mount"][row, k] = np.nanmean(value)
             self.series["mount_dof"][row, k] = len(next(iter(mounts.values())).own)

@@ -9,7 +9,7 @@ from pydantic import Discriminator, Tag
 
 from kalmark.config.models3d import SpaceMotions, SpaceSensors
 from kalmark.config.mounting import PlaneMounted, Ranging
-from kalmark.config.sections import NotNegative, Positive, Section, type_or, types
+from kalmark.config.sections import NotNegative, Number, Positive, Section, type_or, types
 
 
 class _Diffusion(Section):
@@ -76,6 +76,14 @@ class _Range(_Sector):
     """Constant part a of the range noise sqrt(a^2 + (b r)^2)."""
     sigma_range_rel: NotNegative = 0.0
     """Part b of the range noise, growing with range."""
+    scale: Positive = 1.0
+    """Measured range per metre of distance."""
+    bias_m: Number = 0.0
+    """Added to every range."""
+    sigma_scale: NotNegative = 0.0
+    """Standard deviation of the scale; above 0 it is in the map and is estimated."""
+    sigma_bias_m: NotNegative = 0.0
+    """Standard deviation of the bias; above 0 it is in the map and is estimated."""
 
 
 class RangeSensor(_Range):

@@ -30,9 +30,12 @@ Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, 
 
 @compiled
 def head_sizes(blocks: Table, atoms: Table, robot: int, mount: int) -> tuple[int, int]:
-    """Return the numbers of a robot's pose, and those of the head: the pose and, if it is in the map, the mount."""
+    """Return the numbers of a robot's pose, and those of the head: the pose and, if it is in the map, the mount.
+
+    With the mount come the parameters that its sensor has in the map.
+    """
     pose = 3 if atoms[blocks[robot, 4] + 1, 0] == HEADING else 7
-    return pose, pose if mount < 0 else 2 * pose
+    return pose, pose if mount < 0 else pose + blocks[mount, 1]
 
 
 @compiled
@@ -41,13 +44,13 @@ def observed_block(
 ) -> tuple[Index, Table, Array]:
     """Return the rows in P, the atoms and the mean of the head and of the first d numbers of K landmarks."""
     pose, head = head_sizes(blocks, atoms, robot, mount)
-    before = head // pose  # blocks in the head
+    before = 1 if mount < 0 else 2  # blocks in the head
     size = head + d * len(slots)
     index, mean = np.empty(size, np.int64), np.empty(size)
     table = np.empty((size, 3), np.int64)
     count = x_to = p_to = 0
     for i in range(before + len(slots)):
-        slot, width = (robot, pose) if i == 0 else ((mount, pose) if i < before else (slots[i - before], d))
+        slot, width = (robot, pose) if i == 0 else ((mount, head - pose) if i < before else (slots[i - before], d))
         x_at, p_at, first = blocks[slot, 0], blocks[slot, 2], blocks[slot, 4]
         mean[x_to : x_to + width] = x[x_at : x_at + width]
         rows = 0

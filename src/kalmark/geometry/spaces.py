@@ -241,6 +241,12 @@ POINT3 = Space("point3", (VECTOR3,))
 MOUNTS = {3: Space("mount", (SCALAR, SCALAR, ANGLE)), 7: Space("mount in space", (SCALAR, SCALAR, SCALAR, TURNED))}
 
 
+def mount_space(pose: int, parameters: int = 0) -> Space:
+    """Return the space of a mount, 3 or 7 numbers, followed by the sensor's own parameters."""
+    mount = MOUNTS[pose]
+    return Space(mount.name, (*mount.kinds, *(SCALAR,) * parameters)) if parameters else mount
+
+
 def Rn(n: int) -> Space:
     """Return the space of n plain numbers that no rotation of the world changes."""
     return Space(f"R{n}", (SCALAR,) * n)

@@ -2,7 +2,8 @@
 
 `expectation` is the readable form and serves any models.  `linearize` is how the filter's kernels ask for it: plain
 Python for a model written in Python, the compiled twin below for the built-in ones.  Both are tested to be equal.
-The head is the robot's pose or, for a mount in the map, the pose and the mount.
+The head is the robot's pose or, for a mount in the map, the pose and the mount, and behind it the parameters that the
+sensor has in the map: gain and offset of its range.
 """
 
 from __future__ import annotations
@@ -82,9 +83,16 @@ class PythonView:
     def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Return e (K, m), z = y - e, E_h (K, m, 3 or more) and E_l (K, m, n)."""
         size = len(self.mount)
-        r, mount = head[:size], head[size:] if len(head) > size else self.mount
-        e, E_r, E_s, E_l = expectation(r, mount, self.sensor, self.landmark, l)
-        return e, residual(y, e, self.angular), E_r if len(head) == size else np.concatenate([E_r, E_s], axis=2), E_l
+        r, mount = head[:size], head[size : 2 * size] if len(head) > size else self.mount
+        if len(head) <= 2 * size:
+            e, E_r, E_s, E_l = expectation(r, mount, self.sensor, self.landmark, l)
+            E_h = E_r if len(head) == size else np.concatenate([E_r, E_s], axis=2)
+            return e, residual(y, e, self.angular), E_h, E_l
+        sensor: Any = self.sensor
+        sensor = sensor.with_parameters(head[2 * size :])
+        e, E_r, E_s, E_l = expectation(r, mount, sensor, self.landmark, l)
+        E_p = sensor.parameters_jacobian(self.landmark.seen_from(composed(r, mount)[0], l)[0])
+        return e, residual(y, e, self.angular), np.concatenate([E_r, E_s, E_p], axis=2), E_l
 
 
 def fix_view(antenna: Array) -> View:
@@ -143,7 +151,7 @@ def _compiled_sensor_at(view: Any, head: Any) -> Any:
 def position_of_mount(mount: Array, head: Array) -> tuple[Array, Array]:
     """Return the position of a mount on a robot, S, and S_h, h being the pose and, if it is in the map, the mount."""
     pose = len(mount)
-    at = head[pose:] if len(head) > pose else mount
+    at = head[pose : 2 * pose] if len(head) > pose else mount
     size = 2 if pose == 3 else 3
     if pose == 3:
         T, T_r, T_s = compose(head[:pose], at)
@@ -151,7 +159,7 @@ def position_of_mount(mount: Array, head: Array) -> tuple[Array, Array]:
         T, T_r, T_s = frames3d.compose(head[:pose], at)
     if len(head) == pose:
         return T[:size].copy(), T_r[:size].copy()
-    return T[:size].copy(), np.concatenate((T_r[:size], T_s[:size]), axis=1)
+    return T[:size].copy(), np.concatenate((T_r[:size], T_s[:size], np.zeros((size, len(head) - 2 * pose))), axis=1)
 
 
 @compiled
@@ -159,7 +167,9 @@ def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Arr
     """`expectation`, compiled."""
     _, look_at, expect_at, code, at, par, angular = view
     pose = len(at)
-    mount = head[pose:] if len(head) > pose else at
+    mount = head[pose : 2 * pose] if len(head) > pose else at
+    if len(head) > 2 * pose:
+        par = head[2 * pose :].copy()
     T, T_r, T_s = compose(head[:pose], mount) if pose == 3 else frames3d.compose(head[:pose], mount)
     v, V_T, V_l = seen.look(look_at, (T, l))
     e, z, E_v = seen.expect(expect_at, (code, par, angular, v, y))
@@ -168,9 +178,11 @@ def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Arr
     if len(head) == pose:
         return e, z, turned(E_T, T_r), E_l
     k, p, n = E_T.shape
-    E_h = np.empty((k, p, 2 * n))
+    E_h = np.zeros((k, p, 2 * n + len(head) - 2 * pose))
     for i in range(k):
-        E_h[i, :, n:] = E_T[i] @ T_s
+        E_h[i, :, n : 2 * n] = E_T[i] @ T_s
+        if len(head) > 2 * pose:  # gain and offset of the range, the first number
+            E_h[i, 0, 2 * n], E_h[i, 0, 2 * n + 1] = -e[i, 0] / par[0], 1.0 / par[0]
     E_h[:, :, :n] = turned(E_T, T_r)
     return e, z, E_h, E_l
 

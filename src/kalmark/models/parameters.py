@@ -9,6 +9,7 @@ from typing import Any
 
 from kalmark.errors import ModelError
 
+PRIORS = ("sigma_scale", "sigma_bias_m")  # of what may be known exactly
 NEVER_NEGATIVE = ("sigma", "range", "fov", "wheelbase", "min_length")
 
 
@@ -29,7 +30,7 @@ def check_parameters(model: Any, *, noise: str = "", positive: tuple[str, ...] =
         number = float(value)
         if math.isnan(number) or (math.isinf(number) and not key.endswith("_max_m")):
             raise ModelError(f"{name}: {key} is {value}, expected a finite number")
-        above = key in positive or (noise and key.startswith(noise) and not key.endswith("_rel"))
+        above = key in positive or (noise and key.startswith(noise) and not key.endswith("_rel") and key not in PRIORS)
         if key == "sigma_range_m" and getattr(model, "sigma_range_rel", 0.0) > 0:
             above = False  # the noise may be all relative
         if above and number <= 0:

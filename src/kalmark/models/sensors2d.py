@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +50,11 @@ def expected_in_plane(
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Return e (K, m), the innovations z (K, m) of y (K, m), and E_v (K, m, d): of the form `seen.EXPECT`."""
     e, E_v = expect(code, v)
+    if len(par) == 2:  # gain and offset of the range
+        for i in range(len(e)):
+            e[i, 0] = (e[i, 0] + par[1]) / par[0]
+            for j in range(E_v.shape[2]):
+                E_v[i, 0, j] /= par[0]
     return e, residual(y, e, angular), E_v
 
 
@@ -111,10 +116,64 @@ class Planar:
 
 
 class _Ranging(Planar):
-    """Sensors whose first component is a range: its noise may grow with it.  [F]."""
+    """Sensors whose first component is a range, scale * distance + bias: its noise may grow with it.  [F].
+
+    Where the scale or the bias has a sigma they are in the map, as the `parameters` gain = 1 / scale and offset =
+    bias / scale of distance = gain * range - offset: so what a wrong scale does to landmarks is linear in its error,
+    and the filter stays consistent (docs/range_only.md).
+    """
 
     sigma_range_m: float
     sigma_range_rel: float
+    scale: float
+    bias_m: float
+    sigma_scale: float
+    sigma_bias_m: float
+
+    def __post_init__(self) -> None:
+        check_parameters(self, noise="sigma", positive=("scale",))
+
+    @property
+    def parameters(self) -> Array:
+        """Gain and offset of the range (2,)."""
+        return np.array([1.0, self.bias_m]) / self.scale
+
+    @property
+    def parameter_cov(self) -> Array | None:
+        """The covariance (2, 2) of gain and offset, None if both are known."""
+        if not (self.sigma_scale or self.sigma_bias_m):
+            return None
+        J = np.array([[-1.0 / self.scale, 0.0], [-self.bias_m / self.scale, 1.0]]) / self.scale
+        return np.asarray(J @ np.diag([self.sigma_scale**2, self.sigma_bias_m**2]) @ J.T)
+
+    def with_parameters(self, parameters: Array) -> Self:
+        """Return the sensor with another gain and offset (2,)."""
+        gain, offset = parameters.tolist()
+        return replace(self, scale=1.0 / gain, bias_m=offset / gain)  # type: ignore[type-var]
+
+    def expect(self, v: Array) -> tuple[Array, Array]:
+        """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
+        e, E_v = super().expect(v)
+        e[:, 0] = self.scale * e[:, 0] + self.bias_m
+        E_v[:, 0] *= self.scale
+        return e, E_v
+
+    def parameters_jacobian(self, v: Array) -> Array:
+        """Return E_p (K, m, 2): how the measurements of v (K, d) change with gain and offset."""
+        e, _ = self.expect(v)
+        E_p = np.zeros((*e.shape, 2))
+        E_p[:, 0, 0], E_p[:, 0, 1] = -self.scale * e[:, 0], self.scale
+        return E_p
+
+    def distances(self, y: Array) -> Array:
+        """Return the distances (K,) that measurements y (K, m) stand for."""
+        return np.asarray((y[:, 0] - self.bias_m) / self.scale)
+
+    def points(self, y: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
+        p, P_y = inv_scan_many(np.column_stack([self.distances(y), y[:, 1]]))
+        P_y[:, :, 0] /= self.scale
+        return p, P_y
 
     @property
     def additive(self) -> bool:
@@ -140,6 +199,10 @@ class RangeBearing(_Ranging):
     range_min_m: float = 0.0
     range_max_m: float = math.inf
     fov_rad: float = 2 * math.pi
+    scale: float = 1.0
+    bias_m: float = 0.0
+    sigma_scale: float = 0.0
+    sigma_bias_m: float = 0.0
 
     code: ClassVar[int] = RANGE_BEARING
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")
@@ -156,7 +219,7 @@ class RangeBearing(_Ranging):
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return points v (K, 2) and V_y (K, 2, 2).  [S] (62)."""
-        return inv_scan_many(np.ascontiguousarray(y))
+        return self.points(y)
 
 
 @dataclass(frozen=True)
@@ -186,6 +249,10 @@ class Range(_Ranging):
     range_min_m: float = 0.0
     range_max_m: float = math.inf
     fov_rad: float = 2 * math.pi
+    scale: float = 1.0
+    bias_m: float = 0.0
+    sigma_scale: float = 0.0
+    sigma_bias_m: float = 0.0
 
     code: ClassVar[int] = RANGE
     columns: ClassVar[tuple[str, ...]] = ("range_m",)
@@ -230,6 +297,10 @@ class RangeBearingSignature(_Ranging):
     range_min_m: float = 0.0
     range_max_m: float = math.inf
     fov_rad: float = 2 * math.pi
+    scale: float = 1.0
+    bias_m: float = 0.0
+    sigma_scale: float = 0.0
+    sigma_bias_m: float = 0.0
 
     code: ClassVar[int] = RANGE_BEARING_SIGNATURE
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "signature")
@@ -245,7 +316,7 @@ class RangeBearingSignature(_Ranging):
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return (x, y, signature) (K, 3) and V_y (K, 3, 3)."""
-        p, P_y = inv_scan_many(np.ascontiguousarray(y[:, :2]))
+        p, P_y = self.points(y)
         V_y = np.zeros((len(y), 3, 3))
         V_y[:, :2, :2], V_y[:, 2, 2] = P_y, 1.0
         return np.column_stack([p, y[:, 2]]), V_y

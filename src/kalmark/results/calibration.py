@@ -17,7 +17,8 @@ from kalmark.results.describe import describe_pose
 from kalmark.results.history import Array, Mounted
 from kalmark.results.words import figure
 
-AXES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
+AXES = {3: ("x", "y", "theta"), 5: ("x", "y", "theta", "gain", "offset"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
+UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m", "gain": ""}  # of the others: deg
 UNOBSERVED = 0.9  # of its prior sigma: so much is left of a direction that counts as not observed
 SINGULAR = 1e-12  # eigenvalues of a prior's correlations that are zero
 NAMED = 0.01  # the least share of an axis in a direction that is named
@@ -44,8 +45,9 @@ class Direction(NamedTuple):
 
 
 def directions(prior: Array, posterior: Array) -> list[Direction]:
-    """Return the directions of a mount (3 or 6) between a prior and a posterior covariance, the least observed first.
+    """Return the directions of a mount between a prior and a posterior covariance, the least observed first.
 
+    The covariances are (3, 3) or (6, 6); (5, 5) with gain and offset of a range.
     Axes that the prior knows exactly are left out.  Turns are about the axes of the robot.
     """
     open_ = np.flatnonzero(np.diagonal(prior) > 0)
@@ -67,24 +69,35 @@ def _direction(names: list[str], sigma: Array, axis: Array, ratio: float) -> Dir
     """Return a direction by the squares of its unit vector (n,), the largest first, the smallest left out."""
     order = np.argsort(-(axis**2), kind="stable").tolist()
     shares = {names[i]: float(axis[i] ** 2) for i in order if axis[i] ** 2 >= NAMED}
-    unit = "m" if names[order[0]] in ("x", "y", "z") else "deg"
-    before = float(sigma[order[0]] if unit == "m" else np.degrees(sigma[order[0]]))
+    unit = UNITS.get(names[order[0]], "deg")
+    before = float(np.degrees(sigma[order[0]]) if unit == "deg" else sigma[order[0]])
     return Direction(shares, ratio * before, before, unit)
 
 
 def mount_figures(mount: Mounted) -> dict[str, Any]:
     """Return where the filter believes a sensor to sit that calibrates itself, how far that is known, what was seen."""
-    d = 3 if len(mount.mean) == 7 else 2
+    d, pose, dof = (3, 7, 6) if len(mount.mean) == 7 else (2, 3, 3)
     sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
     found = [
         {"direction": str(each), "sigma": each.sigma, "prior_sigma": each.prior, "unit": each.unit, "ratio": each.ratio}
         for each in directions(mount.prior, mount.covariance)
     ]
-    return describe_pose(mount.mean) | {
+    return describe_pose(mount.mean[:pose]) | {
         "sigma_position_m": float(sigma[:d].max()),
-        "sigma_rotation_deg": math.degrees(sigma[d:].max()),
+        "sigma_rotation_deg": math.degrees(sigma[d:dof].max()),
+        **_range_figures(mount.mean[pose:], mount.covariance[dof:, dof:]),
         "directions": found,
     }
+
+
+def _range_figures(parameters: Array, P: Array) -> dict[str, float]:
+    """Return scale and bias of a range by its gain and offset (2,), nothing for those of a sensor that has none."""
+    if len(parameters) != 2:
+        return {}
+    gain, offset = parameters.tolist()
+    J = np.array([[-1.0 / gain, 0.0], [-offset / gain, 1.0]]) / gain
+    sigma = np.sqrt(np.diagonal(J @ P @ J.T)).tolist()
+    return {"scale": 1.0 / gain, "bias_m": offset / gain, "sigma_scale": sigma[0], "sigma_bias_m": sigma[1]}
 
 
 def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
@@ -112,8 +125,8 @@ def mount_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
 
 def _sigma(value: float, unit: str) -> str:
     """Return a sigma as people read it: 5 cm, 1.2 mm, 0.06 deg."""
-    if unit == "deg":
-        return f"{figure(value)} deg"
+    if unit != "m":
+        return f"{figure(value)} {unit}".rstrip()
     for scale, name in ((1.0, "m"), (1e-2, "cm")):
         if value >= scale:
             return f"{figure(value / scale)} {name}"

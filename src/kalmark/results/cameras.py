@@ -37,9 +37,9 @@ def mounts(slam: Slam) -> tuple[Mounted, ...]:
     found = []
     for robot in slam.robots.values():
         for sensor, mount in robot.sensors.items():
-            name, prior = f"{robot.name}.{sensor}", mount.covariance(3 if len(mount.at) == 3 else 6, sensor)
-            if prior is not None and _in_map(slam, name):
-                found.append(Mounted(name, slam.mean(name), slam.covariance(name), prior))
+            name, block = f"{robot.name}.{sensor}", mount.block(sensor)
+            if block is not None and _in_map(slam, name):
+                found.append(Mounted(name, slam.mean(name), slam.covariance(name), block[2]))
     return tuple(found)
 
 
@@ -54,7 +54,7 @@ def _in_map(slam: Slam, name: str) -> bool:
 def mount_now(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
     """Return where a sensor sits on its robot: as given, or as estimated so far if its mount is in the map."""
     name = f"{robot}.{sensor}"
-    return np.array(slam.mean(name) if _in_map(slam, name) else at, dtype=np.float64)
+    return np.array(slam.mean(name)[: len(at)] if _in_map(slam, name) else at, dtype=np.float64)
 
 
 def _size(sensor: Any) -> tuple[float, float]:

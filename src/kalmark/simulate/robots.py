@@ -9,7 +9,7 @@ rig is the one configured, and where the sensor sits is drawn around it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -172,9 +172,17 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
         at, cov = np.array(mount.at), getattr(mount, "cov", None)
         if cov is not None:
             at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(cov, chance.mounts))
-        sensors[key] = SimSensor(mount.sensor, at, simulated.sensing.get(key, Sensing()))
+        sensors[key] = SimSensor(true_sensor(mount.sensor, chance.mounts), at, simulated.sensing.get(key, Sensing()))
     driver = simulated.route.driver(motion, world.dt_s, area, chance.route)
     return SimRobot(name, motion, state, driver, sensors)
+
+
+def true_sensor(sensor: Any, rng: Generator) -> Any:
+    """Return a sensor whose own parameters are drawn around those that the estimator is given, if these have sigmas."""
+    if getattr(sensor, "parameter_cov", None) is None:
+        return sensor
+    scale, bias_m = rng.normal([sensor.scale, sensor.bias_m], [sensor.sigma_scale, sensor.sigma_bias_m]).tolist()
+    return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0)
 
 
 def step(robot: SimRobot, world: World, rng: Generator) -> Array:

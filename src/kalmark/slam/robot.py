@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from kalmark.errors import ModelError
-from kalmark.geometry.spaces import SE2, SE3, Space
+from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.models.protocols import Landmark, Motion, Sensor
 from kalmark.slam.association import Association
 from kalmark.slam.attention import EVERYTHING, Attention
@@ -74,6 +75,18 @@ class Mount:
     def covariance(self, dof: int, what: str) -> Array | None:
         """Return the covariance of the mount in a robot's frame, or None if it is known exactly."""
         return None if self.cov is None else covariance(self.cov, dof, what, definite=False, error=ModelError)
+
+    def block(self, what: str) -> tuple[Space, Array, Array] | None:
+        """Return the space, the mean and the covariance of what the map has of this sensor, None for nothing.
+
+        That is the mount, if it is uncertain, with the sensor's own parameters behind it, if they are.
+        """
+        pose, dof = len(self.at), 3 if len(self.at) == 3 else 6
+        cov, own = self.covariance(dof, what), getattr(self.sensor, "parameter_cov", None)
+        if own is None:
+            return None if cov is None else (mount_space(pose), self.at, cov)
+        whole = block_diag(np.zeros((dof, dof)) if cov is None else cov, own)
+        return mount_space(pose, len(own)), np.concatenate([self.at, self.sensor.parameters]), whole  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, eq=False)

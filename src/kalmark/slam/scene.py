@@ -117,7 +117,7 @@ class View:
         return len(self.sensor.angular)
 
     def head(self, map_: Map, robot: int) -> Array:
-        """Return the robot's pose, followed by the mount's if it is in the map."""
+        """Return the robot's pose, followed by the mount's and the sensor's own parameters if they are in the map."""
         pose = map_.mean(robot)[: len(self.at)]
         return pose if self.mount < 0 else np.concatenate([pose, map_.mean(self.mount)])
 
@@ -130,13 +130,19 @@ class View:
         """Return the sensor's pose T in the map's frame."""
         head = self.head(map_, robot)
         size = len(self.at)
-        return composed(head[:size], head[size:] if len(head) > size else self.at)[0]
+        return composed(head[:size], head[size : 2 * size] if len(head) > size else self.at)[0]
+
+    def calibrated(self, map_: Map) -> Any:
+        """Return the sensor with the parameters that it has by now."""
+        if self.mount < 0 or len(own := map_.mean(self.mount)[len(self.at) :]) == 0:
+            return self.sensor
+        return self.sensor.with_parameters(own)  # type: ignore[attr-defined]
 
     def places(self, map_: Map, robot: int, y: Array) -> Array | None:
         """Return where measurements y (K, m) seem to come from (K, 2 or 3); None if this sensor does not tell."""
-        sensor: Any = self.sensor
         if not self.tells_places:
             return None
+        sensor = self.calibrated(map_)
         return self.landmark.from_view(self.pose(map_, robot), sensor.invert(y)[0])[0][
             :, : 2 if len(self.at) == 3 else 3
         ]
@@ -191,8 +197,8 @@ class View:
         """
         y = event.y[k : k + 1]
         head, size = self.head(map_, robot), len(self.at)
-        r, mount = head[:size], head[size:] if self.mount >= 0 else self.at
-        sensor: Any = self.sensor
+        r, mount = head[:size], head[size : 2 * size] if self.mount >= 0 else self.at
+        sensor = self.calibrated(map_)
         v, V_y = (a[:, which] for a in sensor.both(y)[:2]) if hasattr(sensor, "both") else sensor.invert(y)
         depth = getattr(sensor, "finds_depth", True)
         l, L_r, L_s, L_y, prior = landmark_at(r, mount, self.landmark, v, V_y, depth)
@@ -205,6 +211,8 @@ class View:
                 else np.broadcast_to(event.cov, (len(event.y), 4, 4))[k]
             )
         L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
+        if len(head) > 2 * size:  # y = h(v, p) stays what it is: V_p = -V_y E_p
+            L_h = np.concatenate([L_h, -L_y[0] @ sensor.parameters_jacobian(v)[0]], axis=1)
         return l[0], L_h, L_y[0] @ R @ L_y[0].T + prior[0]
 
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.filter.estimators import Estimator, Invariant, Map
 from kalmark.filter.kernels import all_finite
-from kalmark.geometry.spaces import MOUNTS, Rn
+from kalmark.geometry.spaces import Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
@@ -91,9 +91,9 @@ class Slam:
         self.members.slots[robot.name] = self.map.add(robot.motion.space, robot.start, robot.cov)
         self._drives[robot.name] = Drive(robot.motion)
         for name, mount in robot.sensors.items():
-            slot, cov = -1, mount.covariance(6 if len(mount.at) == 7 else 3, name)
-            if cov is not None:  # the mount calibrates itself
-                slot = self.map.add(MOUNTS[len(mount.at)], mount.at, cov)
+            slot, block = -1, mount.block(name)
+            if block is not None:  # the mount calibrates itself
+                slot = self.map.add(*block)
                 self.members.slots[mount_name(robot.name, name)] = slot
             self._views[robot.name, name] = View(mount, landmarks, self, slot)
 

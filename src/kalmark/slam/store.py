@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from kalmark.errors import KalmarkError, MapError
 from kalmark.filter.estimators import Estimator
-from kalmark.geometry.spaces import MOUNTS, Rn, Space
+from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
@@ -208,9 +208,10 @@ def _check_owners(slam: Slam) -> None:
     """Refuse a map whose blocks are not each one robot, one landmark or one control's error, of their shapes."""
     spaces: dict[Id, Space] = {name: robot.motion.space for name, robot in slam.robots.items()}
     spaces |= {name: kind.space for name, kind in slam.members.kinds.items()}
-    for (robot, sensor), view in slam._views.items():
-        if view.mount >= 0:
-            spaces[mount_name(robot, sensor)] = MOUNTS[len(view.at)]
+    for robot, sensor in slam._views:
+        own = slam.robots[robot].sensors[sensor].block(sensor)
+        if own is not None:
+            spaces[mount_name(robot, sensor)] = own[0]
     if (
         slam.robots.keys() & slam.members.kinds.keys()
         or spaces.keys() != slam.members.slots.keys()
