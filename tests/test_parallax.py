@@ -135,7 +135,7 @@ def test_a_correction_equals_the_filter_written_out_in_parallaxes(mounted: bool)
         e = expectation(map_.mean(0), MOUNT, CAMERA, POINT, map_.mean(slot)[None])[0]
         y = e + rng.normal(size=(1, 2)) * 20
         x, P = written.correct(y, 30)
-        done = km.estimators.Invariant(30).correct(
+        done = km.estimators.Invariant(30, 1e-9).correct(
             map_, view_of(CAMERA, POINT, MOUNT), 0, 1 if mounted else -1, np.array([slot]), 7, y,
             4 * np.eye(2)[None], np.inf,
         )  # fmt: skip
@@ -152,7 +152,7 @@ def test_a_change_of_scale_moves_the_inverse_distance_along_its_hyperbola() -> N
     scale[0], scale[12] = 2.0, -0.2  # the way and the distance are known up to a common factor
     map_.P[:13, :13] = np.tril(np.outer(scale, scale)) * 0.3**2 + 1e-9 * np.eye(13)
     antenna = np.array([0.0, 0, 0, 0, 0, 0, 1])
-    km.estimators.Invariant(30).correct(
+    km.estimators.Invariant(30, 1e-9).correct(
         map_, km.models.observe.fix_view(antenna), 0, -1, np.array([], dtype=np.int64), 0, np.array([[2.6, 0, 0]]),
         1e-6 * np.eye(3)[None], np.inf,
     )  # fmt: skip

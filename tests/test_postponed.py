@@ -179,7 +179,7 @@ class Frozen:
 @pytest.mark.parametrize(("noise", "steps"), [(1.0, 3000), (4.0, 220)])
 def test_the_invariant_form_equals_a_dense_filter_that_freezes_the_same_landmarks(noise: float, steps: int) -> None:
     cov = np.diag([0.1, 0.1, 0.05 * noise]) ** 2
-    slam = slam_of(km.estimators.Invariant(), most=60, cov=cov)
+    slam = slam_of(km.estimators.Invariant(tolerance=1e-9), most=60, cov=cov)
     done, book = counted(slam.map), Frozen(cov)
     events, leaps = drive(steps, 2), 0
     for t, event in enumerate(events):
@@ -219,7 +219,7 @@ def test_the_invariant_form_equals_a_dense_filter_that_freezes_the_same_landmark
 
 def test_a_robot_that_stands_still_learns_nothing_of_its_heading_in_a_postponed_map() -> None:
     prior = np.radians(20)
-    slam = slam_of(km.estimators.Invariant(), most=12, cov=np.diag([0.5, 0.5, prior]) ** 2)
+    slam = slam_of(km.estimators.Invariant(tolerance=1e-9), most=12, cov=np.diag([0.5, 0.5, prior]) ** 2)
     assert isinstance(slam.map, PostponedMap | StochasticMap)
     rng, near = np.random.default_rng(3), np.argsort(np.hypot(*(WORLD - START[:2]).T))[:12]
     for t in range(200):

@@ -110,6 +110,8 @@ class InvariantEstimator(Section):
     type: Literal["invariant"] = "invariant"
     iterations: Annotated[int, Field(ge=1)] = 6
     """At most this many linearisations of a scan."""
+    tolerance: Positive = 1e-3
+    """No more once nothing moves by more than this many of its sigmas."""
 
 
 class FejEstimator(Section):

@@ -17,7 +17,14 @@ import numpy.typing as npt
 from numba.extending import register_jitable
 
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Index, cholesky_inverse, columns, downdate, submatrix, transport
+from kalmark.filter.kernels import (
+    Index,
+    cholesky_inverse,
+    columns,
+    downdate,
+    downdate_and_transport,
+    submatrix,
+)
 from kalmark.filter.parallax import anchored, carried, carry_back, retract_parallax, spread, transport_parallax
 from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table, generator, retract
 from kalmark.models.observe import linearize, sensor_at
@@ -155,6 +162,19 @@ def add_blocks(S: Array, R: Array) -> None:
         S[i * m : (i + 1) * m, i * m : (i + 1) * m] += R[i]
 
 
+@compiled
+def settled(table: Table, change: Array, P: Array, tolerance: float) -> bool:
+    """Return whether each atom of the means changes by less than that many of its sigmas, however the world is turned."""
+    for i in range(len(table)):
+        size, variance = 0.0, 0.0
+        for j in range(table[i, 2], table[i, 2] + ERROR_SIZE[table[i, 0]]):
+            size += change[j] ** 2
+            variance += P[j, j]
+        if size > tolerance**2 * variance:
+            return False
+    return True
+
+
 @register_jitable  # type: ignore[untyped-decorator]
 def iterate(
     view: Any,
@@ -164,16 +184,20 @@ def iterate(
     P_ss: Array,
     y: Array,
     R: Array,
-    most: int,
-    tolerance: float,
+    linear: tuple[Array, Array, Array],
+    limits: tuple[int, float],
 ) -> tuple[Array, Array, Array, bool]:
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
+
+    It begins with the innovations and Jacobians at the mean, z, E_r and E_l.
+
+    `limits`: at most so many times, until nothing moves by more than that many of its sigmas.
 
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
     back where inverse distances are corrected by their parallax.
     """
-    pose, head, axes = sizes
+    (pose, head, axes), (most, tolerance) = sizes, limits
     k, d = len(y), (len(mean) - head) // len(y)
     theta = (3 if pose == 3 else 6) - axes
     correction = np.zeros(len(P_ss))
@@ -182,9 +206,10 @@ def iterate(
     s, S = s_j, S_j = sensor_at(view, mean[:head])
     h = S.shape[1]
     baselines = (depths, s, S, spread(P_ss, np.arange(h), S, depths))
-    x_j = mean
-    for _ in range(most):
-        _e, z, E_r, E_l = linearize(view, x_j[:head], x_j[head:].reshape(k, d), y)
+    x_j, (z, E_r, E_l) = mean, linear
+    for j in range(most):
+        if j > 0:
+            _e, z, E_r, E_l = linearize(view, x_j[:head], x_j[head:].reshape(k, d), y)
         H = stacked(E_r, E_l)
         carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
         H[:, theta : theta + axes] += H @ (generator(table, x_j, len(P_ss), axes, mean[:3]) - turned)
@@ -196,28 +221,26 @@ def iterate(
         if not positive:
             break
         step = HP.T @ (M.T @ (M @ v))
-        change = np.abs(step - correction).max()
+        change = step - correction
         correction = step
         x_j = mean.copy()
         retract(table, x_j, correction, gauge(mean, correction, pose, axes))
         s_j, S_j = sensor_at(view, x_j[:head])
         retract_parallax(x_j, mean, baselines, correction, correction[:h], s_j)
-        if change < tolerance:
+        if settled(table, change, P_ss, tolerance):
             break
     return H, M, v, positive
 
 
 @compiled
-def fuse(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> Array:
-    """P <- P - W W' with W = P H' L^-T, M = L^-1; return the correction K v (n,) of the mean.  [S] (28)-(30)."""
+def gain(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> tuple[Array, Array]:
+    """Return W = P H' L^-T, M = L^-1, which P loses as W W', and the correction K v (n,) of the mean.  [S] (28)-(30)."""
     W = (columns(P, index, n) @ H.T) @ M.T
-    d = W @ (M @ v)
-    downdate(P, W)
-    return d
+    return W, W @ (M @ v)
 
 
 def invariant(
-    view: Any, map_: Map, scan: Scan, most: int
+    view: Any, map_: Map, scan: Scan, limits: tuple[int, float]
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan: gate, iterate, fuse, retract, transport; inverse distances by their parallax.
 
@@ -234,21 +257,22 @@ def invariant(
     near = (d2 <= gate) & (d2 < np.inf)
     if not healthy or not near.any():
         return e, z, Z, d2, near, healthy
+    linear = z, E_r, E_l
     if not near.all():
-        y, R = y[near], R[near]
+        y, R, linear = y[near], R[near], (z[near], E_r[near], E_l[near])
         index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
-    H, M, v, positive = iterate(view, (pose, head, axes), table, mean, submatrix(P, index), y, R, most, 1e-7)
+    H, M, v, positive = iterate(view, (pose, head, axes), table, mean, submatrix(P, index), y, R, linear, limits)
     if not positive:
         return e, z, Z, d2, near, False
     before, x_before = generator(atoms, x, n, axes, mean[:3]), x.copy()
-    depths = anchored(atoms if most > 1 else atoms[:0])
+    depths = anchored(atoms if limits[0] > 1 else atoms[:0])
     s, S = sensor_at(view, mean[:head])
     rows = index[: S.shape[1]]
     baselines = (depths, s, S, spread(P, rows, S, depths))
-    correction = fuse(P, n, index, H, M, v)
+    W, correction = gain(P, n, index, H, M, v)
     retract(atoms, x, correction, gauge(mean, correction[index], pose, axes))
     theta = index[(3 if pose == 3 else 6) - axes]
-    transport(P, generator(atoms, x, n, axes, mean[:3]) - before, theta)
+    downdate_and_transport(P, W, generator(atoms, x, n, axes, mean[:3]) - before, theta)
     if len(depths):
         s_now, S_now = sensor_at(view, observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2])
         retract_parallax(x, x_before, baselines, correction, correction[rows], s_now)
@@ -274,7 +298,9 @@ def textbook(
         near[i] = d2[i] < gate
         if near[i]:
             M, _positive = cholesky_inverse(Z[i])
-            retract(atoms, x, fuse(P, n, index, stacked(E_r, E_l), M, z[i].copy()), np.zeros(0))
+            W, correction = gain(P, n, index, stacked(E_r, E_l), M, z[i].copy())
+            downdate(P, W)
+            retract(atoms, x, correction, np.zeros(0))
     return e, z, Z, d2, near, healthy
 
 
@@ -299,7 +325,9 @@ def first_estimates(
     add_blocks(Z_all, R[near])
     M, positive = cholesky_inverse(Z_all)
     if positive:
-        retract(atoms, x, fuse(P, n, index, H, M, z[near].ravel()), np.zeros(0))
+        W, correction = gain(P, n, index, H, M, z[near].ravel())
+        downdate(P, W)
+        retract(atoms, x, correction, np.zeros(0))
     return e, z, Z, d2, near, positive
 
 

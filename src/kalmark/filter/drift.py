@@ -20,6 +20,10 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+NO_NUMBERS = np.zeros(0)
+NO_ROWS = np.zeros(0, dtype=np.int64)
+
+
 class Watch(NamedTuple):
     """Numbers of a block in the active map, where they were at rest, and one over their sigmas."""
 
@@ -29,12 +33,19 @@ class Watch(NamedTuple):
 
 
 @compiled
-def farthest(x: Array, at: Index, frozen: Array, per_sigma: Array) -> float:
-    """Return how far the numbers `at` are from where they were, in sigmas."""
-    most = 0.0
+def is_farther(limit: float, x: Array, standing: Watch, G: Array, s: Array, per_sigma: Array) -> bool:
+    """Return whether a number is more than `limit` sigmas from where it was: of those that stand, or among G s."""
+    at, frozen, per = standing
     for i in range(len(at)):
-        most = max(most, abs(x[at[i]] - frozen[i]) * per_sigma[i])
-    return most
+        if abs(x[at[i]] - frozen[i]) * per[i] > limit:
+            return True
+    for i in range(len(per_sigma)):
+        moved = 0.0
+        for j in range(len(s)):
+            moved += G[i, j] * s[j]
+        if abs(moved) * per_sigma[i] > limit:
+            return True
+    return False
 
 
 class Drift:
@@ -42,9 +53,11 @@ class Drift:
 
     def __init__(self) -> None:
         self._standing: dict[int, Watch] = {}
-        self._moving: dict[int, tuple[Index, Array]] = {}  # of robots, rows of their positions, and one over the sigmas
         self._all: Watch | None = None
-        self._rest: dict[int, Array] = {}  # of moving robots, their covariance with the blocks that have entered
+        self.moving: list[int] = []  # the blocks that move by themselves,
+        self._rows: Index = NO_ROWS  # the rows of their positions,
+        self._per_sigma: Array = NO_NUMBERS  # one over those sigmas,
+        self._rest: Array | None = None  # and their covariance at rest with the blocks that have entered
 
     def watch(self, slot: int, space: Space, at: int, frozen: Array, variances: Array) -> None:
         """Watch those numbers of a block, `at` and further in the active map, on which its coordinates depend."""
@@ -60,11 +73,6 @@ class Drift:
             self._standing[slot] = Watch(index + at, frozen[index], np.array(per_sigma))
             self._all = None
 
-    @property
-    def moving(self) -> list[int]:
-        """The blocks that move by themselves."""
-        return [*self._moving]
-
     def stands(self, slot: int) -> bool:
         """Return whether a block is watched that has not moved by itself."""
         return slot in self._standing
@@ -79,7 +87,10 @@ class Drift:
         watch = self._standing.get(slot)
         if watch is not None:
             self.forget(slot)
-            self._moving[slot] = rows, watch.per_sigma[: len(rows)]
+            self.moving.append(slot)
+            self._rows = np.concatenate([self._rows, rows])
+            self._per_sigma = np.concatenate([self._per_sigma, watch.per_sigma[: len(rows)]])
+            self._rest = None
 
     def is_beyond(self, limit: float, x: Array, s: Array, read: Callable[[Index, int], Array]) -> bool:
         """Return whether a block is farther than `limit` sigmas from where it was.
@@ -87,16 +98,11 @@ class Drift:
         x is the mean of the active map, s that of its shadows; `read` returns rows' covariance at rest with the shadows
         from a first one on.
         """
-        if self._all is None and self._standing:
-            self._all = Watch(*(np.concatenate(parts) for parts in zip(*self._standing.values(), strict=True)))
-        if self._all is not None and self._standing and farthest(x, *self._all) > limit:
-            return True
-        for slot, (rows, per_sigma) in self._moving.items():
-            G = self._rest.get(slot)
-            if G is None:
-                G = self._rest[slot] = read(rows, 0)
-            elif G.shape[1] < len(s):
-                G = self._rest[slot] = np.hstack([G, read(rows, G.shape[1])])
-            if (np.abs(G @ s) * per_sigma).max() > limit:
-                return True
-        return False
+        if self._all is None:
+            parts = zip(*self._standing.values(), strict=True)
+            self._all = Watch(*map(np.concatenate, parts)) if self._standing else Watch(NO_ROWS, NO_NUMBERS, NO_NUMBERS)
+        if self._rest is None:
+            self._rest = read(self._rows, 0)
+        elif self._rest.shape[1] < len(s):
+            self._rest = np.hstack([self._rest, read(self._rows, self._rest.shape[1])])
+        return bool(is_farther(limit, x, self._all, self._rest, s, self._per_sigma))

@@ -102,11 +102,13 @@ class Ekf(_Estimator):
 class Invariant(_Estimator):
     """The iterated right-invariant filter: honest about what cannot be observed (docs/invariant.md).
 
-    One iteration is enough for small corrections by relative measurements; fixes are always iterated, and so should be
-    landmarks known beforehand.
+    A scan is linearised at most so many times, until nothing seen moves by more than `tolerance` of its sigma; the next
+    time would change about a thousandth of that.  Once is enough for small corrections by relative measurements; fixes
+    are always iterated, and so should be landmarks known beforehand.
     """
 
     iterations: int = 6
+    tolerance: float = 1e-3
 
     coordinates: ClassVar[str] = "log"
     transports: ClassVar[bool] = True
@@ -117,13 +119,15 @@ class Invariant(_Estimator):
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise ModelError(f"Invariant: iterations is {self.iterations}, expected at least 1")
+        if not 0 < self.tolerance < math.inf:
+            raise ModelError(f"Invariant: tolerance is {self.tolerance}, expected a positive number of sigmas")
 
-    def _option(self, map_: StochasticMap) -> int:
-        return self.iterations
+    def _option(self, map_: StochasticMap) -> tuple[int, float]:
+        return self.iterations, float(self.tolerance)
 
     def for_fixes(self) -> Invariant:
         """Return the estimator that fuses absolute positions: a large step must be iterated."""
-        return Invariant(max(6, self.iterations))
+        return Invariant(max(6, self.iterations), self.tolerance)
 
 
 @dataclass(frozen=True)

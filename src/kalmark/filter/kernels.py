@@ -37,9 +37,15 @@ def _load_blas(module: str) -> str:
 
 _BLAS = _load_blas("scipy.linalg.cython_blas")
 llvmlite.binding.add_symbol("kalmark_dsyrk", get_cython_function_address(_BLAS, "dsyrk"))
+llvmlite.binding.add_symbol("kalmark_dgemm", get_cython_function_address(_BLAS, "dgemm"))
 _dsyrk = types.ExternalFunction("kalmark_dsyrk", types.void(*[types.intp] * 10))
+_dgemm = types.ExternalFunction("kalmark_dgemm", types.void(*[types.intp] * 13))
 _UPPER_TRANS = np.array([ord("U"), ord("T")], dtype=np.uint8)
+_TRANS_NO = np.array([ord("T"), ord("N")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
+
+CACHED = 256  # rows of a covariance that stays in a cache between one pass over it and the next
+PANEL = 128  # rows that do of any
 
 
 def one_thread() -> Any:
@@ -155,6 +161,36 @@ def transport(P: Array, a: Array, theta: int) -> None:
             a_i, w_i = a_c[i], w_c[i]
             for j in range(i + 1):
                 P[i, j] += a_i * w_c[j] + w_i * a_c[j]
+
+
+@compiled
+def subtract_product(C: int, stride: int, L: int, rows: int, R: int, columns: int, q: int) -> None:
+    """C -= L R' for L (rows, q), R (columns, q) and C, of so many numbers a row, at those addresses."""
+    sizes = np.array([columns, rows, q, stride], dtype=np.int32)
+    at, chars, numbers = sizes.ctypes.data, _TRANS_NO.ctypes.data, _MINUS_ONE_ONE.ctypes.data
+    _dgemm(chars, chars + 1, at, at + 4, at + 8, numbers, R, at + 8, L, at + 8, numbers + 8, C, at + 12)
+    sizes[0] = rows  # keeps them alive until the call is over
+
+
+@compiled
+def downdate_and_transport(P: Array, W: Array, a: Array, theta: int) -> None:
+    """P <- A (P - W W') A', `downdate` and `transport` in one pass over a P that is larger than a cache."""
+    n, axes = a.shape
+    if n <= CACHED:
+        downdate(P, W)
+        transport(P, a, theta)
+        return
+    q, rows = W.shape[1], np.arange(theta, theta + axes)
+    L, R = np.empty((n, q + 2 * axes)), np.empty((n, q + 2 * axes))
+    w = columns(P, rows, n) - W @ W[theta : theta + axes].T
+    w += a @ (0.5 * w[theta : theta + axes])
+    L[:, :q], L[:, q : q + axes], L[:, q + axes :] = W, -w, -a
+    R[:, :q], R[:, q : q + axes], R[:, q + axes :] = W, a, w
+    for first in range(0, n, PANEL):
+        last = min(first + PANEL, n)
+        C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[0]
+        subtract_product(C, P.shape[1], here, last - first, R.ctypes.data, last, L.shape[1])
+    L[0], R[0] = 0.0, 0.0  # keeps them alive until the calls are over
 
 
 @compiled

@@ -19,6 +19,8 @@ from kalmark.geometry.spaces import REMOVED, Space, Table
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+CAPACITY = 72  # an odd number of cache lines, and so its successors: rows of 2^k keep a column in few places of a cache
+
 X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
 
 
@@ -28,12 +30,13 @@ class Layout:
     Blocks are addressed by slots, the rows of `blocks`; names are the caller's business.
     """
 
-    def __init__(self, capacity: int = 64) -> None:
+    def __init__(self, capacity: int = CAPACITY) -> None:
         self.x: Array = np.zeros(capacity)
         self.x_first: Array = np.zeros(capacity)  # where each block was first estimated, robots last predicted
         self.blocks: Table = np.zeros((0, 6), dtype=np.int64)
         self.atoms: Table = np.zeros((0, 3), dtype=np.int64)
         self.spaces: list[Space | None] = []
+        self.used = 0  # slots
         self.axes = 1  # of the gauge: 1 in the plane, 3 in space, 6 where translations have a generator, too
         self.n = 0  # rows of P in use
         self.x_n = 0  # numbers of x in use
@@ -57,7 +60,7 @@ class Layout:
         slot = free.pop() if free else self._append(space)
         _, _, _, _, atom_at, count = self.blocks[slot]
         self.atoms[atom_at : atom_at + count, 0] = space.kinds
-        self.spaces[slot] = space
+        self.spaces[slot], self.used = space, self.used + 1
         self.axes = max(self.axes, 6 if space.steps else space.axes)
         where = self.numbers(slot)
         self.x[where] = self.x_first[where] = mean
@@ -81,7 +84,8 @@ class Layout:
         """Make room for a mean and a covariance of that size."""
         capacity = len(self.x)
         if size > capacity:
-            x, x_first = np.zeros(max(size, 2 * capacity)), np.zeros(max(size, 2 * capacity))
+            bigger = max((size + 7) // 16 * 16 + 8, 2 * capacity + 8)
+            x, x_first = np.zeros(bigger), np.zeros(bigger)
             x[:capacity], x_first[:capacity] = self.x, self.x_first
             self.x, self.x_first = x, x_first
 
@@ -93,7 +97,7 @@ class Layout:
         self._free.setdefault(space.kinds, []).append(slot)
         atom_at, count = self.blocks[slot, ATOM_AT], self.blocks[slot, ATOMS]
         self.atoms[atom_at : atom_at + count, 0] = REMOVED
-        self.spaces[slot] = None
+        self.spaces[slot], self.used = None, self.used - 1
 
 
 class StochasticMap(Layout):
@@ -102,7 +106,7 @@ class StochasticMap(Layout):
     P is a lower triangle.
     """
 
-    def __init__(self, capacity: int = 64) -> None:
+    def __init__(self, capacity: int = CAPACITY) -> None:
         super().__init__(capacity)
         self.P: Array = np.zeros((capacity, capacity))
 
@@ -159,7 +163,7 @@ class StochasticMap(Layout):
 
     def reset(self) -> None:
         """Forget all blocks, keep the room."""
-        self.blocks, self.atoms, self.spaces = self.blocks[:0], self.atoms[:0], []
+        self.blocks, self.atoms, self.spaces, self.used = self.blocks[:0], self.atoms[:0], [], 0
         self.n, self.x_n, self._free = 0, 0, {}
 
     def _reserve(self, size: int) -> None:

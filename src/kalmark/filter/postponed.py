@@ -172,9 +172,8 @@ class PostponedMap(Layout):
         """Return the rows of what turns the world with a robot: of its orientation, or its whole pose."""
         space = self.spaces[robot]
         assert space is not None
-        pose = 3 if space.axes == 1 else 6
-        at = int(self.active.rows(self._owners[robot])[0])
-        return np.arange(at + pose - self.axes, at + pose)
+        last = int(self.active.blocks[self._owners[robot], P_AT]) + (3 if space.axes == 1 else 6)
+        return np.arange(last - self.axes, last)
 
     def _read(self, rows: Index, columns: Index) -> Array:
         return self.storage.get(rows, columns) if self._job is None else self._job.read(rows, columns)
@@ -296,18 +295,14 @@ class PostponedMap(Layout):
     def corrected(self, robot: int, transports: bool) -> None:
         """Take note that `robot` has corrected what `opened` returned, transporting its covariance or not."""
         if transports and len(self._A0):
-            s = self.active.x[self._s_x]
-            ds = s - sum(self._moved.values())
-            self._moved[robot] = self._moved.get(robot, 0.0) + ds
-            if len(self._owners) < self._used() and self._far(robot, s):
-                self.flush(robot, ds)
+            s, before = self.active.x[self._s_x], self._moved.get(robot, 0.0)
+            self._moved[robot] = now = s - sum(moved for other, moved in self._moved.items() if other != robot)
+            if len(self._owners) < self.used and self._far(robot, s):
+                self.flush(robot, now - before)
         self._pace.count(self.active.n)
         if self._job is not None:
             self._job.advance(self._pace.due(self._progress(), self._job.spent, self._job.work))
             self._job = None if self._job.done else self._job
-
-    def _used(self) -> int:
-        return len(self.spaces) - sum(len(slots) for slots in self._free.values()) - len(self._gone)
 
     def _enter(self, slot: int) -> None:
         """Make a block active: augment it from the shadows, and give it a shadow of its own.  O(active^2)."""
@@ -356,8 +351,8 @@ class PostponedMap(Layout):
 
     def _far(self, robot: int, s: Array) -> bool:
         """Return whether the rest has moved too far for the coordinates in which its errors were left."""
-        turns = self._turn_rows(robot)[-3:] if self.axes > 1 else self._turn_rows(robot)
-        limit = TAU / math.sqrt(max(1e-300, self.active.P[turns, turns].sum()))
+        turned = sum(self.active.P[i, i] for i in self._turn_rows(robot)[-3:].tolist())
+        limit = TAU / math.sqrt(max(1e-300, turned))
         return self._drift.is_beyond(limit, self.active.x, s, lambda rows, i: self._read(rows, self._A0[i:]))
 
     # ------------------------------------------------------------------ flushing

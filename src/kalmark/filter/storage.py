@@ -10,27 +10,21 @@ import os
 from pathlib import Path
 from typing import Any
 
-import llvmlite.binding
 import numpy as np
 import numpy.typing as npt
 from numba import carray, types
 from numba.core import cgutils
-from numba.extending import get_cython_function_address, intrinsic
+from numba.extending import intrinsic
 
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
+from kalmark.filter.kernels import PANEL, subtract_product
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Stored = npt.NDArray[Any]  # float64 or float32
 
-PANEL = 128
 FLUSH = 16_000  # bytes a row that a flush may need while it is under way
-
-llvmlite.binding.add_symbol("kalmark_dgemm", get_cython_function_address("scipy.linalg.cython_blas", "dgemm"))
-_dgemm = types.ExternalFunction("kalmark_dgemm", types.void(*[types.intp] * 13))
-_TRANS_NO = np.array([ord("T"), ord("N")], dtype=np.uint8)
-_MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -77,13 +71,8 @@ def scatter(addresses: Index, like: Stored, rows: Index, columns: Index, C: Arra
 def subtract(panel: Stored, L: Array, R: Array, first: int, last: int) -> None:
     """panel[:, first:last] -= L R[first:last]', in place."""
     if panel.itemsize == 8:
-        sizes = np.array([last - first, len(L), L.shape[1], panel.shape[1]], dtype=np.int32)
-        at, chars, numbers = sizes.ctypes.data, _TRANS_NO.ctypes.data, _MINUS_ONE_ONE.ctypes.data
         r, c = R.ctypes.data + first * R.strides[0], panel.ctypes.data + first * panel.itemsize
-        _dgemm(
-            chars, chars + 1, at, at + 4, at + 8, numbers, r, at + 8, L.ctypes.data, at + 8, numbers + 8, c, at + 12
-        )  # fmt: skip
-        sizes[0] = len(L) + len(R)  # keeps them alive until the call is over
+        subtract_product(c, panel.shape[1], L.ctypes.data, len(L), r, last - first, L.shape[1])
         return
     product = L @ np.ascontiguousarray(R[first:last]).T
     for i in range(len(L)):

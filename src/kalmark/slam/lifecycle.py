@@ -47,6 +47,13 @@ def let_grow(slam: Slam) -> None:
         slam.map = PostponedMap.from_dense(slam.map, Triangle(NUMBERS[slam.numbers]))
 
 
+def review(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation]) -> tuple[tuple[Id, str], ...]:
+    """Simplify and extend what a scan has told of, and return what has been given up, each with the reason."""
+    simplify(slam, view, event.robot, [o.landmark for o in outcomes if o.outcome == "associated"])
+    extend(slam, view, event, outcomes)
+    return tuple(give_up(slam, view, event, outcomes)) if view.attention.delete else ()
+
+
 def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:
     """Make Euclidean points of those whose depth has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4.
 

@@ -22,6 +22,7 @@ Array = npt.NDArray[np.float64]
 class Members:
     """The names of the map's blocks: `slots` of all of them, `kinds` of the landmarks alone, and their `names` by slot.
 
+    `sorts` has the words by which a `View` finds its `looks`: a landmark's kind, or ROBOT.
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
     found.  `ends` are the abscissas (2,) of the segments seen of lines, `doubts` and `tentative` what waits to become a
     landmark: without a block, and with one.
@@ -32,6 +33,7 @@ class Members:
         self.slots: dict[Id, int] = {}
         self.names: dict[int, Id] = {}
         self.kinds: dict[Id, Landmark] = {}
+        self.sorts: dict[Id, str] = {}
         self.seen: dict[Id, int] = {}
         self.searched: dict[Id, list[int]] = {}
         self.ends: dict[Id, Array] = {}
@@ -54,6 +56,7 @@ class Members:
         """Enter a landmark, or give one another slot and kind."""
         self.names.pop(self.slots.get(name, -1), None)
         self.slots[name], self.kinds[name], self.names[slot] = slot, kind, name
+        self.sorts[name] = kind.kind
 
     def start(self, name: Id, slot: int, kind: Landmark) -> None:
         """Enter a landmark that a sensor has just seen for the first time."""
@@ -62,15 +65,24 @@ class Members:
         if hasattr(kind, "first_ends"):
             self.ends[name] = np.array(kind.first_ends)
 
-    def count(self, name: Any, used: bool) -> None:
-        """Count an observation of a landmark or a robot if it was used."""
-        if used:
-            self.seen[name] = self.seen.get(name, 0) + 1
+    def place_robot(self, name: str, slot: int) -> None:
+        """Enter a robot."""
+        self.slots[name], self.sorts[name] = slot, ROBOT
+
+    def enter(self, slots: dict[Id, int], kinds: dict[Id, Landmark]) -> None:
+        """Enter all blocks and all landmarks of a map at once."""
+        self.slots, self.kinds = slots, kinds
+        self.names = {slots[name]: name for name in kinds if name in slots}
+        self.sorts = {name: kind.kind for name, kind in kinds.items()} | dict.fromkeys(self.robots, ROBOT)
+
+    def count(self, name: Id) -> None:
+        """Count an observation of a landmark or a robot that was used."""
+        self.seen[name] = self.seen.get(name, 0) + 1
 
     def forget(self, name: Id) -> None:
         """Strike out a landmark."""
         self.names.pop(self.slots[name], None)
-        for table in (self.slots, self.kinds, self.seen, self.searched, self.ends):
+        for table in (self.slots, self.kinds, self.sorts, self.seen, self.searched, self.ends):
             table.pop(name, None)
 
     def new_name(self) -> str:
@@ -85,20 +97,16 @@ class Members:
         """Return the landmarks that a sensor could see."""
         return [name for name, kind in self.kinds.items() if kind.kind in view.looks]
 
-    def known_to(self, view: View, robot: str, name: Any) -> bool:
-        """Return whether a sensor of this robot can observe what has that name in the map."""
-        return name in self.slots and name != robot and self._kind(name) in view.looks
+    def known_to(self, view: View, robot: str, names: Sequence[Any]) -> list[int]:
+        """Return the indices of those names that a sensor of this robot can observe in the map."""
+        return [i for i, name in enumerate(names) if self.sorts.get(name) in view.looks and name != robot]
 
     def by_look(self, view: View, names: Sequence[Id]) -> list[tuple[Look, list[int]]]:
         """Return the indices of names grouped by how a sensor looks at them, points of known depth first."""
+        looks = [view.looks[self.sorts[name]] for name in names]
+        if len({id(look) for look in looks}) == 1:
+            return [(looks[0], list(range(len(names))))]
         groups: dict[int, tuple[Look, list[int]]] = {}
-        for i, name in enumerate(names):
-            look = view.looks[self._kind(name)]
+        for i, look in enumerate(looks):
             groups.setdefault(id(look), (look, []))[1].append(i)
         return sorted(groups.values(), key=lambda group: group[0].landmark.kind != "point3")
-
-    def _kind(self, name: Id) -> str:
-        """Return the kind of a block, "" of a mount."""
-        if name in self.robots:
-            return ROBOT
-        return self.kinds[name].kind if name in self.kinds else ""

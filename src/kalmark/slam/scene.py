@@ -85,6 +85,8 @@ class View:
         self.tells_places = full and all(has_place(look.landmark.space) for look in self.looks.values())
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
         self.noise_at = self.sensor.noise_at if varies else None  # type: ignore[attr-defined]
+        kinds_ = [look.landmark for look in self.looks.values()]
+        self.changes = self.attention.delete or any(hasattr(k, "linearity") or hasattr(k, "extend") for k in kinds_)
         self.rough: Look | None = None  # how to come near to what is far away: `approach`
         if hasattr(self.sensor, "is_far"):
             self.rough = Look(self.landmark, TagPose(), self.at)

@@ -88,7 +88,7 @@ class Slam:
             raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
         self.robots[robot.name] = robot
         self.refuse_other_world(f"robot {robot.name!r}", robot.motion.space.world)
-        self.members.slots[robot.name] = self.map.add(robot.motion.space, robot.start, robot.cov)
+        self.members.place_robot(robot.name, self.map.add(robot.motion.space, robot.start, robot.cov))
         self._drives[robot.name] = Drive(robot.motion)
         for name, mount in robot.sensors.items():
             slot, block = -1, mount.block(name)
@@ -208,24 +208,22 @@ class Slam:
     ) -> Report:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
         report = Report(event, event.y)
-        known = [k for k, (name, _) in enumerate(decisions) if self.members.known_to(view, event.robot, name)]
+        known = self.members.known_to(view, event.robot, [name for name, _ in decisions])
         outcomes: list[Observation | None] = [None] * len(decisions)
         for seen in self._correct(event, report, view, known, ids, decisions, R):
             outcomes[seen.index] = seen
-        matched = [o for o in outcomes if o is not None]
-        lifecycle.simplify(self, view, event.robot, [o.landmark for o in matched if o.outcome == "associated"])
-        lifecycle.extend(self, view, event, matched)
-        if view.attention.delete:
-            report.removed = tuple(lifecycle.give_up(self, view, event, matched))
-        new = [k for k, outcome in enumerate(outcomes) if outcome is None]
-        for k, seen in self._sight(event, report, view, new, ids, decisions, R):
-            outcomes[k] = seen
-        new = [k for k in new if outcomes[k] is None]
-        reasons = budget.starts(self, view, new, known, event.y, decisions)
-        for k in new:
-            name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
-            outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
-        lifecycle.let_grow(self)
+        if view.changes:
+            report.removed = lifecycle.review(self, view, event, [o for o in outcomes if o is not None])
+        if len(known) < len(decisions):
+            new = [k for k, outcome in enumerate(outcomes) if outcome is None]
+            for k, seen in self._sight(event, report, view, new, ids, decisions, R):
+                outcomes[k] = seen
+            new = [k for k in new if outcomes[k] is None]
+            reasons = budget.starts(self, view, new, known, event.y, decisions)
+            for k in new:
+                name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
+                outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
+            lifecycle.let_grow(self)
         report.observations = tuple(outcomes)  # type: ignore[arg-type]
         return tentative.dropped(self, view, event, report)
 
@@ -268,7 +266,8 @@ class Slam:
             self._healthy(done.healthy, event)
             report.fill(rows, done)
             for k, d2, fused in zip(rows, done.d2.tolist(), done.fused.tolist(), strict=True):
-                self.members.count(decisions[k][0], fused)
+                if fused:
+                    self.members.count(decisions[k][0])  # type: ignore[arg-type]
                 yield judged(k, ids[k], decisions[k][0], d2, fused, view.gate)
 
     def _initialize(

@@ -177,9 +177,8 @@ def _array(members: dict[str, bytes], name: str, shape: tuple[int, ...]) -> Arra
 def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark | None) -> None:
     slam.map = map_restored(state, partial(_array, members))
     own = [view.landmark for view in slam._views.values()] + ([] if given is None else [given])
-    slam.members.kinds = {i: _kind(i, d, own) for i, d in state["kinds"]}
-    slam.members.slots, slam._errors = dict(map(tuple, state["slots"])), dict(state["errors"])
-    slam.members.names = {slam.members.slots[name]: name for name in slam.members.kinds if name in slam.members.slots}
+    slam.members.enter(dict(map(tuple, state["slots"])), {i: _kind(i, d, own) for i, d in state["kinds"]})
+    slam._errors = dict(state["errors"])
     for (robot, sensor), view in slam._views.items():
         view.mount = slam.members.slots.get(mount_name(robot, sensor), -1)
     slam.members.seen = {i: _count(count, f"observations of {i!r}") for i, count in state["seen"]}
