@@ -164,7 +164,7 @@ def add_blocks(S: Array, R: Array) -> None:
 
 @compiled
 def settled(table: Table, change: Array, P: Array, tolerance: float) -> bool:
-    """Return whether each atom of the means changes by less than that many of its sigmas, however the world is turned."""
+    """Return whether each atom of a mean changes by less than that many of its sigmas, however the world is turned."""
     for i in range(len(table)):
         size, variance = 0.0, 0.0
         for j in range(table[i, 2], table[i, 2] + ERROR_SIZE[table[i, 0]]):
@@ -234,7 +234,7 @@ def iterate(
 
 @compiled
 def gain(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> tuple[Array, Array]:
-    """Return W = P H' L^-T, M = L^-1, which P loses as W W', and the correction K v (n,) of the mean.  [S] (28)-(30)."""
+    """Return W = P H' L^-T, M = L^-1, of which P loses W W', and the mean's correction K v (n,).  [S] (28)-(30)."""
     W = (columns(P, index, n) @ H.T) @ M.T
     return W, W @ (M @ v)
 

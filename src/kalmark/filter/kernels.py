@@ -45,7 +45,7 @@ _TRANS_NO = np.array([ord("T"), ord("N")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
 CACHED = 256  # rows of a covariance that stays in a cache between one pass over it and the next
-PANEL = 128  # rows that do of any
+BAND = 128  # rows of a larger one that do
 
 
 def one_thread() -> Any:
@@ -186,8 +186,8 @@ def downdate_and_transport(P: Array, W: Array, a: Array, theta: int) -> None:
     w += a @ (0.5 * w[theta : theta + axes])
     L[:, :q], L[:, q : q + axes], L[:, q + axes :] = W, -w, -a
     R[:, :q], R[:, q : q + axes], R[:, q + axes :] = W, a, w
-    for first in range(0, n, PANEL):
-        last = min(first + PANEL, n)
+    for first in range(0, n, BAND):
+        last = min(first + BAND, n)
         C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[0]
         subtract_product(C, P.shape[1], here, last - first, R.ctypes.data, last, L.shape[1])
     L[0], R[0] = 0.0, 0.0  # keeps them alive until the calls are over

@@ -18,12 +18,13 @@ from numba.extending import intrinsic
 
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
-from kalmark.filter.kernels import PANEL, subtract_product
+from kalmark.filter.kernels import subtract_product
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Stored = npt.NDArray[Any]  # float64 or float32
 
+PANEL = 128
 FLUSH = 16_000  # bytes a row that a flush may need while it is under way
 
 
