@@ -131,7 +131,7 @@ def test_a_robot_that_stands_still_in_space_learns_nothing_of_its_orientation(es
 def test_an_uncertain_start_in_space_leaves_the_map_relative_to_the_robot_as_it_is() -> None:
     maps = []
     for cov in (None, np.diag([0.5, 0.5, 0.5, *np.radians([20, 20, 20])]) ** 2):
-        slam = km.Slam([robot(cov)])
+        slam = km.Slam([robot(cov)], estimator=km.estimators.Invariant(tolerance=1e-9))
         drive(slam, 60, 5, ORIGIN)
         r = slam.mean("r")
         maps.append(np.array([matrix(r[3:]).T @ (slam.mean(i) - r[:3]) for i in range(12)]))
