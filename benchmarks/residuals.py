@@ -20,6 +20,7 @@ from kalmark.results.record import record
 from kalmark.slam.events import Control, Scan
 
 SECOND = 1_000_000_000
+WHEELBASE_M = 2.83
 
 
 def spread(values: np.ndarray) -> float:
@@ -95,6 +96,30 @@ def victoria_park() -> None:
     print(f"  bearing RMS {np.sqrt(np.mean(b**2)):.4f} rad, 1.48 MAD {spread(b):.4f} rad")
 
 
+def steering() -> None:
+    """Print how the two calibrations of Victoria Park's steering, and the headings driven by them, part."""
+    one, other = (controls(name) for name in ("ascii", "mat"))
+    mat = np.interp(one[:, 0], other[:, 0], other[:, 2])
+    moving = one[:, 1] > 0.1
+    v, ascii_, mat = one[moving, 1], one[moving, 2], mat[moving]
+    slope, offset = np.polyfit(mat, ascii_, 1)
+    left = np.std(ascii_ - slope * mat - offset)
+    print(f"Victoria Park, steering: ascii = {slope:.4f} mat + {offset:.4f} rad, residual {left:.1e} rad")
+    dt = 0.025
+    turned = v * (np.tan(ascii_) - np.tan(mat)) / WHEELBASE_M * dt
+    for t_s in (1, 2, 5, 10, 20, 40):
+        steps = round(t_s / dt)
+        parted = np.add.reduceat(turned, np.arange(0, len(turned) - steps, steps))
+        print(f"  {t_s:3d} s: headings part by {np.sqrt(np.mean(parted**2) / t_s):.4f} rad/sqrt(s)")
+
+
+def controls(calibration: str) -> np.ndarray:
+    """Return time, speed and steering (N, 3) by one of the calibrations."""
+    log = open_config_log(load_config("victoria_park_known", [f"log.steering={calibration}"]))
+    return np.array([[e.t_s, *e.u] for e in log if isinstance(e, Control)])
+
+
 if __name__ == "__main__":
     mrclam()
     victoria_park()
+    steering()

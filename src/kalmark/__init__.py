@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
-    from kalmark import geometry
+    from kalmark import detect, geometry
     from kalmark.filter import estimators
     from kalmark.logs import Log, open_log
     from kalmark.models import landmarks, motion, sensors
@@ -35,12 +35,13 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Attention", "Control", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run", "Scan",
-    "Slam", "Upkeep", "association", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise", "record",
-    "sensors",
+    "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise",
+    "record", "sensors",
 ]  # fmt: skip
 
 _MODULES = {
     "association": "kalmark.slam.association",
+    "detect": "kalmark.detect",
     "estimators": "kalmark.filter.estimators",
     "geometry": "kalmark.geometry",
     "landmarks": "kalmark.models.landmarks",

@@ -187,3 +187,19 @@ def test_victoria_park_without_its_detections_says_which_file_is_missing(tmp_pat
     (tmp_path / "victoria_park_ascii.zip").write_bytes(b"PK")
     with pytest.raises(LogError, match=r"victoria_park_ascii\.zip: .*expected a zip with DRS\.txt"):
         open_log(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0.5 1.0 2.0", r"LASER\.txt: 3 numbers, expected whole scans of a time and 361 ranges"),
+        ("0.5 " + "1.0 " * 360 + "x", r"LASER\.txt: .*'x', expected numbers"),
+        ("0.5 " + "1.0 " * 360 + "-2", r"LASER\.txt: scan 1 beam 361 has range -2\.0, expected at least 0"),
+        ("0.5 " + "1.0 " * 361 + "0.4 " + "1.0 " * 361, r"LASER\.txt: times run backwards"),
+    ],
+)
+def test_bad_laser_scans_of_victoria_park_are_named(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "DRS.txt").write_text("0.4 0.5 0.01\n")
+    (tmp_path / "LASER.txt").write_text(text)
+    with pytest.raises(LogError, match=message):
+        open_log(tmp_path, detections="laser")

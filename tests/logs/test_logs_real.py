@@ -234,8 +234,6 @@ def test_victoria_park_clocks_agree(data: Data) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"detections": "laser"}, "detections is 'laser', which is not read yet; expected 'slsjf'"),
-        ({"detections": "rfs"}, "detections is 'rfs', which is not read yet; expected 'slsjf'"),
         ({"detections": "slsj"}, "expected one of slsjf, rfs, laser; did you mean 'slsjf'"),
         ({"steering": 3}, "steering is 3, expected one of ascii, mat"),
         ({"stering": "mat"}, "'stering' is unknown to victoria_park, expected .*did you mean 'steering'"),
@@ -244,6 +242,20 @@ def test_victoria_park_clocks_agree(data: Data) -> None:
 def test_victoria_park_names_what_is_available(options: dict, message: str, data: Data) -> None:
     with pytest.raises(LogError, match=message):
         opened(data("victoria_park"), **options)
+
+
+def test_victoria_park_has_the_beams_and_the_trees_of_another_program(data: Data) -> None:
+    raw = [e for e in opened(data("victoria_park"), detections="laser") if isinstance(e, Scan)]
+    assert len(raw) == 7230
+    assert raw[0].t_ns == 21_819_000_000  # .852 s on the clock of the ascii files
+    assert raw[0].y.shape == (361, 2)
+    assert (raw[0].y[[0, 180], 1] == [-np.pi / 2, 0.0]).all()
+    assert np.mean([np.mean(scan.y[:, 0] > 80) for scan in raw]) == pytest.approx(0.83, abs=0.005)
+    log = opened(data("victoria_park"), detections="rfs")
+    rfs = [e for e in log if isinstance(e, Scan)]
+    assert sum(len(scan.y) for scan in rfs) == 52_974
+    assert log.sensor_columns["car", "laser"] == ("range_m", "bearing_rad", "signature")
+    assert rfs[0].t_ns == raw[0].t_ns
 
 
 def test_dlr_has_its_counts(data: Data) -> None:

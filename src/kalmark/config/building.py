@@ -133,6 +133,10 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
         "association": _build(config, (*path, "association"), sensor.association),
         "cov": covariance_of(sensor.mount, 3 if world == "plane" else 6),
     }
+    if sensor.detector is not None:
+        signed, theirs = "signature" in sensor.type, sensor.detector.signature
+        found = sensor.detector.model_copy(update={"signature": signed if theirs is None else theirs})
+        own["detector"] = _build(config, (*path, "detector"), found)
     if sensor.attention is not None:
         own["attention"] = Attention(**sensor.attention.model_dump())
     if sensor.upkeep is not None:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from kalmark.config.mounting import PlanePose, SpacePose, SpaceStartConfig
 from kalmark.config.sections import Section
+from kalmark.detect import corners, reflectors, trunks
 from kalmark.filter import estimators
 from kalmark.geometry.rotations import from_euler
 from kalmark.models import landmarks, motion, sensors
@@ -52,6 +53,9 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "nearest": association.NearestNeighbour,
     "global": association.GlobalAssignment,
     "jcbb": association.JointCompatibility,
+    "trunks": trunks.Trunks,
+    "reflectors": reflectors.Reflectors,
+    "corners": corners.Corners,
     "ekf": estimators.Ekf,
     "invariant": estimators.Invariant,
     "fej": estimators.Fej,

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from kalmark.config import landmarks, models, mounting, schema
+from kalmark.config import detectors, landmarks, models, mounting, schema
 from kalmark.config.sections import LATER, Section, members
 
 UNITS = {
@@ -82,6 +82,7 @@ def page() -> str:
     parts += [_section("`robots.NAME.sensors.SENSOR`", mounting.Mounted)]
     parts += [_choice("`robots.NAME.sensors.SENSOR`, in the plane", models.PlaneSensor, None, mounting.PlaneMounted)]
     parts += [_choice("`robots.NAME.sensors.SENSOR`, in space", models.SpaceSensor, "sensor", mounting.SpaceMounted)]
+    parts += [_choice("`robots.NAME.sensors.SENSOR.detector`", detectors.Detector, None)]
     parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in the plane", mounting.MountConfig)]
     parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in space", mounting.SpaceMountConfig)]
     parts += [_choice("`landmarks`, and `landmark` of a sensor", landmarks.Landmark, "landmark")]

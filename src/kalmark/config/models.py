@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Tag
 
+from kalmark.config.detectors import Detector
 from kalmark.config.models3d import SpaceMotions, SpaceSensors
 from kalmark.config.mounting import PlaneMounted, Ranging
 from kalmark.config.sections import NotNegative, Number, Positive, Section, type_or, types
@@ -96,6 +97,7 @@ class RangeBearingSensor(_Range):
     """Distance and direction of a landmark."""
 
     type: Literal["range_bearing"] = "range_bearing"
+    detector: Detector | None = None
     sigma_bearing_rad: NotNegative = 0.02
     """Noise of the bearing."""
 
@@ -104,6 +106,7 @@ class RangeBearingSignatureSensor(_Range):
     """Distance, direction and signature of a landmark."""
 
     type: Literal["range_bearing_signature"] = "range_bearing_signature"
+    detector: Detector | None = None
     sigma_bearing_rad: NotNegative = 0.02
     """Noise of the bearing."""
     sigma_signature: NotNegative = 0.1

@@ -151,7 +151,7 @@ class Mounted(Section):
     upkeep: UpkeepConfig | None = None
     """What makes a landmark; the configuration's `upkeep` if absent."""
     detector: Reserved = None
-    """Reserved: how landmarks are found in raw data."""
+    """How landmarks are found in raw scans: for `range_bearing` and `range_bearing_signature`, else reserved."""
 
 
 class PlaneMounted(Mounted):

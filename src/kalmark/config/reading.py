@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from kalmark.config.detectors import Detector
 from kalmark.config.landmarks import Association, Landmark
 from kalmark.config.models import Motion, PlaneSensor, Sensor, SpaceSensor
 from kalmark.config.schema import Config, Estimator
@@ -27,6 +28,7 @@ _CHOICES = {
     "landmark": Landmark,
     "association": Association,
     "estimator": Estimator,
+    "detector": Detector,
 }
 _ENDINGS = (".yaml", ".yml")
 _EXPECTED = {

@@ -126,4 +126,4 @@ def _none_yet(value: Any) -> None:
         raise expected("nothing: this key is reserved and not available yet")
 
 
-Reserved = Annotated[None, PlainValidator(_none_yet)]
+Reserved = Annotated[Any, PlainValidator(_none_yet)]

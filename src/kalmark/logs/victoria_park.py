@@ -6,6 +6,7 @@ Everything is put on the clock of the `.mat` files; the ascii files run 20.967 s
 from __future__ import annotations
 
 import zipfile
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,21 @@ from kalmark.errors import LogError
 from kalmark.logs.log import Array, Log, PositionTrack, Times
 from kalmark.logs.matlab import arrays, column
 from kalmark.logs.source import Format, Request, choice, folder_of
-from kalmark.logs.text import timed_rows
+from kalmark.logs.text import nanoseconds, read_text, timed_rows
 from kalmark.slam.events import Control, Event, Scan, order
 
 ROBOT, SENSOR = "car", "laser"
 ASCII_ZIP, ASCII_DR, MAT_DR, GPS = "victoria_park_ascii.zip", "DRS.txt", "aa3_dr.mat", "aa3_gpsx.mat"
 SLSJF = Path("slsjf") / "data_sensor_clean_clean.mat"
+ASCII_LASER, RFS = "LASER.txt", Path("rfs-slam") / "measurements.dat"
+BEAMS = 361
+ANGLES = np.radians(np.arange(BEAMS) / 2 - 90.0)
+"""The laser's beams, rad: by half a degree from the right to the left."""
 ASCII_BEHIND_NS = 20_967_000_000
 ANTENNA = np.array([3.78, 0.5])
 """Laser and GPS antenna from the centre of the rear axle, m: a + L ahead (0.95 + 2.83), b to the left."""
 IGNORE = -1
+RANGE_BEARING = ("range_m", "bearing_rad")
 
 
 def find(path: Path) -> Path | None:
@@ -33,17 +39,19 @@ def find(path: Path) -> Path | None:
 
 
 def read(path: Path, request: Request, detections: Any = "slsjf", steering: Any = "ascii") -> Log:
-    """Return the log with trees of known identity (`slsjf`) and the encoders' calibration `ascii` or `mat`."""
+    """Return the log with detections, and the encoders' calibration `ascii` or `mat`.
+
+    `slsjf`: trees of known identity; `rfs`: trees without, by range, bearing and radius; `laser`: the beams themselves.
+    """
     wanted = choice(detections, "detections", ("slsjf", "rfs", "laser"))
-    if wanted != "slsjf":
-        raise LogError(
-            f"log option detections is {wanted!r}, which is not read yet; expected 'slsjf' (trees with known ids)"
-        )
     if choice(steering, "steering", ("ascii", "mat")) == "ascii":
         events = ascii_controls(path, request)
     else:
         events = mat_controls(path / MAT_DR)
-    events += slsjf_scans(path / SLSJF, request)
+    if wanted == "slsjf":
+        events += slsjf_scans(path / SLSJF, request)
+    else:
+        events += rfs_scans(path / RFS, request) if wanted == "rfs" else laser_scans(path)
     return Log(
         name="victoria_park",
         format="victoria_park",
@@ -53,21 +61,25 @@ def read(path: Path, request: Request, detections: Any = "slsjf", steering: Any 
         gps={ROBOT: read_gps(path / GPS)} if (path / GPS).is_file() else {},
         skipped=request.skipped,
         control_columns={ROBOT: ("v_mps", "steering_rad")},
-        sensor_columns={(ROBOT, SENSOR): ("range_m", "bearing_rad")},
+        sensor_columns={(ROBOT, SENSOR): RANGE_BEARING + (("signature",) if wanted == "rfs" else ())},
     )
+
+
+def ascii_text(path: Path, name: str, otherwise: str) -> tuple[Path, str]:
+    """Return an ascii file and its text, from beside the zip or from within."""
+    if (path / name).is_file():
+        return path / name, read_text(path / name)
+    file = path / ASCII_ZIP
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return file / name, archive.read(name).decode("ascii")
+    except (OSError, KeyError, UnicodeDecodeError, zipfile.BadZipFile) as error:
+        raise LogError(f"{file}: {error}, expected a zip with {name} (or {otherwise})") from None
 
 
 def ascii_controls(path: Path, request: Request) -> list[Event]:
     """Return speed and steering of the ascii files (recalibrated), from DRS.txt or the zip that holds it."""
-    file, text = path / ASCII_DR, None
-    if not file.is_file():
-        file = path / ASCII_ZIP
-        try:
-            with zipfile.ZipFile(file) as archive:
-                text = archive.read(ASCII_DR).decode("ascii")
-        except (OSError, KeyError, UnicodeDecodeError, zipfile.BadZipFile) as error:
-            raise LogError(f"{file}: {error}, expected a zip with {ASCII_DR} (or steering: mat)") from None
-        file = file / ASCII_DR
+    file, text = ascii_text(path, ASCII_DR, "steering: mat")
     table = timed_rows(file, ("v_mps", "steering_rad"), request.refuse, text)
     return [Control(t_ns=t_ns + ASCII_BEHIND_NS, robot=ROBOT, u=u) for _, t_ns, u in table]
 
@@ -101,6 +113,48 @@ def slsjf_scans(path: Path, request: Request) -> list[Event]:
     ]
 
 
+def laser_scans(path: Path) -> list[Event]:
+    """Return the raw scans, each beam's range and bearing; 81.91 m is no return."""
+    file, text = ascii_text(path, ASCII_LASER, "detections: slsjf")
+    cells = text.split()
+    if not cells or len(cells) % (BEAMS + 1):
+        raise LogError(f"{file}: {len(cells)} numbers, expected whole scans of a time and {BEAMS} ranges")
+    try:
+        table = np.array(cells, dtype=np.float64).reshape(-1, BEAMS + 1)
+        t_ns = [nanoseconds(cell) + ASCII_BEHIND_NS for cell in cells[:: BEAMS + 1]]
+    except ValueError as error:
+        raise LogError(f"{file}: {error}, expected numbers") from None
+    r = table[:, 1:]
+    bad = ~(np.isfinite(r) & (r >= 0))
+    if bad.any():
+        scan, beam = (int(i) + 1 for i in np.argwhere(bad)[0])
+        raise LogError(f"{file}: scan {scan} beam {beam} has range {r[scan - 1, beam - 1]}, expected at least 0")
+    if any(after < before for before, after in pairwise(t_ns)):
+        raise LogError(f"{file}: times run backwards, expected times that never do")
+    scans: list[Event] = []
+    for t, ranges in zip(t_ns, r, strict=True):
+        scans.append(Scan(t_ns=t, robot=ROBOT, sensor=SENSOR, y=np.column_stack([ranges, ANGLES])))
+    return scans
+
+
+def rfs_scans(path: Path, request: Request) -> list[Event]:
+    """Return the scans of trees of unknown identity: range, bearing with 0 forward, and radius, half of column 4."""
+    events: list[Event] = []
+    names = (*RANGE_BEARING, "diameter_m")
+    table = [(t, y) for line, t, y in timed_rows(path, names, request.refuse) if _is_tree(path, line, y, request)]
+    for t_ns, rows in groupby(table, key=lambda row: row[0]):
+        y = [[r, b - np.pi / 2, diameter / 2] for _, (r, b, diameter) in rows]
+        events.append(Scan(t_ns=t_ns + ASCII_BEHIND_NS, robot=ROBOT, sensor=SENSOR, y=y))
+    return events
+
+
+def _is_tree(path: Path, line: int, y: list[float], request: Request) -> bool:
+    if y[0] < 0 or y[2] < 0:
+        request.refuse(f"{path}:{line}: range {y[0]} m, diameter {y[2]} m, expected numbers of at least 0")
+        return False
+    return True
+
+
 def read_gps(path: Path) -> PositionTrack:
     """Return the GPS fixes (x = Lo_m, y = La_m), which jump and drop out: for scoring only."""
     data = arrays(path, ("timeGps", "Lo_m", "La_m"))
@@ -119,7 +173,7 @@ def milliseconds(values: Array, path: Path, name: str) -> Times:
 
 VICTORIA_PARK = Format(
     "victoria_park",
-    f"a folder with {ASCII_ZIP} or {MAT_DR}, and {SLSJF.as_posix()}",
+    f"a folder with {ASCII_ZIP} or {MAT_DR}, and {SLSJF.as_posix()} or the zip's laser",
     find,
     read,
     options=("detections", "steering"),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from kalmark import detect
 from kalmark.errors import MapError
 from kalmark.filter import estimators
 from kalmark.models import landmarks, motion, sensors
@@ -25,6 +26,7 @@ MODULES = {
     "association": (association, "associate"),
     "attention": (attention, "hopeless"),
     "upkeep": (upkeep, "hopeless"),
+    "detector": (detect, "detect"),
 }
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 
@@ -79,7 +81,7 @@ def robot_described(robot: Robot) -> State:
                 "at": list(mount.at),
                 "landmark": None if mount.landmark is None else described(mount.landmark),
                 "association": None if mount.association is None else described(mount.association),
-                "detector": mount.detector is not None,
+                "detector": None if mount.detector is None else described(mount.detector),
                 "attention": described(mount.attention),
                 "upkeep": None if mount.upkeep is None else described(mount.upkeep),
                 "cov": None if mount.cov is None else np.asarray(mount.cov).tolist(),
@@ -96,14 +98,15 @@ def _robot_restored(d: State) -> Robot:
     who, mounts = f"robot {d['name']!r}", {}
     for name, m in d["sensors"]:
         what = f"{who}: sensor {name!r}"
-        if m["detector"]:
+        if m["detector"] is True:  # written before kalmark had its own
             raise MapError(f"{what} has a detector of your own: give the robots to load() again")
+        finds = m["detector"] and restored("detector", m["detector"], f"{what}: detector", "robots")
         landmark = m["landmark"] and restored("landmark", m["landmark"], f"{what}: landmark", "robots")
         paired = m["association"] and restored("association", m["association"], f"{what}: association", "robots")
         budget = restored("attention", m["attention"], f"{what}: attention", "robots")
         cleaned = m.get("upkeep") and restored("upkeep", m["upkeep"], f"{what}: upkeep", "robots")
         sensor = restored("sensor", m["sensor"], what, "robots")
-        mounts[name] = Mount(sensor, m["at"], landmark, paired, None, budget, m["cov"], cleaned)
+        mounts[name] = Mount(sensor, m["at"], landmark, paired, finds or None, budget, m["cov"], cleaned)
     return Robot(d["name"], restored("motion", d["motion"], f"{who}: motion", "robots"), d["start"], mounts, d["cov"])
 
 

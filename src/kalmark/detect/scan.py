@@ -1,0 +1,127 @@
+"""What every laser detector shares: the raw scan it takes, the detections it gives, and how it serves a mount."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.detect.circles import segments
+from kalmark.errors import EventError, ModelError
+from kalmark.slam.events import Scan, when
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+RAW = ("range_m", "bearing_rad", "intensity")
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """What was found in one scan: K measurements `y` (K, m) named by `columns`, with covariances `cov` (K, m, m).
+
+    `beams` (K, 2) are the first and the last beam of each, `attributes` what else is known of them, K of each.
+    """
+
+    columns: tuple[str, ...]
+    y: Array
+    cov: Array
+    beams: Index
+    attributes: dict[str, Array] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def take(self, keep: Any) -> Detections:
+        """Return some of the detections, chosen by a mask or by their indices."""
+        rest = {name: values[keep] for name, values in self.attributes.items()}
+        return Detections(self.columns, self.y[keep], self.cov[keep], self.beams[keep], rest)
+
+
+@dataclass(frozen=True)
+class Laser:
+    """A scanning laser: N ranges at increasing angles, of which those below `range_min_m`, from `range_max_m` on and
+    those that are not finite are no returns.
+
+    `sigma_range_m` is the noise of a range.  Neighbouring beams hit one surface unless their ranges differ by more than
+    they would on one that is hit under `incidence_deg`, and `jump_m` more.  `sigma_position_m` and `sigma_bearing_rad`
+    are added to what is found: how far a real thing is from what the detector takes it for, and how far the whole scan
+    is turned, by the robot's motion while it was taken, or a time stamp that is late.  With `signature` the third
+    component of a detection is kept.
+    """
+
+    sigma_range_m: float = 0.03
+    sigma_position_m: float = 0.0
+    sigma_bearing_rad: float = 0.0
+    range_min_m: float = 0.05
+    range_max_m: float = math.inf
+    incidence_deg: float = 12.0
+    jump_m: float = 0.15
+    signature: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            low = 0.0 if name != "sigma_range_m" else 1e-6
+            if isinstance(value, float | int) and not value >= low:
+                raise ModelError(f"{type(self).__name__}: {name} is {value}, expected at least {low:g}")
+        if not 0 < self.incidence_deg < 90:
+            what = f"{type(self).__name__}: incidence_deg is {self.incidence_deg}"
+            raise ModelError(f"{what}, expected an angle between 0 and 90")
+
+    def detect(self, ranges: Any, angles: Any, intensities: Any = None) -> Detections:
+        """Return what is found among beams of these ranges (N,) m at these angles (N,) rad.  Raises EventError."""
+        r, a, i = _beams(ranges, angles, intensities)
+        returned = (self.range_min_m <= r) & (r < self.range_max_m)
+        return self._widened(self._find(np.where(returned, r, np.inf), a, i))
+
+    def __call__(self, scan: Scan) -> Scan:
+        """Return the scan of what is found in a raw one, whose y (N, 2 or 3) has beams: range, bearing[, intensity]."""
+        if not len(scan.y):
+            return scan
+        if scan.y.shape[1] not in (2, 3):
+            raise EventError(f"{when(scan)}: y has {scan.y.shape[1]} columns, expected beams: {', '.join(RAW)}")
+        try:
+            found = self.detect(*scan.y.T)
+        except EventError as error:
+            raise EventError(f"{when(scan)}: {error}") from None
+        size = 3 if self.signature else 2
+        y, cov = found.y[:, :size], found.cov[:, :size, :size]
+        return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=y, cov=cov if len(y) else None)
+
+    def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
+        raise NotImplementedError
+
+    def _widened(self, found: Detections) -> Detections:
+        """Return detections (range, bearing, ...) with the noise that is not in the beams."""
+        cov, d = found.cov.copy(), np.maximum(found.y[:, 0], 1e-3)
+        cov[:, 0, 0] += self.sigma_position_m**2
+        cov[:, 1, 1] += (self.sigma_position_m / d) ** 2 + self.sigma_bearing_rad**2
+        return Detections(found.columns, found.y, cov, found.beams, found.attributes)
+
+    def pieces(self, r: Array, a: Array) -> tuple[Index, float]:
+        """Return the first and last beam (S, 2) of each piece of surface, and the step between beams."""
+        step = float(np.diff(a).min())
+        least = math.radians(self.incidence_deg)
+        if not 0 < step < least:
+            raise EventError(f"the least step between beams is {step:.3g} rad, expected less than {least:.3g}")
+        return segments(r, a, step, least, self.jump_m), step
+
+
+def _beams(ranges: Any, angles: Any, intensities: Any) -> tuple[Array, Array, Array | None]:
+    """Return the beams as arrays of one length, no returns as infinite ranges."""
+    given = {"ranges": ranges, "angles": angles} | ({} if intensities is None else {"intensities": intensities})
+    arrays = {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in given.items()}
+    r, a = arrays["ranges"], arrays["angles"]
+    for name, values in arrays.items():
+        if values.ndim != 1 or values.shape != r.shape or len(r) < 3:
+            raise EventError(f"{name} has shape {values.shape}, expected the beams of one scan, at least 3")
+    if not (np.isfinite(a).all() and (np.diff(a) > 0).all()):
+        first = int(np.argmin(np.diff(a) > 0)) + 1
+        raise EventError(f"angle {first} is {a[first]} after {a[first - 1]} rad, expected increasing angles")
+    if (r < 0).any():
+        first = int(np.argmax(r < 0))
+        raise EventError(f"range {first} is {r[first]} m, expected at least 0")
+    return r, a, arrays.get("intensities")

@@ -1,0 +1,74 @@
+"""AprilTags in images, by OpenCV: ``pip install 'kalmark[opencv]'``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import EventError, ModelError
+from kalmark.slam.events import Scan, when
+
+Array = npt.NDArray[np.float64]
+
+FAMILIES = {"16h5": "DICT_APRILTAG_16h5", "25h9": "DICT_APRILTAG_25h9",
+            "36h10": "DICT_APRILTAG_36h10", "36h11": "DICT_APRILTAG_36h11"}  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _detector(family: str) -> Any:
+    """Return OpenCV's detector of a family, its corners refined to a fraction of a pixel."""
+    try:
+        import cv2
+    except ImportError:
+        raise ModelError("Tags: OpenCV is not installed, expected it: pip install 'kalmark[opencv]'") from None
+    aruco: Any = cv2.aruco
+    parameters = aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+    return aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, FAMILIES[family])), parameters)
+
+
+@dataclass(frozen=True)
+class Tags:
+    """Tags of one family and one size, by the pixels of their corners, as a `TagCorners` sensor takes them."""
+
+    family: str = "36h11"
+    size_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.family not in FAMILIES:
+            raise ModelError(f"Tags: family is {self.family!r}, expected one of {', '.join(FAMILIES)}")
+        if not 0 < self.size_m < math.inf:
+            raise ModelError(f"Tags: size_m is {self.size_m}, expected a positive length")
+
+    def detect(self, image: Any) -> tuple[Array, list[int]]:
+        """Return the corners and the size (K, 9) of the tags in an image (H, W) or (H, W, 3) of bytes, and their ids.
+
+        Corners in the order (-s, -s), (s, -s), (s, s), (-s, s) of the tag's frame, x right and y up as it is printed.
+        A tag that appears twice is left out.
+        """
+        pixels = np.asarray(image)
+        if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or not pixels.size:
+            raise EventError(f"the image is {pixels.dtype} {pixels.shape}, expected bytes (H, W) or (H, W, 3)")
+        corners, ids, _ = _detector(self.family).detectMarkers(np.ascontiguousarray(pixels))
+        names = [] if ids is None else [int(i) for i in np.ravel(ids)]
+        once = [k for k, i in enumerate(names) if names.count(i) == 1]
+        y = np.empty((len(once), 9))
+        for row, k in enumerate(once):
+            y[row, :8] = corners[k].reshape(4, 2)[::-1].ravel()  # OpenCV goes the other way round, from the top left
+        y[:, 8] = self.size_m
+        return y, [names[k] for k in once]
+
+    def __call__(self, scan: Scan) -> Scan:
+        """Return the scan of the tags in an image, given as a scan whose y (H, W) are grey values of 0 to 255."""
+        if not len(scan.y):
+            return scan
+        try:
+            y, ids = self.detect(np.clip(np.rint(scan.y), 0, 255).astype(np.uint8))
+        except EventError as error:
+            raise EventError(f"{when(scan)}: {error}") from None
+        return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=y if ids else (), ids=ids or None)
