@@ -11,12 +11,16 @@ import kalmark as km
 from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.gaussian import gate
 from kalmark.slam.joint import best_matching
+from kalmark.slam.matchings import Places, matchings
 from kalmark.slam.scene import Scene
 
 METHODS = (
     km.association.NearestNeighbour(),
     km.association.GlobalAssignment(),
     km.association.JointCompatibility(),
+    km.association.Cliques(),
+    km.association.Sampled(),
+    km.association.Automatic(),
 )
 ORIGIN = np.zeros(3)
 
@@ -68,6 +72,7 @@ def test_a_joint_test_finds_the_landmarks_when_the_pose_is_off_by_half_their_spa
         for method in METHODS:
             right[type(method).__name__] += seen_from(truth, points, cov, method, seen) == seen
     assert right["JointCompatibility"] >= 18
+    assert min(right["Sampled"], right["Cliques"]) >= 12
     assert right["NearestNeighbour"] < 14
 
 
@@ -114,6 +119,110 @@ def test_what_is_asked_jointly_is_the_same_of_a_postponed_map_and_of_a_dense_one
         asked.append(scene.jointly(np.array([3, 3, 0]), [3, 4, 3]))
     np.testing.assert_allclose(asked[0][0], asked[1][0], atol=1e-12)
     np.testing.assert_allclose(asked[0][1], asked[1][1], atol=1e-12)
+
+
+def jittered_grid(rng: np.random.Generator) -> np.ndarray:
+    grid = np.stack(np.meshgrid(np.arange(-6, 7), np.arange(-6, 7)), -1).reshape(-1, 2) * 2.0
+    return grid + rng.uniform(-0.7, 0.7, grid.shape)
+
+
+def test_lost_by_a_metre_and_fifteen_degrees_the_automatic_choice_pairs_much_and_nothing_wrongly() -> None:
+    rng, sigmas, paired = np.random.default_rng(5), np.array([1.0, 1.0, np.radians(15)]), 0
+    for _ in range(25):
+        points, truth = jittered_grid(rng), rng.normal(size=3) * sigmas
+        near = np.flatnonzero(np.linalg.norm(points - truth[:2], axis=1) < 7)
+        seen = rng.choice(near, 8, replace=False).tolist()
+        told = seen_from(truth, points, np.diag(sigmas**2), km.association.Automatic(), seen)
+        assert all(t in ("deferred", "tentative", s) for t, s in zip(told, seen, strict=True))
+        paired += sum(t == s for t, s in zip(told, seen, strict=True))
+    assert paired > 0.85 * 8 * 25
+
+
+def test_where_two_matchings_are_alike_the_automatic_choice_holds_them_back_and_says_so() -> None:
+    points = np.array([[5.0, 1.0], [5.0, -1.0], [-3.0, 1.0], [-3.0, -1.0]])  # ahead and behind look the same
+    mount = km.Mount(km.sensors.Position2D(0.02))
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([6.0, 0.1, 0.01]) ** 2, sensors={"s": mount})
+    for method in (km.association.Automatic(), km.association.Cliques()):
+        slam = km.Slam([robot], method)
+        for i, point in enumerate(points):
+            slam.add_landmark(i, point, 1e-4 * np.eye(2))
+        before = slam.mean("r")
+        report = slam.process(km.Scan(1, "r", "s", [[1.0, 1.0], [1.0, -1.0]]))
+        assert [o.outcome for o in report.observations] == ["deferred"] * 2
+        assert all(
+            word in report.observations[0].reason for word in ("contradict",) if method == km.association.Cliques()
+        )
+        np.testing.assert_array_equal(slam.mean("r"), before)
+
+
+def test_samples_are_drawn_as_often_as_their_matchings_are_likely_and_again_for_the_same_scan() -> None:
+    points = np.array([[4.0, 0.0], [4.0, 1.0]])  # one thing is seen, half way between the two
+    mount = km.Mount(km.sensors.Position2D(0.05))
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([1e-3, 0.5, 1e-4]) ** 2, sensors={"s": mount})
+
+    def drawn(seed: int) -> object:
+        slam = km.Slam([robot], km.association.Sampled(seed=seed))
+        for i, point in enumerate(points):
+            slam.add_landmark(i, point, 1e-4 * np.eye(2))
+        return slam.process(km.Scan(1, "r", "s", [[4.0, 0.5]])).observations[0].landmark
+
+    draws = [drawn(seed) for seed in range(60)]
+    assert 15 <= draws.count(0) <= 45 and draws.count(0) + draws.count(1) >= 40
+    assert draws[:10] == [drawn(seed) for seed in range(10)]
+
+
+def test_what_fits_no_landmark_from_where_the_others_are_seen_is_new_however_uncertain_the_pose() -> None:
+    points, truth = jittered_grid(np.random.default_rng(6)), np.array([0.9, -1.1, 0.2])
+    seen = np.flatnonzero(np.linalg.norm(points - truth[:2], axis=1) < 6)[:9].tolist()
+    left_out = seen[4]
+    mount = km.Mount(km.sensors.Position2D(0.02))
+    cov = np.diag([1.0, 1.0, 0.2]) ** 2
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=cov, sensors={"s": mount})
+    slam = km.Slam([robot], km.association.Automatic(), upkeep=km.Upkeep(confirm=1))
+    for i, point in enumerate(points):
+        if i != left_out:
+            slam.add_landmark(i, point, 1e-4 * np.eye(2))
+    report = slam.process(km.Scan(1, "r", "s", km.geometry.to_frame(truth, points[seen])[0]))
+    told = [o.landmark if o.outcome == "associated" else o.outcome for o in report.observations]
+    assert told == [s if s != left_out else "new" for s in seen]
+
+
+def test_the_search_for_agreeing_pairs_finds_every_matching_that_a_look_at_all_finds() -> None:
+    rng, gate1 = np.random.default_rng(7), gate(0.99, 1)
+    for _ in range(40):
+        v, l = rng.uniform(0, 3, (4, 2)), rng.uniform(0, 3, (5, 2))
+        places = v, np.tile(0.05 * np.eye(2), (4, 1, 1)), l, 0.02 * np.eye(10)
+        candidates = [np.flatnonzero(rng.uniform(size=5) < 0.7) for _ in range(4)]
+        first, landmark = np.cumsum([0, *(len(c) for c in candidates)]), np.concatenate(candidates)
+        found, finished = matchings(first, landmark, places, gate1, 1, 10**7, 1000)
+        assert finished
+        told = {tuple(-1 if m < 0 else int(landmark[m]) for m in row) for row in found}
+        every = set()
+        for choice in itertools.product(*[[-1, *c.tolist()] for c in candidates]):
+            pairs = [(i, a) for i, a in enumerate(choice) if a >= 0]
+            if (
+                pairs
+                and len({a for _, a in pairs}) == len(pairs)
+                and all(fit(*p, *q, places, gate1) for p, q in itertools.combinations(pairs, 2))
+            ):
+                every.add(choice)
+        most = max((sum(a >= 0 for a in c) for c in every), default=0)
+        whole = {c for c in every if not any(grown(c, d) for d in every)}
+        assert told == {c for c in whole if sum(a >= 0 for a in c) >= most - 1}
+
+
+def fit(i: int, a: int, j: int, b: int, places: Places, gate1: float) -> bool:
+    v, V, l, C = places
+    seen, known = v[i] - v[j], l[a] - l[b]
+    r, s = np.linalg.norm(seen), np.linalg.norm(known)
+    J = np.zeros(10)
+    J[2 * a : 2 * a + 2], J[2 * b : 2 * b + 2] = known / s, -known / s
+    var = seen / r @ (V[i] + V[j]) @ (seen / r) + J @ C @ J
+    return bool((r - s) ** 2 <= gate1 * var)
+
+
+def grown(small: tuple[int, ...], large: tuple[int, ...]) -> bool:
+    return small != large and all(a in (-1, b) for a, b in zip(small, large, strict=True))
 
 
 def prefix_fits(used: list[int], z: np.ndarray, Z: np.ndarray, gates: np.ndarray) -> bool:

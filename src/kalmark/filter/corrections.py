@@ -280,6 +280,23 @@ def invariant(
     return e, z, Z, d2, near, True
 
 
+def fit(view: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
+    """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if it cannot be."""
+    x, P, _n, blocks, atoms, axes = map_
+    robot, mount, slots, d, y, R, _gate = scan
+    index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    pose, head = head_sizes(blocks, atoms, robot, mount)
+    _e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
+    linear = z, E_r, E_l
+    _H, M, v, positive = iterate(view, (pose, head, axes), table, mean, submatrix(P, index), y, R, linear, limits)
+    if not positive:
+        return np.inf, np.inf
+    w, log_det = M @ v, 0.0
+    for i in range(len(M)):
+        log_det -= 2.0 * np.log(M[i, i])
+    return (w * w).sum(), log_det
+
+
 def textbook(
     view: Any, map_: Map, scan: Scan, _: None
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
@@ -332,5 +349,6 @@ def first_estimates(
 
 
 compiled_invariant = compiled(invariant)
+compiled_fit = compiled(fit)
 compiled_textbook = compiled(textbook)
 compiled_first_estimates = compiled(first_estimates)

@@ -17,11 +17,17 @@ from kalmark.errors import ModelError
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.slam.events import Id
 from kalmark.slam.joint import best_matching
+from kalmark.slam.posterior import Posterior, Together, added, agreeing, crowd, posterior
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 FORBIDDEN = 1e6  # times the gate: a pair outside
+HELD_BACK, FRESH = -2, -3  # in the place of a pair
+CLEAR = 0.05  # landmarks in a gate by chance, up to which each observation can be told by itself
+BY_CHANCE = 1e-2  # matchings as good to be expected by chance where there is more than one landmark in a gate
+WIDEST = 256  # candidates for an observation
 
 Gate = float | str
 
@@ -30,8 +36,12 @@ class New:
     """The answer for an observation of something that is not in the map yet."""
 
 
-NEW = New()
-Decision = tuple[Id | New | None, str]
+class Deferred:
+    """The answer for an observation that cannot be told yet."""
+
+
+NEW, DEFERRED = New(), Deferred()
+Decision = tuple[Id | New | Deferred | None, str]
 
 
 class Query(Protocol):
@@ -48,8 +58,14 @@ class Query(Protocol):
     def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
         """Return the innovations z (M, p) of pairs of an observation and a landmark, and their Z (M p, M p)."""
 
+    def together(self, names: list[Id]) -> Together | None:
+        """Return landmarks to be asked about jointly, None where that cannot be."""
+
     def dof(self) -> int:
         """Return the size m of one measurement."""
+
+    def key(self) -> tuple[int, ...]:
+        """Return numbers, at least 0, that tell this scan from all others."""
 
 
 class Association(Protocol):
@@ -124,28 +140,39 @@ class _Gated:
         """Answer with the ids where there are, with the pairs of `match` elsewhere."""
         answers: list[Decision] = [(i, "") if i is not None else (NEW, "no landmark near") for i in query.ids]
         open_ = np.array([k for k, i in enumerate(query.ids) if i is None], dtype=np.int64)
-        named = {i for i in query.ids if i is not None}
-        names = [c for c in query.candidates(self.nearest, self.farther) if c not in named] if len(open_) else []
+        gate, far = chi2_gate(self.gate, query.dof()), chi2_gate(self.new_gate, query.dof())
+        names, d2 = self.near(query, open_, gate) if len(open_) else ([], np.zeros((0, 0)))
         if not names:
             return answers
-        d2 = query.distances(names)[open_]
-        d2[np.isnan(d2)] = np.inf
-        gate, far = chi2_gate(self.gate, query.dof()), chi2_gate(self.new_gate, query.dof())
         pairs, reasons = self.match(query, open_, names, d2, gate)
         for row, k in enumerate(open_.tolist()):
             least = int(np.argmin(d2[row]))
             if pairs[row] >= 0:
-                answers[k] = (names[pairs[row]], "")
+                answers[k] = (names[pairs[row]], reasons.get(row, ""))
+            elif pairs[row] == HELD_BACK:
+                answers[k] = (DEFERRED, reasons[row])
+            elif pairs[row] == FRESH:
+                answers[k] = (NEW, reasons[row])
             elif d2[row, least] <= gate:
                 answers[k] = (None, reasons.get(row, f"its nearest landmark {names[least]!r} is another observation's"))
             elif d2[row, least] <= far:
                 answers[k] = (None, f"between {names[least]!r} and a new landmark: d2 {d2[row, least]:.1f}")
         return answers
 
+    def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
+        """Return the candidates and their squared distances d2 (K, L) from the observations `open_`."""
+        return self._near(query, open_, self.nearest)
+
+    def _near(self, query: Query, open_: Index, nearest: int) -> tuple[list[Id], Array]:
+        named = {i for i in query.ids if i is not None}
+        names = [c for c in query.candidates(nearest, self.farther) if c not in named]
+        d2 = query.distances(names)[open_] if names else np.zeros((len(open_), 0))
+        return names, np.where(np.isnan(d2), np.inf, d2)
+
     def match(
         self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
     ) -> tuple[Index, dict[int, str]]:
-        """Return the number of the name paired with each row of d2 (K, L), -1 for none, and why none where one fits."""
+        """Return the number of the name paired with each row of d2 (K, L), -1 for none, HELD_BACK, FRESH; and why."""
         raise NotImplementedError
 
 
@@ -221,3 +248,145 @@ class JointCompatibility(_Gated):
         pairs[order] = np.where(chosen >= 0, columns[chosen], -1)
         why = "it does not fit with the others" + ("" if finished else f", as far as {self.most_nodes} nodes tell")
         return pairs, dict.fromkeys(range(len(d2)), why)
+
+
+@dataclass(frozen=True)
+class _Joint(_Gated):
+    """Matchings as wholes, of landmarks however many are inside a gate.
+
+    Where there is more than one on average, the robot is lost: pairs are then not held against the pose one by one.
+    """
+
+    most_nodes: int = 5_000_000
+
+    nearest: ClassVar[int] = 8
+    farther: ClassVar[float] = math.inf
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.most_nodes < 1:
+            raise ModelError(f"{type(self).__name__}: most_nodes is {self.most_nodes}, expected at least 1")
+
+    def threshold(self, m: int, default: float) -> float:
+        """Return that any pair of a matching is fused: it was tested as a whole."""
+        return math.inf
+
+    def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
+        """Return candidates: of each observation's so many that not all of them are inside its gate."""
+        nearest = self.nearest
+        names, d2 = self._near(query, open_, nearest)
+        while nearest < WIDEST and ((d2 <= gate).sum(axis=1) >= nearest).any():
+            nearest *= 4
+            names, d2 = self._near(query, open_, nearest)
+        return names, d2
+
+    def match(
+        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
+    ) -> tuple[Index, dict[int, str]]:
+        """Pair one by one where each observation can be told by itself, jointly elsewhere."""
+        crowded = crowd(d2, gate, query.dof()).max()
+        if crowded <= CLEAR:
+            return GlobalAssignment.match(self, query, open_, names, d2, gate)  # type: ignore[arg-type]
+        lost = crowded > 1
+        together = query.together(names)
+        if together is None:
+            return JointCompatibility(self.gate, self.new_gate).match(query, open_, names, d2, gate)
+        far = chi2_gate(self.new_gate, query.dof())
+        near = np.isfinite(d2) if lost else d2 <= gate  # far off, the distances themselves are not to be trusted
+        found = posterior(together, open_, d2, near, query.dof(), self.gate, self.most_nodes)
+        pairs, reasons = self.choose(query, names, found, near.any(axis=1), lost)
+        for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
+            if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
+                pairs[row], reasons[row] = FRESH, "no landmark fits there, from where the others are seen"
+        return pairs, reasons
+
+    def choose(
+        self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool
+    ) -> tuple[Index, dict[int, str]]:
+        """Choose from the matchings; `near` tells which observations any landmark could be."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Automatic(_Joint):
+    """Pair one by one where the pose is clear, jointly where it is not, and hold back what remains ambiguous.
+
+    Where gates are small against the gaps between landmarks, that is the global assignment.  Elsewhere the likeliest of
+    the matchings whose pairs agree with each other is taken (`posterior`), and of it each pair that is at least as
+    probable as `confidence`; the others are deferred.  Where there is more than one landmark in a gate on average, the
+    robot is lost, and a matching is only taken if none as good is to be expected by chance.
+    """
+
+    confidence: float = 0.9
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.confidence < 1:
+            raise ModelError(f"Automatic: confidence is {self.confidence!r}, expected a probability below 1")
+
+    def choose(
+        self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool
+    ) -> tuple[Index, dict[int, str]]:
+        """Choose the likeliest matching, and hold back pairs that are not sure."""
+        if lost and found.chance > BY_CHANCE:
+            why = f"its scan is ambiguous: {found.chance:.1g} matchings as good are expected by chance"
+            return np.full(len(near), HELD_BACK), dict.fromkeys(range(len(near)), why)
+        pairs, shares = found.pairs[0].copy(), found.shares()
+        unsure = ((shares < self.confidence) | (not found.finished)) & near
+        reasons = {row: found.why(row, names) for row in np.flatnonzero(unsure).tolist()}
+        pairs[unsure] = HELD_BACK
+        return pairs, reasons
+
+
+@dataclass(frozen=True)
+class Sampled(_Joint):
+    """Draw a matching by how likely each is, instead of the likeliest: [F]'s independent samples from the posterior.
+
+    The same scan draws the same matching for the same `seed`.
+    """
+
+    seed: int = 0
+
+    def choose(
+        self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool
+    ) -> tuple[Index, dict[int, str]]:
+        """Draw one."""
+        rng = np.random.default_rng([self.seed, *query.key()])
+        drawn = int(rng.choice(len(found.weights), p=found.weights))
+        why = f"drawn with the probability {found.weights[drawn]:.2f}"
+        return found.pairs[drawn], dict.fromkeys(range(len(near)), why)
+
+
+@dataclass(frozen=True)
+class Cliques(_Gated):
+    """Take the largest set of pairs that agree with each other wherever the robot is, if it fits jointly.  Bailey 2002.
+
+    Two pairs agree if the landmarks are as far from each other as what was seen is; the pose is not asked before the
+    joint test.  Where two sets as large contradict each other, both are deferred.  For the closing of loops.
+    """
+
+    most_nodes: int = 5_000_000
+
+    nearest: ClassVar[int] = WIDEST
+    farther: ClassVar[float] = math.inf
+
+    def match(
+        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
+    ) -> tuple[Index, dict[int, str]]:
+        """Pair by the largest clique."""
+        together = query.together(names)
+        if together is None:
+            return JointCompatibility(self.gate, self.new_gate).match(query, open_, names, d2, gate)
+        found, finished = agreeing(together, open_, d2, np.isfinite(d2), self.gate, self.most_nodes)
+        sizes, fit = (found >= 0).sum(axis=1), np.full(len(found), np.inf)
+        for i, pairs in enumerate(found):
+            rows = np.flatnonzero(pairs >= 0)
+            fit[i] = together.fit(open_[rows], pairs[rows])[0]
+        fits = fit <= [chi2_gate(self.gate, query.dof() * int(n)) for n in sizes]
+        best = np.flatnonzero(fits & (sizes == sizes[fits].max(initial=0)))
+        if not len(best):
+            return np.full(len(d2), -1), {}
+        alike = (found[best] == found[best[0]]).all(axis=0)
+        why = "cliques as large contradict each other" + ("" if finished else ", and the search was not finished")
+        pairs = np.where(alike, found[best[0]], HELD_BACK)
+        return pairs, dict.fromkeys(np.flatnonzero(~alike).tolist(), why)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from kalmark.models.sensors import TagPose
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.nearby import has_place
 from kalmark.slam.robot import Mount
+from kalmark.slam.together import Landmarks
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
@@ -248,6 +250,11 @@ class Scene:
         """Return the size p of one innovation."""
         return self._view.dof
 
+    def key(self) -> tuple[int, ...]:
+        """Return numbers, at least 0, that tell this scan from all others."""
+        event = self._event
+        return event.t_ns % 2**63, crc32(event.robot.encode()), crc32(event.sensor.encode())
+
     def candidates(self, nearest: int = 4, farther: float = 10.0) -> list[Id]:
         """Return the ids of the landmarks that this sensor could have seen where these observations seem to come from.
 
@@ -303,6 +310,13 @@ class Scene:
         Z = J @ S @ J.T
         add_blocks(Z, R)
         return z, Z
+
+    def together(self, names: list[Id]) -> Landmarks | None:
+        """Return landmarks to be asked about jointly; None if they are of several kinds, or this sensor tells no place."""
+        sorts = {self._slam.members.sorts[name] for name in names}
+        if not self._view.tells_places or len(sorts) > 1:
+            return None
+        return Landmarks(self._slam, self._view, self._event, names, self._R)
 
     def _near(self, candidates: list[Id]) -> tuple[Index, Index]:
         """Return the observations and the numbers of candidates that are near each other."""

@@ -26,7 +26,7 @@ from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
 from kalmark.slam import budget, lifecycle, tentative
 from kalmark.slam.approach import approach
-from kalmark.slam.association import NEW, Association, ByIdentity, Decision
+from kalmark.slam.association import DEFERRED, NEW, Association, ByIdentity, Decision
 from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
 from kalmark.slam.doubts import MIRRORED
 from kalmark.slam.drive import Drive, Part, body_axes
@@ -274,8 +274,8 @@ class Slam:
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
     ) -> Observation:
         """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
-        if name is None:
-            return Observation(k, id_, "ignored", None, None, reason)
+        if name is None or name is DEFERRED:
+            return Observation(k, id_, "ignored" if name is None else "deferred", None, None, reason)
         if name == event.robot:
             return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
         if name in self.members.slots:
