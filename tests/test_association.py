@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.errors import EventError
 from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.gaussian import gate
 from kalmark.slam.joint import best_matching
@@ -20,6 +21,7 @@ METHODS = (
     km.association.JointCompatibility(),
     km.association.Cliques(),
     km.association.Sampled(),
+    km.association.Averaged(),
     km.association.Automatic(),
 )
 ORIGIN = np.zeros(3)
@@ -169,6 +171,69 @@ def test_samples_are_drawn_as_often_as_their_matchings_are_likely_and_again_for_
     draws = [drawn(seed) for seed in range(60)]
     assert 15 <= draws.count(0) <= 45 and draws.count(0) + draws.count(1) >= 40
     assert draws[:10] == [drawn(seed) for seed in range(10)]
+
+
+def pair_of_posts(method: object, estimator: object, spread: float = 0.4) -> km.Slam:
+    """Return a robot, uncertain across its way, before two posts a metre apart across it."""
+    mount = km.Mount(km.sensors.Position2D(0.1))
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([0.05, spread, 0.02]) ** 2, sensors={"s": mount})
+    slam = km.Slam([robot], method, estimator)  # type: ignore[arg-type]
+    for i, point in enumerate([[4.0, 0.0], [4.0, 1.0]]):
+        slam.add_landmark(i, point, 0.05**2 * np.eye(2))
+    return slam
+
+
+def test_an_average_over_matchings_has_the_mean_and_covariance_of_their_mixture() -> None:
+    scan = km.Scan(1, "r", "s", [[4.0, 0.45]])
+    soft = pair_of_posts(km.association.Averaged(), km.estimators.Ekf())
+    observation = soft.process(scan).observations[0]
+    weights = dict(observation.shares)
+    assert set(weights) == {0, 1} and min(weights.values()) > 0.2 and sum(weights.values()) < 1
+    none = 1 - sum(weights.values())
+    means, covs, shares = [], [], [none, weights[0], weights[1]]
+    for id_ in (None, 0, 1):
+        hard = pair_of_posts(km.association.ByIdentity("off"), km.estimators.Ekf())
+        hard.process(km.Scan(1, "r", "s", [[4.0, 0.45]], ids=[id_]))
+        means.append(np.concatenate([hard.mean("r"), hard.mean(0), hard.mean(1)]))
+        covs.append(hard.covariance("r", 0, 1))
+    mean = np.average(means, axis=0, weights=shares)
+    cov = sum(w * (P + np.outer(x - mean, x - mean)) for w, x, P in zip(shares, means, covs, strict=True))
+    np.testing.assert_allclose(np.concatenate([soft.mean("r"), soft.mean(0), soft.mean(1)]), mean, atol=1e-9)
+    np.testing.assert_allclose(soft.covariance("r", 0, 1), cov, atol=1e-9)
+
+
+@pytest.mark.parametrize("estimator", [km.estimators.Ekf(), km.estimators.Invariant()], ids=["ekf", "invariant"])
+def test_where_posts_are_confounded_the_average_is_as_certain_as_it_says_and_the_nearest_is_not(
+    estimator: object,
+) -> None:
+    rng, sigmas, nees = np.random.default_rng(8), np.array([0.05, 0.6, 0.02]), {}
+    truths = rng.normal(size=(300, 3)) * sigmas
+    noise = rng.normal(size=(300, 2)) * 0.1
+    posts = np.array([[4.0, 0.0], [4.0, 1.0]]) + rng.normal(size=(300, 2, 2)) * 0.05
+    which = rng.integers(0, 2, 300)
+    for method in (km.association.Averaged(), km.association.NearestNeighbour()):
+        spent = []
+        for truth, e, post, i in zip(truths, noise, posts, which, strict=True):
+            slam = pair_of_posts(method, estimator, spread=0.6)
+            y = km.geometry.to_frame(truth, post[i : i + 1])[0] + e
+            slam.process(km.Scan(1, "r", "s", y))
+            error = slam.mean("r") - truth
+            spent.append(error @ np.linalg.solve(slam.covariance("r"), error))
+        nees[type(method).__name__] = float(np.mean(spent))
+    assert 2.4 < nees["Averaged"] < 3.6
+    assert nees["NearestNeighbour"] > 6
+
+
+def test_averages_need_a_dense_map_and_keep_it() -> None:
+    slam = pair_of_posts(km.association.Averaged(), km.estimators.Invariant())
+    for i in range(100):
+        slam.add_landmark(f"far {i}", [100.0 + i, 0.0], np.eye(2))
+    assert not isinstance(slam.map, PostponedMap)
+    postponed = km.Slam(slam.robots.values(), km.association.Averaged(), map="postponed")
+    for i, point in enumerate([[4.0, 0.0], [4.0, 1.0]]):
+        postponed.add_landmark(i, point, 0.05**2 * np.eye(2))
+    with pytest.raises(EventError, match="dense"):
+        postponed.process(km.Scan(1, "r", "s", [[4.0, 0.45]]))
 
 
 def test_what_fits_no_landmark_from_where_the_others_are_seen_is_new_however_uncertain_the_pose() -> None:

@@ -102,8 +102,8 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ("robots.each.sensors.camera.type=sonar", "robots.each.sensors.camera.type: got 'sonar', expected one of "),
         ("robots.each.sensors=[1]", "robots.each.sensors: got [1], expected a mapping of keys"),
         (
-            "association.type=jpda",
-            "association.type: got 'jpda', which is not available yet, expected one of identity",
+            "robots.each.motion.type=inertial",
+            "robots.each.motion.type: got 'inertial', which is not available yet, expected one of ",
         ),
         ("association.gate=2", "association.gate: got 2, expected a probability between 0 and 1, off or default"),
         ("map.type=sparse", "map.type: got 'sparse', expected one of auto, dense, postponed"),

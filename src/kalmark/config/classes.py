@@ -58,6 +58,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "corners": corners.Corners,
     "clique": association.Cliques,
     "sample": association.Sampled,
+    "jpda": association.Averaged,
     "auto": association.Automatic,
     "ekf": estimators.Ekf,
     "invariant": estimators.Invariant,

@@ -176,6 +176,14 @@ class SampleAssociation(_GatedAssociation):
     """Another one draws others."""
 
 
+class AveragedAssociation(_GatedAssociation):
+    """The mean over all matchings, each by how likely it is; for a dense map."""
+
+    type: Literal["jpda"] = "jpda"
+    most_nodes: Annotated[int, Field(ge=1)] = 5_000_000
+    """Comparisons of pairs after which the search ends."""
+
+
 class AutomaticAssociation(_GatedAssociation):
     """One by one where the pose is clear, the likeliest matching where it is not; what is ambiguous is deferred."""
 
@@ -193,6 +201,7 @@ Association = Annotated[
     | Annotated[JointAssociation, Tag("jcbb")]
     | Annotated[CliqueAssociation, Tag("clique")]
     | Annotated[SampleAssociation, Tag("sample")]
+    | Annotated[AveragedAssociation, Tag("jpda")]
     | Annotated[AutomaticAssociation, Tag("auto")],
     Discriminator(type_or("identity")),
 ]

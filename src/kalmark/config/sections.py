@@ -21,7 +21,7 @@ LATER: dict[str, tuple[str, ...]] = {
     "motion": ("inertial",),
     "sensor": ("position_fix",),
     "landmark": ("polar",),
-    "association": ("jpda",),
+    "association": (),
     "estimator": (),
     "map": (),
 }

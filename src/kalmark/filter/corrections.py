@@ -19,11 +19,13 @@ from numba.extending import register_jitable
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import (
     Index,
+    add_square,
     cholesky_inverse,
     columns,
     downdate,
     downdate_and_transport,
     submatrix,
+    transport,
 )
 from kalmark.filter.parallax import anchored, carried, carry_back, retract_parallax, spread, transport_parallax
 from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table, generator, retract
@@ -281,7 +283,7 @@ def invariant(
 
 
 def fit(view: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
-    """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if it cannot be."""
+    """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if it is sick."""
     x, P, _n, blocks, atoms, axes = map_
     robot, mount, slots, d, y, R, _gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
@@ -295,6 +297,49 @@ def fit(view: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[fl
     for i in range(len(M)):
         log_det -= 2.0 * np.log(M[i, i])
     return (w * w).sum(), log_det
+
+
+def averaged(
+    view: Any, map_: Map, scan: Scan, limits: tuple[int, float], pairs: Index, weights: Array, transports: bool
+) -> tuple[Array, bool]:
+    """Correct by the mean over H matchings: x <- sum w_h x_h, P <- sum w_h (P_h + (x_h - x) (x_h - x)').  [F], JPDA.
+
+    `pairs` (H, K) are the numbers of slots, -1 for none; `weights` (H,) add up to 1.  Each matching is linearised where
+    it would be alone; inverse distances are corrected as they are.  Returns d2 (K,) of the first matching's pairs, each
+    for itself, NaN for none, and whether the filter can go on.
+    """
+    x, P, n, blocks, atoms, axes = map_
+    robot, mount, slots, d, y, R, _gate = scan
+    pose, head = head_sizes(blocks, atoms, robot, mount)
+    q = R.shape[1]
+    W, D = np.zeros((n, q * (pairs >= 0).sum())), np.zeros((n, len(pairs)))
+    d2, used = np.full(len(y), np.nan), 0
+    for i in range(len(pairs)):
+        rows = np.flatnonzero(pairs[i] >= 0)
+        if len(rows) == 0:
+            continue
+        index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[pairs[i][rows]], d)
+        _e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(rows), d), y[rows])
+        if i == 0:
+            d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
+        linear, S = (z, E_r, E_l), submatrix(P, index)
+        H, M, v, positive = iterate(view, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
+        if not positive:
+            return d2, False
+        W_i, D[:, i] = gain(P, n, index, H, M, v)
+        W[:, used : used + W_i.shape[1]] = np.sqrt(weights[i]) * W_i
+        used += W_i.shape[1]
+    index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
+    correction = D @ weights
+    spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
+    before = generator(atoms, x, n, axes, mean[:3])
+    retract(atoms, x, correction, gauge(mean, correction[index], pose, axes) if transports else np.zeros(0))
+    downdate(P, W)
+    add_square(P, spread)
+    if transports:
+        theta = index[(3 if pose == 3 else 6) - axes]
+        transport(P, generator(atoms, x, n, axes, mean[:3]) - before, theta)
+    return d2, True
 
 
 def textbook(
@@ -350,5 +395,6 @@ def first_estimates(
 
 compiled_invariant = compiled(invariant)
 compiled_fit = compiled(fit)
+compiled_averaged = compiled(averaged)
 compiled_textbook = compiled(textbook)
 compiled_first_estimates = compiled(first_estimates)

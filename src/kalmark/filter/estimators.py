@@ -50,6 +50,12 @@ class Estimator(Protocol):
         `mount` is the slot of the sensor's mount, -1 if it is not in the map.
         """
 
+    def average(
+        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
+        pairs: Index, weights: Array,
+    ) -> tuple[Array, bool]:  # fmt: skip
+        """Fuse the mean over matchings; only `km.association.Averaged` asks for it."""
+
     def for_fixes(self) -> Estimator:
         """Return the estimator that fuses absolute positions."""
 
@@ -76,8 +82,25 @@ class _Estimator:
         map_.corrected(robot, self.transports)
         return done
 
+    def average(
+        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
+        pairs: Index, weights: Array,
+    ) -> tuple[Array, bool]:  # fmt: skip
+        """Correct by the mean over matchings (H, K), numbers of slots or -1, of these weights (H,).
+
+        Returns d2 (K,) of the first one's pairs, and whether the filter can go on.
+        """
+        run = corrections.compiled_averaged if isinstance(view, tuple) else corrections.averaged
+        scan = robot, mount, slots, d, y, R, math.inf
+        where = map_.x, map_.P, map_.n, map_.blocks, map_.atoms, map_.axes
+        d2, healthy = run(view, where, scan, self._limits(), pairs, weights, self.transports)
+        return d2, bool(healthy)
+
     def _option(self, map_: StochasticMap) -> Any:
         return None
+
+    def _limits(self) -> tuple[int, float]:
+        return 1, math.inf
 
     def for_fixes(self) -> Any:
         """Return the estimator that fuses absolute positions."""
@@ -122,8 +145,11 @@ class Invariant(_Estimator):
         if not 0 < self.tolerance < math.inf:
             raise ModelError(f"Invariant: tolerance is {self.tolerance}, expected a positive number of sigmas")
 
-    def _option(self, map_: StochasticMap) -> tuple[int, float]:
+    def _limits(self) -> tuple[int, float]:
         return self.iterations, float(self.tolerance)
+
+    def _option(self, map_: StochasticMap) -> tuple[int, float]:
+        return self._limits()
 
     def for_fixes(self) -> Invariant:
         """Return the estimator that fuses absolute positions: a large step must be iterated."""

@@ -150,6 +150,16 @@ def downdate(P: Array, W: Array) -> None:
 
 
 @compiled
+def add_square(P: Array, D: Array) -> None:
+    """P <- P + D D', D (n, q), on the lower triangle."""
+    n, q = D.shape
+    for i in range(n):
+        for j in range(i + 1):
+            for k in range(q):
+                P[i, j] += D[i, k] * D[j, k]
+
+
+@compiled
 def transport(P: Array, a: Array, theta: int) -> None:
     """P <- A P A' with A = I + a e_theta', a (n, 1 or 3): P += a w' + w a', w = P[:, theta] + a P[theta, theta] / 2."""
     n, axes = a.shape

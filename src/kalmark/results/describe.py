@@ -51,6 +51,7 @@ TYPES = {
     "Corners": "corners",
     "Cliques": "clique",
     "Sampled": "sample",
+    "Averaged": "jpda",
     "Automatic": "auto",
     "Ekf": "ekf",
     "Invariant": "invariant",

@@ -1,13 +1,13 @@
 """Which landmark was that?  By the identity the log gives, or by what fits: each for itself, together, or jointly.
 
-An association answers for each observation of a scan with a landmark's id, `NEW`, or None (leave it alone), and why.
+What an association may ask and answer is in `decisions`; a user's own one needs no more than `Association` says.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,67 +15,37 @@ from scipy.optimize import linear_sum_assignment
 
 from kalmark.errors import ModelError
 from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.slam.decisions import (
+    DEFERRED,
+    FRESH,
+    HELD_BACK,
+    MIXED,
+    NEW,
+    Association,
+    Decision,
+    Matched,
+    Mixture,
+    Query,
+)
 from kalmark.slam.events import Id
 from kalmark.slam.joint import best_matching
-from kalmark.slam.posterior import Posterior, Together, added, agreeing, crowd, posterior
+from kalmark.slam.posterior import Posterior, added, agreeing, crowd, posterior
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
+__all__ = [
+    "DEFERRED", "NEW", "Association", "Automatic", "Averaged", "ByIdentity", "Cliques", "Decision", "GlobalAssignment",
+    "JointCompatibility", "NearestNeighbour", "Query", "Sampled",
+]  # fmt: skip
+
 FORBIDDEN = 1e6  # times the gate: a pair outside
-HELD_BACK, FRESH = -2, -3  # in the place of a pair
 CLEAR = 0.05  # landmarks in a gate by chance, up to which each observation can be told by itself
 BY_CHANCE = 1e-2  # matchings as good to be expected by chance where there is more than one landmark in a gate
 WIDEST = 256  # candidates for an observation
 
 Gate = float | str
-
-
-class New:
-    """The answer for an observation of something that is not in the map yet."""
-
-
-class Deferred:
-    """The answer for an observation that cannot be told yet."""
-
-
-NEW, DEFERRED = New(), Deferred()
-Decision = tuple[Id | New | Deferred | None, str]
-
-
-class Query(Protocol):
-    """What an association may ask about a scan."""
-
-    ids: tuple[Id | None, ...]
-
-    def candidates(self, nearest: int = 4, farther: float = 10.0) -> list[Id]:
-        """Return the landmarks this sensor could have seen: of each place the nearest ones, none so much farther."""
-
-    def distances(self, candidates: list[Id]) -> Array:
-        """Return the squared Mahalanobis distances (K, L) of the observations from the candidates."""
-
-    def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
-        """Return the innovations z (M, p) of pairs of an observation and a landmark, and their Z (M p, M p)."""
-
-    def together(self, names: list[Id]) -> Together | None:
-        """Return landmarks to be asked about jointly, None where that cannot be."""
-
-    def dof(self) -> int:
-        """Return the size m of one measurement."""
-
-    def key(self) -> tuple[int, ...]:
-        """Return numbers, at least 0, that tell this scan from all others."""
-
-
-class Association(Protocol):
-    """Decides which landmark each observation of a scan belongs to."""
-
-    def threshold(self, m: int, default: float) -> float:
-        """Return the squared Mahalanobis distance up to which a pair is fused."""
-
-    def associate(self, query: Query) -> list[Decision]:
-        """Return a landmark's id, NEW or None for each observation, and the reason."""
 
 
 def _checked(gate: Gate, where: str) -> None:
@@ -144,13 +114,16 @@ class _Gated:
         names, d2 = self.near(query, open_, gate) if len(open_) else ([], np.zeros((0, 0)))
         if not names:
             return answers
-        pairs, reasons = self.match(query, open_, names, d2, gate)
+        pairs, reasons, mixed = self.match(query, open_, names, d2, gate)
+        mixture = None if mixed is None else Mixture(open_, names, mixed)
         for row, k in enumerate(open_.tolist()):
             least = int(np.argmin(d2[row]))
             if pairs[row] >= 0:
                 answers[k] = (names[pairs[row]], reasons.get(row, ""))
             elif pairs[row] == HELD_BACK:
                 answers[k] = (DEFERRED, reasons[row])
+            elif pairs[row] == MIXED and mixture is not None:
+                answers[k] = (mixture, reasons[row])
             elif pairs[row] == FRESH:
                 answers[k] = (NEW, reasons[row])
             elif d2[row, least] <= gate:
@@ -169,10 +142,8 @@ class _Gated:
         d2 = query.distances(names)[open_] if names else np.zeros((len(open_), 0))
         return names, np.where(np.isnan(d2), np.inf, d2)
 
-    def match(
-        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
-    ) -> tuple[Index, dict[int, str]]:
-        """Return the number of the name paired with each row of d2 (K, L), -1 for none, HELD_BACK, FRESH; and why."""
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
+        """Return the number of the name paired with each row of d2 (K, L), -1 for none or its like, and why."""
         raise NotImplementedError
 
 
@@ -180,9 +151,7 @@ class _Gated:
 class NearestNeighbour(_Gated):
     """Take the nearest landmark inside an individual gate, each at most once in a scan, the closest pair first."""
 
-    def match(
-        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
-    ) -> tuple[Index, dict[int, str]]:
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair greedily; an observation whose nearest landmark is taken gets none."""
         pairs, reasons, taken = np.full(len(d2), -1), {}, set()
         for row in np.argsort(d2.min(axis=1), kind="stable").tolist():
@@ -192,7 +161,7 @@ class NearestNeighbour(_Gated):
             elif d2[row, column] <= gate:
                 taken.add(column)
                 pairs[row] = column
-        return pairs, reasons
+        return Matched(pairs, reasons)
 
 
 @dataclass(frozen=True)
@@ -202,15 +171,13 @@ class GlobalAssignment(_Gated):
     Bipartite matching: an observation gives way to another if that makes the whole better.
     """
 
-    def match(
-        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
-    ) -> tuple[Index, dict[int, str]]:
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair by the linear assignment of the whole scan."""
         count = len(names)
         cost = np.full((len(d2), count + len(d2)), gate)
         cost[:, :count] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
         columns = linear_sum_assignment(cost)[1]
-        return np.where(columns < count, columns, -1), {}
+        return Matched(np.where(columns < count, columns, -1), {})
 
 
 @dataclass(frozen=True)
@@ -231,9 +198,7 @@ class JointCompatibility(_Gated):
         if self.most_nodes < 1:
             raise ModelError(f"JointCompatibility: most_nodes is {self.most_nodes}, expected at least 1")
 
-    def match(
-        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
-    ) -> tuple[Index, dict[int, str]]:
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair by branch and bound, the observations with the fewest candidates first."""
         order = np.argsort((d2 <= gate).sum(axis=1), kind="stable")
         fitting = [np.flatnonzero(d2[row] <= gate) for row in order]
@@ -241,13 +206,13 @@ class JointCompatibility(_Gated):
         first, columns = np.cumsum([0, *(len(c) for c in fitting)]), np.concatenate(fitting)
         pairs = np.full(len(d2), -1)
         if not len(columns):
-            return pairs, {}
+            return Matched(pairs, {})
         z, Z = query.jointly(np.repeat(open_[order], np.diff(first)), [names[c] for c in columns.tolist()])
         gates = np.array([0.0, *(chi2_gate(self.gate, z.shape[1] * (n + 1)) for n in range(len(d2)))])
         chosen, finished = best_matching(first, columns, z, Z, gates, self.most_nodes)
         pairs[order] = np.where(chosen >= 0, columns[chosen], -1)
         why = "it does not fit with the others" + ("" if finished else f", as far as {self.most_nodes} nodes tell")
-        return pairs, dict.fromkeys(range(len(d2)), why)
+        return Matched(pairs, dict.fromkeys(range(len(d2)), why))
 
 
 @dataclass(frozen=True)
@@ -280,9 +245,7 @@ class _Joint(_Gated):
             names, d2 = self._near(query, open_, nearest)
         return names, d2
 
-    def match(
-        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
-    ) -> tuple[Index, dict[int, str]]:
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair one by one where each observation can be told by itself, jointly elsewhere."""
         crowded = crowd(d2, gate, query.dof()).max()
         if crowded <= CLEAR:
@@ -294,15 +257,13 @@ class _Joint(_Gated):
         far = chi2_gate(self.new_gate, query.dof())
         near = np.isfinite(d2) if lost else d2 <= gate  # far off, the distances themselves are not to be trusted
         found = posterior(together, open_, d2, near, query.dof(), self.gate, self.most_nodes)
-        pairs, reasons = self.choose(query, names, found, near.any(axis=1), lost)
+        pairs, reasons, mixed = self.choose(query, names, found, near.any(axis=1), lost)
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
             if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
                 pairs[row], reasons[row] = FRESH, "no landmark fits there, from where the others are seen"
-        return pairs, reasons
+        return Matched(pairs, reasons, mixed)
 
-    def choose(
-        self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool
-    ) -> tuple[Index, dict[int, str]]:
+    def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
         """Choose from the matchings; `near` tells which observations any landmark could be."""
         raise NotImplementedError
 
@@ -324,18 +285,16 @@ class Automatic(_Joint):
         if not 0 <= self.confidence < 1:
             raise ModelError(f"Automatic: confidence is {self.confidence!r}, expected a probability below 1")
 
-    def choose(
-        self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool
-    ) -> tuple[Index, dict[int, str]]:
+    def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
         """Choose the likeliest matching, and hold back pairs that are not sure."""
         if lost and found.chance > BY_CHANCE:
             why = f"its scan is ambiguous: {found.chance:.1g} matchings as good are expected by chance"
-            return np.full(len(near), HELD_BACK), dict.fromkeys(range(len(near)), why)
+            return Matched(np.full(len(near), HELD_BACK), dict.fromkeys(range(len(near)), why))
         pairs, shares = found.pairs[0].copy(), found.shares()
         unsure = ((shares < self.confidence) | (not found.finished)) & near
         reasons = {row: found.why(row, names) for row in np.flatnonzero(unsure).tolist()}
         pairs[unsure] = HELD_BACK
-        return pairs, reasons
+        return Matched(pairs, reasons)
 
 
 @dataclass(frozen=True)
@@ -347,14 +306,29 @@ class Sampled(_Joint):
 
     seed: int = 0
 
-    def choose(
-        self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool
-    ) -> tuple[Index, dict[int, str]]:
+    def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
         """Draw one."""
         rng = np.random.default_rng([self.seed, *query.key()])
         drawn = int(rng.choice(len(found.weights), p=found.weights))
         why = f"drawn with the probability {found.weights[drawn]:.2f}"
-        return found.pairs[drawn], dict.fromkeys(range(len(near)), why)
+        return Matched(found.pairs[drawn].copy(), dict.fromkeys(range(len(near)), why))
+
+
+@dataclass(frozen=True)
+class Averaged(_Joint):
+    """Average over all matchings, each by how likely it is, as [F] would ideally: JPDA, but jointly for a whole scan.
+
+    The map becomes the mean of what it would be after each, and its covariance holds how far these are apart.  Needs a
+    dense map.
+    """
+
+    averages: ClassVar[bool] = True
+
+    def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
+        """Average over what any landmark could be."""
+        unlikely = (found.pairs >= 0).T @ found.weights < 0.5
+        pairs = np.where(near & ~unlikely, MIXED, -1)
+        return Matched(pairs, {row: found.why(row, names) for row in np.flatnonzero(near).tolist()}, found)
 
 
 @dataclass(frozen=True)
@@ -370,9 +344,7 @@ class Cliques(_Gated):
     nearest: ClassVar[int] = WIDEST
     farther: ClassVar[float] = math.inf
 
-    def match(
-        self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float
-    ) -> tuple[Index, dict[int, str]]:
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair by the largest clique."""
         together = query.together(names)
         if together is None:
@@ -385,8 +357,8 @@ class Cliques(_Gated):
         fits = fit <= [chi2_gate(self.gate, query.dof() * int(n)) for n in sizes]
         best = np.flatnonzero(fits & (sizes == sizes[fits].max(initial=0)))
         if not len(best):
-            return np.full(len(d2), -1), {}
+            return Matched(np.full(len(d2), -1), {})
         alike = (found[best] == found[best[0]]).all(axis=0)
         why = "cliques as large contradict each other" + ("" if finished else ", and the search was not finished")
         pairs = np.where(alike, found[best[0]], HELD_BACK)
-        return pairs, dict.fromkeys(np.flatnonzero(~alike).tolist(), why)
+        return Matched(pairs, dict.fromkeys(np.flatnonzero(~alike).tolist(), why))

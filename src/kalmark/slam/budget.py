@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.slam.association import DEFERRED, Decision
+from kalmark.slam.decisions import DEFERRED, Decision
 from kalmark.slam.events import Scan
 from kalmark.slam.scene import Look, View
 

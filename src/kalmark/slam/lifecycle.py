@@ -39,8 +39,10 @@ def new_map(type_: str, numbers: str) -> Map:
 
 
 def let_grow(slam: Slam) -> None:
-    """Postpone corrections from so many landmarks on that it pays; inverse distances are not postponed."""
+    """Postpone corrections from so many landmarks on that it pays; but not of inverse distances, nor averages."""
     kinds = slam.members.kinds
+    if any(view.averages for view in slam._views.values()):
+        return
     if slam.map_type != "auto" or not isinstance(slam.map, StochasticMap) or len(kinds) <= DENSE:
         return
     if sum(RHO not in kind.space.kinds for kind in kinds.values()) > DENSE:

@@ -24,7 +24,10 @@ NOTHING.flags.writeable = False
 
 
 class Observation(NamedTuple):
-    """One observation's fate: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance."""
+    """One observation's fate: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance.
+
+    `shares` are the landmarks over which a soft association averaged, each with its weight, the likeliest first.
+    """
 
     index: int  # type: ignore[assignment]  # of the observation in its scan; hides tuple.index
     id: Id | None
@@ -32,6 +35,7 @@ class Observation(NamedTuple):
     landmark: Id | None
     d2: float | None
     reason: str
+    shares: tuple[tuple[Id, float], ...] = ()
 
 
 def judged(index: int, id_: Id | None, name: Any, d2: float, fused: bool, gate: float) -> Observation:

@@ -13,9 +13,9 @@ from scipy.linalg import block_diag
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.models.protocols import Landmark, Motion, Sensor
-from kalmark.slam.association import Association
 from kalmark.slam.attention import EVERYTHING, Attention
 from kalmark.slam.checks import covariance, instance
+from kalmark.slam.decisions import Association
 from kalmark.slam.events import Scan, finite, shown
 from kalmark.slam.upkeep import Upkeep
 

@@ -77,6 +77,7 @@ class View:
         slam.refuse_other_world(self.landmark.kind, self.landmark.space.world)
         self.association = mount.association or slam.association
         self.upkeep = mount.upkeep or slam.upkeep
+        self.averages = getattr(self.association, "averages", False)
         self.looks = self._looks()
         self._refuse_misfit()
         self.dof = self._dof()
@@ -312,7 +313,7 @@ class Scene:
         return z, Z
 
     def together(self, names: list[Id]) -> Landmarks | None:
-        """Return landmarks to be asked about jointly; None if they are of several kinds, or this sensor tells no place."""
+        """Return landmarks to be asked about jointly; None if of several kinds, or if this sensor tells no place."""
         sorts = {self._slam.members.sorts[name] for name in names}
         if not self._view.tells_places or len(sorts) > 1:
             return None

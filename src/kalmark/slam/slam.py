@@ -26,8 +26,10 @@ from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
 from kalmark.slam import budget, lifecycle, tentative
 from kalmark.slam.approach import approach
-from kalmark.slam.association import DEFERRED, NEW, Association, ByIdentity, Decision
+from kalmark.slam.association import ByIdentity
+from kalmark.slam.averaging import average
 from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
+from kalmark.slam.decisions import DEFERRED, NEW, Association, Decision
 from kalmark.slam.doubts import MIRRORED
 from kalmark.slam.drive import Drive, Part, body_axes
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
@@ -156,7 +158,7 @@ class Slam:
         gate = self.association.threshold(size, self.estimator.default_gate)
         view, estimator, R = fix_view(ORIGIN[pose]), self.estimator.for_fixes(), event.cov.reshape(1, size, size)
         done = estimator.correct(self.map, view, slot, -1, np.array([slot]), 0, report.y, R, gate)
-        self._healthy(done.healthy, event)
+        self.refuse_sick(done.healthy, event)
         report.e, report.z, report.Z = done.e, done.z, done.Z
         outcome, reason = ("associated", "") if done.fused[0] else ("rejected", f"outside the gate of {gate:.2f}")
         report.observations = (Observation(0, event.robot, outcome, event.robot, float(done.d2[0]), reason),)
@@ -257,18 +259,18 @@ class Slam:
         for look, rows in groups:
             if not rows:
                 continue
-            slots = self.members.slots_of([decisions[k][0] for k in rows])
-            approach(self, view, robot, look, slots, event.y[rows], R[rows])
+            slots, y = self.members.slots_of([decisions[k][0] for k in rows]), event.y[rows]
+            approach(self, view, robot, look, slots, y, R[rows])
             noise = view.noise(self.map, robot, look, slots, R[rows], event)
-            done = self.estimator.correct(
-                self.map, look.view, robot, view.mount, slots, look.d, event.y[rows], noise, view.gate
-            )
-            self._healthy(done.healthy, event)
+            done = self.estimator.correct(self.map, look.view, robot, view.mount, slots, look.d, y, noise, view.gate)
+            self.refuse_sick(done.healthy, event)
             report.fill(rows, done)
             for k, d2, fused in zip(rows, done.d2.tolist(), done.fused.tolist(), strict=True):
                 if fused:
                     self.members.count(decisions[k][0])  # type: ignore[arg-type]
                 yield judged(k, ids[k], decisions[k][0], d2, fused, view.gate)
+        if view.averages:
+            yield from average(self, event, view, decisions, R)
 
     def _initialize(
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
@@ -304,7 +306,8 @@ class Slam:
         self.members.start(name, slot, view.landmark)
         return Observation(k, id_, "new", name, None, reason)
 
-    def _healthy(self, healthy: bool, event: Event) -> None:
+    def refuse_sick(self, healthy: bool, event: Event) -> None:
+        """Raise DivergedError where the filter cannot go on."""
         if not healthy:
             raise DivergedError(f"{when(event)}: the innovation's covariance is not positive definite")
 
@@ -359,10 +362,9 @@ class Slam:
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
-        if name in self.robots:
-            raise MapError(f"{name!r} is a robot, expected a landmark")
         if name in self.members.slots and name not in self.members.kinds:
-            raise MapError(f"{name!r} is a sensor's mount, expected a landmark")
+            what = "robot" if name in self.robots else "sensor's mount"
+            raise MapError(f"{name!r} is a {what}, expected a landmark")
         self.map.remove(self.slot(name))
         self.members.forget(name)
 

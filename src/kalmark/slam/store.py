@@ -21,7 +21,7 @@ from kalmark.errors import KalmarkError, MapError
 from kalmark.filter.estimators import Estimator
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.protocols import Landmark
-from kalmark.slam.association import Association
+from kalmark.slam.decisions import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
 from kalmark.slam.doubts import Doubt
 from kalmark.slam.events import Id

@@ -17,7 +17,8 @@ from scipy.optimize import linear_sum_assignment
 
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import Landmark
-from kalmark.slam.association import FORBIDDEN, NEW, Decision
+from kalmark.slam.association import FORBIDDEN
+from kalmark.slam.decisions import NEW, Decision
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation, Report
 
