@@ -56,7 +56,7 @@ def possible(alive: Flags, first: Index, i: int) -> int:
     """Return how many observations from i on have a pair alive."""
     count = 0
     for j in range(i, len(first) - 1):
-        count += alive[first[j] : first[j + 1]].any()
+        count += int(alive[first[j] : first[j + 1]].any())
     return count
 
 
