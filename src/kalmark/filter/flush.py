@@ -6,6 +6,7 @@ corrected by what is still to come; that makes a slice as long or as short as on
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 ROWS = 8  # of the active blocks, to write at once
+SOME = 32  # rows to know at once
 FRESH = 400  # multiplications that take as long as to write a number there: memory is used for the first time
 
 
@@ -141,23 +143,40 @@ def _turn(before: Array, after: Array, axes: int) -> Array:
     return np.concatenate([np.linalg.solve(left_jacobian(turn), after[:3] - before[:3]), turn])
 
 
+class Room:
+    """Memory that one flush leaves to the next: to use it for the first time takes longer than all else."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, Array] = {}
+
+    def array(self, name: str, shape: tuple[int, ...]) -> Array:
+        """Return an array of that shape, holding anything."""
+        size, kept = math.prod(shape), self._numbers.get(name)
+        if kept is None or len(kept) < size:
+            kept = self._numbers[name] = np.empty(size + size // 16)
+        return kept[:size].reshape(shape)
+
+
 class Flush:
     """P_BB <- P_BB - W W', P_AB, P_AA and the means, in slices."""
 
-    def __init__(self, map_: Layout, storage: Triangle, phase: Phase, leap: Leap | None) -> None:
+    def __init__(self, map_: Layout, storage: Triangle, phase: Phase, leap: Leap | None, room: Room) -> None:
         self.map, self.storage, self.phase, self.leap = map_, storage, phase, leap
         self.x_before, self.n = map_.x[: map_.x_n].copy(), map_.n
         self.where: Index = np.full(self.n, -1)
         self.where[phase.A] = np.arange(len(phase.A))
         self.L = _root(phase.Psi, storage.diagonal(phase.A0))
         self.q = self.L.shape[1]
-        self.R = np.zeros((self.n, self.q + 2 * len(phase.thetas)))
-        self.V = np.zeros((len(range(0, self.n, PANEL)), len(phase.A), PANEL))  # one panel's memory after the other
+        self.R = room.array("R", (self.n, self.q + 2 * len(phase.thetas)))
+        self.V = room.array("V", (len(range(0, self.n, PANEL)), len(phase.A), PANEL))  # one panel's after the other
         self.known = self.where >= 0
         self.resting = _in_use(map_, self.n) & (self.where < 0)
+        gaps = np.flatnonzero(~self.resting & (self.where < 0))
+        self.R[gaps] = 0.0
+        self.V[gaps // PANEL, :, gaps % PANEL] = 0.0
         self.panel = self.column = self.row = 0
         self.cost = PANEL * max(1, self.R.shape[1])  # of a column of a panel, in multiplications
-        self.aside = 10 * PANEL  # to begin a panel, for each row there is
+        self.aside = 10 * PANEL  # to know a panel, for each row there is
         panels = range(0, self.n, PANEL)
         self.work = sum(self.cost * min(k + PANEL, self.n) + self.aside * self.n for k in panels)
         self.work += FRESH * int(phase.A.sum())
@@ -187,14 +206,14 @@ class Flush:
             if self.row == last:
                 self.panel, self.column = self.panel + 1, 0
             return FRESH * last * int((self.where[begin : self.row] >= 0).sum())
-        if self.column == 0:
-            self._know_panel(first, last)
+        if self.column == 0 and self._know_more(first, last):
+            return self.aside * self.n * SOME // PANEL
         start, self.column = self.column, min(last, self.column + PANEL * max(1, tiles))
         if self.R.shape[1]:
             W, m = self.R[first:last, : self.q], len(self.phase.thetas)
             L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
             subtract(panel[: last - first], L, self.R, start, self.column)
-        return self.cost * (self.column - start) + (0 if start else self.aside * self.n)
+        return self.cost * (self.column - start)
 
     def read(self, rows: Index, columns: Index) -> Array:
         """Return elements as they will be when all is done; all rows must be known."""
@@ -210,9 +229,13 @@ class Flush:
         if rows[0] < self.n and not self.known[rows[0]]:
             self._know(slot, slot + 1)
 
-    def _know_panel(self, first: int, last: int) -> None:
-        starts = self.map.blocks[:, P_AT]
-        self._know(*np.searchsorted(starts, [first, last]))
+    def _know_more(self, first: int, last: int) -> bool:
+        """Know the next blocks at rest among the rows first..last; return whether there were any."""
+        unknown = np.flatnonzero(self.resting[first:last] & ~self.known[first:last])
+        if len(unknown):
+            begin = first + unknown[0]
+            self._know(*np.searchsorted(self.map.blocks[:, P_AT], [begin, min(begin + SOME, last)]))
+        return len(unknown) > 0
 
     def _know(self, slot: int, end: int) -> None:
         """Work out the means of the blocks slot..end, their rows of R = [W, w, a], and their covariances V' with A."""

@@ -24,6 +24,14 @@ CAPACITY = 72  # an odd number of cache lines, and so its successors: rows of 2^
 X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
 
 
+BIT, PAGE = 1 << 16, 512  # numbers of a buffer to use at once, and in a page
+
+
+def next_capacity(capacity: int) -> int:
+    """Return the capacity that follows when this one is full."""
+    return 2 * capacity + 8
+
+
 class Layout:
     """Where blocks are: their slots, means, and the rows they have in a covariance that a subclass keeps.
 
@@ -84,7 +92,7 @@ class Layout:
         """Make room for a mean and a covariance of that size."""
         capacity = len(self.x)
         if size > capacity:
-            bigger = max((size + 7) // 16 * 16 + 8, 2 * capacity + 8)
+            bigger = max((size + 7) // 16 * 16 + 8, next_capacity(capacity))
             x, x_first = np.zeros(bigger), np.zeros(bigger)
             x[:capacity], x_first[:capacity] = self.x, self.x_first
             self.x, self.x_first = x, x_first
@@ -109,6 +117,8 @@ class StochasticMap(Layout):
     def __init__(self, capacity: int = CAPACITY) -> None:
         super().__init__(capacity)
         self.P: Array = np.zeros((capacity, capacity))
+        self._next: Array | None = None  # a larger one
+        self._touched = 0  # numbers of it
 
     # ------------------------------------------------------------------ reading
     def index(self, slot: int) -> Index:
@@ -170,9 +180,20 @@ class StochasticMap(Layout):
         super()._reserve(size)
         capacity, bigger = len(self.P), len(self.x)
         if bigger > capacity:
-            P = np.zeros((bigger, bigger))
+            P, self._next = self._next, None
+            if P is None or len(P) != bigger:
+                P = np.zeros((bigger, bigger))
             P[:capacity, :capacity] = self.P
             self.P = P
+
+    def prepare(self) -> None:
+        """Have a larger buffer ready in time, its memory used bit by bit: the first use is what takes long."""
+        if self._next is None and 2 * self.n > len(self.P):
+            size = next_capacity(len(self.P))
+            self._next, self._touched = np.zeros((size, size)), 0
+        if self._next is not None and self._touched < self._next.size:
+            self._next.ravel()[self._touched : self._touched + BIT : PAGE] = 0.0
+            self._touched += BIT
 
     # ------------------------------------------------------------------ moving
     def predict(self, index: Index, F: Array, Q: Array) -> None:
@@ -191,6 +212,7 @@ class StochasticMap(Layout):
 
     def corrected(self, robot: int, transports: bool) -> None:
         """Take note that `robot` has corrected what `opened` returned."""
+        self.prepare()
 
 
 def _appended(table: Table, rows: Table) -> Table:

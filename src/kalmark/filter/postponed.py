@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from kalmark.filter import kernels
 from kalmark.filter.drift import Drift
-from kalmark.filter.flush import Flush, Phase, displaced, leap_of
+from kalmark.filter.flush import Flush, Phase, Room, displaced, leap_of
 from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
 from kalmark.filter.pace import Pace
 from kalmark.filter.storage import PANEL, Triangle
@@ -52,6 +52,7 @@ class PostponedMap(Layout):
         self.phase = 0  # number of flushes
         self._at: Index = np.full(64, -1)  # slot in the active map, -1 at rest
         self._job: Flush | None = None
+        self._room = Room()
         self._anchored: set[int] = set()  # blocks with inverse distances
         super().__init__()
         self._begin()
@@ -300,6 +301,7 @@ class PostponedMap(Layout):
             if len(self._owners) < self.used and self._far(robot, s):
                 self.flush(robot, now - before)
         self._pace.count(self.active.n)
+        self.active.prepare()
         if self._job is not None:
             self._job.advance(self._pace.due(self._progress(), self._job.spent, self._job.work))
             self._job = None if self._job.done else self._job
@@ -387,7 +389,7 @@ class PostponedMap(Layout):
             S[:, leap.robot] -= leap.ds
         turns = np.array(thetas, dtype=np.int64)
         phase = Phase(self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, turns, origins, axes)
-        self._job = Flush(self, self.storage, phase, leap)
+        self._job = Flush(self, self.storage, phase, leap, self._room)
         for slot in slots:
             at = self._owners[slot]
             self.x[self.numbers(slot)], self.x_first[self.numbers(slot)] = m.mean(at), m.first(at)
