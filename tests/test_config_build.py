@@ -48,7 +48,11 @@ def test_keys_and_defaults_are_those_of_the_models(choice: Any) -> None:
     for name in types(choice):
         section = validate(Tree(values={"section": {"type": name}}), holder).section  # type: ignore[attr-defined]
         parameters = {f.name: f.default for f in dataclasses.fields(CLASSES[name]) if f.init}  # type: ignore[arg-type]
-        assert section.model_dump(exclude={"type", *MOUNTED}) == parameters, name
+        keys = section.model_dump(exclude={"type", *MOUNTED})
+        assert keys.keys() == parameters.keys(), name
+        left_open = {key for key, value in keys.items() if value is None}  # differs in plane and space
+        assert keys == parameters | dict.fromkeys(left_open), name
+        assert not left_open or name == "inverse_depth"
 
 
 def test_an_attention_has_the_keys_and_defaults_of_its_model() -> None:

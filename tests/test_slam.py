@@ -125,7 +125,7 @@ def test_every_outcome_has_its_reason() -> None:
 
 
 def test_a_sensor_that_cannot_start_a_landmark_says_so() -> None:
-    slam = km.Slam([rover(camera=km.Mount(km.sensors.Bearing()))])
+    slam = km.Slam([rover(camera=km.Mount(km.sensors.Bearing(), landmark=km.landmarks.Point2D()))])
     (observation,) = slam.process(km.Scan(0, "rover", "camera", [[0.1]], [1])).observations
     assert observation.outcome == "ignored"
     assert "alone cannot start a landmark" in observation.reason

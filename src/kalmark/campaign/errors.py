@@ -86,7 +86,7 @@ def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordin
         own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
         return Judged(own, world, np.eye(6), mean[None, :3], truth[None, :3])
     point, F = position(model, mean, len(truth))
-    if len(mean) > len(truth) and len(truth) == 3 and not is_known(point, F @ P @ F.T, eye):
+    if hasattr(model, "to_point") and len(mean) > len(truth) and not is_known(point, F @ P @ F.T, eye):
         return None
     own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
     return Judged(own, world, F, point[None], truth[None])
@@ -99,7 +99,7 @@ def is_known(point: Array, P: Array, eye: Array) -> bool:
 
 def position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
     """Return the Euclidean position (d,) of a landmark's state, and its Jacobian (d, dof)."""
-    if d == 3 and hasattr(model, "to_point"):
+    if hasattr(model, "to_point"):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             p, P_l = model.to_point(mean[None])
         return p[0], P_l[0]

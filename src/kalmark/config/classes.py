@@ -40,7 +40,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "tag_corners": sensors.TagCorners,
     "point": landmarks.Point2D,
     "point_signature": landmarks.PointSignature2D,
-    "inverse_depth": landmarks.InverseDepth3D,
+    "inverse_depth": landmarks.InverseDepth2D,
     "anchored_homogeneous": landmarks.AnchoredHomogeneous,
     "homogeneous": landmarks.Homogeneous,
     "tag": landmarks.Tag,
@@ -64,7 +64,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "invariant": estimators.Invariant,
     "fej": estimators.Fej,
 }
-IN_SPACE: dict[str, Callable[..., Any]] = {"point": landmarks.Point3D}
+IN_SPACE: dict[str, Callable[..., Any]] = {"point": landmarks.Point3D, "inverse_depth": landmarks.InverseDepth3D}
 MOUNTED = frozenset({"mount", "landmark", "association", "attention", "upkeep", "detector"})
 
 
@@ -73,7 +73,7 @@ def model_of(section: Section, world: str = "plane") -> Any:
 
     Raises ModelError if the model refuses its parameters.
     """
-    keys = section.model_dump(exclude=set(MOUNTED))
+    keys = {key: value for key, value in section.model_dump(exclude=set(MOUNTED)).items() if value is not None}
     kind = keys.pop("type")
     return (IN_SPACE.get(kind, CLASSES[kind]) if world == "space" else CLASSES[kind])(**keys)
 

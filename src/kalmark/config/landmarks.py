@@ -28,10 +28,17 @@ class _Depth(Section):
     """Standard deviation of that."""
 
 
-class InverseDepthLandmark(_Depth):
-    """A point of space by anchor, azimuth, elevation and inverse distance (6 numbers)."""
+class InverseDepthLandmark(Section):
+    """A point by anchor, direction and inverse distance: 4 numbers in the plane, 6 in space.
+
+    The nearest landmark at d m is in the prior if prior_rho_per_m + 2 sigma_rho_per_m is 1 / d.
+    """
 
     type: Literal["inverse_depth"] = "inverse_depth"
+    prior_rho_per_m: Number | None = None
+    """Inverse distance expected where the sensor sees none; if absent 0.5 in the plane, 0.01 in space."""
+    sigma_rho_per_m: NotNegative | None = None
+    """Standard deviation of that; if absent 0.25 in the plane, 0.5 in space."""
 
 
 class AnchoredHomogeneousLandmark(_Depth):

@@ -33,6 +33,8 @@ class LogConfig(Section):
     """`hidden`: the filter is not told which landmark is which; the summary says how often it was wrong."""
     r_max: Positive | None = None
     """lost_in_the_woods: drop observations beyond this range."""
+    measured: Literal["range_bearing", "bearing"] | None = None
+    """lost_in_the_woods: take ranges and bearings, or bearings alone (range_bearing if absent)."""
     bearing_shift_s: Number | None = None
     """mrclam: added to the time of every observation."""
     robot_sightings: bool | None = None

@@ -5,7 +5,7 @@ parallax q = rho n, n = sqrt(|t|^2 + c2), not rho.  What they leave open, the sc
 along straight lines but rho along a hyperbola, so that a plain correction of rho reads the gap as news of the scale.
 Here it is the error of the parallax, d_q = n d_rho + g.(d_s - d_a) with g = rho t / n, that a correction adds to q and
 that keeps its meaning from x- to x+, just as xi does.  c2 = trace Cov(t) at the prediction: where the baseline is less
-than its own uncertainty, rho is corrected as it is.
+than its own uncertainty, rho is corrected as it is.  In space an anchor is an atom ANCHOR, in the plane the vector that a block with RHO begins with.
 
 A table of the `anchored` has the rows (rho's place in x and in P, its anchor's place in x and in P).  The sensor is
 at s, (2 or 3,), with the Jacobian S (., h) in the head: the robot's pose and, if it is in the map, the mount.
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import Index, columns, submatrix
-from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, X_AT, Table
+from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, VECTOR, X_AT, Table
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def anchored(atoms: Table) -> Table:
     rows = np.empty((len(atoms), 4), np.int64)
     count = anchor = 0
     for i in range(len(atoms)):
-        if atoms[i, KIND] == ANCHOR:
+        if atoms[i, KIND] == ANCHOR or atoms[i, KIND] == VECTOR:
             anchor = i
         elif atoms[i, KIND] == RHO:
             rows[count, RHO_X], rows[count, RHO_P] = atoms[i, X_AT], atoms[i, P_AT]

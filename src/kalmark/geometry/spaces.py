@@ -18,6 +18,7 @@ HOMOGENEOUS  4 / 4          E h, rho (the point h / rho)                        
 PLUECKER     6 / 6          E n, E v (the line of direction v, moment n)        -[n]x, -[v]x
 ANCHOR       3 / 3          as VECTOR3: where inverse distances count from      -[x]x
 RHO          1 / 1          as SCALAR: the inverse of a distance to the ANCHOR  0
+                            (in the plane, to the VECTOR its block begins with)
 ===========  =============  ==================================================  =================
 
 Orientation errors are world errors, R = Exp(d) R_hat, positions and landmarks are additive world vectors: Sola's 2-D
@@ -207,7 +208,7 @@ class Space:
     @cached_property
     def world(self) -> str:
         """Where it lives: "plane", "space", or "" for plain numbers, which fit either."""
-        if any(kind >= VECTOR3 for kind in self.kinds):
+        if any(kind >= VECTOR3 and kind != RHO for kind in self.kinds):
             return "space"
         return "plane" if any(kind in (VECTOR, HEADING) for kind in self.kinds) else ""
 

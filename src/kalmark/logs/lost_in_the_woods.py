@@ -17,6 +17,7 @@ from kalmark.logs.source import Format, Request, quantity
 from kalmark.slam.events import Control, Event, Scan, order
 
 ROBOT, SENSOR, FILE = "robot", "laser", "dataset2.mat"
+COLUMNS = {"range_bearing": ("range_m", "bearing_rad"), "bearing": ("bearing_rad",)}
 NAMES = ("t", "v", "om", "r", "b", "l", "x_true", "y_true", "th_true", "true_valid")
 
 
@@ -26,12 +27,16 @@ def find(path: Path) -> Path | None:
     return file if file.suffix == ".mat" and variables(file) >= set(NAMES) else None
 
 
-def read(path: Path, request: Request, r_max: Any = None) -> Log:
+def read(path: Path, request: Request, r_max: Any = None, measured: Any = "range_bearing") -> Log:
     """Return the log; ranges over `r_max` m are dropped, as the course does (None: all are kept).
+
+    Of what was `measured` only bearings may be asked for, "bearing".
 
     A control at t acts from t on and the scan at t is of the same instant; a range of 0 means "not seen".  A scan that
     saw nothing stays in the log, empty: the robot's path is scored there too.
     """
+    if measured not in COLUMNS:
+        raise LogError(f"{path}: measured is {measured!r}, expected {' or '.join(COLUMNS)}")
     limit = float("inf") if r_max is None else quantity(r_max, "r_max", 0.0)
     data = arrays(path, NAMES)
     t_ns = np.rint(column(data["t"]) * 1e9).astype(np.int64)
@@ -52,7 +57,7 @@ def read(path: Path, request: Request, r_max: Any = None) -> Log:
     for t, u, r, b in zip(t_ns.tolist(), controls, data["r"], data["b"], strict=True):
         events.append(Control(t_ns=t, robot=ROBOT, u=u))
         seen = np.flatnonzero((r > 0) & (r <= limit))
-        y = np.column_stack([r[seen], b[seen]])
+        y = np.column_stack([r[seen], b[seen]])[:, -len(COLUMNS[measured]) :]
         events.append(Scan(t_ns=t, robot=ROBOT, sensor=SENSOR, y=y, ids=(seen + 1).tolist()))
     return Log(
         name="lost_in_the_woods",
@@ -64,8 +69,8 @@ def read(path: Path, request: Request, r_max: Any = None) -> Log:
         landmarks={i + 1: position for i, position in enumerate(data["l"])},
         skipped=request.skipped,
         control_columns={ROBOT: ("v_mps", "w_radps")},
-        sensor_columns={(ROBOT, SENSOR): ("range_m", "bearing_rad")},
+        sensor_columns={(ROBOT, SENSOR): COLUMNS[measured]},
     )
 
 
-LOST_IN_THE_WOODS = Format("lost_in_the_woods", f"{FILE} or its folder", find, read, options=("r_max",))
+LOST_IN_THE_WOODS = Format("lost_in_the_woods", f"{FILE} or its folder", find, read, options=("r_max", "measured"))

@@ -1,7 +1,7 @@
 """Landmarks, and how they look from a pose: Euclidean points, points of unknown depth, tags, lines.
 
 A landmark of a kind that has a prior can be started by a sensor that does not see all of it: the prior says what is
-expected of the rest.  How the kinds of space look from a sensor is in `landmarks3d`, `lines` and `tags`.
+expected of the rest.  How they look from a sensor is in `landmarks2d`, `landmarks3d`, `lines` and `tags`.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.compiled import compiled
 from kalmark.geometry.directions import unit_many
-from kalmark.geometry.frames import from_frame_many, to_frame_many
 from kalmark.geometry.spaces import (
     ANCHOR,
     DIRECTION,
+    HEADING,
     HOMOGENEOUS,
     PLUECKER,
     POINT2,
@@ -29,38 +28,10 @@ from kalmark.geometry.spaces import (
     VECTOR3,
     Space,
 )
-from kalmark.models import landmarks3d, lines, seen, segments, tags
+from kalmark.models import landmarks2d, landmarks3d, lines, seen, segments, tags
 from kalmark.models.parameters import check_parameters
 
 Array = npt.NDArray[np.float64]
-
-
-@compiled
-def seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
-    """Return v (K, d) of points l (K, d) with d - 2 attributes, V_T (K, d, 3), V_l (K, d, d).  [S] (56)."""
-    k, d = l.shape
-    p, P_T, P_l = to_frame_many(T, l)
-    if d == 2:
-        return p, P_T, P_l
-    v, V_T, V_l = l.copy(), np.zeros((k, d, 3)), np.zeros((k, d, d))
-    v[:, :2], V_T[:, :2], V_l[:, :2, :2] = p, P_T, P_l
-    for j in range(2, d):
-        V_l[:, j, j] = 1.0
-    return v, V_T, V_l
-
-
-@compiled
-def from_view(T: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Return points l (K, d) with attributes that look like v (K, d) from T, L_T, L_v.  [S] (55)."""
-    k, d = v.shape
-    p, P_T, P_v = from_frame_many(T, v)
-    if d == 2:
-        return p, P_T, P_v
-    l, L_T, L_v = v.copy(), np.zeros((k, d, 3)), np.zeros((k, d, d))
-    l[:, :2], L_T[:, :2], L_v[:, :2, :2] = p, P_T, P_v
-    for j in range(2, d):
-        L_v[:, j, j] = 1.0
-    return l, L_T, L_v
 
 
 @dataclass(frozen=True)
@@ -69,15 +40,15 @@ class Point2D:
 
     kind: ClassVar[str] = "point"
     space: ClassVar[Space] = POINT2
-    look: ClassVar[Any] = staticmethod(seen_from)
+    look: ClassVar[Any] = staticmethod(landmarks2d.point_seen_from)
 
     def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
         """Return v (K, d), V_T (K, d, 3), V_l (K, d, d)."""
-        return seen_from(T, np.ascontiguousarray(l))
+        return landmarks2d.point_seen_from(T, np.ascontiguousarray(l))
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return l (K, d), L_T (K, d, 3), L_v (K, d, d)."""
-        return from_view(T, np.ascontiguousarray(v))
+        return landmarks2d.point_from_view(T, np.ascontiguousarray(v))
 
 
 @dataclass(frozen=True)
@@ -139,34 +110,57 @@ class _Depth(_Prior, _Spatial):
     prior_rho_per_m: float = 0.01
     sigma_rho_per_m: float = 0.5
 
+    space: ClassVar[Space]
     _from_view: ClassVar[Any]
     _to_point: ClassVar[Any]
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return l (K, n) on rays at inverse distances v (K, 4), L_T (K, n, 6), L_v (K, n, 4)."""
-        l, L_T, L_ray, L_rho = type(self)._from_view(T, np.ascontiguousarray(v[:, :3]), v[:, 3].copy())
+        """Return l (K, n) on rays at inverse distances v (K, d + 1), L_T (K, n, 6 or 3), L_v (K, n, d + 1)."""
+        l, L_T, L_ray, L_rho = type(self)._from_view(T, np.ascontiguousarray(v[:, :-1]), v[:, -1].copy())
         return l, L_T, np.concatenate([L_ray, L_rho], axis=2)
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, Array]:
-        """Return rays with inverse distances (K, 4), V_y and the covariance (K, 4, 4) of what was not measured."""
-        N = np.zeros((len(v), 4, 4))
-        if v.shape[1] == 4:
+        """Return rays with inverse distances (K, d + 1), V_y and the covariance of what was not measured."""
+        d = 2 if self.space.world == "plane" else 3
+        N = np.zeros((len(v), d + 1, d + 1))
+        if v.shape[1] == d + 1:
             return v, V_y, N
         ray, rho = v, np.full(len(v), self.prior_rho_per_m)
-        W_v = np.zeros((len(v), 4, 3))
-        W_v[:, :3] = np.eye(3)
+        W_v = np.zeros((len(v), d + 1, d))
+        W_v[:, :d] = np.eye(d)
         if depth:
             ray, W_v[:, :3] = unit_many(np.ascontiguousarray(v))
             rho = 1.0 / np.linalg.norm(v, axis=1)
             W_v[:, 3] = -ray * rho[:, None] ** 2
         else:
-            N[:, 3, 3] = self.sigma_rho_per_m**2
+            N[:, d, d] = self.sigma_rho_per_m**2
         return np.column_stack([ray, rho]), W_v @ V_y, N
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
-        """Return the Euclidean points p (K, 3) and P_l (K, 3, n)."""
+        """Return the Euclidean points p (K, d) and P_l (K, d, n)."""
         p, P_l = type(self)._to_point(np.ascontiguousarray(l))
         return p, P_l
+
+
+@dataclass(frozen=True)
+class InverseDepth2D(_Depth):
+    """Anchor, direction alpha and inverse depth rho (4), for sensors of bearings.  [S] 2.3.6, (48).
+
+    The default prior is [S] (47), rho in [0, 1 / d_min] with d_min = 1 m, as a Gaussian with both ends at two sigmas.
+    """
+
+    prior_rho_per_m: float = 0.5
+    sigma_rho_per_m: float = 0.25
+
+    kind: ClassVar[str] = "inverse_depth_2d"
+    space: ClassVar[Space] = Space("inverse_depth_2d", (VECTOR, HEADING, RHO))
+    look: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_seen_from)
+    _from_view = landmarks2d.inverse_depth_from_view
+    _to_point = landmarks2d.inverse_depth_to_point
+
+    def linearity(self, T: Array, l: Array, sigma_rho: Array) -> Array:
+        """Return the linearity indices (K,) seen from T."""
+        return landmarks2d.inverse_depth_linearity(T, l, sigma_rho)
 
 
 @dataclass(frozen=True)
@@ -351,4 +345,4 @@ class HomogeneousLine(_DepthsPrior):
 
 POINTS = (Point3D, InverseDepth3D, AnchoredHomogeneous, Homogeneous)
 LINES = (PlueckerLine, AnchoredPlueckerLine, InverseDepthLine, AnchoredHomogeneousLine, HomogeneousLine)
-BUILT_IN = (Point2D, PointSignature2D, *POINTS, Tag, *LINES)
+BUILT_IN = (Point2D, PointSignature2D, InverseDepth2D, *POINTS, Tag, *LINES)

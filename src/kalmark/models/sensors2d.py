@@ -234,10 +234,17 @@ class Bearing(Planar):
     code: ClassVar[int] = BEARING
     columns: ClassVar[tuple[str, ...]] = ("bearing_rad",)
     angular: ClassVar[tuple[bool, ...]] = (True,)
+    finds_depth: ClassVar[bool] = False
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point", "inverse_depth_2d")
 
     def noise(self, y: Array) -> Array:
         """Return R (K, 1, 1)."""
         return constant((self.sigma_bearing_rad**2,), len(y))
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return rays v (K, 2) of length 1 and V_y (K, 2, 1)."""
+        c, s = np.cos(y), np.sin(y)
+        return np.hstack([c, s]), np.stack([-s, c], axis=1)
 
 
 @dataclass(frozen=True)

@@ -153,8 +153,8 @@ class World(Section):
         values: dict[str, Any] = {"robots": {}}
         for name, robot in self.robots.items():
             values["robots"][name] = robot.model_dump(exclude={"route", "sensing"}, exclude_none=True)
-        if self.dimensions == 2:
-            values["landmarks"] = {"type": "point_signature" if self.has_signatures else "point"}
+        if self.has_signatures:
+            values["landmarks"] = {"type": "point_signature"}
         return values
 
     def to_yaml(self) -> str:

@@ -13,8 +13,9 @@ from kalmark.filter.estimators import Map
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.postponed import PostponedMap
 from kalmark.filter.storage import Triangle
-from kalmark.geometry.spaces import POINT3, RHO
-from kalmark.models.landmarks import Point3D
+from kalmark.geometry.spaces import RHO
+from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.models.protocols import Landmark
 from kalmark.slam.ends import extended_ends
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation
@@ -36,6 +37,14 @@ def new_map(type_: str, numbers: str) -> Map:
         if value not in known:
             raise ModelError(f"{what} is {value!r}, expected one of {', '.join(known)}")
     return PostponedMap(Triangle(NUMBERS[numbers])) if type_ == "postponed" else StochasticMap()
+
+
+def surveyed(kind: Landmark, mean: Any) -> Landmark:
+    """Return what a landmark of that mean is: a point, also where a sensor would start one of unknown depth."""
+    size = np.size(mean)
+    if not hasattr(kind, "prior_rho_per_m") or size == kind.space.size:
+        return kind
+    return Point2D() if kind.space.world == "plane" else Point3D()
 
 
 def let_grow(slam: Slam) -> None:
@@ -72,11 +81,12 @@ def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> 
         T = view.pose(map_, members.slots[robot])
         if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < slam.reparametrize:
             p, P_l = kind.to_point(l)
+            point: Landmark = Point2D() if len(p[0]) == 2 else Point3D()
             try:
-                place = map_.augment(POINT3, p[0], index, P_l[0], np.zeros((3, 3)))
+                place = map_.augment(point.space, p[0], index, P_l[0], np.zeros((len(p[0]),) * 2))
             except MapError:
                 return
-            members.place(name, place, Point3D())
+            members.place(name, place, point)
             map_.remove(slot)
 
 

@@ -13,7 +13,7 @@ from kalmark.models.protocols import Landmark
 from kalmark.slam.doubts import Doubts
 from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot
-from kalmark.slam.scene import ROBOT, Look, View
+from kalmark.slam.scene import EUCLIDEAN, ROBOT, Look, View
 from kalmark.slam.tentative import Tentative
 
 Array = npt.NDArray[np.float64]
@@ -109,4 +109,4 @@ class Members:
         groups: dict[int, tuple[Look, list[int]]] = {}
         for i, look in enumerate(looks):
             groups.setdefault(id(look), (look, []))[1].append(i)
-        return sorted(groups.values(), key=lambda group: group[0].landmark.kind != "point3")
+        return sorted(groups.values(), key=lambda group: group[0].landmark.kind not in EUCLIDEAN)

@@ -15,7 +15,7 @@ from kalmark.filter import kernels
 from kalmark.filter.corrections import add_blocks, innovation, observed_block
 from kalmark.filter.estimators import Map
 from kalmark.models import landmarks as kinds
-from kalmark.models.landmarks import Point2D, Point3D, PointSignature2D, Tag
+from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Tag
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.models.sensors import TagPose
@@ -34,6 +34,7 @@ AT_ONCE = 32  # landmarks whose joint covariance is looked at
 
 ROBOT = "robot"
 ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one view applies to
+EUCLIDEAN = ("point", "point3")
 BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
 
 
@@ -83,7 +84,7 @@ class View:
         self.dof = self._dof()
         self.gate = self.association.threshold(self.dof, slam.estimator.default_gate)
         depth = getattr(self.sensor, "finds_depth", True) or hasattr(self.landmark, "prior_rho_per_m")
-        self.starts = isinstance(self.sensor, FullSensor) and (depth or self.landmark.kind != "point3")
+        self.starts = isinstance(self.sensor, FullSensor) and (depth or self.landmark.kind not in EUCLIDEAN)
         full = isinstance(self.sensor, FullSensor) and getattr(self.sensor, "finds_depth", True)
         self.tells_places = full and all(has_place(look.landmark.space) for look in self.looks.values())
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive
@@ -106,6 +107,8 @@ class View:
     def _refuse_misfit(self) -> None:
         """Refuse a kind of landmark that one of kalmark's own sensors does not see."""
         sensor, kind = type(self.sensor).__name__, self.landmark.kind
+        if isinstance(self.landmark, InverseDepth2D) and getattr(self.sensor, "finds_depth", True):
+            raise ModelError(f"a {sensor} does not see the rays to landmarks of unknown depth, {kind}, expected point")
         if not self.looks[kind].built_in:
             return
         seen = getattr(self.sensor, "sees_kinds", None)
@@ -230,6 +233,8 @@ def _natural(mount: Mount) -> Landmark:
     if "size_m" in mount.sensor.columns or "qw" in mount.sensor.columns:
         return Tag()
     if len(mount.at) == 3:
+        if not getattr(mount.sensor, "finds_depth", True):
+            return InverseDepth2D()
         return PointSignature2D() if "signature" in mount.sensor.columns else Point2D()
     seen = getattr(mount.sensor, "sees_kinds", ("point3",))
     if "point3" not in seen:

@@ -350,7 +350,7 @@ class Slam:
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
         name = checked_id(name, "landmark")
-        kind = landmark or next((v.landmark for v in self._views.values()), Point2D())
+        kind = landmark or lifecycle.surveyed(next((v.landmark for v in self._views.values()), Point2D()), mean)
         self.refuse_other_world(kind.kind, kind.space.world)
         if name in self.members.slots:
             raise MapError(f"landmark {name!r} is in the map already, expected a new id")
