@@ -149,7 +149,7 @@ def test_an_unknown_start_leaves_the_map_relative_to_the_robot_as_it_was() -> No
     lost = run(events, km.Slam([rover(cov=np.diag([0.5, 0.5, 20 * DEG]) ** 2)]))
     for i in (1, 2, 3):
         a, b = (km.geometry.to_frame(s.mean("r"), place(s, i)[None])[0] for s in (sure, lost))
-        np.testing.assert_allclose(a, b, atol=1e-3)  # what there is comes with c2, docs/bearing_only.md
+        np.testing.assert_allclose(a, b, atol=1e-7)
 
 
 def place(slam: km.Slam, i: int) -> np.ndarray:

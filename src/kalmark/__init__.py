@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from kalmark.results.run import Run
     from kalmark.slam import association
     from kalmark.slam.attention import Attention
+    from kalmark.slam.delayed import Delayed
     from kalmark.slam.events import Control, Fix, Scan
     from kalmark.slam.report import Observation, Report
     from kalmark.slam.robot import Mount, Robot
@@ -34,9 +35,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Attention", "Control", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run", "Scan",
-    "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "landmarks", "motion", "open_log", "pointwise",
-    "record", "sensors",
+    "Attention", "Control", "Delayed", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run",
+    "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "landmarks", "motion", "open_log",
+    "pointwise", "record", "sensors",
 ]  # fmt: skip
 
 _MODULES = {
@@ -51,6 +52,7 @@ _MODULES = {
 _NAMES = {
     "Attention": "kalmark.slam.attention",
     "Control": "kalmark.slam.events",
+    "Delayed": "kalmark.slam.delayed",
     "Fix": "kalmark.slam.events",
     "Log": "kalmark.logs",
     "Mount": "kalmark.slam.robot",

@@ -141,6 +141,8 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
         own["attention"] = Attention(**sensor.attention.model_dump())
     if sensor.upkeep is not None:
         own["upkeep"] = Upkeep(**sensor.upkeep.model_dump())
+    if world == "plane" and sensor.initialization.type != "immediate":
+        own["initialization"] = _build(config, (*path, "initialization"), sensor.initialization)
     try:
         return Mount(_build(config, path, sensor), at=pose_of(sensor.mount), **own)
     except ModelError as error:

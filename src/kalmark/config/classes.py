@@ -15,6 +15,7 @@ from kalmark.filter import estimators
 from kalmark.geometry.rotations import from_euler
 from kalmark.models import landmarks, motion, sensors
 from kalmark.slam import association
+from kalmark.slam.delayed import Delayed
 
 Array = npt.NDArray[np.float64]
 
@@ -49,6 +50,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "inverse_depth_line": landmarks.InverseDepthLine,
     "anchored_homogeneous_line": landmarks.AnchoredHomogeneousLine,
     "homogeneous_line": landmarks.HomogeneousLine,
+    "delayed": Delayed,
     "identity": association.ByIdentity,
     "nearest": association.NearestNeighbour,
     "global": association.GlobalAssignment,
@@ -65,7 +67,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "fej": estimators.Fej,
 }
 IN_SPACE: dict[str, Callable[..., Any]] = {"point": landmarks.Point3D, "inverse_depth": landmarks.InverseDepth3D}
-MOUNTED = frozenset({"mount", "landmark", "association", "attention", "upkeep", "detector"})
+MOUNTED = frozenset({"mount", "landmark", "association", "attention", "upkeep", "initialization", "detector"})
 
 
 def model_of(section: Section, world: str = "plane") -> Any:

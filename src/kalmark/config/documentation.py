@@ -84,6 +84,7 @@ def page() -> str:
     parts += [_choice("`robots.NAME.sensors.SENSOR`, in space", models.SpaceSensor, "sensor", mounting.SpaceMounted)]
     parts += [_choice("`robots.NAME.sensors.SENSOR.detector`", detectors.Detector, None)]
     parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in the plane", mounting.MountConfig)]
+    parts += [_choice("`robots.NAME.sensors.SENSOR.initialization`, in the plane", mounting.Initialization, None)]
     parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in space", mounting.SpaceMountConfig)]
     parts += [_choice("`landmarks`, and `landmark` of a sensor", landmarks.Landmark, "landmark")]
     parts += [_choice("`association`, also of a sensor", landmarks.Association, "association")]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from kalmark.config.landmarks import Association, Landmark
-from kalmark.config.sections import Limit, NotNegative, Number, Reserved, Section, Sigmas, expected
+from kalmark.config.sections import Limit, NotNegative, Number, Positive, Reserved, Section, Sigmas, expected, type_or
 
 Most = Annotated[int, Field(ge=0)] | None
 Count = Annotated[int, Field(ge=1)]
@@ -154,8 +154,43 @@ class Mounted(Section):
     """How landmarks are found in raw scans: for `range_bearing` and `range_bearing_signature`, else reserved."""
 
 
+class ImmediateInitialization(Section):
+    """Start landmarks at first sight; of bearings alone with an unknown depth, `landmark: {type: inverse_depth}`."""
+
+    type: Literal["immediate"] = "immediate"
+
+
+class DelayedInitialization(Section):
+    """Start landmarks when intersections of past measurements have persisted: docs/bearing_only.md."""
+
+    type: Literal["delayed"] = "delayed"
+    persistence: Count = 4
+    """Intersections that must have been merged into one."""
+    distance: Positive = 3.0
+    """Bhattacharyya distance up to which two Gaussians are of one landmark."""
+    spacing_m: Positive = 0.5
+    """Poses are kept every so many m of the way."""
+    poses: Annotated[int, Field(ge=3)] = 20
+    """So many of them, the last ones."""
+    precision: Positive = 0.1
+    """A landmark starts when its sigma is below this part of its distance."""
+    patience: Count = 3
+    """A candidate is dropped when it was in view and not seen at so many kept poses in a row."""
+    candidates: Count = 200
+    """At most so many candidates, the most persistent ones."""
+
+
+Initialization = Annotated[
+    Annotated[ImmediateInitialization, Tag("immediate")] | Annotated[DelayedInitialization, Tag("delayed")],
+    Discriminator(type_or("immediate")),
+]
+
+
 class PlaneMounted(Mounted):
     """What every sensor of the plane has."""
+
+    initialization: Initialization = ImmediateInitialization()
+    """Start landmarks at first sight, or late; late ones are points."""
 
     mount: MountConfig = MountConfig()
     """Where the sensor sits on the robot."""

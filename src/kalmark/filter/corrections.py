@@ -207,7 +207,7 @@ def iterate(
     depths = anchored(table if most > 1 else table[:0])  # a single step is worse off with it: docs/bearing_only.md
     s, S = s_j, S_j = sensor_at(view, mean[:head])
     h = S.shape[1]
-    baselines = (depths, s, S, spread(P_ss, np.arange(h), S, depths))
+    baselines = (depths, s, S, spread(P_ss, np.arange(h), mean, s, S, depths))
     x_j, (z, E_r, E_l) = mean, linear
     for j in range(most):
         if j > 0:
@@ -270,7 +270,7 @@ def invariant(
     depths = anchored(atoms if limits[0] > 1 else atoms[:0])
     s, S = sensor_at(view, mean[:head])
     rows = index[: S.shape[1]]
-    baselines = (depths, s, S, spread(P, rows, S, depths))
+    baselines = (depths, s, S, spread(P, rows, x, s, S, depths))
     W, correction = gain(P, n, index, H, M, v)
     retract(atoms, x, correction, gauge(mean, correction[index], pose, axes))
     theta = index[(3 if pose == 3 else 6) - axes]

@@ -5,7 +5,8 @@ parallax q = rho n, n = sqrt(|t|^2 + c2), not rho.  What they leave open, the sc
 along straight lines but rho along a hyperbola, so that a plain correction of rho reads the gap as news of the scale.
 Here it is the error of the parallax, d_q = n d_rho + g.(d_s - d_a) with g = rho t / n, that a correction adds to q and
 that keeps its meaning from x- to x+, just as xi does.  c2 = trace Cov(t) at the prediction: where the baseline is less
-than its own uncertainty, rho is corrected as it is.  In space an anchor is an atom ANCHOR, in the plane the vector that a block with RHO begins with.
+than its own uncertainty, rho is corrected as it is.  In space an anchor is an atom ANCHOR, in the plane the vector that
+a block with RHO begins with.
 
 A table of the `anchored` has the rows (rho's place in x and in P, its anchor's place in x and in P).  The sensor is
 at s, (2 or 3,), with the Jacobian S (., h) in the head: the robot's pose and, if it is in the map, the mount.
@@ -42,13 +43,20 @@ def anchored(atoms: Table) -> Table:
 
 
 @compiled
-def spread(P: Array, head: Index, S: Array, table: Table) -> Array:
-    """Return c2 = trace Cov(s - a) of each row of the table; `head` are the rows of P of the head."""
+def spread(P: Array, head: Index, x: Array, s: Array, S: Array, table: Table) -> Array:
+    """Return c2 = trace Cov(s - a) of each row of the table; `head` are the rows of P of the head.
+
+    In the plane it is that of t without its turn with the robot's heading, which tells nothing of its length.
+    """
     size, h = S.shape
     c2, rows, D = np.empty(len(table)), np.empty(h + size, np.int64), np.zeros((size, h + size))
-    D[:, :h], D[:, h:] = S, -np.eye(size)
     rows[:h] = head
     for i in range(len(table)):
+        D[:, :h], D[:, h:] = S, -np.eye(size)
+        if size == 2:
+            a = table[i, ANCHOR_X]
+            D[0, 2] += s[1] - x[a + 1]
+            D[1, 2] -= s[0] - x[a]
         rows[h:] = np.arange(table[i, ANCHOR_P], table[i, ANCHOR_P] + size)
         c2[i] = np.trace(D @ submatrix(P, rows) @ D.T) + 1e-12
     return c2

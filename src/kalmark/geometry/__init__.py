@@ -14,9 +14,12 @@ from kalmark.geometry.frames import (
     to_frame,
 )
 from kalmark.geometry.gaussian import (
+    between,
+    bhattacharyya,
     compound,
     ellipse,
     gate,
+    intersection,
     mahalanobis,
     merge,
     sigma_probability,
@@ -25,7 +28,8 @@ from kalmark.geometry.gaussian import (
 from kalmark.geometry.spaces import POINT2, POINT3, SE2, SE3, Rn, Space
 
 __all__ = [
-    "POINT2", "POINT3", "SE2", "SE3", "Rn", "Space", "V", "V_inverse", "compose", "compound", "directions", "ellipse",
-    "frames3d", "from_frame", "gate", "inv_observe", "inv_scan", "inverse", "mahalanobis", "merge", "move", "observe",
-    "rotation", "rotations", "scan", "sigma_probability", "sigma_table", "to_frame", "wrap",
+    "POINT2", "POINT3", "SE2", "SE3", "Rn", "Space", "V", "V_inverse", "between", "bhattacharyya", "compose",
+    "compound", "directions", "ellipse", "frames3d", "from_frame", "gate", "intersection", "inv_observe", "inv_scan",
+    "inverse", "mahalanobis", "merge", "move", "observe", "rotation", "rotations", "scan", "sigma_probability",
+    "sigma_table", "to_frame", "wrap",
 ]  # fmt: skip

@@ -1,6 +1,7 @@
-"""Gaussians: ellipses, Mahalanobis distance, gates, and uncertain transforms compounded and merged.
+"""Gaussians: ellipses, distances, gates, and uncertain transforms compounded, intersected and merged.
 
-[S] App. B for the first three; Smith and Cheeseman's approximate transformations, as in [T] 2, for the last two.
+[S] App. B for ellipses, Mahalanobis distance and gates; Smith and Cheeseman's approximate transformations, as in [T] 2,
+for the rest.  How landmarks are started from them is in `kalmark.slam.delayed`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames import compose
+from kalmark.geometry.frames import compose, inverse
 
 Array = npt.NDArray[np.float64]
 
@@ -28,6 +29,18 @@ def mahalanobis(x: Any, mean: Any, cov: Any) -> float:
     """Return the Mahalanobis distance (not its square) of x from a Gaussian.  [S] (83)."""
     d = np.asarray(x, dtype=np.float64) - np.asarray(mean, dtype=np.float64)
     return float(np.sqrt(d @ np.linalg.solve(np.asarray(cov, dtype=np.float64), d)))
+
+
+def bhattacharyya(a: Any, A: Any, b: Any, B: Any) -> float:
+    """Return the Bhattacharyya distance between two Gaussians (n,): how far apart they are, and how unlike.  [T] 2.
+
+    (a - b)' (A + B)^-1 (a - b) / 4 + log(det((A + B) / 2) / sqrt(det A det B)) / 2.
+    """
+    A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
+    d = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
+    _, both = np.linalg.slogdet((A + B) / 2)
+    apart = d @ np.linalg.solve(A + B, d) / 4
+    return float(apart + (both - (np.linalg.slogdet(A)[1] + np.linalg.slogdet(B)[1]) / 2) / 2)
 
 
 def gate(probability: float, dof: int) -> float:
@@ -70,3 +83,37 @@ def merge(a: Any, A: Any, b: Any, B: Any) -> tuple[Array, Array]:
         c[2] = wrap(c[2])
     C = A - K @ A
     return c, (C + C.T) / 2
+
+
+def between(a: Any, b: Any) -> tuple[Array, Array, Array]:
+    """Return the frame b as seen from the frame a, c = a^-1 o b (3,), with C_a and C_b (3, 3)."""
+    back, A_a = inverse(np.array(a, dtype=np.float64))
+    c, C_back, C_b = compose(back, np.array(b, dtype=np.float64))
+    return c, C_back @ A_a, C_b
+
+
+def intersection(a: Any, b: Any) -> tuple[Array, Array, Array]:
+    """Return where two rays meet, p (..., 2), with P_a and P_b (..., 2, 3).  [T] 2.
+
+    A ray is a frame (..., 3) and runs along its x axis; p is NaN where they do not meet ahead of both.
+    """
+    a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+    u_a, u_b = (np.stack([np.cos(r[..., 2]), np.sin(r[..., 2])], axis=-1) for r in (a, b))
+    w = b[..., :2] - a[..., :2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sin = _cross(u_a, u_b)
+        t_a, t_b = _cross(w, u_b) / sin, _cross(w, u_a) / sin
+        p = a[..., :2] + t_a[..., None] * u_a
+        P_a, P_b = _moved(u_a, u_b, t_a, sin), _moved(u_b, u_a, t_b, -sin)
+    p[~((t_a > 0) & (t_b > 0))] = np.nan
+    return p, P_a, P_b
+
+
+def _cross(u: Array, v: Array) -> Array:
+    return np.asarray(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
+
+
+def _moved(u: Array, other: Array, t: Array, sin: Array) -> Array:
+    """Return how the point at t along the ray u moves with that ray: along the other one, by what u moves across."""
+    across = np.stack([-u[..., 1], u[..., 0], t], axis=-1)  # of the point, with (x, y, heading)
+    return np.asarray(-other[..., :, None] * across[..., None, :] / -sin[..., None, None])

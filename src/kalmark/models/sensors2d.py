@@ -13,6 +13,7 @@ import numpy.typing as npt
 from kalmark.compiled import compiled
 from kalmark.errors import EventError
 from kalmark.geometry.frames import inv_scan_many, scan_many
+from kalmark.geometry.gaussian import intersection
 from kalmark.models.parameters import check_parameters
 from kalmark.models.seen import residual
 
@@ -245,6 +246,12 @@ class Bearing(Planar):
         """Return rays v (K, 2) of length 1 and V_y (K, 2, 1)."""
         c, s = np.cos(y), np.sin(y)
         return np.hstack([c, s]), np.stack([-s, c], axis=1)
+
+    def meet(self, T: Array, y: Array, y2: Array) -> Array:
+        """Return where the rays y (K, 1) from the origin and y2 (K, 1) from T meet: (K, 1, 2), NaN if nowhere."""
+        at_origin = np.column_stack([np.zeros((len(y), 2)), y])
+        at_T = np.column_stack([np.tile(T[:2], (len(y2), 1)), T[2] + y2])
+        return intersection(at_origin, at_T)[0][:, None]
 
 
 @dataclass(frozen=True)

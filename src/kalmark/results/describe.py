@@ -43,6 +43,7 @@ TYPES = {
     "AnchoredHomogeneousLine": "anchored_homogeneous_line",
     "HomogeneousLine": "homogeneous_line",
     "PointSignature2D": "point_signature",
+    "Delayed": "delayed",
     "ByIdentity": "identity",
     "NearestNeighbour": "nearest",
     "GlobalAssignment": "global",
@@ -116,7 +117,7 @@ def _robot(robot: Any) -> dict[str, Any]:
         at = describe_pose(mount.at)
         if any(at.values()):
             sensor["mount"] = at
-        for part in ("landmark", "association", "detector"):
+        for part in ("landmark", "association", "detector", "initialization"):
             if getattr(mount, part, None) is not None:
                 sensor[part] = model(getattr(mount, part))
         attention = getattr(mount, "attention", None)

@@ -13,7 +13,7 @@ from kalmark.errors import MapError
 from kalmark.filter import estimators
 from kalmark.models import landmarks, motion, sensors
 from kalmark.models.protocols import Landmark
-from kalmark.slam import association, attention, upkeep
+from kalmark.slam import association, attention, delayed, upkeep
 from kalmark.slam.robot import Mount, Robot
 
 State = dict[str, Any]
@@ -27,6 +27,7 @@ MODULES = {
     "attention": (attention, "hopeless"),
     "upkeep": (upkeep, "hopeless"),
     "detector": (detect, "detect"),
+    "initialization": (delayed, "is_ripe"),
 }
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 
@@ -84,6 +85,7 @@ def robot_described(robot: Robot) -> State:
                 "detector": None if mount.detector is None else described(mount.detector),
                 "attention": described(mount.attention),
                 "upkeep": None if mount.upkeep is None else described(mount.upkeep),
+                "initialization": None if mount.initialization is None else described(mount.initialization),
                 "cov": None if mount.cov is None else np.asarray(mount.cov).tolist(),
             },
         ]
@@ -105,8 +107,9 @@ def _robot_restored(d: State) -> Robot:
         paired = m["association"] and restored("association", m["association"], f"{what}: association", "robots")
         budget = restored("attention", m["attention"], f"{what}: attention", "robots")
         cleaned = m.get("upkeep") and restored("upkeep", m["upkeep"], f"{what}: upkeep", "robots")
+        late = m.get("initialization") and restored("initialization", m["initialization"], what, "robots")
         sensor = restored("sensor", m["sensor"], what, "robots")
-        mounts[name] = Mount(sensor, m["at"], landmark, paired, finds or None, budget, m["cov"], cleaned)
+        mounts[name] = Mount(sensor, m["at"], landmark, paired, finds or None, budget, m["cov"], cleaned, late)
     return Robot(d["name"], restored("motion", d["motion"], f"{who}: motion", "robots"), d["start"], mounts, d["cov"])
 
 

@@ -16,6 +16,7 @@ from kalmark.models.protocols import Landmark, Motion, Sensor
 from kalmark.slam.attention import EVERYTHING, Attention
 from kalmark.slam.checks import covariance, instance
 from kalmark.slam.decisions import Association
+from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Scan, finite, shown
 from kalmark.slam.upkeep import Upkeep
 
@@ -50,8 +51,9 @@ class Mount:
 
     `landmark` is the type of landmark this sensor starts and `association` its own, if not the slam's.  `detector`
     turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
-    and unmakes a landmark, if not the slam's.  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is
-    uncertain: a block of the map, called "robot.sensor", that calibrates itself.
+    and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight).  With
+    `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map, called "robot.sensor",
+    that calibrates itself.
     """
 
     sensor: Sensor
@@ -62,6 +64,7 @@ class Mount:
     attention: Attention = EVERYTHING
     cov: Any = None
     upkeep: Upkeep | None = None
+    initialization: Delayed | None = None
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
@@ -70,6 +73,8 @@ class Mount:
         instance(self.attention, Attention, "Mount: attention", "an Attention")
         if self.upkeep is not None:
             instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")
+        if self.initialization is not None:
+            instance(self.initialization, Delayed, "Mount: initialization", "a Delayed")
         object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
 
     def covariance(self, dof: int, what: str) -> Array | None:

@@ -19,6 +19,7 @@ from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSign
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.models.sensors import TagPose
+from kalmark.slam.delayed import Waiting
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.nearby import has_place
 from kalmark.slam.robot import Mount
@@ -35,6 +36,7 @@ AT_ONCE = 32  # landmarks whose joint covariance is looked at
 ROBOT = "robot"
 ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one view applies to
 EUCLIDEAN = ("point", "point3")
+TINY_RHO = 1e-9  # 1 / m: as good as infinitely far
 BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
 
 
@@ -74,6 +76,7 @@ class View:
         self.at: Array = np.array(mount.at)  # writable, like all else: numba compiles per kind of array
         self.mount = slot  # of the mount in the map, -1 if it is not there
         self.landmark: Landmark = mount.landmark or landmarks or _natural(mount)
+        self.delayed, self.waiting = mount.initialization, Waiting()
         slam.refuse_other_world(type(self.sensor).__name__, getattr(self.sensor, "world", ""))
         slam.refuse_other_world(self.landmark.kind, self.landmark.space.world)
         self.association = mount.association or slam.association
@@ -109,6 +112,10 @@ class View:
         sensor, kind = type(self.sensor).__name__, self.landmark.kind
         if isinstance(self.landmark, InverseDepth2D) and getattr(self.sensor, "finds_depth", True):
             raise ModelError(f"a {sensor} does not see the rays to landmarks of unknown depth, {kind}, expected point")
+        if self.delayed is not None and not (hasattr(self.sensor, "meet") and kind == "point"):
+            raise ModelError(
+                f"a {sensor} does not start a {kind} late: expected one that has meet(), and points of the plane"
+            )
         if not self.looks[kind].built_in:
             return
         seen = getattr(self.sensor, "sees_kinds", None)
@@ -160,7 +167,10 @@ class View:
         T, l = self.pose(map_, robot), map_.means(np.array(slots), look.d)
         sensor: Any = self.sensor
         if not hasattr(look.landmark, "endpoints"):
-            return np.flatnonzero(sensor.sees(look.landmark.seen_from(T, l)[0]))
+            v = look.landmark.seen_from(T, l)[0]
+            if isinstance(look.landmark, InverseDepth2D):  # a ray, as long as rho times the distance
+                v = v / np.maximum(l[:, -1:], TINY_RHO)
+            return np.flatnonzero(sensor.sees(v))
         p, _ = look.landmark.endpoints(l, np.array(ends))
         return np.flatnonzero(sensor.sees_segments(T, p[:, 0], p[:, 1])[0])
 
@@ -233,7 +243,7 @@ def _natural(mount: Mount) -> Landmark:
     if "size_m" in mount.sensor.columns or "qw" in mount.sensor.columns:
         return Tag()
     if len(mount.at) == 3:
-        if not getattr(mount.sensor, "finds_depth", True):
+        if not getattr(mount.sensor, "finds_depth", True) and mount.initialization is None:
             return InverseDepth2D()
         return PointSignature2D() if "signature" in mount.sensor.columns else Point2D()
     seen = getattr(mount.sensor, "sees_kinds", ("point3",))

@@ -24,7 +24,7 @@ from kalmark.geometry.spaces import Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
-from kalmark.slam import budget, lifecycle, tentative
+from kalmark.slam import budget, delayed, lifecycle, tentative
 from kalmark.slam.approach import approach
 from kalmark.slam.association import ByIdentity
 from kalmark.slam.averaging import average
@@ -236,6 +236,9 @@ class Slam:
         """Count the sightings of tentative landmarks; fuse those that confirm one."""
         seen, confirmed = tentative.sightings(self, view, event, new, decisions, R)
         yield from seen.items()
+        yield from delayed.sightings(
+            self, view, event, [k for k in new if k not in {**seen, **confirmed}], decisions, R
+        )
         told = [confirmed.get(k, decision) for k, decision in enumerate(decisions)]
         for done in self._correct(event, report, view, list(confirmed), ids, told, R) if confirmed else ():
             yield done.index, done._replace(outcome="new", reason=told[done.index][1])

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from kalmark.errors import KalmarkError, MapError
 from kalmark.filter.estimators import Estimator
-from kalmark.geometry.spaces import Rn, Space
+from kalmark.geometry.spaces import SE2, Rn, Space
 from kalmark.models.protocols import Landmark
 from kalmark.slam.decisions import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
@@ -28,6 +28,7 @@ from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
 from kalmark.slam.store_map import map_arrays, map_described, map_restored
+from kalmark.slam.store_waiting import waiting_described, waiting_restored
 from kalmark.slam.tentative import Tentative
 from kalmark.slam.upkeep import CAREFUL
 
@@ -76,6 +77,7 @@ def _state(slam: Slam) -> State:
         "tentative": [
             [name, t.slot, described(t.kind), t.hits, t.chances, t.unseen] for name, t in slam.members.tentative.items()
         ],
+        "waiting": waiting_described(slam),
         "seen": [[_id(name), count] for name, count in slam.members.seen.items()],
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
@@ -186,6 +188,7 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.ends = {i: np.array(t, dtype=np.float64).reshape(2) for i, t in state["ends"]}
     slam.members.doubts.open = {i: _doubt(i, *rest) for i, *rest in state["doubts"]}
     slam.members.tentative = {i: _tentative(i, own, *rest) for i, *rest in state.get("tentative", ())}
+    waiting_restored(slam, state.get("waiting", []))
     slam.members.unnamed = _count(state["unnamed"], "unnamed")
     slam.t_ns = _time(state["t_ns"])
     _check_owners(slam)
@@ -219,6 +222,8 @@ def _check_owners(slam: Slam) -> None:
         raise MapError("the slots' names are not those of the robots and landmarks")
     owners = [(f"{name!r}", slot, spaces[name]) for name, slot in slam.members.slots.items()]
     owners += [(f"tentative {name!r}", t.slot, t.kind.space) for name, t in slam.members.tentative.items()]
+    for view in slam._views.values():
+        owners += [(f"kept pose {n}", slot, SE2) for n, slot in view.waiting.poses.items()]
     for name, slot in slam._errors.items():
         owners.append((f"the error of {name!r}", slot, Rn(len(slam.robots[name].motion.columns))))
     used = [i for i, space in enumerate(slam.map.spaces) if space is not None]
