@@ -163,13 +163,14 @@ def _joined(
     assert policy is not None
     joined: dict[int, list[Candidate]] = {k: [] for k in sights}
     made: dict[int, list[Candidate]] = {k: [] for k in sights}
-    here, frames = next(iter(sights.values())).at, dict[int, tuple[Array, Array]]()
+    sensor, here = view.calibrated(slam.map), next(iter(sights.values())).at
+    frames: dict[int, tuple[Array, Array]] = {}
     for c in waiting.candidates:
         first, best = c.sights[0], None
         if first.at not in frames:
             frames[first.at] = _relative(slam, view, first.at, here)
         mine = {k: sight for k, sight in sights.items() if names[k] == c.name}
-        for k, mean, cov in _places(view, frames[first.at], first, mine) if mine else ():
+        for k, mean, cov in _places(view, sensor, frames[first.at], first, mine) if mine else ():
             if c.mean is None:
                 made[k].append(Candidate(c.name, [first, sights[k]], mean, cov))
                 continue
@@ -199,7 +200,7 @@ def _in_view(view: View, T: Array, p: Array) -> int:
 
 
 def _places(
-    view: View, frame: tuple[Array, Array], first: Sight, others: dict[int, Sight]
+    view: View, sensor: Any, frame: tuple[Array, Array], first: Sight, others: dict[int, Sight]
 ) -> Iterator[tuple[int, Array, Array]]:
     """Yield the Gaussians (2,), (2, 2) of where measurements meet a first one, in the frame of the first one's sensor.
 
@@ -207,7 +208,6 @@ def _places(
     Jacobians follow from those of what is expected, F p_x = -F_x.
     """
     T, C = frame
-    sensor: Any = view.sensor
     y = np.array([sight.y for sight in others.values()])
     p = sensor.meet(T, np.tile(first.y, (len(y), 1)), y)
     rows, which = np.nonzero(np.isfinite(p).all(axis=2))
@@ -231,11 +231,15 @@ def _places(
 def _relative(slam: Slam, view: View, a: int, b: int) -> tuple[Array, Array]:
     """Return the pose of the sensor at b as seen from that at a, (3,), and its covariance (3, 3)."""
     slots = [view.waiting.poses[a], view.waiting.poses[b]]
-    at = view.at if view.mount < 0 else slam.map.mean(view.mount)
-    (S, S_a, _), (T, T_b, _) = (compose(slam.map.mean(slot), at) for slot in slots)
+    (S, S_a, _), (T, T_b, _) = (compose(slam.map.mean(slot), _mount(slam, view)) for slot in slots)
     c, C_S, C_T = between(S, T)
     J = np.hstack([C_S @ S_a, C_T @ T_b])
     return c, J @ slam.map.covariance(slots) @ J.T
+
+
+def _mount(slam: Slam, view: View) -> Array:
+    """Return where the sensor sits on its robot, as far as is known."""
+    return view.at if view.mount < 0 else slam.map.mean(view.mount)[:3]
 
 
 def _forget_hopeless(view: View) -> None:
@@ -285,7 +289,7 @@ def _filled(slam: Slam, view: View, c: Candidate, found: Solution) -> tuple[Solu
     Where two landmarks were in line for a while and something else across, there was nothing to be seen in between.
     """
     waiting, gap, longest = view.waiting, 0, 0
-    own = {sight.at for sight in c.sights}
+    own, size = {sight.at for sight in c.sights}, len(found.rows) - 3 * (len(c.sights) - 1)
     sights = {(s.at, s.k): s for other in waiting.candidates if other.name == c.name for s in other.sights}
     for at in [n for n in waiting.poses if c.sights[0].at < n < c.sights[-1].at]:
         T = view.pose(slam.map, waiting.poses[at])
@@ -293,7 +297,7 @@ def _filled(slam: Slam, view: View, c: Candidate, found: Solution) -> tuple[Solu
             gap = 0
             continue
         gap, here = gap + 1, [s for s in sights.values() if s.at == at]
-        off = [_linearized(slam, view, Candidate(c.name, [s]), found.p, 3 if view.mount < 0 else 6)[0] for s in here]
+        off = [_linearized(slam, view, Candidate(c.name, [s]), found.p, size)[0] for s in here]
         for i in np.argsort([np.linalg.norm(z) for z in off])[:1].tolist():
             more = Candidate(c.name, sorted([*c.sights, here[i]], key=lambda s: s.at), c.mean, c.cov)
             better = _solved(slam, view, more)
@@ -353,10 +357,10 @@ def _solved(slam: Slam, view: View, c: Candidate) -> Solution:
             break
     z = z - E @ step
     chi2 = float(z @ np.linalg.solve(H @ P @ H.T + R, z))
-    last = view.pose(map_, view.waiting.poses[c.sights[-1].at])
+    last = view.pose(map_, slots[n - 1])
     v, V_T, V_p = (a[0] for a in view.landmark.seen_from(last, p[None]))
     V_P = np.zeros((2, len(P)))
-    V_P[:, 3 * (n - 1) : 3 * n] = V_T @ compose(map_.mean(view.waiting.poses[c.sights[-1].at]), view.at)[1]
+    V_P[:, 3 * (n - 1) : 3 * n] = V_T @ compose(map_.mean(slots[n - 1]), _mount(slam, view))[1]
     worst = 0.0
     for i in range(n):
         keep = np.repeat(np.arange(n) != i, m)

@@ -236,9 +236,8 @@ class Slam:
         """Count the sightings of tentative landmarks; fuse those that confirm one."""
         seen, confirmed = tentative.sightings(self, view, event, new, decisions, R)
         yield from seen.items()
-        yield from delayed.sightings(
-            self, view, event, [k for k in new if k not in {**seen, **confirmed}], decisions, R
-        )
+        left = [k for k in new if k not in seen and k not in confirmed]
+        yield from delayed.sightings(self, view, event, left, decisions, R)
         told = [confirmed.get(k, decision) for k, decision in enumerate(decisions)]
         for done in self._correct(event, report, view, list(confirmed), ids, told, R) if confirmed else ():
             yield done.index, done._replace(outcome="new", reason=told[done.index][1])
