@@ -27,7 +27,7 @@ from kalmark.geometry.frames import compose
 from kalmark.geometry.gaussian import between, bhattacharyya, gate, merge
 from kalmark.geometry.spaces import SE2
 from kalmark.models.observe import linearize
-from kalmark.slam.association import NEW, Decision
+from kalmark.slam.decisions import NEW, Decision
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation
 
@@ -112,7 +112,7 @@ def sightings(
 ) -> Iterator[tuple[int, Observation]]:
     """Take what belongs to no landmark yet, and yield what became of each observation: still waiting, or a landmark."""
     names = {k: decisions[k][0] for k in new}
-    rows = [k for k, n in names.items() if n is NEW or (n is not None and n not in slam.members.slots)]
+    rows = [k for k, n in names.items() if n is NEW or (isinstance(n, int | str) and n not in slam.members.slots)]
     if view.delayed is None or not rows:
         return
     waiting, robot = view.waiting, slam.members.slots[event.robot]
