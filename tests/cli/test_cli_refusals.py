@@ -140,7 +140,7 @@ def test_a_motion_that_does_not_fit_the_controls_is_refused(kalmark: Kalmark, lo
         (["convert", "nowhere", "x"], "log 'nowhere' not found"),
         (["data", "fetch", "mrclm"], "dataset 'mrclm' is unknown, expected one of"),
         (["nonsense"], "No such command 'nonsense'"),
-        *[([verb, "x"], f"{verb} is not available yet") for verb in ("view", "diagnose", "explain", "tune", "live")],
+        *[([verb, "x"], f"{verb} is not available yet") for verb in ("view", "diagnose", "tune", "live")],
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(

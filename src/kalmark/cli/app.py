@@ -16,6 +16,7 @@ from kalmark.cli.convert import convert
 from kalmark.cli.data import data
 from kalmark.cli.demo import demo
 from kalmark.cli.evaluate import evaluate
+from kalmark.cli.explain import explain
 from kalmark.cli.report import report
 from kalmark.cli.run import run
 from kalmark.cli.simulate import simulate
@@ -32,7 +33,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (demo, run, simulate, evaluate, report, campaign, config, convert, check):
+for verb in (demo, run, simulate, evaluate, report, explain, campaign, config, convert, check):
     app.command()(verb)
 app.add_typer(data, name="data")
 for name, what in COMING.items():

@@ -12,7 +12,6 @@ from kalmark.errors import KalmarkError
 COMING = {
     "view": "Replay a run interactively.",
     "diagnose": "Say whether the filter is consistent on a log, and if not why.",
-    "explain": "Draw one scan's association.",
     "tune": "Fit the noise of a configuration.",
     "live": "Take events as JSON lines, give estimates.",
 }

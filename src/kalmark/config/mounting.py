@@ -131,6 +131,12 @@ class UpkeepConfig(Section):
     """A tentative landmark becomes one when it was seen so often; 1: at its first sighting."""
     within: Count = 10
     """It is dropped if that did not happen in so many scans in which it was in view."""
+    merge: bool = True
+    """Merge landmarks that turn out to be one."""
+    hold_back: bool = False
+    """Hold back pairings that are not beyond doubt (`nearest`, `global`, `jcbb`), and map anew what is held back."""
+    odds: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 100.0
+    """So many times likelier than chance is beyond doubt."""
 
     @model_validator(mode="after")
     def _can_be(self) -> UpkeepConfig:

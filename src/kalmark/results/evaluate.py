@@ -17,6 +17,7 @@ from kalmark.results.scoring import association_figures, best_known
 from kalmark.results.shapes import EUCLIDEAN, LINE
 from kalmark.results.truth import Fixes, Truth, fitted
 from kalmark.results.warnings import fix_nis_per_dof, warnings
+from kalmark.results.windows import window_figures
 from kalmark.slam.report import OUTCOMES
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def evaluate(run: Run) -> dict[str, Any]:
         "nis_per_dof": nis_per_dof(history),
         "diverged": bool(run.stopped) or any(figures.get("diverged", False) for figures in robots.values()),
     }
+    summary |= window_figures(history)
     if run.fixes:
         summary["fix_nis_per_dof"] = fix_nis_per_dof(history.inputs.fixes)
     if run.stopped:

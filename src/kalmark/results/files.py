@@ -39,20 +39,21 @@ def _lifted(x: float, y: float, theta: float) -> tuple[float, ...]:
 
 
 def associations_csv(history: History) -> str:
-    """Return one row an observation: when, who, with what, and what became of it."""
+    """Return one row an observation: when, who, with what, and what became of it; and what became of landmarks later.
+
+    Landmarks that were merged or removed have rows of their own, without an index, after the scan that did it.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(ASSOCIATIONS)
     times = [seconds(t_ns) for t_ns in history.t_ns.tolist()]
     robots = history.robot.tolist()
     columns = (history.step, history.sensor, history.index, history.id, history.outcome, history.landmark)
-    for (step, *row), d2, reason in zip(
-        zip(*(column.tolist() for column in columns), strict=True),
-        history.d2.tolist(),
-        history.reason.tolist(),
-        strict=True,
-    ):
-        writer.writerow([times[step], robots[step], *row, "" if math.isnan(d2) else repr(d2), reason])
+    told = zip(*(column.tolist() for column in (*columns, history.d2, history.reason)), strict=True)
+    rows = [(step, [*row, "" if math.isnan(d2) else repr(d2), reason]) for step, *row, d2, reason in told]
+    rows += [(c.step, ["", "", "", c.what, c.landmark, "", c.reason]) for c in history.decisions.changes]
+    for step, row in sorted(rows, key=lambda each: each[0]):
+        writer.writerow([times[step], robots[step], *row])
     return out.getvalue()
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.results.decisions import Decisions
 from kalmark.results.inputs import Inputs
 from kalmark.slam.events import Id
 
@@ -80,7 +81,7 @@ class History:
     not, are texts ("" for none), `kind` is that of the landmark after the scan, `d2` is NaN where there is none;
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
     NaN where robots or sensors differ in size.  `left_px` (O,) is what the corners of tags are off by after the scan
-    (`kalmark.results.corners`).
+    (`kalmark.results.corners`); `decisions` has what they were compared with.
     """
 
     t_ns: Ints
@@ -108,6 +109,7 @@ class History:
     cameras: tuple[Camera, ...] = ()
     mounts: tuple[Mounted, ...] = ()
     true_id: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    decisions: Decisions = field(default_factory=Decisions)
 
     @property
     def in_space(self) -> bool:
@@ -141,6 +143,7 @@ class History:
         named = {"t": self.t_ns * 1e-9} | {key: getattr(self, key) for key in ("robot", "mean", "covariance")}
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
         named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px", "true_id")}
+        named |= self.decisions.arrays()
         return (
             named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._sensor_arrays()
         )
@@ -174,7 +177,8 @@ class History:
         mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P), _cut(C)) for name, mean, P, C in rows)
         columns = {key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)}
         columns |= {"kind": kind, "left_px": left, "true_id": named.get("true_id", named["id"])}
-        return cls(**columns, maps=maps, starts=starts, inputs=inputs, cameras=cameras, mounts=mounts)
+        told = Decisions.from_arrays(named)
+        return cls(**columns, maps=maps, starts=starts, inputs=inputs, cameras=cameras, mounts=mounts, decisions=told)
 
 
 def _map_arrays(maps: tuple[MapSnapshot, ...]) -> dict[str, npt.NDArray[Any]]:

@@ -14,6 +14,7 @@ from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
 from kalmark.results.cameras import cameras, mounts
 from kalmark.results.corners import left_px
+from kalmark.results.decisions import Decisions
 from kalmark.results.describe import describe, plain
 from kalmark.results.history import Array, History, MapSnapshot, Start, Texts, padded, texts
 from kalmark.results.inputs import Controlled, Inputs, UsedFix
@@ -200,4 +201,5 @@ class _Recorder:
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),
             true_id=self._true_ids(log),
+            decisions=Decisions.of(steps, 3 if n > 3 else 2),
         )

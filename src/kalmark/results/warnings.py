@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from kalmark.results.calibration import mount_warnings
 from kalmark.results.inputs import UsedFix
+from kalmark.results.windows import window_warnings
 from kalmark.results.words import count, figure
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ FEW_FIXES = 5  # fewer say little of the noise
 
 def warnings(run: Run, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
-    parts = (_lost, _observations, _robots, _truth, _fixes, _noise)
+    parts = (_lost, _windows, _observations, _robots, _truth, _fixes, _noise)
     return [line for part in parts for line in part(run, summary)] + list(mount_warnings(summary))
 
 
@@ -41,6 +42,10 @@ def _lost(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
     if lost:
         names = ", ".join(lost)
         yield f"DIVERGED: the error of {names} exceeds 10 of its own sigmas and 5 % of the path; do not use this map"
+
+
+def _windows(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    yield from window_warnings(run.history)
 
 
 def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:

@@ -224,6 +224,7 @@ class _Joint(_Gated):
 
     most_nodes: int = 5_000_000
 
+    weighs: ClassVar[bool] = True  # it says itself what is ambiguous
     nearest: ClassVar[int] = 8
     farther: ClassVar[float] = math.inf
 
@@ -341,6 +342,7 @@ class Cliques(_Gated):
 
     most_nodes: int = 5_000_000
 
+    weighs: ClassVar[bool] = True
     nearest: ClassVar[int] = WIDEST
     farther: ClassVar[float] = math.inf
 

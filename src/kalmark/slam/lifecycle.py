@@ -16,9 +16,10 @@ from kalmark.filter.storage import Triangle
 from kalmark.geometry.spaces import RHO
 from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.protocols import Landmark
+from kalmark.slam import merging, tentative
 from kalmark.slam.ends import extended_ends
 from kalmark.slam.events import Id, Scan
-from kalmark.slam.report import Observation
+from kalmark.slam.report import Observation, Report
 from kalmark.slam.scene import View
 
 if TYPE_CHECKING:
@@ -63,6 +64,12 @@ def review(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation])
     simplify(slam, view, event.robot, [o.landmark for o in outcomes if o.outcome == "associated"])
     extend(slam, view, event, outcomes)
     return tuple(give_up(slam, view, event, outcomes)) if view.attention.delete else ()
+
+
+def tidied(slam: Slam, view: View, event: Scan, report: Report) -> Report:
+    """Tidy up after a scan: merge landmarks that are one, drop tentative ones without hope; return its report."""
+    report.merged = tuple(merging.merge(slam, view, event.robot, report.observations))
+    return tentative.dropped(slam, view, event, report)
 
 
 def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:

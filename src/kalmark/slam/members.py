@@ -24,8 +24,9 @@ class Members:
 
     `sorts` has the words by which a `View` finds its `looks`: a landmark's kind, or ROBOT.
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
-    found.  `ends` are the abscissas (2,) of the segments seen of lines, `doubts` and `tentative` what waits to become a
-    landmark: without a block, and with one.
+    found, `together` is what was seen in one scan with it; `lately` are those seen last.  `ends` are the abscissas (2,)
+    of the segments seen of lines, `doubts` and `tentative` what waits to become a landmark: without a block, and with
+    one.
     """
 
     def __init__(self, robots: Mapping[str, Robot]) -> None:
@@ -39,6 +40,8 @@ class Members:
         self.ends: dict[Id, Array] = {}
         self.doubts = Doubts()
         self.tentative: dict[Id, Tentative] = {}
+        self.together: dict[Id, set[Id]] = {}
+        self.lately: list[Id] = []
         self.unnamed = 0
 
     def slot(self, name: Id) -> int:
@@ -82,7 +85,10 @@ class Members:
     def forget(self, name: Id) -> None:
         """Strike out a landmark."""
         self.names.pop(self.slots[name], None)
-        for table in (self.slots, self.kinds, self.sorts, self.seen, self.searched, self.ends):
+        for other in self.together.get(name, ()):
+            if other != name:
+                self.together[other].discard(name)
+        for table in (self.slots, self.kinds, self.sorts, self.seen, self.searched, self.ends, self.together):
             table.pop(name, None)
 
     def new_name(self) -> str:

@@ -38,6 +38,15 @@ class Observation(NamedTuple):
     shares: tuple[tuple[Id, float], ...] = ()
 
 
+class Candidate(NamedTuple):
+    """A landmark that observation `index` was compared with: its squared distance and its place in the map."""
+
+    index: int  # type: ignore[assignment]
+    landmark: Id
+    d2: float
+    place: Array
+
+
 def judged(index: int, id_: Id | None, name: Any, d2: float, fused: bool, gate: float) -> Observation:
     """Return what became of an observation that was compared with the landmark `name`; NaN if it could not be."""
     if fused:
@@ -52,15 +61,20 @@ class Report:
 
     `y` and the expectation `e` are (K, m), the innovation `z` (K, p) and its covariance `Z` (K, p, p), with p = m but
     for sensors that measure more than can be innovated; rows of observations that were not compared with a landmark
-    are NaN.  `removed` are landmarks given up and tentative ones dropped, each with the reason.
+    are NaN.  `removed` are landmarks given up and tentative ones dropped, each with the reason, and
+    `merged` are those that are gone, the ones they turned out to be, and why.  `candidates` are the landmarks that
+    observations without an id were compared with, `seen_at` (K, 2 or 3) is where these seemed to come from.
     """
 
-    __slots__ = ("Z", "e", "event", "observations", "removed", "y", "z")
+    __slots__ = ("Z", "candidates", "e", "event", "merged", "observations", "removed", "seen_at", "y", "z")
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
         self.observations: tuple[Observation, ...] = ()
         self.removed: tuple[tuple[Id, str], ...] = ()
+        self.merged: tuple[tuple[Id, Id, str], ...] = ()
+        self.candidates: list[Candidate] = []
+        self.seen_at: Array = NOTHING
         self.y = y
         self.e: Array = NOTHING
         self.z: Array = NOTHING

@@ -22,6 +22,7 @@ from kalmark.models.sensors import TagPose
 from kalmark.slam.delayed import Waiting
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.nearby import has_place
+from kalmark.slam.report import Candidate, Report
 from kalmark.slam.robot import Mount
 from kalmark.slam.together import Landmarks
 
@@ -258,9 +259,11 @@ class Scene:
     """One scan before it is fused: the association's window on the map."""
 
     def __init__(self, slam: Slam, view: View, event: Scan, ids: tuple[Id | None, ...], R: Array) -> None:
-        self.ids = ids
+        self.ids, self.y, self.robot = ids, event.y, event.robot
         self._slam, self._view, self._event, self._R = slam, view, event, R
         self._pairs: tuple[Index, list[Id]] | None = None
+        self.seen_at: Array | None = None  # where the observations seem to come from, once that was asked for
+        self.compared: tuple[list[Id], Array] = ([], np.zeros((0, 0)))  # the last answer of `distances`
 
     def dof(self) -> int:
         """Return the size p of one innovation."""
@@ -280,6 +283,7 @@ class Scene:
         places = self._view.places(self._slam.map, self._slam.members.slots[self._event.robot], self._event.y)
         if places is None:
             return self._slam.members.in_reach(self._view)
+        self.seen_at = places
         self._pairs = self._slam.nearby.pairs(self._slam, frozenset(self._view.looks), places, nearest, farther)
         return list(dict.fromkeys(self._pairs[1]))
 
@@ -297,7 +301,25 @@ class Scene:
             slots = members.slots_of([candidates[i] for i in c.tolist()])
             R = view.noise(map_, robot, look, slots, self._R[k], event)
             d2[k, c] = view.predict(map_, robot, look, slots, event.y[k], R)[1]
+        self.compared = candidates, d2
         return d2
+
+    def report(self) -> Report:
+        """Return a report of what was compared, before anything is fused."""
+        report = Report(self._event, self.y)
+        if self.seen_at is not None:
+            report.seen_at, report.candidates = self.seen_at, self.candidates_of()
+        return report
+
+    def candidates_of(self) -> list[Candidate]:
+        """Return the landmarks that the observations without an id were compared with, and how far they were."""
+        names, d2 = self.compared
+        near = [k for k in np.argwhere(np.isfinite(d2)).tolist() if self.ids[k[0]] is None]
+        if not near:
+            return []
+        d = 2 if len(self._view.at) == 3 else 3
+        places = self._slam.map.means(self._slam.members.slots_of([names[c] for _, c in near]), d)
+        return [Candidate(k, names[c], float(d2[k, c]), p) for (k, c), p in zip(near, places, strict=True)]
 
     def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
         """Return the innovations z (M, p) of M pairs of an observation and a landmark, and their Z (M p, M p).

@@ -24,7 +24,7 @@ from kalmark.geometry.spaces import Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
-from kalmark.slam import budget, delayed, lifecycle, tentative
+from kalmark.slam import ambiguity, budget, delayed, lifecycle, tentative
 from kalmark.slam.approach import approach
 from kalmark.slam.association import ByIdentity
 from kalmark.slam.averaging import average
@@ -139,15 +139,14 @@ class Slam:
         R = measurements(event, view.sensor)
         self.t_ns = event.t_ns
         self._advance(event.robot)
-        count = len(event.y)
-        if count == 0:
-            return tentative.dropped(self, view, event, Report(event))
-        ids = event.ids or (None,) * count
+        if len(event.y) == 0:
+            return lifecycle.tidied(self, view, event, Report(event))
+        ids = event.ids or (None,) * len(event.y)
         for i in ids:
             if i in self.robots:
                 self._advance(i)
-        decisions = view.association.associate(Scene(self, view, event, ids, R))
-        return self._fuse(event, view, ids, decisions, R)
+        scene = Scene(self, view, event, ids, R)
+        return self._fuse(event, view, scene, ambiguity.associate(self, view, scene), R)
 
     def _fix(self, event: Fix) -> Report:
         pose, size = (3, 2) if self.robots[event.robot].motion.space.axes == 1 else (7, 3)
@@ -205,11 +204,9 @@ class Slam:
             self.map.remove(error)
 
     # ------------------------------------------------------------------ scans
-    def _fuse(
-        self, event: Scan, view: View, ids: tuple[Id | None, ...], decisions: Sequence[Decision], R: Array
-    ) -> Report:
+    def _fuse(self, event: Scan, view: View, scene: Scene, decisions: Sequence[Decision], R: Array) -> Report:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
-        report = Report(event, event.y)
+        report, ids = scene.report(), scene.ids
         known = self.members.known_to(view, event.robot, [name for name, _ in decisions])
         outcomes: list[Observation | None] = [None] * len(decisions)
         for seen in self._correct(event, report, view, known, ids, decisions, R):
@@ -227,7 +224,7 @@ class Slam:
                 outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
             lifecycle.let_grow(self)
         report.observations = tuple(outcomes)  # type: ignore[arg-type]
-        return tentative.dropped(self, view, event, report)
+        return lifecycle.tidied(self, view, event, report)
 
     def _sight(
         self, event: Scan, report: Report, view: View, new: list[int], ids: tuple[Id | None, ...],
@@ -238,7 +235,7 @@ class Slam:
         yield from seen.items()
         left = [k for k in new if k not in seen and k not in confirmed]
         yield from delayed.sightings(self, view, event, left, decisions, R)
-        told = [confirmed.get(k, decision) for k, decision in enumerate(decisions)]
+        told = [confirmed.get(k, (None, "")) for k in range(len(decisions))]
         for done in self._correct(event, report, view, list(confirmed), ids, told, R) if confirmed else ():
             yield done.index, done._replace(outcome="new", reason=told[done.index][1])
 
@@ -278,7 +275,7 @@ class Slam:
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
     ) -> Observation:
         """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
-        if name is None or name is DEFERRED:
+        if name is None or (name is DEFERRED and not view.upkeep.hold_back):
             return Observation(k, id_, "ignored" if name is None else "deferred", None, None, reason)
         if name == event.robot:
             return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
@@ -297,14 +294,15 @@ class Slam:
             return Observation(k, id_, "ignored", None, None, found)
         if not (np.isfinite(l).all() and np.isfinite(L_h).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
-        unproven, name = name is NEW and view.upkeep.confirm > 1, self.members.new_name() if name is NEW else name
+        held, unproven = name is DEFERRED, name is DEFERRED or (name is NEW and view.upkeep.confirm > 1)
+        name = self.members.new_name() if name in (NEW, DEFERRED) else name
         G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
         try:
             slot = self.map.augment(view.landmark.space, l, index, G, Q)
         except MapError as full:
             return Observation(k, id_, "ignored", None, None, str(full))
         if unproven:
-            return tentative.started(self, view, k, name, slot, reason)
+            return tentative.started(self, view, k, name, slot, reason, held)
         self.members.start(name, slot, view.landmark)
         return Observation(k, id_, "new", name, None, reason)
 

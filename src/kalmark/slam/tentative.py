@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import FORBIDDEN
-from kalmark.slam.decisions import NEW, Decision
+from kalmark.slam.decisions import DEFERRED, NEW, Decision
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation, Report
 
@@ -57,7 +57,8 @@ def sightings(
     Return those that are still tentative or left alone, and the decisions about those that confirm a landmark, which is
     one from here on.
     """
-    rows = [k for k in new if decisions[k][0] is NEW]
+    use = (NEW, DEFERRED) if view.upkeep.hold_back else (NEW,)
+    rows = [k for k in new if decisions[k][0] in use]
     names = [name for name, t in slam.members.tentative.items() if t.kind.kind in view.looks]
     seen: dict[int, Observation] = {}
     confirmed: dict[int, Decision] = {}
@@ -99,9 +100,11 @@ def _sighted(slam: Slam, view: View, name: Id) -> str:
     return f"confirmed: seen in {t.hits} of {t.chances} scans"
 
 
-def started(slam: Slam, view: View, k: int, name: Id, slot: int, reason: str) -> Observation:
-    """Enter the block that observation k has started as a tentative landmark."""
+def started(slam: Slam, view: View, k: int, name: Id, slot: int, reason: str, held: bool) -> Observation:
+    """Enter the block that observation k has started as a tentative landmark; one that was `held` back is deferred."""
     slam.members.tentative[name] = Tentative(slot, view.landmark, unseen=-1)
+    if held:
+        return Observation(k, None, "deferred", name, None, reason)
     return Observation(k, None, "tentative", name, None, f"first sighting: {reason}" if reason else "first sighting")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from kalmark.errors import ModelError
@@ -14,10 +15,17 @@ class Upkeep:
     An observation without an id that belongs to no landmark starts a *tentative* one, which becomes a landmark when it
     was seen `confirm` times within `within` scans in which it was in the sensor's view, and is dropped when that cannot
     be any more.  With `confirm` 1 it is one at once.
+
+    With `merge`, two landmarks that turn out to be one are merged (`slam/merging.py`) when that is `odds` times
+    likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
+    (`slam/ambiguity.py`); what is held back, by this or by the association, is mapped anew until then.
     """
 
     confirm: int = 3
     within: int = 10
+    merge: bool = True
+    hold_back: bool = False
+    odds: float = 100.0
 
     def __post_init__(self) -> None:
         for name in ("confirm", "within"):
@@ -26,6 +34,8 @@ class Upkeep:
                 raise ModelError(f"Upkeep: {name} is {value!r}, expected a whole number of at least 1")
         if self.within < self.confirm:
             raise ModelError(f"Upkeep: within is {self.within}, expected at least confirm, {self.confirm}")
+        if not 1 <= self.odds < math.inf:
+            raise ModelError(f"Upkeep: odds is {self.odds!r}, expected a finite number of at least 1")
 
     def confirms(self, hits: int) -> bool:
         """Return whether a tentative landmark seen so often is one."""

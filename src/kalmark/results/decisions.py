@@ -1,0 +1,97 @@
+"""What each observation was compared with, where it seemed to come from, and what became of landmarks later."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from kalmark.slam.report import Report
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Texts = npt.NDArray[np.str_]
+
+
+class Change(NamedTuple):
+    """What became of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now."""
+
+    step: int
+    landmark: str
+    what: str
+    into: str
+    reason: str
+
+
+def _none(*shape: int) -> Array:
+    return np.full(shape, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Decisions:
+    """Observations without an id (rows `row` of the history): the landmarks each was compared with before the scan.
+
+    `landmark` (C,), `d2` (C,) and `place` (C, d), where that landmark was in the map; `seen_at` (O, d) is where each
+    observation seemed to come from, NaN where its sensor does not tell.
+    """
+
+    row: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    landmark: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    d2: Array = field(default_factory=lambda: _none(0))
+    place: Array = field(default_factory=lambda: _none(0, 2))
+    seen_at: Array = field(default_factory=lambda: _none(0, 2))
+    changes: tuple[Change, ...] = ()
+
+    @classmethod
+    def of(cls, reports: Sequence[Report], d: int) -> Decisions:
+        """Return what the reports of a run's scans say, in a plane (d = 2) or in space."""
+        first = np.cumsum([0, *(len(r.observations) for r in reports)])
+        seen = [(start + c.index, c) for start, r in zip(first, reports, strict=False) for c in r.candidates]
+        seen_at = _none(int(first[-1]), d)
+        for start, end, report in zip(first, first[1:], reports, strict=False):
+            if len(report.seen_at):
+                seen_at[start:end] = report.seen_at
+        changes = [
+            change
+            for step, report in enumerate(reports)
+            for change in (
+                *(Change(step, str(gone), "merged", str(kept), why) for gone, kept, why in report.merged),
+                *(Change(step, str(gone), "removed", "", why) for gone, why in report.removed),
+            )
+        ]
+        return cls(
+            np.array([row for row, _ in seen], dtype=np.int64),
+            np.array([str(c.landmark) for _, c in seen], dtype=np.str_),
+            np.array([c.d2 for _, c in seen], dtype=np.float64),
+            np.array([c.place for _, c in seen], dtype=np.float64).reshape(-1, d),
+            seen_at,
+            tuple(changes),
+        )
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return everything as named arrays for ``history.npz``."""
+        columns: Any = zip(*self.changes, strict=True) if self.changes else [()] * 5
+        step, *texts = columns
+        named = {f"change_{k}": np.array(v, dtype=np.str_) for k, v in zip(Change._fields[1:], texts, strict=True)}
+        return named | {
+            "change_step": np.array(step, dtype=np.int64),
+            "candidate_row": self.row,
+            "candidate_landmark": self.landmark,
+            "candidate_d2": self.d2,
+            "candidate_place": self.place,
+            "seen_at": self.seen_at,
+        }
+
+    @classmethod
+    def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> Decisions:
+        """Return what `arrays` gave, nothing if the run was saved without."""
+        if "candidate_row" not in named:
+            return cls(seen_at=_none(len(named["landmark"]), 2))
+        rows = zip(*(named[f"change_{key}"].tolist() for key in Change._fields), strict=True)
+        columns = (named[f"candidate_{key}"] for key in ("row", "landmark", "d2", "place"))
+        row, landmark, d2, place = columns
+        return cls(row, landmark, d2, place, named["seen_at"], tuple(Change(*each) for each in rows))

@@ -1,0 +1,146 @@
+"""Why one scan's observations became what they did: what each was compared with, by what gates, what was decided."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kalmark.errors import RunError
+from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.results.decisions import Change
+from kalmark.results.files import seconds
+from kalmark.results.history import Array, History, Ints
+from kalmark.results.words import count
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A landmark that an observation was compared with, and where it was in the map."""
+
+    landmark: str
+    d2: float
+    place: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Fate:
+    """One observation: where it seemed to come from (d,), what became of it and why, what it was compared with."""
+
+    index: int
+    id: str
+    outcome: str
+    landmark: str
+    d2: float
+    reason: str
+    seen_at: Array
+    compared: tuple[Compared, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """One scan of a run: its step, time since the first scan, the robot, the gates on d2, all that was decided."""
+
+    step: int
+    t_s: float
+    log_t_s: str
+    robot: str
+    sensor: str
+    pose: Array
+    covariance: Array
+    gates: tuple[float, float] | None
+    fates: tuple[Fate, ...]
+    changes: tuple[Change, ...]
+
+    def lines(self) -> Iterator[str]:
+        """Tell it."""
+        d = 3 if len(self.pose) == 7 else 2
+        sigma = math.sqrt(max(np.trace(self.covariance[:d, :d]) / d, 0.0))
+        at = ", ".join(f"{x:.2f}" for x in self.pose[:d])
+        yield f"{self.robot} · {self.sensor or 'no sensor'} · t = {self.t_s:.3f} s ({self.log_t_s} s in the log)"
+        yield f"then at ({at}) m, sigma {sigma:.3g} m; {count(len(self.fates), 'observation')}"
+        if self.gates is not None:
+            near, far = self.gates
+            yield f"paired where d2 is at most {near:.2f}, a new landmark where it is above {far:.2f} from all"
+        for fate in self.fates:
+            yield self._line(fate)
+            if fate.compared:
+                yield "      compared with " + ", ".join(f"{c.landmark} (d2 {c.d2:.3g})" for c in fate.compared)
+        for change in self.changes:
+            yield f"{change.landmark} {change.what}: {change.reason}"
+
+    @staticmethod
+    def _line(fate: Fate) -> str:
+        name = f" {fate.landmark}" if fate.landmark else ""
+        known = f" (id {fate.id})" if fate.id else ""
+        d2 = "" if math.isnan(fate.d2) else f", d2 {fate.d2:.3g}"
+        return f"{fate.index:4d}{known}: {fate.outcome}{name}{d2}{': ' if fate.reason else ''}{fate.reason}"
+
+
+def explain(run: Run, t_s: float, robot: str | None = None) -> Explanation:
+    """Return why the scan nearest to a time became what it did.
+
+    `t_s` counts from the first scan, as in the report; one beyond the last scan is a time of the log, as in
+    ``associations.csv``.  Raises RunError if there is no such robot or scan.
+    """
+    history = run.history
+    if robot is not None and robot not in history.robots:
+        raise RunError(f"robot is {robot!r}, expected one of {', '.join(history.robots)}")
+    steps = np.arange(len(history.t_ns)) if robot is None else np.flatnonzero(history.robot == robot)
+    if not len(steps):
+        raise RunError("the run has no scan, expected one to explain")
+    t = (history.t_ns[steps] - history.t_ns[0]) * 1e-9
+    span = float((history.t_ns[-1] - history.t_ns[0]) * 1e-9)
+    since = t_s if t_s <= span + 1.0 else t_s - float(history.t_ns[0]) * 1e-9
+    if not -1.0 <= since <= span + 1.0:
+        first, last = seconds(history.t_ns[0]), seconds(history.t_ns[-1])
+        raise RunError(f"scan is {t_s:g} s, expected 0 to {span:.3f} s, or {first} to {last} s as in the log")
+    return explained(run, int(steps[np.argmin(np.abs(t - since))]))
+
+
+def explained(run: Run, step: int) -> Explanation:
+    """Return why the scan of a step became what it did."""
+    history = run.history
+    rows = np.flatnonzero(history.step == step)
+    sensor = str(history.sensor[rows[0]]) if len(rows) else ""
+    return Explanation(
+        step=step,
+        t_s=float((history.t_ns[step] - history.t_ns[0]) * 1e-9),
+        log_t_s=seconds(history.t_ns[step]),
+        robot=str(history.robot[step]),
+        sensor=sensor,
+        pose=history.poses[step],
+        covariance=history.pose_covariances[step],
+        gates=_gates(run, str(history.robot[step]), sensor, rows),
+        fates=tuple(fate_of(history, int(row)) for row in rows),
+        changes=tuple(c for c in history.decisions.changes if c.step == step),
+    )
+
+
+def fate_of(history: History, row: int) -> Fate:
+    """Return what became of an observation."""
+    told, d = history.decisions, 3 if history.in_space else 2
+    mine = np.flatnonzero(told.row == row)
+    mine = mine[np.argsort(told.d2[mine], kind="stable")]
+    compared = tuple(Compared(str(told.landmark[i]), float(told.d2[i]), told.place[i]) for i in mine)
+    seen_at = told.seen_at[row] if row < len(told.seen_at) else np.full(d, np.nan)
+    id_, outcome, landmark, reason = (str(getattr(history, k)[row]) for k in ("id", "outcome", "landmark", "reason"))
+    return Fate(int(history.index[row]), id_, outcome, landmark, float(history.d2[row]), reason, seen_at, compared)
+
+
+def _gates(run: Run, robot: str, sensor: str, rows: Ints) -> tuple[float, float] | None:
+    """Return the gates on d2 of a sensor's association, None if it has none."""
+    robots = run.config.get("robots") or {}
+    own = ((robots.get(robot) or robots.get("each") or {}).get("sensors") or {}).get(sensor) or {}
+    section = own.get("association") or run.config.get("association") or {}
+    near, far = section.get("gate"), section.get("new_gate")
+    size = int(np.isfinite(run.history.y[rows]).sum(axis=1).max(initial=0)) if len(rows) else 0
+    if not size or not isinstance(near, float) or not isinstance(far, float):
+        return None
+    return chi2_gate(near, size), chi2_gate(far, size)

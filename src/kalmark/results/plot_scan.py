@@ -1,0 +1,114 @@
+"""``scan_<t>.png``: one scan's observations in the map, the landmarks each was compared with, and what was decided."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from kalmark.results.explain import Explanation
+from kalmark.results.history import Array
+from kalmark.results.picture import INK, ellipses
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+OUTCOME = {
+    "associated": "#4a8f7b", "new": "#d2a23c", "rejected": "#c8553d", "ignored": "#8b929c",
+    "deferred": "#5b67a8", "tentative": "#9a62ab",
+}  # fmt: skip
+FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
+PATH = 60  # steps of the path before the scan
+LEAST_M = 1.0
+
+
+def save_scan(run: Run, told: Explanation, path: str | Path) -> None:
+    """Draw one scan of a run and write it as a PNG."""
+    figure = draw_scan(run, told)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=130, format="png")
+
+
+def draw_scan(run: Run, told: Explanation) -> Figure:
+    """Return the figure of one scan, from above: axes in metres, in the frame of the map.
+
+    Crosses are the observations where they seem to come from before the scan, squares the landmarks they were compared
+    with then; a full line goes to the landmark that was decided on, dotted ones, with d2, to the others.
+    """
+    figure = Figure(figsize=(9.5, 8.5), layout="constrained", facecolor="white")
+    axes = figure.subplots()
+    _robot(axes, run, told)
+    low, high = _extent(told)
+    _landmarks(axes, run, told, low, high)
+    for fate in told.fates:
+        colour = OUTCOME.get(fate.outcome, INK)
+        if not np.isfinite(fate.seen_at[:2]).all():
+            continue
+        at = float(fate.seen_at[0]), float(fate.seen_at[1])
+        axes.plot(*at, "x", color=colour, ms=9, mew=2, zorder=5)
+        axes.annotate(str(fate.index), at, (5, 5), textcoords="offset points", color=colour, fontsize=9, zorder=6)
+        for other in fate.compared:
+            chosen, there = other.landmark == fate.landmark, (float(other.place[0]), float(other.place[1]))
+            axes.plot(*zip(at, there, strict=True), "-" if chosen else ":", color=colour, lw=2 if chosen else 1)
+            axes.plot(*there, "s", color=INK, mfc="none", ms=8, zorder=4)
+            axes.annotate(
+                f"{other.landmark}: {other.d2:.3g}", there, (6, -11), textcoords="offset points",
+                fontsize=8, color=colour, clip_on=True,
+            )  # fmt: skip
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    axes.grid(color="#eceef1")
+    lines = [*told.lines()]
+    figure.suptitle(lines[0], x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
+    axes.set_title("; ".join(lines[1:3] if told.gates else lines[1:2]), loc="left", fontsize=9, color=INK)
+    figure.legend(handles=_legend(told), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+def _robot(axes: Axes, run: Run, told: Explanation) -> None:
+    history = run.history
+    mine = np.flatnonzero(history.robot[: told.step + 1] == told.robot)[-PATH:]
+    axes.plot(*history.poses[mine, :2].T, color=ROBOT, lw=1)
+    axes.plot(*ellipses(told.pose[None, :2], told.covariance[None, :2, :2])[0].T, color=ROBOT, lw=1)
+    axes.plot(*told.pose[:2], "o", color=ROBOT, ms=7)
+
+
+def _landmarks(axes: Axes, run: Run, told: Explanation, low: Array, high: Array) -> None:
+    """Draw the map as it was kept last before the scan, and later if it was not kept before."""
+    kept = run.history.map_at(told.step)
+    inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
+    for i in np.flatnonzero(inside).tolist():
+        axes.plot(*kept.means[i, :2], ".", color=FAINT, ms=4, zorder=1)
+        if np.isfinite(kept.covariances[i, :2, :2]).all():
+            axes.plot(
+                *ellipses(kept.means[i : i + 1, :2], kept.covariances[i : i + 1, :2, :2])[0].T, color=FAINT, lw=0.8
+            )
+
+
+def _extent(told: Explanation) -> tuple[Array, Array]:
+    """Return the corners (2,) of what is drawn."""
+    points = [told.pose[:2], *(f.seen_at[:2] for f in told.fates)]
+    points += [c.place[:2] for f in told.fates for c in f.compared]
+    shown = np.array([p for p in points if np.isfinite(p).all()])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    middle, half = (low + high) / 2, 0.58 * max(float((high - low).max()), LEAST_M)
+    return middle - half, middle + half
+
+
+def _legend(told: Explanation) -> list[Line2D]:
+    outcomes = dict.fromkeys(f.outcome for f in told.fates)
+    marks = [Line2D([], [], ls="", marker="x", mew=2, color=OUTCOME.get(o, INK), label=o) for o in outcomes]
+    return [
+        Line2D([], [], color=ROBOT, marker="o", label="robot after the scan, 3 sigma"),
+        Line2D([], [], ls="", marker="s", color=INK, mfc="none", label="compared with it: name and d2"),
+        Line2D([], [], ls="", marker=".", color=FAINT, label="other landmarks, as kept last"),
+        *marks,
+    ]

@@ -1,0 +1,161 @@
+"""Is the map wrong from some time on?  NIS, observations left out and the whiteness of innovations, in windows of time.
+
+A filter on a wrong map contradicts itself: innovations that are too large or keep their signs, and observations that
+fit nothing.  Bar-Shalom, Li, Kirubarajan 2001, section 5.4: time-average NIS and autocorrelation of the innovations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from kalmark.results.consistency import nis
+from kalmark.results.history import Array, History, Ints
+from kalmark.results.words import figure
+
+DEGREES = 100  # of freedom in a window, at least
+OBSERVATIONS = 60  # in a window of those left out, at least
+CHANCE = 1e-6  # with which a consistent run would raise a flag
+TIMES = 3.0  # a window's NIS over the median window's
+LEFT_OUT = 0.5  # share of a window's observations that fit nothing, where the median window has less than half of it
+CORRELATED = 0.5  # by which a window's autocorrelation of innovations exceeds the median window's
+PAIRS = 60  # of successive innovations in a window
+MOST_GAP_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch of time: when it begins and ends, in seconds since the first step, and its figure."""
+
+    start_s: float
+    end_s: float
+    value: float
+    number: int
+
+
+def window_figures(history: History) -> dict[str, Any]:
+    """Return the figures of ``summary.json`` that windows of time have; absent where there is too little."""
+    out: dict[str, Any] = {}
+    values = nis_windows(history)
+    if len(values) > 1:
+        worst = max(values, key=lambda w: w.value)
+        out |= {"nis_window_max": worst.value, "nis_window_max_s": [worst.start_s, worst.end_s]}
+        out["nis_window_median"] = float(np.median([w.value for w in values]))
+    shares = left_out_windows(history)
+    if len(shares) > 1:
+        worst = max(shares, key=lambda w: w.value)
+        out |= {"left_out_window_max": worst.value, "left_out_window_max_s": [worst.start_s, worst.end_s]}
+        out["left_out_window_median"] = float(np.median([w.value for w in shares]))
+    correlations = autocorrelations(history)
+    if correlations:
+        out["innovation_autocorrelation"] = float(np.median([w.value for w in correlations]))
+    return out
+
+
+def nis_windows(history: History) -> list[Window]:
+    """Return the NIS per degree of freedom of windows of at least so many degrees, one after the other."""
+    used = history.outcome == "associated"
+    value, dof = nis(history.z[used], history.Z[used])
+    return _windows(history, history.step[used], np.nan_to_num(value), dof, DEGREES)
+
+
+def left_out_windows(history: History) -> list[Window]:
+    """Return the share of observations that were rejected, or ignored because they fit nothing, window by window."""
+    mine = history.outcome != "tentative"
+    out = np.isin(history.outcome[mine], ["rejected", "ignored", "deferred"]) & (history.d2[mine] > 0)
+    told = np.char.startswith(history.reason[mine], "between ") | np.char.startswith(
+        history.reason[mine], "it does not"
+    )
+    wrong = (out | told).astype(np.float64)
+    return _windows(history, history.step[mine], wrong, np.ones(len(wrong), dtype=np.int64), OBSERVATIONS)
+
+
+def autocorrelations(history: History) -> list[Window]:
+    """Return the correlation of successive whitened innovations of the same landmark, window by window."""
+    rows = np.flatnonzero((history.outcome == "associated") & np.isfinite(history.z).any(axis=1))
+    white = _whitened(history, rows)
+    robots = history.robot[history.step[rows]]
+    order = np.lexsort((history.step[rows], history.landmark[rows], history.sensor[rows], robots))
+    one, two = order[:-1], order[1:]
+    same = (history.landmark[rows[one]] == history.landmark[rows[two]]) & (robots[one] == robots[two])
+    same &= history.sensor[rows[one]] == history.sensor[rows[two]]
+    same &= history.step[rows[two]] - history.step[rows[one]] <= MOST_GAP_STEPS
+    one, two = one[same], two[same]
+    turn = np.argsort(history.step[rows[two]], kind="stable")
+    a, b, step = white[one[turn]], white[two[turn]], history.step[rows[two[turn]]]
+    both = np.nansum(a * b, axis=1)
+    size = np.sqrt(np.nansum(a**2, axis=1) * np.nansum(b**2, axis=1))
+    ones = np.ones(len(both), dtype=np.int64)
+    products, sizes = (_windows(history, step, value, ones, PAIRS) for value in (both, size))
+    return [
+        Window(p.start_s, p.end_s, p.value / max(s.value, 1e-300), p.number)
+        for p, s in zip(products, sizes, strict=True)
+    ]
+
+
+def _whitened(history: History, rows: Ints) -> Array:
+    """Return L^-1 z (K, p), L the factor of Z, NaN where there is none."""
+    out = np.full((len(rows), history.z.shape[1]), np.nan)
+    sizes = np.isfinite(history.z[rows]).sum(axis=1)
+    for m in np.unique(sizes[sizes > 0]):
+        mine = np.flatnonzero(sizes == m)
+        L = np.linalg.cholesky(history.Z[rows[mine], :m, :m])
+        out[mine, :m] = np.linalg.solve(L, history.z[rows[mine], :m, None])[..., 0]
+    return out
+
+
+def _windows(history: History, step: Ints, value: Array, weight: Ints, least: int) -> list[Window]:
+    """Return sums of values over sums of weights, cut each time the weights add up to so much."""
+    if not len(step):
+        return []
+    total = np.cumsum(weight)
+    number = (total - weight) // least
+    t = (history.t_ns - history.t_ns[0]) * 1e-9
+    out = []
+    for i in range(int(number[-1]) + 1):
+        mine = number == i
+        if weight[mine].sum() >= 0.9 * least:
+            first, last = step[mine][0], step[mine][-1]
+            share = float(value[mine].sum() / weight[mine].sum())
+            out.append(Window(float(t[first]), float(t[last]), share, int(weight[mine].sum())))
+    return out
+
+
+def window_warnings(history: History) -> Iterator[str]:
+    """Return a line for each sign that the map is wrong."""
+    yield from _of(nis_windows(history), _high_nis)
+    yield from _of(left_out_windows(history), _left_out)
+    yield from _of(autocorrelations(history), _correlated)
+
+
+def _of(windows: list[Window], told: Any) -> Iterator[str]:
+    if len(windows) < 3:
+        return
+    median = float(np.median([w.value for w in windows]))
+    worst = max(windows, key=lambda w: w.value)
+    line = told(worst, median, len(windows))
+    if line:
+        yield f"{line} from t={figure(worst.start_s)} to {figure(worst.end_s)} s: the map may be wrong from there on"
+
+
+def _high_nis(worst: Window, median: float, count: int) -> str:
+    bound = float(chi2.ppf(1 - CHANCE / count, worst.number)) / worst.number
+    if worst.value <= max(bound, TIMES * median):
+        return ""
+    return f"NIS per degree of freedom rises to {figure(worst.value, 2)}, median {figure(median, 2)},"
+
+
+def _correlated(worst: Window, median: float, count: int) -> str:
+    if worst.value - max(median, 0.0) < CORRELATED:
+        return ""
+    return f"successive innovations are correlated by {figure(worst.value, 2)}, median {figure(median, 2)},"
+
+
+def _left_out(worst: Window, median: float, count: int) -> str:
+    if worst.value < LEFT_OUT or median > LEFT_OUT / 2:
+        return ""
+    return f"{worst.value:.0%} of the observations fit nothing, median {median:.0%},"

@@ -1,0 +1,198 @@
+"""Two landmarks that turn out to be one: found by their joint covariance, constrained equal, and one of them removed.
+
+What closes a loop late looks like this: the robot did not recognise the place and mapped it again.  Landmarks that were
+never seen in one scan may be the same; which are is decided for all that were seen lately, at once, and only when it is
+beyond doubt (`ambiguity.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3, Space
+from kalmark.slam.ambiguity import density, gains
+from kalmark.slam.events import Id
+from kalmark.slam.report import Observation
+
+if TYPE_CHECKING:
+    from kalmark.slam.scene import View
+    from kalmark.slam.slam import Slam
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+EVERY = 5  # sightings of a landmark, after each of which it is looked at
+NEAREST = 128  # landmarks near it, among which are those that it may be
+COMPANY = 12  # landmarks seen lately, which must find their own as well
+TRIES = 8  # of what it may be
+WIDE = 1.5  # times the gate of the nearest it may be, within which all are that it may be
+SLACK_M, SLACK_RAD = 0.3, 0.3  # by which the company may miss, and by which it may be turned
+GATE = 0.99
+EQUAL_M = 1e-4  # how equal two landmarks are made
+LINEAR = (VECTOR, VECTOR3, SCALAR)  # atoms of which a difference is one
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """What is seen of a block that is the difference of two others: that it is zero."""
+
+    mount: Array
+    numbers: int
+
+    def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+        """Return e = l, z = y - e, E_h = 0 and E_l = 1."""
+        count, n = l.shape
+        E_l = np.tile(np.eye(n), (count, 1, 1))
+        pose = 3 if len(self.mount) == 3 else 6
+        return l.copy(), y - l, np.zeros((count, n, pose * (len(head) // len(self.mount)))), E_l
+
+
+def note(slam: Slam, outcomes: Sequence[Observation]) -> list[Id]:
+    """Note which landmarks were seen in one scan, and so are different; return those without an id in the log."""
+    members = slam.members
+    if all(o.id is not None for o in outcomes):
+        return []
+    seen: list[Any] = [o.landmark for o in outcomes if o.outcome in ("associated", "new")]
+    names = [name for name in seen if name in members.kinds]
+    for name in names:
+        members.together.setdefault(name, set()).update(names)
+    members.lately = [name for name in members.lately if name not in names][-COMPANY:] + names
+    unnamed: list[Any] = [o.landmark for o in outcomes if o.id is None]
+    return [name for name in unnamed if name in names]
+
+
+def merge(slam: Slam, view: View, robot: str, outcomes: Sequence[Observation]) -> Iterator[tuple[Id, Id, str]]:
+    """Merge landmarks that are one beyond doubt; return each that is gone, the one it is now, and why."""
+    members = slam.members
+    mine = note(slam, outcomes)
+    if not view.upkeep.merge:
+        return
+    again = False
+    for name in mine:
+        due = again or members.seen.get(name, 0) % EVERY == 0
+        if due and name in members.kinds and _fits(members.kinds[name].space):
+            for merged in _merge_with(slam, view, robot, name):
+                again = True  # now the others are known better to each other
+                yield merged
+
+
+def _fits(space: Space) -> bool:
+    return all(kind in LINEAR for kind in space.kinds)
+
+
+def _merge_with(slam: Slam, view: View, robot: str, name: Id) -> Iterator[tuple[Id, Id, str]]:
+    """Merge a landmark, and others seen lately, with what they are, if that is beyond doubt.
+
+    What it may be is tried one by one: the others, moved along, find their own.  Of those hypotheses for which most of
+    them do, the one that gains most must gain more than chance and than any other that has nothing in common with it.
+    """
+    d = 2 if len(view.at) == 3 else 3
+    tried = []
+    for pairs in _hypotheses(slam, name, d):
+        z, Z = _differences(slam, pairs)
+        sensor = view.pose(slam.map, slam.members.slots[robot])
+        chance = math.log(density(slam, [name], sensor, d))
+        found = gains(z, Z, np.full(len(pairs), chance))
+        best = int(np.argmax(np.cumsum(found.gain))) + 1
+        d2 = 2.0 * float((found.room - found.gain)[:best].sum())
+        if d2 <= chi2_gate(GATE, z.shape[1] * best):
+            tried.append((float(found.gain[:best].sum()), [pairs[i] for i in found.order[:best]]))
+    if not tried:
+        return
+    gain, chosen = max(tried, key=lambda each: each[0])
+    rival = max((other for other, pairs in tried if not set(pairs) & set(chosen)), default=0.0)
+    if gain - max(rival, 0.0) >= math.log(view.upkeep.odds):
+        yield from _fuse(slam, view, robot, chosen, gain)
+
+
+def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
+    """Return what a landmark and others seen lately may be: lists of pairs, its own first."""
+    members, together = slam.members, slam.members.together
+    at = slam.mean(name)[:d]
+    kind = members.kinds[name].kind
+    _, around = slam.nearby.pairs(slam, frozenset((kind,)), at[None], NEAREST, math.inf)
+    others = [n for n in around if n in together and n != name and members.kinds[n].kind == kind]
+    places = slam.map.means(members.slots_of(others), d) if others else np.zeros((0, d))
+    far = np.linalg.norm(places - at, axis=1)
+    possible = sorted((l for l, o in enumerate(others) if o not in together[name]), key=lambda l: far[l])
+    if not possible:
+        return
+    _, Z = _differences(slam, [(name, others[possible[0]])])
+    reach = WIDE * math.sqrt(chi2_gate(GATE, len(Z)) * float(np.linalg.eigvalsh(Z)[-1]))
+    possible = [l for l in possible if far[l] <= reach]
+    if not possible:
+        return
+    company = [n for n in members.lately if n != name and n in members.kinds and members.kinds[n].kind == kind]
+    mine = slam.map.means(members.slots_of(company), d) if company else np.zeros((0, d))
+    moved = mine[:, None] + (places[possible] - at)  # (C, L, d): the company, were the landmark the l-th that it may be
+    gaps: Any = cKDTree(places).query(moved)
+    found, nearest = gaps[0], gaps[1]
+    alone = np.array([[o in together[c] or o == c for o in others] for c in company]).reshape(len(company), len(others))
+    found[np.take_along_axis(alone, nearest, axis=1)] = np.inf
+    slack = SLACK_M + SLACK_RAD * np.linalg.norm(mine - at, axis=1)[:, None]
+    score = np.maximum(1.0 - found / slack, 0.0).sum(axis=0)
+    for i in np.argsort(-score, kind="stable")[:TRIES].tolist():
+        first = (name, others[possible[i]])
+        z, Z = _differences(slam, [first])
+        if z[0] @ np.linalg.solve(Z, z[0]) <= chi2_gate(GATE, len(Z)):
+            pairs, used = [first], {*first}
+            for c in np.argsort(found[:, i], kind="stable").tolist():
+                pair = company[c], others[nearest[c, i]]
+                if found[c, i] <= slack[c, 0] and used.isdisjoint(pair):
+                    pairs.append(pair)
+                    used |= {*pair}
+            yield pairs
+
+
+def _differences(slam: Slam, pairs: Sequence[tuple[Id, Id]]) -> tuple[Array, Array]:
+    """Return the differences z (M, n) of pairs of landmarks and their joint covariance (M n, M n)."""
+    names = list(dict.fromkeys(name for pair in pairs for name in pair))
+    slots = slam.members.slots_of(names).tolist()
+    P = slam.map.covariance(slots)
+    n = len(P) // len(names)
+    at = {name: i for i, name in enumerate(names)}
+    means = [slam.map.mean(slot) for slot in slots]
+    z = np.array([means[at[b]] - means[at[a]] for a, b in pairs])
+    J = np.zeros((len(pairs) * n, len(P)))
+    for i, (a, b) in enumerate(pairs):
+        J[i * n : (i + 1) * n, at[a] * n : (at[a] + 1) * n] = -np.eye(n)
+        J[i * n : (i + 1) * n, at[b] * n : (at[b] + 1) * n] = np.eye(n)
+    return z, J @ P @ J.T + EQUAL_M**2 * np.eye(len(J))
+
+
+def _fuse(
+    slam: Slam, view: View, robot: str, pairs: Sequence[tuple[Id, Id]], gain: float
+) -> Iterator[tuple[Id, Id, str]]:
+    """Constrain pairs of landmarks to be equal, through the estimator, and remove the younger of each."""
+    map_, members = slam.map, slam.members
+    slots, space = [], members.kinds[pairs[0][0]].space
+    for a, b in pairs:
+        one, other = members.slots[a], members.slots[b]
+        l, index = map_.mean(other) - map_.mean(one), np.concatenate([map_.index(one), map_.index(other)])
+        n = len(index) // 2
+        G = np.hstack([-np.eye(n), np.eye(n)])
+        slots.append(map_.augment(Space("difference", space.kinds), l, index, G, np.zeros((n, n))))
+    look: Any = Difference(view.at, space.size)
+    y, R = np.zeros((len(pairs), space.size)), np.tile(EQUAL_M**2 * np.eye(space.size), (len(pairs), 1, 1))
+    done = slam.estimator.correct(
+        map_, look, members.slots[robot], view.mount, np.array(slots), space.size, y, R, math.inf
+    )
+    age = {name: i for i, name in enumerate(members.kinds)}
+    for slot, (a, b), d2 in zip(slots, pairs, done.d2.tolist(), strict=True):
+        map_.remove(slot)
+        kept, gone = (a, b) if age[a] < age[b] else (b, a)
+        members.seen[kept] = members.seen.get(kept, 0) + members.seen.get(gone, 0)
+        for name in list(members.together.get(gone, ())):
+            members.together.setdefault(name, set()).add(kept)
+        members.together.setdefault(kept, set()).update(members.together.get(gone, ()))
+        slam.remove(gone)
+        others = f", with {len(pairs) - 1} others" if len(pairs) > 1 else ""
+        yield gone, kept, f"merged into {kept!r}: d2 {d2:.1f}, e^{gain:.0f} times likelier than chance{others}"

@@ -1,0 +1,106 @@
+"""A run folder is enough to say why an observation became what it did."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.errors import RunError
+from kalmark.results.explain import explain
+from kalmark.results.run import Run
+from test_merging import GARDEN, look, slam_of
+
+
+def lost_run(tmp_path: Path) -> Run:
+    """Map the garden, lose the way, map it again, until the two become one."""
+    rng, events = np.random.default_rng(0), []
+    for t in range(20):
+        if t == 6:
+            events.append(km.Control(t, "cart", (2.5, -2.5, 0.03), np.diag([3.0, 3.0, 0.05]) ** 2))
+        y = km.geometry.observe(np.zeros(3), GARDEN)[0] + rng.normal(size=(6, 2)) * [0.05, 0.01]
+        events.append(km.Scan(100 + t, "cart", "lidar", y) if t != 6 else km.Scan(100 + t, "cart", "lidar", ()))
+    events[6] = km.Control(106, "cart", events[6].u, events[6].cov)  # type: ignore[union-attr]
+    run = km.record(slam_of(), events, progress=False)
+    run.save(tmp_path / "run")
+    return Run.load(tmp_path / "run")
+
+
+def test_it_names_the_landmarks_compared_with_their_distances_gates_and_the_decision(tmp_path: Path) -> None:
+    run = lost_run(tmp_path)
+    told = explain(run, 5.0)
+    assert (told.robot, told.sensor, told.t_s, told.log_t_s) == ("cart", "lidar", 5.0, "105.000000000")
+    assert told.gates == pytest.approx((9.21, 23.03), abs=0.01)
+    assert [f.outcome for f in told.fates] == ["associated"] * 6
+    for fate, point in zip(told.fates, GARDEN, strict=True):
+        assert fate.compared[0].landmark == fate.landmark
+        assert np.linalg.norm(fate.seen_at - point) < 0.4
+        assert np.linalg.norm(fate.compared[0].place - point) < 0.2
+    held = explain(run, 7.0)
+    assert {f.outcome for f in held.fates} == {"deferred"}
+    text = "\n".join(held.lines())
+    assert "cart · lidar · t = 7.000 s (107.000000000 s in the log)" in text
+    assert "or a new landmark: the odds are" in text
+    assert "compared with u" in text
+
+
+def test_the_time_may_be_that_of_the_log(tmp_path: Path) -> None:
+    run = lost_run(tmp_path)
+    assert explain(run, 107.0).step == explain(run, 7.0).step
+    with pytest.raises(RunError, match=r"scan is 50 s, expected 0 to 19.000 s, or 100.000000000 to 119.000000000 s"):
+        explain(run, 50.0)
+    with pytest.raises(RunError, match="robot is 'ship', expected one of cart"):
+        explain(run, 5.0, "ship")
+
+
+def test_merged_and_removed_landmarks_have_rows_of_their_own(tmp_path: Path) -> None:
+    run = lost_run(tmp_path)
+    with (tmp_path / "run" / "associations.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    merged = [row for row in rows if row["outcome"] == "merged"]
+    assert merged
+    assert all(row["index"] == "" and row["reason"].startswith("merged into 'u") for row in merged)
+    step = run.history.decisions.changes[0].step
+    told = explain(run, (run.history.t_ns[step] - run.history.t_ns[0]) * 1e-9)
+    assert any(change.what in ("merged", "removed") for change in told.changes)
+    times = [float(row["t_s"]) for row in rows]
+    assert times == sorted(times)
+
+
+def test_a_run_with_ids_says_what_it_can(tmp_path: Path) -> None:
+    robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.RangeBearing())})
+    run = km.record(km.Slam([robot]), [km.Scan(1, "r", "s", [[3.0, 0.1]], [7])] * 2, progress=False)
+    run.save(tmp_path / "run")
+    told = explain(Run.load(tmp_path / "run"), 0.0)
+    assert [*told.lines()][2] == "   0 (id 7): new 7"
+    assert told.gates is None
+
+
+def test_a_wrong_map_is_noticed_from_the_time_on_when_it_is_wrong() -> None:
+    rng = np.random.default_rng(5)
+    robot = km.Robot("r", km.motion.Odometry2D(0.02, 0.02, 0.01), sensors={"s": km.Mount(km.sensors.RangeBearing())})
+    for wrong in (False, True):
+        events = []
+        for t in range(300):
+            events.append(km.Control(t, "r", rng.normal(size=3) * [0.02, 0.02, 0.01]))
+            y = km.geometry.observe(np.zeros(3), GARDEN)[0] + rng.normal(size=(6, 2)) * [0.1, 0.02]
+            ids = [0, 1, 2, 3, 4, 5] if not wrong or t < 200 else [1, 0, 2, 3, 4, 5]  # two are taken for each other
+            events.append(km.Scan(t, "r", "s", y, ids))
+        run = km.record(km.Slam([robot]), events, progress=False)
+        lines = [line for line in run.evaluate()["warnings"] if "the map may be wrong from there on" in line]
+        assert bool(lines) == wrong, lines
+    assert lines[0].startswith("NIS per degree of freedom rises to ")
+    low = run.summary["nis_window_max_s"][0]
+    assert 180 <= low <= 215
+
+
+def test_looking_is_the_same_with_and_without_a_record() -> None:
+    one, two = slam_of(), slam_of()
+    for t in range(4):
+        report = look(one, t, GARDEN)
+        look(two, t, GARDEN)
+        assert len(report.seen_at) == len(GARDEN)
+    np.testing.assert_array_equal(one.mean("cart"), two.mean("cart"))

@@ -1,0 +1,117 @@
+"""What is ambiguous is held back; two landmarks that turn out to be one are merged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.slam.ambiguity import doubtful, gains
+
+ESTIMATORS = [km.estimators.Ekf(), km.estimators.Invariant()]  # for `Fej` the first estimates must be good
+GARDEN = np.array([[4.0, 1.0], [6.0, -2.0], [5.0, 4.0], [8.0, 1.0], [9.0, -3.0], [3.0, -4.0]])
+
+
+def slam_of(estimator: object = None, map_: str = "auto", **upkeep: float) -> km.Slam:
+    sensor = km.sensors.RangeBearing(0.05, 0.01, range_max_m=12.0)
+    cart = km.Robot("cart", km.motion.Odometry2D(), sensors={"lidar": km.Mount(sensor)})
+    kept = km.Upkeep(hold_back=True, **upkeep)  # type: ignore[arg-type]
+    return km.Slam([cart], km.association.GlobalAssignment(), estimator, map=map_, upkeep=kept)  # type: ignore[arg-type]
+
+
+def look(slam: km.Slam, t: int, points: np.ndarray, seed: int = 0) -> km.Report:
+    """See points from the origin, where the robot really stands."""
+    rng = np.random.default_rng([seed, t])
+    y = km.geometry.observe(np.zeros(3), points)[0] + rng.normal(size=(len(points), 2)) * [0.05, 0.01]
+    return slam.process(km.Scan(t, "cart", "lidar", y))
+
+
+def carried_off(
+    slam: km.Slam, points: np.ndarray = GARDEN, sigma: float = 1.0, off: float = 0.8
+) -> tuple[km.Slam, list[km.Report]]:
+    """Map the garden, lose the way by less than is believed, and look at some of it again."""
+    for t in range(6):
+        look(slam, t, GARDEN)
+    assert len(slam.landmarks()) == len(GARDEN)
+    cov = np.diag([sigma, sigma, 0.05]) ** 2
+    slam.process(km.Control(6, "cart", (off, -off, 0.03), cov))
+    return slam, [look(slam, t, points) for t in range(7, 20)]
+
+
+def test_what_pairs_gain_depends_on_those_before_them() -> None:
+    shift, own = 4.0 * np.eye(2), 1e-3 * np.eye(2)  # two pairs whose pose error is common
+    Z = np.kron(np.ones((2, 2)), shift) + np.kron(np.eye(2), own)
+    found = gains(np.array([[1.0, 1.0], [1.02, 1.0]]), Z, np.log([0.5, 0.5]))
+    assert found.order == [0, 1]
+    told = found.gain
+    assert told[0] < 0, "the first tells nothing"
+    assert told[1] > 2, "the second that it fits the first"
+    alone = -0.5 * 2 / 4.001 - np.log(4.001) - np.log(2 * np.pi) - np.log(0.5)
+    assert told[0] == pytest.approx(alone)
+    assert doubtful(found, 0, 1e3) == [0, 1]
+    assert doubtful(found, 0, 2.0) == []
+
+
+def test_one_sighting_of_a_place_long_unseen_is_held_back_and_several_together_are_not() -> None:
+    _, reports = carried_off(slam_of(), GARDEN[:1])
+    first = reports[0].observations[0]
+    assert first.outcome == "deferred"
+    assert "or a new landmark: the odds are" in first.reason
+    _, reports = carried_off(slam_of(), GARDEN[:5], sigma=0.5, off=0.1)
+    assert {o.outcome for o in reports[0].observations} == {"associated"}
+
+
+def test_what_is_held_back_does_not_pull_the_pose() -> None:
+    slam = slam_of()
+    for t in range(6):
+        look(slam, t, GARDEN)
+    slam.process(km.Control(6, "cart", (0.8, -0.8, 0.03), np.diag([1.0, 1.0, 0.05]) ** 2))
+    slam.process(km.Scan(6, "cart", "lidar", ()))
+    before = slam.mean("cart"), slam.covariance("cart")
+    look(slam, 7, GARDEN[:1])
+    np.testing.assert_array_equal(slam.mean("cart"), before[0])
+    np.testing.assert_array_equal(slam.covariance("cart"), before[1])
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
+def test_a_garden_mapped_twice_becomes_one(estimator: object, map_: str) -> None:
+    slam, reports = carried_off(slam_of(estimator, map_), sigma=3.0, off=2.5)
+    merged = [m for r in reports for m in r.merged]
+    assert all(reason.startswith(f"merged into {kept!r}: d2 ") for _, kept, reason in merged)
+    table = slam.landmarks()
+    assert len(table) == len(GARDEN)
+    assert merged
+    assert {gone for gone, _, _ in merged}.isdisjoint(table.ids)
+    assert np.linalg.norm(slam.mean("cart")) < 0.2, "the robot has found its way again"
+    gaps = np.linalg.norm(np.array(table.means)[:, None] - GARDEN, axis=2).min(axis=1)
+    assert gaps.max() < 0.2
+    sigma = np.sqrt([np.trace(P) / 2 for P in table.covariances])
+    assert sigma.max() < 0.1
+
+
+def test_landmarks_that_were_seen_in_one_scan_are_never_merged() -> None:
+    slam = slam_of()
+    pair = np.array([[4.0, 0.0], [4.3, 0.0]])  # within each other's gates, if the bearing were the only clue
+    for t in range(40):
+        report = look(slam, t, pair)
+        assert report.merged == ()
+    assert len(slam.landmarks()) == 2
+
+
+def test_a_merge_resumes_bit_for_bit(tmp_path: Path) -> None:
+    slam = slam_of(confirm=2)
+    for t in range(6):
+        look(slam, t, GARDEN)
+    slam.process(km.Control(6, "cart", (2.5, -2.5, 0.03), np.diag([3.0, 3.0, 0.05]) ** 2))
+    for t in range(7, 10):
+        look(slam, t, GARDEN)
+    slam.save(tmp_path / "map.kmk")
+    again = km.Slam.load(tmp_path / "map.kmk")
+    told = [[look(each, t, GARDEN).merged for t in range(10, 20)] for each in (slam, again)]
+    assert told[0] == told[1]
+    assert any(told[0])
+    everything = ["cart", *slam.landmarks().ids]
+    np.testing.assert_array_equal(slam.covariance(*everything), again.covariance(*everything))
