@@ -56,18 +56,35 @@ def test_the_time_may_be_that_of_the_log(tmp_path: Path) -> None:
         explain(run, 5.0, "ship")
 
 
-def test_merged_and_removed_landmarks_have_rows_of_their_own(tmp_path: Path) -> None:
+def test_merged_and_removed_landmarks_are_listed_in_a_file_of_their_own(tmp_path: Path) -> None:
     run = lost_run(tmp_path)
-    with (tmp_path / "run" / "associations.csv").open() as file:
+    with (tmp_path / "run" / "changes.csv").open() as file:
         rows = list(csv.DictReader(file))
-    merged = [row for row in rows if row["outcome"] == "merged"]
+    merged = [row for row in rows if row["change"] == "merged"]
     assert merged
-    assert all(row["index"] == "" and row["reason"].startswith("merged into 'u") for row in merged)
+    assert all(row["reason"].startswith(f"merged into '{row['into']}'") for row in merged)
     step = run.history.decisions.changes[0].step
     told = explain(run, (run.history.t_ns[step] - run.history.t_ns[0]) * 1e-9)
     assert any(change.what in ("merged", "removed") for change in told.changes)
-    times = [float(row["t_s"]) for row in rows]
-    assert times == sorted(times)
+    with (tmp_path / "run" / "associations.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(run.history.step)
+
+
+def test_an_average_over_landmarks_has_a_row_for_each_with_its_weight(tmp_path: Path) -> None:
+    mount = km.Mount(km.sensors.Position2D(0.1))
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([0.05, 0.4, 0.02]) ** 2, sensors={"s": mount})
+    slam = km.Slam([robot], km.association.Averaged())
+    for name, point in zip("ab", [[4.0, 0.0], [4.0, 1.0]], strict=True):
+        slam.add_landmark(name, point, 0.05**2 * np.eye(2))
+    run = km.record(slam, [km.Scan(1, "r", "s", [[4.0, 0.45]]), km.Scan(2, "r", "s", [[9.0, 9.0]])], progress=False)
+    run.save(tmp_path)
+    assert Run.load(tmp_path).evaluate()["associated"] == 1
+    with (tmp_path / "associations.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["index"] for row in rows] == ["0", "0", "0"]
+    assert {row["landmark"] for row in rows[:2]} == {"a", "b"}
+    weights = [float(row["weight"]) for row in rows]
+    assert weights[0] > weights[1] > 0.2 and sum(weights[:2]) < 1 and weights[2] == 1
 
 
 def test_a_run_with_ids_says_what_it_can(tmp_path: Path) -> None:

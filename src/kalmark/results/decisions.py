@@ -36,7 +36,8 @@ class Decisions:
     """Observations without an id (rows `row` of the history): the landmarks each was compared with before the scan.
 
     `landmark` (C,), `d2` (C,) and `place` (C, d), where that landmark was in the map; `seen_at` (O, d) is where each
-    observation seemed to come from, NaN where its sensor does not tell.
+    observation seemed to come from, NaN where its sensor does not tell.  The observations `share_row` (W,) were
+    averaged over landmarks `share_landmark`, of these weights.
     """
 
     row: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -45,6 +46,9 @@ class Decisions:
     place: Array = field(default_factory=lambda: _none(0, 2))
     seen_at: Array = field(default_factory=lambda: _none(0, 2))
     changes: tuple[Change, ...] = ()
+    share_row: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    share_landmark: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
+    share_weight: Array = field(default_factory=lambda: _none(0))
 
     @classmethod
     def of(cls, reports: Sequence[Report], d: int) -> Decisions:
@@ -55,6 +59,12 @@ class Decisions:
         for start, end, report in zip(first, first[1:], reports, strict=False):
             if len(report.seen_at):
                 seen_at[start:end] = report.seen_at
+        shares = [
+            (start + k, str(name), weight)
+            for start, report in zip(first, reports, strict=False)
+            for k, o in enumerate(report.observations)
+            for name, weight in o.shares
+        ]
         changes = [
             change
             for step, report in enumerate(reports)
@@ -70,6 +80,9 @@ class Decisions:
             np.array([c.place for _, c in seen], dtype=np.float64).reshape(-1, d),
             seen_at,
             tuple(changes),
+            np.array([row for row, _, _ in shares], dtype=np.int64),
+            np.array([name for _, name, _ in shares], dtype=np.str_),
+            np.array([weight for _, _, weight in shares], dtype=np.float64),
         )
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
@@ -84,6 +97,9 @@ class Decisions:
             "candidate_d2": self.d2,
             "candidate_place": self.place,
             "seen_at": self.seen_at,
+            "share_row": self.share_row,
+            "share_landmark": self.share_landmark,
+            "share_weight": self.share_weight,
         }
 
     @classmethod
@@ -94,4 +110,5 @@ class Decisions:
         rows = zip(*(named[f"change_{key}"].tolist() for key in Change._fields), strict=True)
         columns = (named[f"candidate_{key}"] for key in ("row", "landmark", "d2", "place"))
         row, landmark, d2, place = columns
-        return cls(row, landmark, d2, place, named["seen_at"], tuple(Change(*each) for each in rows))
+        shares = [named[f"share_{key}"] for key in ("row", "landmark", "weight") if f"share_{key}" in named]
+        return cls(row, landmark, d2, place, named["seen_at"], tuple(Change(*each) for each in rows), *shares)

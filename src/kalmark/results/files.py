@@ -1,10 +1,12 @@
-"""The plain files of a run folder: TUM trajectories, ``associations.csv``, ``config.yaml``."""
+"""The plain files of a run folder: TUM trajectories, ``associations.csv``, ``changes.csv``, ``config.yaml``."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from kalmark.results.describe import plain
 from kalmark.results.history import History
 
 ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
+CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
 
 
 def seconds(t_ns: int) -> str:
@@ -39,21 +42,36 @@ def _lifted(x: float, y: float, theta: float) -> tuple[float, ...]:
 
 
 def associations_csv(history: History) -> str:
-    """Return one row an observation: when, who, with what, and what became of it; and what became of landmarks later.
+    """Return one row an observation: when, who, with what, and what became of it.
 
-    Landmarks that were merged or removed have rows of their own, without an index, after the scan that did it.
+    Of an observation that was averaged over landmarks, one row each with its weight, which is then a column more.
     """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(ASSOCIATIONS)
-    times = [seconds(t_ns) for t_ns in history.t_ns.tolist()]
-    robots = history.robot.tolist()
+    times, robots = [seconds(t_ns) for t_ns in history.t_ns.tolist()], history.robot.tolist()
+    soft, shares = history.decisions, defaultdict(list)
+    for row, name, weight in zip(soft.share_row.tolist(), soft.share_landmark, soft.share_weight.tolist(), strict=True):
+        shares[row].append((name, weight))
     columns = (history.step, history.sensor, history.index, history.id, history.outcome, history.landmark)
     told = zip(*(column.tolist() for column in (*columns, history.d2, history.reason)), strict=True)
-    rows = [(step, [*row, "" if math.isnan(d2) else repr(d2), reason]) for step, *row, d2, reason in told]
-    rows += [(c.step, ["", "", "", c.what, c.landmark, "", c.reason]) for c in history.decisions.changes]
-    for step, row in sorted(rows, key=lambda each: each[0]):
-        writer.writerow([times[step], robots[step], *row])
+    rows = []
+    for k, (step, *seen, landmark, d2, reason) in enumerate(told):
+        for name, weight in shares.get(k, [(landmark, 1.0)]):
+            number = "" if math.isnan(d2) or name != landmark else repr(d2)
+            rows.append([times[step], robots[step], *seen, name, number, reason, repr(weight)])
+    return _csv((*ASSOCIATIONS, "weight"), rows) if shares else _csv(ASSOCIATIONS, [row[:-1] for row in rows])
+
+
+def changes_csv(history: History) -> str:
+    """Return one row for each landmark that was removed or merged with another: after which scan, and why."""
+    rows = [
+        [seconds(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
+        for c in history.decisions.changes
+    ]
+    return _csv(CHANGES, rows)
+
+
+def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([header, *rows])
     return out.getvalue()
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from kalmark.errors import RunError
 from kalmark.results.evaluate import evaluate
-from kalmark.results.files import associations_csv, config_yaml, read_yaml, tum
+from kalmark.results.files import associations_csv, changes_csv, config_yaml, read_yaml, tum
 from kalmark.results.history import History
 from kalmark.results.images import cameras_that_saw
 from kalmark.results.landmarks import MapLandmarks
@@ -125,6 +125,9 @@ class Run:
         write(folder / "config.yaml", config_yaml(self.config))
         write(folder / "landmarks.csv", self.landmarks.to_csv())
         write(folder / "associations.csv", associations_csv(self.history))
+        (folder / "changes.csv").unlink(missing_ok=True)
+        if self.history.decisions.changes:
+            write(folder / "changes.csv", changes_csv(self.history))
         replace_file(folder / "history.npz", self._write_arrays)
         self._save_map(folder)
         self.report(folder)
