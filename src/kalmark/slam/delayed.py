@@ -353,10 +353,12 @@ def _solved(slam: Slam, view: View, c: Candidate) -> Solution:
         W = _weights(E, H @ P @ H.T + R)
         step = W @ z
         p = p + step
-        if np.linalg.norm(step) < 1e-9 * (1 + np.linalg.norm(p)):
+        if not np.linalg.norm(step) >= 1e-9 * (1 + np.linalg.norm(p)):
             break
     z = z - E @ step
-    chi2 = float(z @ np.linalg.solve(H @ P @ H.T + R, z))
+    chi2 = float(z @ np.linalg.solve(H @ P @ H.T + R, z)) if np.isfinite(z).all() else math.inf
+    if not math.isfinite(chi2):
+        return Solution(p, -W @ H, W @ R @ W.T, index, math.inf, n * m - 2, math.inf)
     last = view.pose(map_, slots[n - 1])
     v, V_T, V_p = (a[0] for a in view.landmark.seen_from(last, p[None]))
     V_P = np.zeros((2, len(P)))
@@ -367,7 +369,7 @@ def _solved(slam: Slam, view: View, c: Candidate) -> Solution:
         W_i = _weights(E[keep], (H @ P @ H.T + R)[np.ix_(keep, keep)])
         J = V_P - V_p @ W_i @ H[keep]
         cov = J @ P @ J.T + V_p @ W_i @ R[np.ix_(keep, keep)] @ W_i.T @ V_p.T
-        worst = max(worst, float(np.linalg.norm(cov, 2)))
+        worst = max(worst, float(np.linalg.norm(cov, 2)) if np.isfinite(cov).all() else math.inf)
     return Solution(p, -W @ H, W @ R @ W.T, index, chi2, n * m - 2, math.sqrt(worst) / float(np.linalg.norm(v)))
 
 
@@ -385,9 +387,12 @@ def _linearized(slam: Slam, view: View, c: Candidate, p: Array, size: int) -> tu
 
 
 def _weights(E: Array, S: Array) -> Array:
-    """Return W = (E' S^-1 E)^-1 E' S^-1."""
-    S_E = np.linalg.solve(S, E)
-    return np.linalg.solve(E.T @ S_E, S_E.T)
+    """Return W = (E' S^-1 E)^-1 E' S^-1, NaN where there is none: where the measurements do not meet."""
+    try:
+        S_E = np.linalg.solve(S, E)
+        return np.linalg.solve(E.T @ S_E, S_E.T)
+    except np.linalg.LinAlgError:
+        return np.full(E.T.shape, np.nan)
 
 
 def _slots(view: View, c: Candidate) -> list[int]:
