@@ -80,7 +80,7 @@ CASES = {
     "trunks to 10 m": (Trunks(range_max_m=80, beams=1), lambda g: trunks(g, 10.0), 0.01),
     "trunks to 20 m": (Trunks(range_max_m=80, beams=1), trunks, 0.01),
     "trunks to 35 m": (Trunks(range_max_m=80, beams=1), lambda g: trunks(g, 35.0), 0.02),
-    "reflectors": (Reflectors(range_max_m=80, radius_m=0.05, intensity_min=2), reflectors, 0.06),
+    "reflectors": (Reflectors(range_max_m=80, radius_m=0.05, intensity_min=2), reflectors, 0.01),
     "corners of rooms": (Corners(range_max_m=80), room, 0.02),
     "corners of boxes": (Corners(range_max_m=80), box, 0.02),
 }
