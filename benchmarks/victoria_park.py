@@ -31,7 +31,7 @@ BARE = ["log.detections=rfs", "robots.each.sensors.laser.detector=null"]
 CASES: dict[str, tuple[str, list[str]]] = {
     "known": ("victoria_park_known", []),
     "laser": ("victoria_park", []),
-    "laser, 2 beams": ("victoria_park", ["robots.each.sensors.laser.detector.beams=2"]),
+    "laser, 1 beam": ("victoria_park", ["robots.each.sensors.laser.detector.beams=1"]),
     "rfs": ("victoria_park", BARE),
 }
 
