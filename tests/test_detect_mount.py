@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.cli.run import run_log
 from kalmark.config.building import build_robot
 from kalmark.config.reading import load_config
 from kalmark.geometry.rotations import matrix
 from laser_worlds import LaserWorld
 from test_detect import ANGLES, SIGMA_M
+
+Data = Callable[[str], Path]
 
 TREES = np.array([[8.0, 3.0, 0.3, 1], [12.0, -4.0, 0.2, 1], [6.0, -5.0, 0.45, 1], [15.0, 1.0, 0.4, 1]])
 
@@ -77,6 +82,17 @@ def test_the_configuration_gives_the_radius_to_a_sensor_that_takes_it(tmp_path: 
     mounts = build_robot(load_config(path), "robot").sensors
     assert mounts["a"].detector == km.detect.Trunks(beams=3, signature=False)
     assert mounts["b"].detector == km.detect.Corners(signature=True)
+
+
+def test_victoria_park_from_raw_scans_goes_the_way_of_the_known_trees(data: Data) -> None:
+    path, minute = data("victoria_park"), ["log.to_s=60"]
+    raw = run_log("victoria_park", path, overrides=minute, progress=False)
+    known = run_log("victoria_park_known", path, overrides=minute, progress=False)
+    there = raw.history.poses[-1] - known.history.poses[-1]
+    assert np.linalg.norm(there[:2]) < 1.0
+    assert abs(there[2]) < math.radians(2)
+    assert len(raw.landmarks) > 15
+    assert np.sum(raw.history.outcome == "associated") > 10 * len(raw.landmarks)
 
 
 def test_a_scan_and_what_was_found_in_it_is_drawn(tmp_path: Path) -> None:
