@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.cli import main
 from kalmark.errors import RunError
 from kalmark.results.explain import explain
+from kalmark.results.report import report_html
 from kalmark.results.run import Run
+from kalmark.results.series import series
+from kalmark.results.series_association import change_rows
 from test_merging import GARDEN, look, slam_of
 
 
@@ -121,3 +125,27 @@ def test_looking_is_the_same_with_and_without_a_record() -> None:
         look(two, t, GARDEN)
         assert len(report.seen_at) == len(GARDEN)
     np.testing.assert_array_equal(one.mean("cart"), two.mean("cart"))
+
+
+def test_the_page_draws_the_ambiguous_scans_and_lists_what_was_merged(tmp_path: Path) -> None:
+    run = lost_run(tmp_path)
+    shown = series(run)["association"]
+    assert shown["changes"]["merged"]
+    scan = next(s for s in shown["scans"] if s["t"] == 7.0)
+    assert [seen["outcome"] for seen in scan["seen"]] == ["deferred"] * 6
+    told = explain(run, 7.0).fates[0]
+    assert scan["seen"][0]["near"][0]["name"] == told.compared[0].landmark
+    assert scan["seen"][0]["near"][0]["x"] == pytest.approx(told.compared[0].place[0], abs=1e-4)
+    rows = [*change_rows(run)]
+    assert all(reason.startswith("merged into") or what == "removed" for _, _, what, reason in rows)
+    page = report_html(run)
+    assert "Landmarks merged and removed" in page
+    assert "Ambiguous scans" in page
+
+
+def test_a_scan_can_be_drawn_from_the_folder_alone(tmp_path: Path) -> None:
+    run = lost_run(tmp_path)
+    assert main(["explain", str(run.folder), "--scan", "9"]) == 0
+    picture = tmp_path / "run" / "scan_cart_9.000.png"
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert main(["explain", str(run.folder), "--scan", "77"]) == 2

@@ -138,3 +138,57 @@ def test_a_bad_setting_is_refused() -> None:
         km.Upkeep(confirm=0)
     with pytest.raises(ModelError, match="Upkeep: within is 2, expected at least confirm, 3"):
         km.Upkeep(within=2)
+
+
+# ---------------------------------------------------------------------- existence
+SIGHT = {"fov_rad": np.pi, "range_max_m": 20.0}
+WATCHED = km.Upkeep(p_detect=0.9)
+
+
+def watch(slam: km.Slam, trees: np.ndarray, steps: range) -> list[tuple[object, str]]:
+    removed = []
+    for t in steps:
+        rng = np.random.default_rng([7, t])
+        y = km.geometry.observe(np.zeros(3), trees)[0] + rng.normal(size=(len(trees), 2)) * [0.05, 0.01]
+        removed += slam.process(km.Scan(t, "cart", "lidar", y)).removed
+    return removed
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+def test_a_tree_that_was_felled_is_removed_with_its_reason_and_the_others_stay(map_: str) -> None:
+    slam = orchard(map_=map_, upkeep=WATCHED, **SIGHT)
+    assert watch(slam, TREES, range(10)) == []
+    (gone, why), *more = watch(slam, TREES[1:], range(10, 40))
+    assert more == []
+    assert why == "should be in view and was not seen, 5 scans in a row"
+    assert gone not in slam.landmarks().ids
+    assert len(slam.landmarks()) == len(TREES) - 1
+    never = orchard(map_=map_, **SIGHT)
+    assert watch(never, TREES, range(10)) + watch(never, TREES[1:], range(10, 40)) == []
+
+
+def test_what_is_out_of_view_or_hidden_is_not_missed() -> None:
+    slam = orchard(upkeep=WATCHED, fov_rad=1.0, range_max_m=20.0)
+    trees = np.array([[6.0, 1.0], [12.0, 2.05], [5.0, -1.0]])  # the second one stands behind the first
+    watch(slam, trees, range(6))
+    assert watch(slam, trees[[0, 2]], range(6, 40)) == []
+    slam.process(km.Control(40, "cart", (0.0, 0.0, np.pi)))
+    for t in range(40, 60):  # looking the other way
+        assert slam.process(km.Scan(t, "cart", "lidar", ())).removed == ()
+    assert len(slam.landmarks()) == 3
+
+
+def test_how_long_a_landmark_was_missed_is_saved(tmp_path: Path) -> None:
+    slam = orchard(upkeep=WATCHED, **SIGHT)
+    watch(slam, TREES, range(6))
+    watch(slam, TREES[1:], range(6, 9))
+    slam.save(tmp_path / "map.kmk")
+    again = km.Slam.load(tmp_path / "map.kmk")
+    told = watch(slam, TREES[1:], range(9, 20))
+    assert told == watch(again, TREES[1:], range(9, 20))
+    assert len(told) == 1
+
+
+def test_the_probabilities_must_tell() -> None:
+    with pytest.raises(ModelError, match=r"p_detect is 0.04, expected a probability between p_false, 0.05, and 1"):
+        km.Upkeep(p_detect=0.04)

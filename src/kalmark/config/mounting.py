@@ -8,7 +8,18 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from kalmark.config.landmarks import Association, Landmark
-from kalmark.config.sections import Limit, NotNegative, Number, Positive, Reserved, Section, Sigmas, expected, type_or
+from kalmark.config.sections import (
+    Limit,
+    NotNegative,
+    Number,
+    Positive,
+    Probability,
+    Reserved,
+    Section,
+    Sigmas,
+    expected,
+    type_or,
+)
 
 Most = Annotated[int, Field(ge=0)] | None
 Count = Annotated[int, Field(ge=1)]
@@ -137,11 +148,17 @@ class UpkeepConfig(Section):
     """Hold back pairings that are not beyond doubt (`nearest`, `global`, `jcbb`), and map anew what is held back."""
     odds: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 100.0
     """So many times likelier than chance is beyond doubt."""
+    p_detect: Probability | None = None
+    """How often one in view is seen; with it, those that are not seen again and again are removed."""
+    p_false: Probability = 0.05
+    """How often something else is taken for a landmark that is gone."""
 
     @model_validator(mode="after")
     def _can_be(self) -> UpkeepConfig:
         if self.within < self.confirm:
             raise expected(f"at least confirm, {self.confirm}", "within")
+        if self.p_detect is not None and self.p_detect <= self.p_false:
+            raise expected(f"more than p_false, {self.p_false}", "p_detect")
         return self
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,6 +25,7 @@ OUTCOME = {
 FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
 PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
+ON_LINE: dict[str, Any] = {"ha": "center", "va": "center", "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
 def save_scan(run: Run, told: Explanation, path: str | Path) -> None:
@@ -38,7 +39,7 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
     """Return the figure of one scan, from above: axes in metres, in the frame of the map.
 
     Crosses are the observations where they seem to come from before the scan, squares the landmarks they were compared
-    with then; a full line goes to the landmark that was decided on, dotted ones, with d2, to the others.
+    with then; a full line goes to the landmark that was decided on, dotted ones to the others, each with its d2.
     """
     figure = Figure(figsize=(9.5, 8.5), layout="constrained", facecolor="white")
     axes = figure.subplots()
@@ -57,9 +58,9 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
             axes.plot(*zip(at, there, strict=True), "-" if chosen else ":", color=colour, lw=2 if chosen else 1)
             axes.plot(*there, "s", color=INK, mfc="none", ms=8, zorder=4)
             axes.annotate(
-                f"{other.landmark}: {other.d2:.3g}", there, (6, -11), textcoords="offset points",
-                fontsize=8, color=colour, clip_on=True,
-            )  # fmt: skip
+                other.landmark, there, (7, -12), textcoords="offset points", fontsize=8, color=INK, clip_on=True
+            )
+            axes.text(*_between(at, there), f"{other.d2:.3g}", fontsize=8, color=colour, clip_on=True, **ON_LINE)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -71,6 +72,11 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
     axes.set_title("; ".join(lines[1:3] if told.gates else lines[1:2]), loc="left", fontsize=9, color=INK)
     figure.legend(handles=_legend(told), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
+
+
+def _between(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    """Return a place on the line from an observation to a landmark, nearer to the observation."""
+    return one[0] + 0.35 * (other[0] - one[0]), one[1] + 0.35 * (other[1] - one[1])
 
 
 def _robot(axes: Axes, run: Run, told: Explanation) -> None:
@@ -108,7 +114,7 @@ def _legend(told: Explanation) -> list[Line2D]:
     marks = [Line2D([], [], ls="", marker="x", mew=2, color=OUTCOME.get(o, INK), label=o) for o in outcomes]
     return [
         Line2D([], [], color=ROBOT, marker="o", label="robot after the scan, 3 sigma"),
-        Line2D([], [], ls="", marker="s", color=INK, mfc="none", label="compared with it: name and d2"),
+        Line2D([], [], ls="", marker="s", color=INK, mfc="none", label="compared with it; d2 on the line"),
         Line2D([], [], ls="", marker=".", color=FAINT, label="other landmarks, as kept last"),
         *marks,
     ]

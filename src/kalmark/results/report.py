@@ -11,6 +11,7 @@ from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
 from kalmark.results.files import config_yaml
 from kalmark.results.picture import headline
 from kalmark.results.series import reasons, series
+from kalmark.results.series_association import change_rows
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -48,6 +49,7 @@ def report_html(run: Run) -> str:
         warnings="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("warnings", ())),
         mounts=_mounts(run.summary),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),
+        changes=_changes(run),
         skipped=_skipped(run),
         config=html.escape(config_yaml(run.config)),
         plotly=_plotly(),
@@ -101,6 +103,12 @@ def _mounts(summary: dict[str, Any]) -> str:
     return f"<h2>Mounts that calibrate themselves</h2>{_table(rows, MOUNT_COLUMNS)}" if rows else ""
 
 
+def _changes(run: Run) -> str:
+    rows = [*change_rows(run)]
+    head = ("t (s)", "landmark", "", "why")
+    return f"<h2>Landmarks merged and removed</h2>{_table(rows, head)}" if rows else ""
+
+
 def _skipped(run: Run) -> str:
     lines = ([f"stopped: {run.stopped}"] if run.stopped else []) + run.skipped
     if not lines:
@@ -139,7 +147,10 @@ _TEMPLATE = """<!DOCTYPE html>
 <div id="errors"></div>
 <h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
 <section id="nis-section"><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>
-<section id="association"><h2>Association</h2><div id="outcomes"></div>{reasons}</section>
+<section id="association"><h2>Association</h2><div id="outcomes"></div>{reasons}
+<div id="ambiguous"><h2>Ambiguous scans <select id="which"></select>
+<small>crosses: observations; squares: landmarks compared with, and d2; a full line goes to the chosen one</small></h2>
+<div id="scan"></div><ul id="told"></ul></div>{changes}</section>
 <section><h2>Figures</h2>{robots}{summary}{mounts}{skipped}</section>
 <section><h2>Configuration</h2><pre>{config}</pre></section>
 </main>

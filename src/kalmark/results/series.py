@@ -11,6 +11,7 @@ import numpy as np
 from kalmark.results.consistency import anees_interval, nees, nis, pose_error
 from kalmark.results.history import Array, Ints, MapSnapshot
 from kalmark.results.picture import Picture
+from kalmark.results.series_association import association_series
 from kalmark.results.series_space import space_series
 from kalmark.results.thinned import POINTS, gaussians, significant, thin, xy
 from kalmark.slam.report import OUTCOMES
@@ -41,6 +42,7 @@ def series(run: Run) -> dict[str, Any]:
         "dof": dof,
         "neesBounds": anees_interval(dof),
         "outcomes": _outcomes(run, t),
+        "association": association_series(run, t),
     }
 
 

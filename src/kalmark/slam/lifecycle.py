@@ -16,7 +16,7 @@ from kalmark.filter.storage import Triangle
 from kalmark.geometry.spaces import RHO
 from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.protocols import Landmark
-from kalmark.slam import merging, tentative
+from kalmark.slam import existence, merging, tentative
 from kalmark.slam.ends import extended_ends
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation, Report
@@ -67,7 +67,8 @@ def review(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation])
 
 
 def tidied(slam: Slam, view: View, event: Scan, report: Report) -> Report:
-    """Tidy up after a scan: merge landmarks that are one, drop tentative ones without hope; return its report."""
+    """Tidy up after a scan: landmarks that are gone, that are one, tentative ones without hope; return its report."""
+    report.removed += tuple(existence.gone(slam, view, event, report))
     report.merged = tuple(merging.merge(slam, view, event.robot, report.observations))
     return tentative.dropped(slam, view, event, report)
 

@@ -42,6 +42,7 @@ class Members:
         self.tentative: dict[Id, Tentative] = {}
         self.together: dict[Id, set[Id]] = {}
         self.lately: list[Id] = []
+        self.existence: dict[Id, tuple[float, int]] = {}
         self.unnamed = 0
 
     def slot(self, name: Id) -> int:
@@ -88,7 +89,16 @@ class Members:
         for other in self.together.get(name, ()):
             if other != name:
                 self.together[other].discard(name)
-        for table in (self.slots, self.kinds, self.sorts, self.seen, self.searched, self.ends, self.together):
+        for table in (
+            self.slots,
+            self.kinds,
+            self.sorts,
+            self.seen,
+            self.searched,
+            self.ends,
+            self.together,
+            self.existence,
+        ):
             table.pop(name, None)
 
     def new_name(self) -> str:

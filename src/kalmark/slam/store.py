@@ -71,6 +71,7 @@ def _state(slam: Slam) -> State:
         "slots": [[_id(name), slot] for name, slot in slam.members.slots.items()],
         "kinds": [[_id(name), described(kind)] for name, kind in slam.members.kinds.items()],
         "reparametrize": slam.reparametrize,
+        "existence": [[_id(name), *told] for name, told in slam.members.existence.items()],
         "lately": [_id(name) for name in slam.members.lately],
         "together": [[_id(name), [_id(other) for other in others]] for name, others in slam.members.together.items()],
         "searched": [[_id(name), counts] for name, counts in slam.members.searched.items()],
@@ -189,6 +190,7 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.searched = {i: [_count(n, f"searches of {i!r}") for n in counts] for i, counts in state["searched"]}
     slam.members.ends = {i: np.array(t, dtype=np.float64).reshape(2) for i, t in state["ends"]}
     slam.members.doubts.open = {i: _doubt(i, *rest) for i, *rest in state["doubts"]}
+    slam.members.existence = {i: (float(odds), int(missed)) for i, odds, missed in state.get("existence", ())}
     slam.members.lately = list(state.get("lately", ()))
     slam.members.together = {i: set(others) for i, others in state.get("together", ())}
     slam.members.tentative = {i: _tentative(i, own, *rest) for i, *rest in state.get("tentative", ())}

@@ -19,6 +19,10 @@ class Upkeep:
     With `merge`, two landmarks that turn out to be one are merged (`slam/merging.py`) when that is `odds` times
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
     (`slam/ambiguity.py`); what is held back, by this or by the association, is mapped anew until then.
+
+    With `p_detect`, the probability that the sensor sees a landmark in its view, one that should be seen and is not is
+    removed when it is `odds` times likelier that it is gone (`slam/existence.py`); `p_false` is the probability that
+    something else is taken for a landmark that is gone.
     """
 
     confirm: int = 3
@@ -26,6 +30,8 @@ class Upkeep:
     merge: bool = True
     hold_back: bool = False
     odds: float = 100.0
+    p_detect: float | None = None
+    p_false: float = 0.05
 
     def __post_init__(self) -> None:
         for name in ("confirm", "within"):
@@ -36,6 +42,12 @@ class Upkeep:
             raise ModelError(f"Upkeep: within is {self.within}, expected at least confirm, {self.confirm}")
         if not 1 <= self.odds < math.inf:
             raise ModelError(f"Upkeep: odds is {self.odds!r}, expected a finite number of at least 1")
+
+        if not 0 < self.p_false < 1:
+            raise ModelError(f"Upkeep: p_false is {self.p_false!r}, expected a probability between 0 and 1")
+        if self.p_detect is not None and not self.p_false < self.p_detect < 1:
+            wanted = f"a probability between p_false, {self.p_false}, and 1"
+            raise ModelError(f"Upkeep: p_detect is {self.p_detect!r}, expected {wanted}")
 
     def confirms(self, hits: int) -> bool:
         """Return whether a tentative landmark seen so often is one."""

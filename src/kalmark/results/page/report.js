@@ -188,11 +188,58 @@ function drawNis() {
     layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: logAxis("NIS / dof", [...nis.value, ...nis.low, ...nis.high])}), CONFIG);
 }
 
+const CHANGE = {merged: ["#1f5fa8", "triangle-down"], removed: ["#c8553d", "x-thin"]};
+
+/* One ambiguous scan: observations, the landmarks each was compared with, and the decision. */
+function drawScan(scan) {
+  const traces = [], ring = ellipses(scan.pose, 0, 1);
+  traces.push({...ring, mode: "lines", line: {color: "#1f5fa8", width: 1}, name: "robot, 3 sigma", hoverinfo: "skip"},
+    {x: scan.pose.x, y: scan.pose.y, mode: "markers", marker: {color: "#1f5fa8", size: 9}, showlegend: false,
+     hovertemplate: `${scan.robot}<extra></extra>`});
+  const named = new Set();
+  for (const seen of scan.seen.filter(s => s.x !== null)) {
+    const colour = OUTCOME[seen.outcome], first = !named.has(seen.outcome);
+    named.add(seen.outcome);
+    for (const near of seen.near) {
+      const chosen = near.name === seen.landmark;
+      traces.push({x: [seen.x, near.x], y: [seen.y, near.y], mode: "lines", hoverinfo: "skip", showlegend: false,
+                   line: {color: colour, width: chosen ? 2.5 : 1, dash: chosen ? "solid" : "dot"}});
+    }
+    traces.push({x: seen.near.map(n => n.x), y: seen.near.map(n => n.y), mode: "markers+text", showlegend: false,
+      text: seen.near.map(n => n.name), textposition: "bottom right", textfont: {size: 11, color: INK},
+      marker: {symbol: "square-open", size: 10, color: INK}, hovertemplate: `observation ${seen.k}, %{text}<extra></extra>`});
+    const along = axis => seen.near.map(n => seen[axis] + 0.35 * (n[axis] - seen[axis]));
+    traces.push({x: along("x"), y: along("y"), mode: "text", text: seen.near.map(n => `${n.d2}`), showlegend: false,
+      textfont: {size: 11, color: colour}, hoverinfo: "skip"});
+    traces.push({x: [seen.x], y: [seen.y], mode: "markers+text", text: [seen.k], textposition: "top center",
+      textfont: {size: 12, color: colour}, marker: {symbol: "x-thin", size: 11, line: {color: colour, width: 3}},
+      name: seen.outcome, legendgroup: seen.outcome, showlegend: first, hovertemplate: `${seen.k}: ${escaped(seen.text)}<extra></extra>`});
+  }
+  Plotly.react("scan", traces, layout({height: 520, showlegend: true, xaxis: {...axis("x (m)"), constrain: "domain"},
+    yaxis: {...axis("y (m)"), scaleanchor: "x"}}), CONFIG);
+  el("told").replaceChildren(...scan.seen.map(seen => {
+    const line = document.createElement("li");
+    line.textContent = `${seen.k}: ${seen.text}`;
+    line.style.borderColor = OUTCOME[seen.outcome];
+    return line;
+  }));
+}
+
+function escaped(text) {
+  return text.replace(/&/g, "&amp;").replace(/</g, "&lt;");
+}
+
 function drawOutcomes() {
+  const top = Math.max(...DATA.outcomes.t.map((_, i) =>
+    Object.values(DATA.outcomes.counts).reduce((sum, column) => sum + column[i], 0)));
+  const marks = Object.entries(DATA.association.changes).map(([what, t], i) =>
+    ({x: t, y: t.map(() => top * (1.05 + 0.07 * i)), mode: "markers", name: `landmark ${what}`,
+      marker: {color: CHANGE[what][0], symbol: CHANGE[what][1], size: 6, line: {color: CHANGE[what][0], width: 1}},
+      hovertemplate: `%{x:.1f} s: landmark ${what}<extra></extra>`}));
   const traces = Object.entries(DATA.outcomes.counts).map(([name, y]) =>
     ({x: DATA.outcomes.t, y, type: "bar", name, marker: {color: OUTCOME[name]},
       hovertemplate: `%{x:.1f} s: %{y} ${name}<extra></extra>`}));
-  Plotly.react("outcomes", traces, layout({height: 280, barmode: "stack", bargap: 0, xaxis: axis("time (s)"), showlegend: true,
+  Plotly.react("outcomes", [...traces, ...marks], layout({height: 280, barmode: "stack", bargap: 0, xaxis: axis("time (s)"), showlegend: true,
     yaxis: axis("observations"), legend: {orientation: "h", y: 1.02, yanchor: "bottom"}}), CONFIG);
 }
 
@@ -206,3 +253,8 @@ if (judged.length) {
 } else el("against-truth").remove();
 if (DATA.nis.t.length) drawNis(); else el("nis-section").remove();
 if (Object.keys(DATA.outcomes.counts).length) drawOutcomes(); else el("association").remove();
+if (DATA.association.scans.length && el("which")) {
+  DATA.association.scans.forEach((scan, i) => el("which").add(new Option(`t = ${scan.t} s, ${scan.robot}`, i)));
+  el("which").addEventListener("change", () => drawScan(DATA.association.scans[+el("which").value]));
+  drawScan(DATA.association.scans[0]);
+} else if (el("ambiguous")) el("ambiguous").remove();
