@@ -67,7 +67,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "fej": estimators.Fej,
 }
 IN_SPACE: dict[str, Callable[..., Any]] = {"point": landmarks.Point3D, "inverse_depth": landmarks.InverseDepth3D}
-MOUNTED = frozenset({"mount", "landmark", "association", "attention", "upkeep", "initialization", "detector"})
+MOUNTED = frozenset({"mount", "landmark", "association", "attention", "upkeep", "initialization", "preset", "detector"})
 
 
 def model_of(section: Section, world: str = "plane") -> Any:

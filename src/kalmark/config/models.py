@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Tag
+from pydantic import Discriminator, Tag, model_validator
 
 from kalmark.config.detectors import Detector
 from kalmark.config.models3d import SpaceMotions, SpaceSensors
 from kalmark.config.mounting import PlaneMounted, Ranging
-from kalmark.config.sections import NotNegative, Number, Positive, Section, type_or, types
+from kalmark.config.sections import NotNegative, Number, Positive, Section, expected, type_or, types
 
 
 class _Diffusion(Section):
@@ -70,6 +71,24 @@ _IN_SPACE = set(types(Motion)).difference(types(Annotated[PlaneMotions, None]))
 class _Sector(Ranging, PlaneMounted):
     fov_rad: Positive = 2 * math.pi
     """Field of view, centred forward."""
+    preset: Literal["laser", "sonar", "camera", "rgbd"] | None = None
+    """Take what is not given from a documented sensor of `km.presets`: camera for bearing, others for range_bearing."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_from_preset(cls, value: Any) -> Any:
+        from kalmark import presets
+
+        if not isinstance(value, dict) or str(value.get("preset")) not in presets.ALL:
+            return value
+        sensor = presets.ALL[value["preset"]].sensor
+        own = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
+        if not own.keys() <= cls.model_fields.keys() or ("sigma_range_m" in own) != (
+            "sigma_range_m" in cls.model_fields
+        ):
+            kind = "range_bearing" if "sigma_range_m" in own else "bearing"
+            raise expected(f"a preset of this type of sensor: {value['preset']} is a {kind}", "preset")
+        return own | value
 
 
 class _Range(_Sector):
