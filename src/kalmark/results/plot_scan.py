@@ -69,7 +69,7 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
     axes.grid(color="#eceef1")
     lines = [*told.lines()]
     figure.suptitle(lines[0], x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
-    axes.set_title("; ".join(lines[1:3] if told.gates else lines[1:2]), loc="left", fontsize=9, color=INK)
+    axes.set_title("\n".join(lines[1:3] if told.gates else lines[1:2]), loc="left", fontsize=9, color=INK)
     figure.legend(handles=_legend(told), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 

@@ -17,12 +17,13 @@ if TYPE_CHECKING:
 SCANS = 60  # drawn at most, the most ambiguous ones
 CHANGES = 200  # in the table
 MARKS = 2000  # in the timeline
+TENTATIVE = "tentative: "  # how the reasons of those begin that never were landmarks
 UNSURE = ("between ", "its nearest ", "it does not fit", "cliques as large")  # how reasons of ambiguity begin
 
 
 def association_series(run: Run, t: Array) -> dict[str, Any]:
     """Return ambiguous scans in the order of time, and when landmarks were merged or removed."""
-    changes = run.history.decisions.changes
+    changes = [c for c in run.history.decisions.changes if not c.reason.startswith(TENTATIVE)]
     return {
         "scans": [_scan(explained(run, step)) for step in ambiguous(run.history).tolist()],
         "changes": {
@@ -50,7 +51,7 @@ def ambiguous(history: History) -> Ints:
 def change_rows(run: Run) -> Iterator[tuple[str, str, str, str]]:
     """Return rows of what became of landmarks: when, which, what, why; tentative ones that went are not among them."""
     history = run.history
-    told = [c for c in history.decisions.changes if not c.reason.startswith("tentative: ")]
+    told = [c for c in history.decisions.changes if not c.reason.startswith(TENTATIVE)]
     for c in told[:CHANGES]:
         t_s = (history.t_ns[c.step] - history.t_ns[0]) * 1e-9
         yield f"{t_s:.1f}", c.landmark, c.what, c.reason
