@@ -19,7 +19,7 @@ from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSign
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.models.sensors import TagPose
-from kalmark.slam.delayed import Waiting
+from kalmark.slam.candidates import Waiting
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.nearby import has_place
 from kalmark.slam.report import Candidate, Report

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.slam.delayed import Candidate, Sight, Waiting
+from kalmark.slam.candidates import Candidate, Sight, Waiting
 from kalmark.slam.describe import State
 from kalmark.slam.events import Id
 
