@@ -9,7 +9,8 @@ real time on one core, CPU time, reading and detection included.
 The GPS only scores.  A landmark belongs to the tree that was seen where the landmark was seen: in the same scan, within
 half a metre in the laser's frame, three times at least, most often of all trees.  That needs no common frame of two
 maps, which differ by a metre here and there.  Every landmark of a tree but one is a duplicate; their share is that of
-the landmarks that belong to trees.
+the landmarks that belong to trees.  "by place": the same of landmarks within 2 m of a tree of the map with known trees,
+the maps aligned by the trees they share.
 """
 
 from __future__ import annotations
@@ -19,14 +20,17 @@ import time
 from collections import Counter
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from kalmark.cli.run import run_log
 from kalmark.config import load_config, open_config_log
 from kalmark.filter.kernels import one_thread
+from kalmark.results.align import rigid
 from kalmark.results.run import Run
 from kalmark.slam.events import Scan
 
 NEAR_M, SIGHTINGS = 0.5, 3
+PLACE_M = 2.0
 BARE = ["log.detections=rfs", "robots.each.sensors.laser.detector=null"]
 CASES: dict[str, tuple[str, list[str]]] = {
     "known": ("victoria_park_known", []),
@@ -65,6 +69,21 @@ def tree_of_landmark(run: Run, known: dict[int, tuple[np.ndarray, list[int]]]) -
     return {name: tree for name, (tree, count) in best.items() if count >= SIGHTINGS}
 
 
+def duplicates(trees: list[int]) -> float:
+    """Return the share of landmarks that are a tree which another one is already, in per cent."""
+    return 100.0 * (len(trees) - len(set(trees))) / max(len(trees), 1)
+
+
+def trees_by_place(run: Run, of: dict[str, int], known: Run) -> list[int]:
+    """Return the trees within 2 m of a landmark, the maps aligned by the trees they share."""
+    there = {int(i): m[:2] for i, m in zip(known.landmarks.ids, known.landmarks.means, strict=True)}
+    here = {str(i): m[:2] for i, m in zip(run.landmarks.ids, run.landmarks.means, strict=True)}
+    shared = {name: tree for name, tree in of.items() if tree in there}
+    aligned = rigid(np.array([here[n] for n in shared]), np.array([there[t] for t in shared.values()]))
+    gaps, nearest = cKDTree([*there.values()]).query(aligned(np.array([*here.values()])))
+    return np.array([*there])[nearest[gaps < PLACE_M]].tolist()
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -72,7 +91,8 @@ def main() -> None:
     parser.add_argument("--steering", nargs="+", default=["ascii", "mat"])
     parser.add_argument("--set", nargs="+", default=[])
     asked, known = parser.parse_args(), trees_by_scan()
-    titles = ("median m", "RMS 10 m", "in 10 m", "NIS", "landmarks", "trees", "dupl. %", "x real")
+    surveyed = run_log("victoria_park_known", progress=False)
+    titles = ("median m", "RMS 10 m", "in 10 m", "NIS", "landmarks", "trees", "dupl. %", "by place", "x real")
     print(f"{'detections':<18}{'steering':<10}" + "".join(f"{t:>11}" for t in titles))
     for name in asked.only:
         for steering in asked.steering:
@@ -87,12 +107,12 @@ def main() -> None:
             summary = run.evaluate()
             figures = next(iter(summary["robots"].values()))
             trees = tree_of_landmark(run, known)
-            many = len(trees) - len(set(trees.values()))
             log_s = float(run.history.t_ns[-1] - run.history.t_ns[0]) * 1e-9
             cells = (
                 f"{figures['fix_median_m']:.2f}", f"{figures['fix_rms_10m']:.2f}", f"{figures['fix_within_10m']:.1%}",
                 f"{summary['nis_per_dof']:.2f}", f"{summary['landmarks']}", f"{len(set(trees.values()))}",
-                f"{100 * many / max(len(trees), 1):.1f}", f"{log_s / cpu_s:.0f}",
+                f"{duplicates([*trees.values()]):.1f}", f"{duplicates(trees_by_place(run, trees, surveyed)):.1f}",
+                f"{log_s / cpu_s:.0f}",
             )  # fmt: skip
             print(f"{name:<18}{steering:<10}" + "".join(f"{c:>11}" for c in cells), flush=True)
 
