@@ -110,7 +110,7 @@ class InvariantEstimator(Section):
     """The iterated invariant filter."""
 
     type: Literal["invariant"] = "invariant"
-    iterations: Annotated[int, Field(ge=1)] = 6
+    iterations: Annotated[int, Field(ge=1)] = 30
     """At most this many linearisations of a scan."""
     tolerance: Positive = 1e-3
     """No more once nothing moves by more than this many of its sigmas."""

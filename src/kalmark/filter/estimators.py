@@ -130,7 +130,7 @@ class Invariant(_Estimator):
     are always iterated, and so should be landmarks known beforehand.
     """
 
-    iterations: int = 6
+    iterations: int = 30
     tolerance: float = 1e-3
 
     coordinates: ClassVar[str] = "log"
@@ -153,7 +153,7 @@ class Invariant(_Estimator):
 
     def for_fixes(self) -> Invariant:
         """Return the estimator that fuses absolute positions: a large step must be iterated."""
-        return Invariant(max(6, self.iterations), self.tolerance)
+        return Invariant(max(30, self.iterations), self.tolerance)
 
 
 @dataclass(frozen=True)

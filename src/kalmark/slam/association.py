@@ -42,7 +42,7 @@ __all__ = [
 
 FORBIDDEN = 1e6  # times the gate: a pair outside
 CLEAR = 0.05  # landmarks in a gate by chance, up to which each observation can be told by itself
-BY_CHANCE = 1e-2  # matchings as good to be expected by chance where there is more than one landmark in a gate
+BY_CHANCE = 1e-3  # matchings as good to be expected by chance where there is more than one landmark in a gate
 WIDEST = 256  # candidates for an observation
 
 Gate = float | str
@@ -276,7 +276,7 @@ class Automatic(_Joint):
     Where gates are small against the gaps between landmarks, that is the global assignment.  Elsewhere the likeliest of
     the matchings whose pairs agree with each other is taken (`posterior`), and of it each pair that is at least as
     probable as `confidence`; the others are deferred.  Where there is more than one landmark in a gate on average, the
-    robot is lost, and a matching is only taken if none as good is to be expected by chance.
+    robot is lost, and a matching is only taken if it holds most of the scan and none as good is expected by chance.
     """
 
     confidence: float = 0.9
@@ -288,8 +288,9 @@ class Automatic(_Joint):
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
         """Choose the likeliest matching, and hold back pairs that are not sure."""
-        if lost and found.chance > BY_CHANCE:
-            why = f"its scan is ambiguous: {found.chance:.1g} matchings as good are expected by chance"
+        count = int((found.pairs[0] >= 0).sum())
+        if lost and (found.chance > BY_CHANCE or 2 * count <= len(near)):
+            why = f"its scan is ambiguous: {count} pairs, {found.chance:.1g} matchings as good are expected by chance"
             return Matched(np.full(len(near), HELD_BACK), dict.fromkeys(range(len(near)), why))
         pairs, shares = found.pairs[0].copy(), found.shares()
         unsure = ((shares < self.confidence) | (not found.finished)) & near

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-LIMITS = 10, 1e-2  # linearisations of a matching, and the sigmas by which the last one moves anything
+LIMITS = 30, 1e-2  # linearisations of a matching, and the sigmas by which the last one moves anything
 
 
 class Landmarks:
