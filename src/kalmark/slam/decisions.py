@@ -62,6 +62,9 @@ class Query(Protocol):
     def dof(self) -> int:
         """Return the size m of one measurement."""
 
+    def experience(self) -> tuple[float, float]:
+        """Return how many of the last observations without ids were of landmarks of the map, and how many were not."""
+
     def key(self) -> tuple[int, ...]:
         """Return numbers, at least 0, that tell this scan from all others."""
 

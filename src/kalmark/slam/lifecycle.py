@@ -68,6 +68,8 @@ def review(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation])
 
 def tidied(slam: Slam, view: View, event: Scan, report: Report) -> Report:
     """Tidy up after a scan: landmarks that are gone, that are one, tentative ones without hope; return its report."""
+    if event.ids is None or None in event.ids:
+        slam.members.learn(report.observations)
     report.removed += tuple(existence.gone(slam, view, event, report))
     report.merged = tuple(merging.merge(slam, view, event.robot, report.observations))
     return tentative.dropped(slam, view, event, report)

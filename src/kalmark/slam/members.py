@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,12 @@ from kalmark.slam.robot import Robot
 from kalmark.slam.scene import EUCLIDEAN, ROBOT, Look, View
 from kalmark.slam.tentative import Tentative
 
+if TYPE_CHECKING:
+    from kalmark.slam.report import Observation
+
 Array = npt.NDArray[np.float64]
+
+FADES = 0.9  # of what was learnt, from one scan to the next
 
 
 class Members:
@@ -44,6 +49,7 @@ class Members:
         self.lately: list[Id] = []
         self.existence: dict[Id, tuple[float, int]] = {}
         self.unnamed = 0
+        self.experience = [0.0, 0.0]  # observations without ids that were lately of landmarks of the map, and were not
 
     def slot(self, name: Id) -> int:
         """Return the slot of a block.  Raises MapError if there is none of that name."""
@@ -82,6 +88,13 @@ class Members:
     def count(self, name: Id) -> None:
         """Count an observation of a landmark or a robot that was used."""
         self.seen[name] = self.seen.get(name, 0) + 1
+
+    def learn(self, outcomes: Sequence[Observation]) -> None:
+        """Remember how much of a scan was in the map, the less so the longer ago."""
+        known = sum(o.outcome == "associated" for o in outcomes if o.id is None)
+        unknown = sum(o.outcome in ("tentative", "new") for o in outcomes if o.id is None)
+        if known or unknown:
+            self.experience = [FADES * self.experience[0] + known, FADES * self.experience[1] + unknown]
 
     def forget(self, name: Id) -> None:
         """Strike out a landmark."""

@@ -2,7 +2,8 @@
 
 A matching of c pairs has the likelihood N(v; 0, Z) of its joint innovation, linearised where the scan itself would be,
 times the density of what is not in the map for each observation that it leaves without a pair: that of the landmarks
-near it.  What share of a scan is in the map has Jeffreys' prior, Beta(1/2, 1/2): rather all or nothing of it.
+near it.  What share of a scan is in the map has a prior Beta(1/2 + a, 1/2 + b): Jeffreys', rather all or nothing of it,
+and the `experience` of a observations that lately were and b that were not.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from kalmark.slam.matchings import Places, matchings
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
+Experience = tuple[float, float]
 
 SLACK = 1  # pairs that a matching may have less than the largest
 KEEP = 200  # matchings to look at
@@ -83,7 +85,9 @@ def agreeing(
     return pairs, finished
 
 
-def posterior(together: Together, open_: Index, d2: Array, near: Flags, p: int, gate: float, most: int) -> Posterior:
+def posterior(
+    together: Together, open_: Index, d2: Array, near: Flags, p: int, gate: float, most: int, experience: Experience
+) -> Posterior:
     """Return what is known of the matchings of the observations `open_` with the landmarks.
 
     d2 (K, L) are the squared distances of all pairs, `near` those that may be; `gate` is the probability with which a
@@ -92,36 +96,39 @@ def posterior(together: Together, open_: Index, d2: Array, near: Flags, p: int, 
     found, finished = agreeing(together, open_, d2, near, gate, most)
     pairs = np.vstack([found, np.full((1, len(d2)), -1)])
     density = _log_density(together, open_, d2, near, p)
-    scores = np.array([_score(together, open_, one, density, p, gate) for one in pairs])
+    scores = np.array([_score(together, open_, one, density, p, gate, experience) for one in pairs])
     best = int(np.argmax(scores))
     without = np.tile(pairs[best], (len(d2), 1))  # each of its pairs may be one by chance
     np.fill_diagonal(without, -1)
     without = without[pairs[best] >= 0]
-    scores = np.concatenate([scores, [_score(together, open_, one, density, p, gate) for one in without]])
+    scores = np.concatenate([scores, [_score(together, open_, one, density, p, gate, experience) for one in without]])
     pairs = np.concatenate([pairs, without])
     likely = np.argsort(-scores, kind="stable")
     weights = np.exp(scores[likely] - scores[likely[0]])
     count = int((pairs[likely[0]] >= 0).sum())
-    ratio = scores[likely[0]] - _log_share(count, len(d2))  # of the likelihoods: its mean over all there are is 1
+    ratio = scores[likely[0]] - _log_share(count, len(d2), experience)  # of the likelihoods: its mean over all there are is 1
     chance = math.comb(len(d2), count) * math.exp(-ratio) if count else math.inf
     return Posterior(pairs[likely], weights / weights.sum(), chance, finished)
 
 
-def _score(together: Together, open_: Index, pairs: Index, density: Array, p: int, gate: float) -> float:
+def _score(
+    together: Together, open_: Index, pairs: Index, density: Array, p: int, gate: float, experience: Experience
+) -> float:
     """Return the logarithm of how likely a matching (K,) is, up to a constant."""
     rows = np.flatnonzero(pairs >= 0)
     if not len(rows):
-        return _log_share(0, len(pairs))
+        return _log_share(0, len(pairs), experience)
     d2, log_det = together.fit(open_[rows], pairs[rows])
     if not d2 <= chi2_gate(gate, p * len(rows)):
         return -np.inf
-    known = _log_share(len(rows), len(pairs))
+    known = _log_share(len(rows), len(pairs), experience)
     return float(known - 0.5 * (d2 + log_det + len(rows) * p * np.log(2 * np.pi)) - density[rows].sum())
 
 
-def _log_share(count: int, of: int) -> float:
-    """Return the logarithm of how likely it is that just these `count` of all are in the map."""
-    return math.lgamma(count + 0.5) + math.lgamma(of - count + 0.5) - math.lgamma(of + 1.0)
+def _log_share(count: int, of: int, experience: Experience) -> float:
+    """Return the logarithm of how likely it is that just these `count` of all are in the map, up to a constant."""
+    a, b = experience
+    return math.lgamma(count + a + 0.5) + math.lgamma(of - count + b + 0.5)
 
 
 def added(together: Together, open_: Index, pairs: Index, row: int, columns: Index) -> float:

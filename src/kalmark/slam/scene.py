@@ -269,6 +269,11 @@ class Scene:
         """Return the size p of one innovation."""
         return self._view.dof
 
+    def experience(self) -> tuple[float, float]:
+        """Return how many of the last observations without ids were of landmarks of the map, and how many were not."""
+        known, unknown = self._slam.members.experience
+        return known, unknown
+
     def key(self) -> tuple[int, ...]:
         """Return numbers, at least 0, that tell this scan from all others."""
         event = self._event

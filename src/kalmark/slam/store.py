@@ -85,6 +85,7 @@ def _state(slam: Slam) -> State:
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
         "unnamed": slam.members.unnamed,
+        "experience": slam.members.experience,
         "map": slam.map_type,
         "numbers": slam.numbers,
         "postponed": None,
@@ -196,6 +197,7 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.tentative = {i: _tentative(i, own, *rest) for i, *rest in state.get("tentative", ())}
     waiting_restored(slam, state.get("waiting", []))
     slam.members.unnamed = _count(state["unnamed"], "unnamed")
+    slam.members.experience = [float(count) for count in state.get("experience", (0.0, 0.0))]
     slam.t_ns = _time(state["t_ns"])
     _check_owners(slam)
     for i, (drive, (t_ns, fresh)) in enumerate(zip(slam._drives.values(), state["drives"], strict=True)):
