@@ -257,9 +257,7 @@ class _Joint(_Gated):
             return JointCompatibility(self.gate, self.new_gate).match(query, open_, names, d2, gate)
         far = chi2_gate(self.new_gate, query.dof())
         near: Flags = np.isfinite(d2) if lost else d2 <= gate  # far off, the distances themselves are not to be trusted
-        found = posterior(
-            together, open_, d2, near, query.dof(), self.gate, self.most_nodes, query.experience()
-        )
+        found = posterior(together, open_, d2, near, query.dof(), self.gate, self.most_nodes, query.experience())
         pairs, reasons, mixed = self.choose(query, names, found, np.asarray(near.any(axis=1)), lost)
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
             if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
