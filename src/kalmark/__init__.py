@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from kalmark.models.pointwise import pointwise
     from kalmark.results.record import record
     from kalmark.results.run import Run
-    from kalmark.slam import association
+    from kalmark.slam import association, initialization
     from kalmark.slam.attention import Attention
     from kalmark.slam.delayed import Delayed
     from kalmark.slam.events import Control, Fix, Scan
@@ -36,8 +36,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Attention", "Control", "Delayed", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run",
-    "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "landmarks", "motion", "open_log",
-    "pointwise", "presets", "record", "sensors",
+    "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "initialization", "landmarks",
+    "motion", "open_log", "pointwise", "record", "sensors",
 ]  # fmt: skip
 
 _MODULES = {
@@ -45,9 +45,9 @@ _MODULES = {
     "detect": "kalmark.detect",
     "estimators": "kalmark.filter.estimators",
     "geometry": "kalmark.geometry",
+    "initialization": "kalmark.slam.initialization",
     "landmarks": "kalmark.models.landmarks",
     "motion": "kalmark.models.motion",
-    "presets": "kalmark.presets",
     "sensors": "kalmark.models.sensors",
 }
 _NAMES = {

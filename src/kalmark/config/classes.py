@@ -14,7 +14,7 @@ from kalmark.detect import corners, reflectors, trunks
 from kalmark.filter import estimators
 from kalmark.geometry.rotations import from_euler
 from kalmark.models import landmarks, motion, sensors
-from kalmark.slam import association
+from kalmark.slam import association, initialization
 from kalmark.slam.delayed import Delayed
 
 Array = npt.NDArray[np.float64]
@@ -62,6 +62,8 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "sample": association.Sampled,
     "jpda": association.Averaged,
     "auto": association.Automatic,
+    "trilateration": initialization.Trilateration,
+    "hypotheses": initialization.Hypotheses,
     "ekf": estimators.Ekf,
     "invariant": estimators.Invariant,
     "fej": estimators.Fej,

@@ -212,3 +212,25 @@ Association = Annotated[
     | Annotated[AutomaticAssociation, Tag("auto")],
     Discriminator(type_or("identity")),
 ]
+
+
+class TrilaterationConfig(Section):
+    """Keep ranges with where they were taken until a position follows: docs/range_only.md."""
+
+    type: Literal["trilateration"] = "trilateration"
+    poses: Annotated[int, Field(ge=4)] = 24
+    """Ranges kept of one landmark; of more, every other one is given up."""
+    directions: Annotated[int, Field(ge=3)] = 12
+    """Directions in which the search for the position starts."""
+    odds: Probability = 1e-3
+    """A second position with better odds than this means to wait."""
+
+
+class HypothesesConfig(Section):
+    """Start hypotheses of the direction at the first range, and weigh them: docs/range_only.md."""
+
+    type: Literal["hypotheses"] = "hypotheses"
+    count: Annotated[int, Field(ge=3)] = 12
+    """Hypotheses of the direction."""
+    odds: Probability = 1e-3
+    """A hypothesis is removed when its share of the weights falls below this."""

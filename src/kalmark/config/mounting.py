@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from kalmark.config.landmarks import Association, Landmark
+from kalmark.config.landmarks import Association, HypothesesConfig, Landmark, TrilaterationConfig
 from kalmark.config.sections import (
     Limit,
     NotNegative,
@@ -178,7 +178,10 @@ class Mounted(Section):
 
 
 class ImmediateInitialization(Section):
-    """Start landmarks at first sight; of bearings alone with an unknown depth, `landmark: {type: inverse_depth}`."""
+    """Start landmarks at first sight; of bearings alone with an unknown depth, `landmark: {type: inverse_depth}`.
+
+    Ranges alone, which cannot, start them by `trilateration`.
+    """
 
     type: Literal["immediate"] = "immediate"
 
@@ -204,7 +207,10 @@ class DelayedInitialization(Section):
 
 
 Initialization = Annotated[
-    Annotated[ImmediateInitialization, Tag("immediate")] | Annotated[DelayedInitialization, Tag("delayed")],
+    Annotated[ImmediateInitialization, Tag("immediate")]
+    | Annotated[DelayedInitialization, Tag("delayed")]
+    | Annotated[TrilaterationConfig, Tag("trilateration")]
+    | Annotated[HypothesesConfig, Tag("hypotheses")],
     Discriminator(type_or("immediate")),
 ]
 

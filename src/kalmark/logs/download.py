@@ -77,6 +77,11 @@ class OwnCopy:
 
 OWN_COPIES = (
     OwnCopy(
+        "plaza1",
+        "a robot lawn mower ranging to four radio beacons, true path and beacons",
+        "Plaza1_DR.txt, Plaza1_TD.txt and Plaza1_.mat of the package gtsam (gtsam/Data) into KALMARK_DATA/plaza1",
+    ),
+    OwnCopy(
         "starry_night",
         "a stereo camera above 20 reflectors, rates, known ids, true poses and map",
         "vincentive_dataset3.mat into KALMARK_DATA/starry_night (docs/datasets3d.md says where it is from)",

@@ -20,6 +20,7 @@ from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM
 from kalmark.logs.native import NATIVE
+from kalmark.logs.plaza import PLAZA
 from kalmark.logs.slamtb import SLAMTB
 from kalmark.logs.source import Format, Request, choice, nearest, quantity
 from kalmark.logs.starry_night import STARRY_NIGHT
@@ -41,6 +42,7 @@ FORMATS: dict[str, Format] = {
         SLAMTB,
         TAGSLAM,
         KITTI_STEREO,
+        PLAZA,
     )
 }
 

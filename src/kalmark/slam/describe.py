@@ -13,7 +13,7 @@ from kalmark.errors import MapError
 from kalmark.filter import estimators
 from kalmark.models import landmarks, motion, sensors
 from kalmark.models.protocols import Landmark
-from kalmark.slam import association, attention, delayed, upkeep
+from kalmark.slam import association, attention, initialization, upkeep
 from kalmark.slam.robot import Mount, Robot
 
 State = dict[str, Any]
@@ -27,7 +27,7 @@ MODULES = {
     "attention": (attention, "hopeless"),
     "upkeep": (upkeep, "hopeless"),
     "detector": (detect, "detect"),
-    "initialization": (delayed, "is_ripe"),
+    "initialization": (initialization, "__post_init__"),
 }
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 

@@ -12,6 +12,7 @@ from kalmark.errors import MapError
 from kalmark.models.protocols import Landmark
 from kalmark.slam.doubts import Doubts
 from kalmark.slam.events import Id
+from kalmark.slam.initialization import Unlocated
 from kalmark.slam.robot import Robot
 from kalmark.slam.scene import EUCLIDEAN, ROBOT, Look, View
 from kalmark.slam.tentative import Tentative
@@ -31,7 +32,7 @@ class Members:
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
     found, `together` is what was seen in one scan with it; `lately` are those seen last.  `ends` are the abscissas (2,)
     of the segments seen of lines, `doubts` and `tentative` what waits to become a landmark: without a block, and with
-    one.
+    one; `unlocated` what is known of those whose ranges do not tell yet where they are, `here` the last place kept.
     """
 
     def __init__(self, robots: Mapping[str, Robot]) -> None:
@@ -48,6 +49,8 @@ class Members:
         self.together: dict[Id, set[Id]] = {}
         self.lately: list[Id] = []
         self.existence: dict[Id, tuple[float, int]] = {}
+        self.unlocated: dict[Id, Unlocated] = {}
+        self.here: tuple[str, str, int, int] | None = None  # robot, sensor, time: the block of where it was
         self.unnamed = 0
         self.experience = [0.0, 0.0]  # observations without ids that were lately of landmarks of the map, and were not
 

@@ -18,6 +18,8 @@ from kalmark.slam.checks import covariance, instance
 from kalmark.slam.decisions import Association
 from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Scan, finite, shown
+from kalmark.slam.hypotheses import Hypotheses
+from kalmark.slam.trilateration import Trilateration
 from kalmark.slam.upkeep import Upkeep
 
 Array = npt.NDArray[np.float64]
@@ -51,9 +53,9 @@ class Mount:
 
     `landmark` is the type of landmark this sensor starts and `association` its own, if not the slam's.  `detector`
     turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
-    and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight).  With
-    `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map, called "robot.sensor",
-    that calibrates itself.
+    and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
+    by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
+    called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas.
     """
 
     sensor: Sensor
@@ -64,7 +66,7 @@ class Mount:
     attention: Attention = EVERYTHING
     cov: Any = None
     upkeep: Upkeep | None = None
-    initialization: Delayed | None = None
+    initialization: Delayed | Trilateration | Hypotheses | None = None
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
@@ -74,7 +76,9 @@ class Mount:
         if self.upkeep is not None:
             instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")
         if self.initialization is not None:
-            instance(self.initialization, Delayed, "Mount: initialization", "a Delayed")
+            ways = "a Delayed, a Trilateration or Hypotheses"
+            one_of: Any = (Delayed, Trilateration, Hypotheses)
+            instance(self.initialization, one_of, "Mount: initialization", ways)
         object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
 
     def covariance(self, dof: int, what: str) -> Array | None:

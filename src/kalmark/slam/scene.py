@@ -20,7 +20,9 @@ from kalmark.models.observe import composed, is_built_in, landmark_at, linearize
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.models.sensors import TagPose
 from kalmark.slam.candidates import Waiting
+from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Id, Scan
+from kalmark.slam.initialization import initialization_of
 from kalmark.slam.nearby import has_place
 from kalmark.slam.report import Candidate, Report
 from kalmark.slam.robot import Mount
@@ -77,7 +79,8 @@ class View:
         self.at: Array = np.array(mount.at)  # writable, like all else: numba compiles per kind of array
         self.mount = slot  # of the mount in the map, -1 if it is not there
         self.landmark: Landmark = mount.landmark or landmarks or _natural(mount)
-        self.delayed, self.waiting = mount.initialization, Waiting()
+        late = mount.initialization
+        self.delayed, self.waiting = late if isinstance(late, Delayed) else None, Waiting()
         slam.refuse_other_world(type(self.sensor).__name__, getattr(self.sensor, "world", ""))
         slam.refuse_other_world(self.landmark.kind, self.landmark.space.world)
         self.association = mount.association or slam.association
@@ -88,7 +91,8 @@ class View:
         self.dof = self._dof()
         self.gate = self.association.threshold(self.dof, slam.estimator.default_gate)
         depth = getattr(self.sensor, "finds_depth", True) or hasattr(self.landmark, "prior_rho_per_m")
-        self.starts = isinstance(self.sensor, FullSensor) and (depth or self.landmark.kind not in EUCLIDEAN)
+        starts = isinstance(self.sensor, FullSensor) and (depth or self.landmark.kind not in EUCLIDEAN)
+        self.initialization = initialization_of(mount, starts)
         full = isinstance(self.sensor, FullSensor) and getattr(self.sensor, "finds_depth", True)
         self.tells_places = full and all(has_place(look.landmark.space) for look in self.looks.values())
         varies = isinstance(self.sensor, NonAdditiveSensor) and not self.sensor.additive

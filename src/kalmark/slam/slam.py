@@ -281,9 +281,8 @@ class Slam:
             return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
         if name in self.members.slots:
             return Observation(k, id_, "rejected", name, None, f"it is no {view.landmark.kind}")
-        if not view.starts:
-            kind = type(view.sensor).__name__
-            return Observation(k, id_, "ignored", None, None, f"a {kind} measurement alone cannot start a landmark")
+        if view.initialization is not None:
+            return view.initialization.observe(self, view, event, k, id_, name, R[k])
         robot = self.members.slots[event.robot]
         which = self.members.doubts.which(view, self.map, robot, name, event.y[k], event.t_ns)
         if which is None:

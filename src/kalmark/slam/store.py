@@ -28,6 +28,7 @@ from kalmark.slam.events import Id
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
 from kalmark.slam.store_map import map_arrays, map_described, map_restored
+from kalmark.slam.store_ranges import ranges_described, ranges_owners, ranges_restored
 from kalmark.slam.store_waiting import waiting_described, waiting_restored
 from kalmark.slam.tentative import Tentative
 from kalmark.slam.upkeep import CAREFUL
@@ -77,6 +78,8 @@ def _state(slam: Slam) -> State:
         "searched": [[_id(name), counts] for name, counts in slam.members.searched.items()],
         "ends": [[_id(name), t.tolist()] for name, t in slam.members.ends.items()],
         "doubts": [[_id(i), d.poses.tolist(), d.evidence, d.t_ns] for i, d in slam.members.doubts.open.items()],
+        "unlocated": ranges_described(slam.members.unlocated),
+        "here": slam.members.here,
         "tentative": [
             [name, t.slot, described(t.kind), t.hits, t.chances, t.unseen] for name, t in slam.members.tentative.items()
         ],
@@ -194,6 +197,8 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.existence = {i: (float(odds), int(missed)) for i, odds, missed in state.get("existence", ())}
     slam.members.lately = list(state.get("lately", ()))
     slam.members.together = {i: set(others) for i, others in state.get("together", ())}
+    slam.members.unlocated = ranges_restored(state.get("unlocated", []))
+    slam.members.here = None if state.get("here") is None else tuple(state["here"])
     slam.members.tentative = {i: _tentative(i, own, *rest) for i, *rest in state.get("tentative", ())}
     waiting_restored(slam, state.get("waiting", []))
     slam.members.unnamed = _count(state["unnamed"], "unnamed")
@@ -229,6 +234,7 @@ def _check_owners(slam: Slam) -> None:
     ):
         raise MapError("the slots' names are not those of the robots and landmarks")
     owners = [(f"{name!r}", slot, spaces[name]) for name, slot in slam.members.slots.items()]
+    owners += ranges_owners(slam.members.unlocated)
     owners += [(f"tentative {name!r}", t.slot, t.kind.space) for name, t in slam.members.tentative.items()]
     for view in slam._views.values():
         owners += [(f"kept pose {n}", slot, SE2) for n, slot in view.waiting.poses.items()]
