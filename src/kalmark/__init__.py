@@ -37,7 +37,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Attention", "Control", "Delayed", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run",
     "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "initialization", "landmarks",
-    "motion", "open_log", "pointwise", "record", "sensors",
+    "motion", "open_log", "pointwise", "presets", "record", "sensors",
 ]  # fmt: skip
 
 _MODULES = {
@@ -48,6 +48,7 @@ _MODULES = {
     "initialization": "kalmark.slam.initialization",
     "landmarks": "kalmark.models.landmarks",
     "motion": "kalmark.models.motion",
+    "presets": "kalmark.presets",
     "sensors": "kalmark.models.sensors",
 }
 _NAMES = {
