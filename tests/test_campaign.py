@@ -117,7 +117,7 @@ def test_a_saved_campaign_has_figures_a_row_a_step_and_a_picture(small: Campaign
 
 def test_an_estimator_may_be_given_with_a_key_of_its_own() -> None:
     configs = configs_of(load_world("cloister"), ["invariant", "invariant:iterations=1"])
-    assert [c.estimator.iterations for c in configs.values()] == [6, 1]
+    assert [c.estimator.iterations for c in configs.values()] == [30, 1]
     assert [*configs_of(load_world("cloister", ["filter.estimator.type=fej"]), None)] == ["fej"]
 
 

@@ -149,7 +149,7 @@ class Frozen:
     def correct(self, y: np.ndarray, ids: list[int]) -> None:
         d, k = np.zeros(len(self.x)), len(ids)
         seen = np.concatenate([np.arange(3), *(np.arange(s.start, s.stop) for s in map(self.rows, ids))])
-        for _ in range(6):
+        for _ in range(30):
             x, H, z = self.moved(d), np.zeros((2 * k, len(d))), np.zeros(2 * k)
             for row, i in enumerate(ids):
                 e, E_r, E_l = km.geometry.observe(x[:3], x[self.rows(i)])
@@ -160,7 +160,7 @@ class Frozen:
             v, before = z + H @ d, d
             K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + np.kron(np.eye(k), R))
             d = K @ v
-            if np.abs(d - before)[seen].max() < 1e-7:
+            if np.abs(d - before)[seen].max() < 1e-11:
                 break
         x = self.moved(d)
         A = np.eye(len(x))

@@ -27,7 +27,9 @@ STEPPED = ("homogeneous", "pluecker_line", "homogeneous_line")  # moved by a tra
 def a_map(stepped: bool, turn: float, own: float) -> tuple[StochasticMap, list[Space]]:
     """Return a robot, points and two blocks of every other kind: uncertain together by a turn, each by its own."""
     rng, m = np.random.default_rng(1), StochasticMap()
-    kinds = [kind() for kind in landmarks.BUILT_IN[2:] if stepped or kind.kind not in STEPPED]
+    kinds = [
+        kind() for kind in landmarks.BUILT_IN if kind().space.world == "space" and (stepped or kind.kind not in STEPPED)
+    ]
     models = [POINT] * POINTS + [kind for kind in kinds if kind.kind != "point3"] * 2
     spaces, means = [SE3], [START]
     for model in models:
