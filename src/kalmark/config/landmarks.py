@@ -165,38 +165,35 @@ class JointAssociation(_GatedAssociation):
     """Nodes of the search after which the best so far is taken."""
 
 
-class CliqueAssociation(_GatedAssociation):
+class _SearchedAssociation(_GatedAssociation):
+    most_nodes: Annotated[int, Field(ge=1)] = 5_000_000
+    """Comparisons of pairs after which the search ends."""
+
+
+class CliqueAssociation(_SearchedAssociation):
     """The largest set of pairs that agree with each other wherever the robot is, if it fits jointly."""
 
     type: Literal["clique"] = "clique"
-    most_nodes: Annotated[int, Field(ge=1)] = 5_000_000
-    """Comparisons of pairs after which the search ends."""
 
 
-class SampleAssociation(_GatedAssociation):
+class SampleAssociation(_SearchedAssociation):
     """A matching drawn by how likely each is."""
 
     type: Literal["sample"] = "sample"
-    most_nodes: Annotated[int, Field(ge=1)] = 5_000_000
-    """Comparisons of pairs after which the search ends."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Another one draws others."""
 
 
-class AveragedAssociation(_GatedAssociation):
+class AveragedAssociation(_SearchedAssociation):
     """The mean over all matchings, each by how likely it is; for a dense map."""
 
     type: Literal["jpda"] = "jpda"
-    most_nodes: Annotated[int, Field(ge=1)] = 5_000_000
-    """Comparisons of pairs after which the search ends."""
 
 
-class AutomaticAssociation(_GatedAssociation):
+class AutomaticAssociation(_SearchedAssociation):
     """One by one where the pose is clear, the likeliest matching where it is not; what is ambiguous is deferred."""
 
     type: Literal["auto"] = "auto"
-    most_nodes: Annotated[int, Field(ge=1)] = 5_000_000
-    """Comparisons of pairs after which the search ends."""
     confidence: Annotated[float, Field(ge=0, lt=1)] = 0.9
     """A pair of the likeliest matching that is less probable is deferred."""
 
