@@ -153,7 +153,7 @@ class Room:
         """Return an array of that shape, holding anything."""
         size, kept = math.prod(shape), self._numbers.get(name)
         if kept is None or len(kept) < size:
-            kept = self._numbers[name] = np.empty(size + size // 16)
+            kept = self._numbers[name] = np.empty(4 * size)  # what is not used takes no memory
         return kept[:size].reshape(shape)
 
 

@@ -69,9 +69,8 @@ class PostponedMap(Layout):
         self._shadows: dict[int, int] = {}  # slots in the active map, by slot: in the order of A0
         self._gone: list[tuple[int, Space]] = []  # removed, their shadows are still here
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
-        self._drift = Drift()
+        self._drift, self._pace = Drift(), Pace(self.most)
         self._before: dict[int, Array] = {}
-        self._pace = Pace(self.most)
 
     @classmethod
     def from_dense(cls, dense: StochasticMap, storage: Triangle | None = None, most: int | None = None) -> PostponedMap:
@@ -302,9 +301,9 @@ class PostponedMap(Layout):
                 self.flush(robot, now - before)
         self._pace.count(self.active.n)
         self.active.prepare()
-        if self._job is not None:
-            self._job.advance(self._pace.due(self._progress(), self._job.spent, self._job.work))
-            self._job = None if self._job.done else self._job
+        if (job := self._job) is not None:
+            job.advance(self._pace.due(self._progress(), job.spent, job.work))
+            self._job = None if job.done else job
 
     def _enter(self, slot: int) -> None:
         """Make a block active: augment it from the shadows, and give it a shadow of its own.  O(active^2)."""
@@ -365,14 +364,18 @@ class PostponedMap(Layout):
         return bool(self._owners) and self._progress() > (1.0 if self._job is None else 2.0)
 
     def finish(self) -> None:
-        """Finish a flush that is under way."""
+        """Finish a flush that is under way, and give back the memory that it needed."""
+        self._complete()
+        self._room = Room()
+
+    def _complete(self) -> None:
         if self._job is not None:
             self._job.advance(1e300)
-            self._job = None
+        self._job = None
 
     def flush(self, robot: int | None = None, ds: Array | None = None) -> None:
         """Bring all blocks to rest.  The last correction, ds by `robot`, is applied as the dense filter does."""
-        self.finish()
+        self._complete()
         leap = None
         if robot is not None and ds is not None:
             went = {r: (before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
@@ -387,8 +390,17 @@ class PostponedMap(Layout):
         n, S, (axes, origins) = len(here), self._displacements(), self._gauges()
         if leap is not None:
             S[:, leap.robot] -= leap.ds
-        turns = np.array(thetas, dtype=np.int64)
-        phase = Phase(self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, turns, origins, axes)
+        phase = Phase(
+            self._A0,
+            A,
+            -joint[n:, n:],
+            joint[:n, n:],
+            joint[:n, :n],
+            S,
+            np.array(thetas, dtype=np.int64),
+            origins,
+            axes,
+        )
         self._job = Flush(self, self.storage, phase, leap, self._room)
         for slot in slots:
             at = self._owners[slot]
