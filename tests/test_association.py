@@ -232,8 +232,23 @@ def test_averages_need_a_dense_map_and_keep_it() -> None:
     postponed = km.Slam(slam.robots.values(), km.association.Averaged(), map="postponed")
     for i, point in enumerate([[4.0, 0.0], [4.0, 1.0]]):
         postponed.add_landmark(i, point, 0.05**2 * np.eye(2))
+    before = postponed.mean("r"), postponed.covariance("r", 0, 1)
     with pytest.raises(EventError, match="dense"):
-        postponed.process(km.Scan(1, "r", "s", [[4.0, 0.45]]))
+        postponed.process(km.Scan(1, "r", "s", [[4.0, 0.05], [4.0, 1.1]], ids=[0, None]))
+    np.testing.assert_array_equal(postponed.mean("r"), before[0])
+    np.testing.assert_array_equal(postponed.covariance("r", 0, 1), before[1])
+
+
+def test_an_average_takes_each_observations_noise_where_it_is_seen() -> None:
+    points, seen = np.array([[2.0, 0.0], [20.0, 0.0], [20.0, 1.0]]), np.array([[2.0, 0.0], [20.0, 0.02]])
+    laser = km.Mount(km.sensors.RangeBearing(1e-6, 0.01, sigma_range_rel=0.1))
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([0.5, 0.3, 0.01]) ** 2, sensors={"s": laser})
+    slam = km.Slam([robot], km.association.Averaged())
+    for i, point in enumerate(points):
+        slam.add_landmark(i, point, 1e-6 * np.eye(2))
+    slam.process(km.Scan(1, "r", "s", km.geometry.observe(ORIGIN, seen)[0]))
+    once = 1 / (1 / 0.5**2 + 1 / 0.2**2 + 1 / 2.0**2)  # ranges of 2 and of 20 m along x, told apart with 98 %
+    np.testing.assert_allclose(slam.covariance("r")[0, 0], once, rtol=0.1)
 
 
 def test_what_fits_no_landmark_from_where_the_others_are_seen_is_new_however_uncertain_the_pose() -> None:

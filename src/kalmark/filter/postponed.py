@@ -385,22 +385,12 @@ class PostponedMap(Layout):
         A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
         here = np.concatenate([NO_ROWS, *(m.rows(self._owners[slot]) for slot in slots)])
         where = {row: i for i, row in enumerate(here.tolist())}
-        thetas = [where[row] for robot in self._moved for row in self._turn_rows(robot).tolist()]
+        turns = np.array([where[row] for r in self._moved for row in self._turn_rows(r).tolist()], dtype=np.int64)
         joint = kernels.submatrix(m.P, np.concatenate([here, self._s]))
         n, S, (axes, origins) = len(here), self._displacements(), self._gauges()
         if leap is not None:
             S[:, leap.robot] -= leap.ds
-        phase = Phase(
-            self._A0,
-            A,
-            -joint[n:, n:],
-            joint[:n, n:],
-            joint[:n, :n],
-            S,
-            np.array(thetas, dtype=np.int64),
-            origins,
-            axes,
-        )
+        phase = Phase(self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, turns, origins, axes)
         self._job = Flush(self, self.storage, phase, leap, self._room)
         for slot in slots:
             at = self._owners[slot]

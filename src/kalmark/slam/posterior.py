@@ -106,9 +106,7 @@ def posterior(
     likely = np.argsort(-scores, kind="stable")
     weights = np.exp(scores[likely] - scores[likely[0]])
     count = int((pairs[likely[0]] >= 0).sum())
-    ratio = scores[likely[0]] - _log_share(
-        count, len(d2), experience
-    )  # of the likelihoods: its mean over all there are is 1
+    ratio = scores[likely[0]] - _log_share(count, len(d2), experience)  # of likelihoods: has the mean 1 by chance
     chance = math.comb(len(d2), count) * math.exp(-ratio) if count else math.inf
     return Posterior(pairs[likely], weights / weights.sum(), chance, finished)
 

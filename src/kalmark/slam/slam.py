@@ -27,7 +27,7 @@ from kalmark.models.protocols import Landmark
 from kalmark.slam import ambiguity, budget, delayed, lifecycle, tentative
 from kalmark.slam.approach import approach
 from kalmark.slam.association import ByIdentity
-from kalmark.slam.averaging import average
+from kalmark.slam.averaging import average, refuse_postponed
 from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
 from kalmark.slam.decisions import DEFERRED, NEW, Association, Decision
 from kalmark.slam.doubts import MIRRORED
@@ -137,6 +137,8 @@ class Slam:
             raise EventError(f"{when(event)}: sensor is {event.sensor!r}, expected one of {names}")
         event = event if view.detector is None else view.detector(event)
         R = measurements(event, view.sensor)
+        if view.averages:
+            refuse_postponed(self.map, event)
         self.t_ns = event.t_ns
         self._advance(event.robot)
         if len(event.y) == 0:
@@ -255,9 +257,7 @@ class Slam:
             groups = [(look, [k]) for look, rows in groups for k in rows]
         if not len(report.e) and (len(groups) != 1 or len(groups[0][1]) < len(report.y)):
             report.blank(view.dof)
-        for look, rows in groups:
-            if not rows:
-                continue
+        for look, rows in [group for group in groups if group[1]]:
             slots, y = self.members.slots_of([decisions[k][0] for k in rows]), event.y[rows]
             approach(self, view, robot, look, slots, y, R[rows])
             noise = view.noise(self.map, robot, look, slots, R[rows], event)
