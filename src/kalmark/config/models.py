@@ -31,6 +31,10 @@ class UnicycleMotion(_Diffusion):
     """Error of the speed held over its interval."""
     sigma_w_radps: NotNegative = 0.05
     """Error of the turn rate held over its interval."""
+    sigma_v_bias_mps: NotNegative = 0.0
+    """Constant part of the speed's error; above 0 it is in the map and is estimated."""
+    sigma_w_bias_radps: NotNegative = 0.0
+    """Constant part of the turn rate's error; above 0 it is in the map and is estimated."""
 
 
 class Odometry2DMotion(_Diffusion):
@@ -57,6 +61,10 @@ class AckermannMotion(_Diffusion):
     """Error of the wheel speed held over its interval."""
     sigma_steering_rad: NotNegative = 0.02
     """Error of the steering angle held over its interval."""
+    sigma_v_bias_mps: NotNegative = 0.0
+    """Constant part of the wheel speed's error; above 0 it is in the map and is estimated."""
+    sigma_steering_bias_rad: NotNegative = 0.0
+    """Constant part of the steering angle's error; above 0 it is in the map and is estimated."""
 
 
 PlaneMotions = (

@@ -44,6 +44,10 @@ class Velocity3DMotion(Section):
     """Error of the turn rate held over its interval, about y."""
     sigma_wz_radps: NotNegative = 0.05
     """Error of the turn rate held over its interval, about z."""
+    sigma_v_bias_mps: NotNegative = 0.0
+    """Constant part of the speed's error on each axis; above 0 it is in the map and is estimated."""
+    sigma_w_bias_radps: NotNegative = 0.0
+    """Constant part of the turn rate's error about each axis; above 0 it is in the map and is estimated."""
 
 
 class ConstantVelocity3DMotion(Section):

@@ -1,8 +1,9 @@
 """Motion models in the plane: odometry increments ([S] A.3), unicycle with the exact arc ([F]), Ackermann.
 
-Two kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
-displacement is sigma times the duration.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with time,
-along, across and about the robot, while the control is not zero (a robot told to stand does not wander).
+Three kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
+displacement is sigma times the duration.  Its *bias* (`sigma_v_bias_mps`, ...), what is to be added to all of them, is
+in the map and estimated.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with time, along, across and
+about the robot, while the control is not zero (a robot told to stand does not wander).
 """
 
 from __future__ import annotations
@@ -119,6 +120,8 @@ class Unicycle(Planar):
     sigma_along_m_per_sqrt_s: float = 0.0
     sigma_across_m_per_sqrt_s: float = 0.0
     sigma_theta_rad_per_sqrt_s: float = 0.0
+    sigma_v_bias_mps: float = 0.0
+    sigma_w_bias_radps: float = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
     held: ClassVar[bool] = True
@@ -134,6 +137,11 @@ class Unicycle(Planar):
     def control_noise(self, u: Array) -> Array:
         """Return N (2, 2) of the held speed and turn rate."""
         return self._N
+
+    @property
+    def bias_cov(self) -> Array | None:
+        """The covariance (2, 2) of the bias of speed and turn rate, None if there is none."""
+        return _bias_cov(self.sigma_v_bias_mps, self.sigma_w_bias_radps)
 
 
 @dataclass(frozen=True)
@@ -151,6 +159,8 @@ class Ackermann(Planar):
     sigma_along_m_per_sqrt_s: float = 0.0
     sigma_across_m_per_sqrt_s: float = 0.0
     sigma_theta_rad_per_sqrt_s: float = 0.0
+    sigma_v_bias_mps: float = 0.0
+    sigma_steering_bias_rad: float = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
     held: ClassVar[bool] = True
@@ -169,3 +179,12 @@ class Ackermann(Planar):
     def control_noise(self, u: Array) -> Array:
         """Return N (2, 2) of the held speed and steering."""
         return self._N
+
+    @property
+    def bias_cov(self) -> Array | None:
+        """The covariance (2, 2) of the bias of speed and steering, None if there is none."""
+        return _bias_cov(self.sigma_v_bias_mps, self.sigma_steering_bias_rad)
+
+
+def _bias_cov(*sigmas: float) -> Array | None:
+    return np.diag(np.square(sigmas)) if any(sigmas) else None

@@ -96,6 +96,8 @@ class Velocity3D:
     sigma_wx_radps: float = 0.05
     sigma_wy_radps: float = 0.05
     sigma_wz_radps: float = 0.05
+    sigma_v_bias_mps: float = 0.0
+    sigma_w_bias_radps: float = 0.0
 
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
@@ -116,6 +118,12 @@ class Velocity3D:
     def control_noise(self, u: Array) -> Array:
         """Return N (6, 6) of the held velocity."""
         return self._N
+
+    @property
+    def bias_cov(self) -> Array | None:
+        """The covariance (6, 6) of the bias of the velocity, the same for all axes, None if there is none."""
+        sigmas = np.repeat([self.sigma_v_bias_mps, self.sigma_w_bias_radps], 3)
+        return np.diag(sigmas**2) if sigmas.any() else None
 
     def diffusion(self, u: Array, dt_s: float) -> None:
         """Return None: the noise is all in the control."""

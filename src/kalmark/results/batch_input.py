@@ -25,6 +25,7 @@ from kalmark.results.batch_rows import ORIGIN, SPACES
 from kalmark.results.history import History, as_id
 from kalmark.slam.checks import measurements
 from kalmark.slam.events import Control, Event, Fix, Id, Scan
+from kalmark.slam.prediction import bias_block
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -87,6 +88,8 @@ class _Replay:
         starts = {s.robot: (s.mean, s.covariance) for s in self.history.starts}
         self.courses: dict[str, Course] = {}
         for name, robot in self.robots.items():
+            if bias_block(robot.motion) is not None:
+                raise KalmarkError(f"batch solution: the bias of {name!r} is in the map, expected controls without one")
             exactly = np.zeros((robot.motion.space.dof,) * 2)
             mean, P = starts.get(name, (robot.start, exactly if robot.cov is None else robot.cov))
             self.courses[name] = Course(robot, self._new_node(-1, np.array(mean), np.array(P)))

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.results.describe import describe_pose
-from kalmark.results.history import Array, Mounted
+from kalmark.results.history import Array, Biased, Mounted
 from kalmark.results.words import figure
 
 AXES = {3: ("x", "y", "theta"), 5: ("x", "y", "theta", "gain", "offset"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
@@ -88,6 +88,13 @@ def mount_figures(mount: Mounted) -> dict[str, Any]:
         **_range_figures(mount.mean[pose:], mount.covariance[dof:, dof:]),
         "directions": found,
     }
+
+
+def bias_figures(bias: Biased) -> dict[str, float]:
+    """Return what the filter believes is to be added to a robot's controls, and how far that is known."""
+    sigmas = np.sqrt(np.maximum(np.diagonal(bias.covariance), 0.0)).tolist()
+    found = dict(zip(bias.columns, bias.mean.tolist(), strict=True))
+    return found | {f"sigma_{column}": sigma for column, sigma in zip(bias.columns, sigmas, strict=True)}
 
 
 def _range_figures(parameters: Array, P: Array) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The cameras of a run: where they sit on their robots and what their images are, to draw them and in them."""
+"""The cameras of a run: where they sit on their robots and what their images are; and what else calibrates itself."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.results.history import Array, Camera, Mounted
+from kalmark.results.history import Array, Biased, Camera, Mounted
+from kalmark.slam.prediction import bias_name
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
@@ -41,6 +42,15 @@ def mounts(slam: Slam) -> tuple[Mounted, ...]:
             if block is not None and _in_map(slam, name):
                 found.append(Mounted(name, slam.mean(name), slam.covariance(name), block[2]))
     return tuple(found)
+
+
+def biases(slam: Slam) -> tuple[Biased, ...]:
+    """Return the biases of the robots' controls that are in the map, as estimated."""
+    return tuple(
+        Biased(robot.name, tuple(robot.motion.columns), slam.mean(name), slam.covariance(name))
+        for robot in slam.robots.values()
+        if _in_map(slam, name := bias_name(robot.name))
+    )
 
 
 def _in_map(slam: Slam, name: str) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
-from kalmark.results.calibration import mount_figures
+from kalmark.results.calibration import bias_figures, mount_figures
 from kalmark.results.consistency import diverged, nees, nis, pose_error
 from kalmark.results.history import Array, History, Ints
 from kalmark.results.landmarks import MapLandmarks
@@ -65,6 +65,8 @@ def evaluate(run: Run) -> dict[str, Any]:
         summary["corner_rms_px"] = float(np.sqrt(np.nanmean(history.left_px**2)))
     if history.mounts:
         summary["mounts"] = {mount.name: mount_figures(mount) for mount in history.mounts}
+    if history.biases:
+        summary["biases"] = {bias.robot: bias_figures(bias) for bias in history.biases}
     summary |= run.reference
     if run.truth.fixes and not np.isfinite(run.truth.poses).any():
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))

@@ -72,6 +72,15 @@ class Mounted(NamedTuple):
     prior: Array
 
 
+class Biased(NamedTuple):
+    """The bias of a robot's controls at the end: `mean` (k,) of the control's `columns`, and its covariance (k, k)."""
+
+    robot: str
+    columns: tuple[str, ...]
+    mean: Array
+    covariance: Array
+
+
 @dataclass(frozen=True, eq=False)
 class History:
     """A run's steps (S of them) and observations (O of them).
@@ -108,6 +117,7 @@ class History:
     left_px: Array = field(default_factory=lambda: np.empty(0))
     cameras: tuple[Camera, ...] = ()
     mounts: tuple[Mounted, ...] = ()
+    biases: tuple[Biased, ...] = ()
     true_id: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
     decisions: Decisions = field(default_factory=Decisions)
 
@@ -158,6 +168,9 @@ class History:
             "mount_mean": padded_rows([m.mean for m in self.mounts]),
             "mount_covariance": padded_squares([m.covariance for m in self.mounts]),
             "mount_prior": padded_squares([m.prior for m in self.mounts]),
+            "bias": texts([f"{b.robot}\n{','.join(b.columns)}" for b in self.biases]),
+            "bias_mean": padded_rows([b.mean for b in self.biases]),
+            "bias_covariance": padded_squares([b.covariance for b in self.biases]),
         }
 
     @classmethod
@@ -175,10 +188,18 @@ class History:
         keys = ("mount", "mount_mean", "mount_covariance", "mount_prior")
         rows = zip(*(named.get(key, ()) for key in keys), strict=True)
         mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P), _cut(C)) for name, mean, P, C in rows)
-        columns = {key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)}
+        columns: dict[str, Any] = {
+            key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)
+        }
         columns |= {"kind": kind, "left_px": left, "true_id": named.get("true_id", named["id"])}
-        told = Decisions.from_arrays(named)
-        return cls(**columns, maps=maps, starts=starts, inputs=inputs, cameras=cameras, mounts=mounts, decisions=told)
+        columns |= {"maps": maps, "starts": starts, "mounts": mounts, "biases": _biases(named)}
+        return cls(**columns, inputs=inputs, cameras=cameras, decisions=Decisions.from_arrays(named))
+
+
+def _biases(named: Mapping[str, npt.NDArray[Any]]) -> tuple[Biased, ...]:
+    rows = zip(*(named.get(key, ()) for key in ("bias", "bias_mean", "bias_covariance")), strict=True)
+    told = [(*str(name).split("\n"), mean[~np.isnan(mean)], _cut(P)) for name, mean, P in rows]
+    return tuple(Biased(robot, tuple(columns.split(",")), mean, P) for robot, columns, mean, P in told)
 
 
 def _map_arrays(maps: tuple[MapSnapshot, ...]) -> dict[str, npt.NDArray[Any]]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
-from kalmark.results.cameras import cameras, mounts
+from kalmark.results.cameras import biases, cameras, mounts
 from kalmark.results.corners import left_px
 from kalmark.results.decisions import Decisions
 from kalmark.results.describe import describe, plain
@@ -200,6 +200,7 @@ class _Recorder:
             left_px=np.concatenate([np.empty(0), *self.left]),
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),
+            biases=biases(self.slam),
             true_id=self._true_ids(log),
             decisions=Decisions.of(steps, 3 if n > 3 else 2),
         )

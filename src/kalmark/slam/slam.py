@@ -1,6 +1,6 @@
 """EKF-SLAM: the page to read first.  Events come in by one door, `Slam.process`; [S] 2.4 is the loop it serves.
 
-robot moves             -> _move         prediction          [S] (14)-(17)
+robot moves             -> predict       prediction          [S] (14)-(17)
 sensor sees known ones  -> _correct      correction          [S] (26)-(30)
 sensor sees new ones    -> _initialize   augmentation        [S] (32)-(38)
 landmark is removed     -> remove        reduction           [S] Table 1
@@ -19,8 +19,6 @@ import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.filter.estimators import Estimator, Invariant, Map
-from kalmark.filter.kernels import all_finite
-from kalmark.geometry.spaces import Rn
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
@@ -31,10 +29,11 @@ from kalmark.slam.averaging import average, refuse_postponed
 from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
 from kalmark.slam.decisions import DEFERRED, NEW, Association, Decision
 from kalmark.slam.doubts import MIRRORED
-from kalmark.slam.drive import Drive, Part, body_axes
+from kalmark.slam.drive import Drive
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
 from kalmark.slam.members import Members
 from kalmark.slam.nearby import Nearby
+from kalmark.slam.prediction import forget_error, place_bias, predict
 from kalmark.slam.report import LandmarkTable, Observation, Report, judged
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.scene import Scene, View
@@ -92,6 +91,7 @@ class Slam:
         self.refuse_other_world(f"robot {robot.name!r}", robot.motion.space.world)
         self.members.place_robot(robot.name, self.map.add(robot.motion.space, robot.start, robot.cov))
         self._drives[robot.name] = Drive(robot.motion)
+        place_bias(self, robot.name)
         for name, mount in robot.sensors.items():
             slot, block = -1, mount.block(name)
             if block is not None:  # the mount calibrates itself
@@ -126,8 +126,8 @@ class Slam:
         self.t_ns = event.t_ns
         with drive.kept_on_error():
             for part in drive.accept(event):
-                self._move(event.robot, part)
-        self._forget_error(event.robot)
+                predict(self, event.robot, part)
+        forget_error(self, event.robot)
         return Report(event)
 
     def _scan(self, event: Scan) -> Report:
@@ -173,37 +173,7 @@ class Slam:
         with drive.kept_on_error():
             part = drive.advance(self.t_ns)
             if part is not None:
-                self._move(name, part)
-
-    def _move(self, name: str, part: Part) -> None:
-        """Predict: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
-        slot, motion = self.members.slots[name], self.robots[name].motion
-        error = self._errors.get(name)
-        r, index = self.map.mean(slot), self.map.index(slot)
-        u = part.u if error is None else part.u + self.map.mean(error)
-        moved, F, R_u = motion.move(r, u, part.dt_s)
-        F = self.estimator.pose_jacobian(self.map, slot, F)
-        Q = R_u @ part.N @ R_u.T
-        if not all_finite(moved, F, Q):
-            what = f"{name!r} at t={seconds(self.t_ns or 0)} s"
-            raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
-        if error is None and part.N.any() and not (part.first and part.last):
-            error = self._errors[name] = self.map.add(Rn(len(u)), np.zeros(len(u)), part.N)
-        if error is not None:  # the control's error is a block of the map, common to all parts of its interval
-            index = np.concatenate([self.map.index(slot), self.map.index(error)])
-            F = np.block([[F, R_u], [np.zeros((len(u), len(F))), np.eye(len(u))]])
-            Q = np.zeros((len(index), len(index)))
-        D = motion.diffusion(part.u, part.dt_s)
-        if D is not None:
-            G = body_axes(moved)
-            Q[: len(G), : len(G)] += G @ D @ G.T
-        self.map.predict(index, F, Q)
-        self.map.set_predicted(slot, moved)
-
-    def _forget_error(self, name: str) -> None:
-        error = self._errors.pop(name, None)
-        if error is not None:
-            self.map.remove(error)
+                predict(self, name, part)
 
     # ------------------------------------------------------------------ scans
     def _fuse(self, event: Scan, view: View, scene: Scene, decisions: Sequence[Decision], R: Array) -> Report:
@@ -362,7 +332,7 @@ class Slam:
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
         if name in self.members.slots and name not in self.members.kinds:
-            what = "robot" if name in self.robots else "sensor's mount"
+            what = "robot" if name in self.robots else "sensor's mount or a control's bias"
             raise MapError(f"{name!r} is a {what}, expected a landmark")
         self.map.remove(self.slot(name))
         self.members.forget(name)

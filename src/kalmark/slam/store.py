@@ -25,6 +25,7 @@ from kalmark.slam.decisions import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
 from kalmark.slam.doubts import Doubt
 from kalmark.slam.events import Id
+from kalmark.slam.prediction import bias_block, bias_name
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
 from kalmark.slam.store_map import map_arrays, map_described, map_restored
@@ -227,6 +228,10 @@ def _check_owners(slam: Slam) -> None:
         own = slam.robots[robot].sensors[sensor].block(sensor)
         if own is not None:
             spaces[mount_name(robot, sensor)] = own[0]
+    for moving in slam.robots.values():
+        bias = bias_block(moving.motion)
+        if bias is not None:
+            spaces[bias_name(moving.name)] = bias[0]
     if (
         slam.robots.keys() & slam.members.kinds.keys()
         or spaces.keys() != slam.members.slots.keys()
