@@ -5,24 +5,32 @@
 Four ways to take the same step of the same log, in turn within one run, one thread: `Slam.process` with every outcome
 read; its bare compiled kernels; the textbook filter in NumPy; GTSAM's iSAM2 with the pose's marginal covariance (when
 gtsam is installed).  The ratios are the result; the machine's microseconds are for orientation.
+
+Then, on a circle in a field of known landmarks, 2 m apart: the dense step with 6 landmarks in view over the bare update
+of its covariance (dsyrk), step by step in turn; and the step of the map that Slam chooses with 10 in view, by parts.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from field import ODOMETRY, SIGHT, Step, new_slam
+from field import ODOMETRY, SIGHT, Field, Step, new_slam
 from ways import Isam2, Known, Process, Textbook, Way, conditions, in_turns, pin
 
 import kalmark as km
 from kalmark.filter import corrections, kernels
+from kalmark.filter.estimators import Invariant
+from kalmark.filter.postponed import PostponedMap
 from kalmark.models.motion2d import increment
 
 SIGHTINGS, WARM_UP = 6, 101
+SIDE, IN_VIEW = 32, 10  # a field of 1,024 landmarks
 
 
 def simulate(count: int, steps: int) -> list[Step]:
@@ -103,6 +111,59 @@ def table(spent: dict[str, np.ndarray], count: int) -> dict[str, Any]:
     return rows
 
 
+def known_field(map_: str) -> tuple[Field, km.Slam]:
+    """Return a field and a Slam that knows all its landmarks."""
+    field = Field(SIDE, SIDE)
+    slam = field.slam(map_)
+    for i, landmark in enumerate(field.landmarks):
+        slam.add_landmark(i, landmark, 0.01 * np.eye(2))
+    if isinstance(slam.map, PostponedMap):
+        slam.map.flush()
+        slam.map.finish()
+    return field, slam
+
+
+def spent_us(call: Callable[..., Any], *arguments: Any) -> float:
+    """Return the microseconds of processor time that a call takes."""
+    begin = time.thread_time_ns()
+    call(*arguments)
+    return (time.thread_time_ns() - begin) * 1e-3
+
+
+def dense_over_floor(steps: int) -> dict[str, float]:
+    """Return the median step of a dense map and 6 sightings, and that of the update of its covariance alone."""
+    field, slam = known_field("dense")
+    V = np.full((2 * SIGHTINGS, slam.map.n), 1e-9)
+    spent = []
+    for control, scan in field.circle(steps, view=SIGHTINGS):
+        step = spent_us(slam.process, control) + spent_us(slam.process, scan)
+        spent.append((step, spent_us(kernels.downdate, slam.map.P, V)))
+    step, floor = np.median(spent[len(spent) // 2 :], axis=0)
+    return {"landmarks": SIDE * SIDE, "step_us": step, "dsyrk_us": floor, "ratio": step / floor}
+
+
+def parts(steps: int) -> dict[str, float]:
+    """Return the medians of a control, a scan of 10 landmarks, and the compiled correction in it."""
+    field, slam = known_field("auto")
+    kernel: list[float] = []
+    correct = Invariant.compiled
+
+    def timed(*arguments: Any) -> Any:
+        begin = time.thread_time_ns()
+        done = correct(*arguments)
+        kernel.append((time.thread_time_ns() - begin) * 1e-3)
+        return done
+
+    spent = []
+    for control, scan in field.circle(2 * steps, view=IN_VIEW):
+        if len(spent) == steps:
+            Invariant.compiled = staticmethod(timed)  # type: ignore[assignment]
+        spent.append((spent_us(slam.process, control), spent_us(slam.process, scan)))
+    Invariant.compiled = staticmethod(correct)  # type: ignore[assignment]
+    control_us, scan_us = np.median(spent[steps // 2 : steps], axis=0)
+    return {"control_us": control_us, "scan_us": scan_us, "correction_us": float(np.median(kernel))}
+
+
 def main() -> None:
     """Measure, print and save."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -114,8 +175,13 @@ def main() -> None:
     where = conditions()
     with kernels.one_thread():
         rows = {str(n): table(measure(n, options.steps), n) for n in options.landmarks}
+        dense, chosen = dense_over_floor(options.steps // 3), parts(2 * options.steps)
+    print(f"\n{dense['landmarks']:,} landmarks, dense, {SIGHTINGS} seen a step: {dense['step_us']:.0f} us,", end=" ")
+    print(f"dsyrk {dense['dsyrk_us']:.0f} us, ratio {dense['ratio']:.2f}")
+    print(f"the map that Slam chooses, {IN_VIEW} seen a step: control {chosen['control_us']:.1f} us,", end=" ")
+    print(f"scan {chosen['scan_us']:.1f} us, of which the compiled correction {chosen['correction_us']:.1f} us")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps({**where, "landmarks": rows}, indent=1))
+    options.out.write_text(json.dumps({**where, "landmarks": rows, "dense": dense, "parts": chosen}, indent=1))
     print(f"\nsaved to {options.out}")
 
 

@@ -97,13 +97,13 @@ class Process(Way):
 
 
 class Floor(Way):
-    """The bare update of a dense covariance, P <- P - W W', that no dense filter can do without; estimates nothing."""
+    """The bare update of a dense covariance, P <- P - V' V, that no dense filter can do without; estimates nothing."""
 
     def __init__(self, known: Known) -> None:
         self.P = np.eye(3 + 2 * len(known.slam.landmarks()))
 
     def step(self, control: km.Control, scan: km.Scan) -> None:
-        kernels.downdate(self.P, np.full((len(self.P), scan.y.size), 1e-6))
+        kernels.downdate(self.P, np.full((scan.y.size, len(self.P)), 1e-6))
 
     def pose(self) -> Array:
         return np.full(3, np.nan)

@@ -294,15 +294,15 @@ def test_prediction_acts_on_the_rows_of_the_robot_alone() -> None:
 @pytest.mark.parametrize("blocks", [3, 40, 200])
 def test_the_downdate_and_the_transport_equal_their_dense_forms_alone_and_together(blocks: int) -> None:
     rng, m, both = np.random.default_rng(2), random_map(blocks, 3), random_map(blocks, 3)
-    P, W, a = full(m), rng.normal(size=(m.n, 5)), rng.normal(size=m.n)
-    kernels.downdate(m.P, W)
-    P = P - W @ W.T
+    P, V, a = full(m), rng.normal(size=(5, m.n)), rng.normal(size=m.n)
+    kernels.downdate(m.P, V)
+    P = P - V.T @ V
     np.testing.assert_allclose(full(m), P, atol=1e-10)
     A = np.eye(m.n)
     A[:, 2] += a
     kernels.transport(m.P, a[:, None].copy(), 2)
     np.testing.assert_allclose(full(m), A @ P @ A.T, atol=1e-9)
-    kernels.downdate_and_transport(both.P, W, a[:, None].copy(), 2)
+    kernels.downdate_and_transport(both.P, V, a[:, None].copy(), 2)
     np.testing.assert_allclose(full(both), A @ P @ A.T, atol=1e-9)
 
 

@@ -21,58 +21,34 @@ from kalmark.filter.kernels import (
     Index,
     add_square,
     cholesky_inverse,
-    columns,
     downdate,
     downdate_and_transport,
+    rows_of,
     submatrix,
     transport,
 )
+from kalmark.filter.observed import (
+    Linear,
+    diagonal_blocks,
+    head_sizes,
+    innovation,
+    joint_innovation,
+    least_squares,
+    linearized,
+    observed_block,
+    settled,
+    sparse_product,
+    squared_distances,
+    stacked,
+)
 from kalmark.filter.parallax import anchored, carried, carry_back, retract_parallax, spread, transport_parallax
-from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table, generator, retract
+from kalmark.geometry.spaces import Table, generator, retract
 from kalmark.models.observe import linearize, sensor_at
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 Map = tuple[Array, Array, int, Table, Table, int]  # x, P, n, blocks, atoms, axes
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
-
-
-@compiled
-def head_sizes(blocks: Table, atoms: Table, robot: int, mount: int) -> tuple[int, int]:
-    """Return the numbers of a robot's pose, and those of the head: the pose and, if it is in the map, the mount.
-
-    With the mount come the parameters that its sensor has in the map.
-    """
-    pose = 3 if atoms[blocks[robot, 4] + 1, 0] == HEADING else 7
-    return pose, pose if mount < 0 else pose + blocks[mount, 1]
-
-
-@compiled
-def observed_block(
-    x: Array, blocks: Table, atoms: Table, robot: int, mount: int, slots: Index, d: int
-) -> tuple[Index, Table, Array]:
-    """Return the rows in P, the atoms and the mean of the head and of the first d numbers of K landmarks."""
-    pose, head = head_sizes(blocks, atoms, robot, mount)
-    before = 1 if mount < 0 else 2  # blocks in the head
-    size = head + d * len(slots)
-    index, mean = np.empty(size, np.int64), np.empty(size)
-    table = np.empty((size, 3), np.int64)
-    count = x_to = p_to = 0
-    for i in range(before + len(slots)):
-        slot, width = (robot, pose) if i == 0 else ((mount, head - pose) if i < before else (slots[i - before], d))
-        x_at, p_at, first = blocks[slot, 0], blocks[slot, 2], blocks[slot, 4]
-        mean[x_to : x_to + width] = x[x_at : x_at + width]
-        rows = 0
-        for a in range(first, first + blocks[slot, 5]):
-            if atoms[a, 1] - x_at < width:
-                table[count, 0] = atoms[a, 0]
-                table[count, 1], table[count, 2] = x_to + atoms[a, 1] - x_at, p_to + rows
-                rows += ERROR_SIZE[atoms[a, 0]]
-                count += 1
-        for j in range(rows):
-            index[p_to + j] = p_at + j
-        x_to, p_to = x_to + width, p_to + rows
-    return index[:p_to], table[:count], mean
 
 
 @compiled
@@ -88,95 +64,6 @@ def gauge(mean: Array, correction: Array, pose: int, axes: int) -> Array:
     return turn
 
 
-@compiled
-def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array, bool]:
-    """Return each observation's innovation covariance Z (K, p, p) and d2 = z' Z^-1 z (K,).  [S] (27), (83).
-
-    d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a Z is not positive
-    definite: the filter is broken.
-    """
-    k, m, d = E_l.shape
-    head = E_r.shape[2]
-    Z, d2, healthy = np.empty((k, m, m)), np.empty(k), True
-    rows, H = np.empty(head + d, np.int64), np.empty((m, head + d))
-    rows[:head] = index[:head]
-    for i in range(k):
-        rows[head:] = index[head + i * d : head + (i + 1) * d]
-        H[:, :head], H[:, head:] = E_r[i], E_l[i]
-        S = submatrix(P, rows)
-        for a in range(m):
-            for b in range(a + 1):
-                s = R[i, a, b]
-                for c in range(head + d):
-                    t = 0.0
-                    for f in range(head + d):
-                        t += S[c, f] * H[b, f]
-                    s += H[a, c] * t
-                Z[i, a, b] = Z[i, b, a] = s
-        M, positive = cholesky_inverse(Z[i])
-        d2[i] = np.nan
-        if positive:
-            w = 0.0
-            for a in range(m):
-                s = 0.0
-                for b in range(a + 1):
-                    s += M[a, b] * z[i, b]
-                w += s * s
-            d2[i] = w
-        elif np.isfinite(Z[i]).all():
-            healthy = False
-    return Z, d2, healthy
-
-
-@compiled
-def stacked(E_r: Array, E_l: Array) -> Array:
-    """Return the Jacobian H (K p, head + K d) of all observations of a scan with respect to the observed block."""
-    k, m, d = E_l.shape
-    head = E_r.shape[2]
-    H = np.zeros((k * m, head + k * d))
-    for i in range(k):
-        H[i * m : (i + 1) * m, :head] = E_r[i]
-        H[i * m : (i + 1) * m, head + i * d : head + (i + 1) * d] = E_l[i]
-    return H
-
-
-@compiled
-def sparse_product(H: Array, S: Array, head: int, k: int) -> Array:
-    """Return H S, H being zero but in the columns of the head and, for each of K observations, of its landmark."""
-    q, n = len(H) // k, S.shape[1]
-    d = (H.shape[1] - head) // k
-    out = np.zeros((len(H), n))
-    for r in range(len(H)):
-        own = r // q * d
-        for i in range(head + d):
-            c = i if i < head else own + i
-            h = H[r, c]
-            for j in range(n):
-                out[r, j] += h * S[c, j]
-    return out
-
-
-@compiled
-def add_blocks(S: Array, R: Array) -> None:
-    """S += blockdiag(R), R (K, p, p)."""
-    k, m, _ = R.shape
-    for i in range(k):
-        S[i * m : (i + 1) * m, i * m : (i + 1) * m] += R[i]
-
-
-@compiled
-def settled(table: Table, change: Array, P: Array, tolerance: float) -> bool:
-    """Return whether each atom of a mean changes by less than that many of its sigmas, however the world is turned."""
-    for i in range(len(table)):
-        size, variance = 0.0, 0.0
-        for j in range(table[i, 2], table[i, 2] + ERROR_SIZE[table[i, 0]]):
-            size += change[j] ** 2
-            variance += P[j, j]
-        if size > tolerance**2 * variance:
-            return False
-    return True
-
-
 @register_jitable  # type: ignore[untyped-decorator]
 def iterate(
     view: Any,
@@ -186,12 +73,12 @@ def iterate(
     P_ss: Array,
     y: Array,
     R: Array,
-    linear: tuple[Array, Array, Array],
+    linear: Linear,
     limits: tuple[int, float],
 ) -> tuple[Array, Array, Array, bool]:
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
 
-    It begins with the innovations and Jacobians at the mean, z, E_r and E_l.
+    It begins with what `linearized` tells at the mean.
 
     `limits`: at most so many times, until nothing moves by more than that many of its sigmas.
 
@@ -208,37 +95,40 @@ def iterate(
     s, S = s_j, S_j = sensor_at(view, mean[:head])
     h = S.shape[1]
     baselines = (depths, s, S, spread(P_ss, np.arange(h), mean, s, S, depths))
-    x_j, (z, E_r, E_l) = mean, linear
+    x_j, (v, H, HP, Z) = mean, linear
     for j in range(most):
         if j > 0:
             _e, z, E_r, E_l = linearize(view, x_j[:head], x_j[head:].reshape(k, d), y)
-        H = stacked(E_r, E_l)
-        carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
-        H[:, theta : theta + axes] += H @ (generator(table, x_j, len(P_ss), axes, mean[:3]) - turned)
-        v = z.ravel() + H @ correction
-        HP = sparse_product(H, P_ss, h, k)
-        Z = sparse_product(H, HP.T.copy(), h, k)
-        add_blocks(Z, R)
+            H, v = stacked(E_r, E_l), z.copy().ravel()
+            carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
+            turn = generator(table, x_j, len(P_ss), axes, mean[:3]) - turned
+            H[:, theta : theta + axes] += sparse_product(H, turn, h, k)
+            v += sparse_product(H, correction.reshape(-1, 1), h, k).ravel()
+            HP, Z = joint_innovation(H, P_ss, R, h)
         M, positive = cholesky_inverse(Z)
         if not positive:
             break
-        step = HP.T @ (M.T @ (M @ v))
-        change = step - correction
-        correction = step
+        step = least_squares(HP, M, v)
+        change, correction = step - correction, step
+        if settled(table, change, P_ss, tolerance):
+            break
         x_j = mean.copy()
         retract(table, x_j, correction, gauge(mean, correction, pose, axes))
         s_j, S_j = sensor_at(view, x_j[:head])
         retract_parallax(x_j, mean, baselines, correction, correction[:h], s_j)
-        if settled(table, change, P_ss, tolerance):
-            break
     return H, M, v, positive
 
 
 @compiled
-def gain(P: Array, n: int, index: Index, H: Array, M: Array, v: Array) -> tuple[Array, Array]:
-    """Return W = P H' L^-T, M = L^-1, of which P loses W W', and the mean's correction K v (n,).  [S] (28)-(30)."""
-    W = (columns(P, index, n) @ H.T) @ M.T
-    return W, W @ (M @ v)
+def gain(
+    P: Array, n: int, index: Index, H: Array, M: Array, v: Array, sizes: tuple[int, int]
+) -> tuple[Array, Array]:  # fmt: skip
+    """Return V = L^-1 H P, M = L^-1, of which P loses V' V, and the mean's correction K v (n,).  [S] (28)-(30).
+
+    `sizes`: the columns of the head in H, and how many observations there are.
+    """
+    V = M @ sparse_product(H, rows_of(P, index, n), sizes[0], sizes[1])
+    return V, (M @ v) @ V
 
 
 def invariant(
@@ -255,15 +145,18 @@ def invariant(
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
     e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
-    Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
+    P_ss = submatrix(P, index)
+    linear = linearized(z, E_r, E_l, P_ss, R)
+    Z = diagonal_blocks(linear[3], z.shape[1])
+    d2, healthy = squared_distances(Z, z)
     near = (d2 <= gate) & (d2 < np.inf)
     if not healthy or not near.any():
         return e, z, Z, d2, near, healthy
-    linear = z, E_r, E_l
     if not near.all():
-        y, R, linear = y[near], R[near], (z[near], E_r[near], E_l[near])
         index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
-    H, M, v, positive = iterate(view, (pose, head, axes), table, mean, submatrix(P, index), y, R, linear, limits)
+        y, R, P_ss = y[near], R[near], submatrix(P, index)
+        linear = linearized(z[near], E_r[near], E_l[near], P_ss, R)
+    H, M, v, positive = iterate(view, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return e, z, Z, d2, near, False
     before, x_before = generator(atoms, x, n, axes, mean[:3]), x.copy()
@@ -271,10 +164,10 @@ def invariant(
     s, S = sensor_at(view, mean[:head])
     rows = index[: S.shape[1]]
     baselines = (depths, s, S, spread(P, rows, x, s, S, depths))
-    W, correction = gain(P, n, index, H, M, v)
+    V, correction = gain(P, n, index, H, M, v, (len(rows), len(y)))
     retract(atoms, x, correction, gauge(mean, correction[index], pose, axes))
     theta = index[(3 if pose == 3 else 6) - axes]
-    downdate_and_transport(P, W, generator(atoms, x, n, axes, mean[:3]) - before, theta)
+    downdate_and_transport(P, V, generator(atoms, x, n, axes, mean[:3]) - before, theta)
     if len(depths):
         s_now, S_now = sensor_at(view, observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2])
         retract_parallax(x, x_before, baselines, correction, correction[rows], s_now)
@@ -289,8 +182,9 @@ def fit(view: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[fl
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
     _e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
-    linear = z, E_r, E_l
-    _H, M, v, positive = iterate(view, (pose, head, axes), table, mean, submatrix(P, index), y, R, linear, limits)
+    P_ss = submatrix(P, index)
+    linear = linearized(z, E_r, E_l, P_ss, R)
+    _H, M, v, positive = iterate(view, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return np.inf, np.inf
     w, log_det = M @ v, 0.0
@@ -312,7 +206,7 @@ def averaged(
     robot, mount, slots, d, y, R, _gate = scan
     pose, head = head_sizes(blocks, atoms, robot, mount)
     q = R.shape[1]
-    W, D = np.zeros((n, q * (pairs >= 0).sum())), np.zeros((n, len(pairs)))
+    V, D = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs)))
     d2, used = np.full(len(y), np.nan), 0
     for i in range(len(pairs)):
         rows = np.flatnonzero(pairs[i] >= 0)
@@ -322,19 +216,20 @@ def averaged(
         _e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(rows), d), y[rows])
         if i == 0:
             d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
-        linear, S = (z, E_r, E_l), submatrix(P, index)
+        S = submatrix(P, index)
+        linear = linearized(z, E_r, E_l, S, R[rows])
         H, M, v, positive = iterate(view, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
         if not positive:
             return d2, False
-        W_i, D[:, i] = gain(P, n, index, H, M, v)
-        W[:, used : used + W_i.shape[1]] = np.sqrt(weights[i]) * W_i
-        used += W_i.shape[1]
+        V_i, D[:, i] = gain(P, n, index, H, M, v, (E_r.shape[2], len(rows)))
+        V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
+        used += len(V_i)
     index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
     before = generator(atoms, x, n, axes, mean[:3])
     retract(atoms, x, correction, gauge(mean, correction[index], pose, axes) if transports else np.zeros(0))
-    downdate(P, W)
+    downdate(P, V)
     add_square(P, spread)
     if transports:
         theta = index[(3 if pose == 3 else 6) - axes]
@@ -360,8 +255,8 @@ def textbook(
         near[i] = d2[i] < gate
         if near[i]:
             M, _positive = cholesky_inverse(Z[i])
-            W, correction = gain(P, n, index, stacked(E_r, E_l), M, z[i].copy())
-            downdate(P, W)
+            V, correction = gain(P, n, index, stacked(E_r, E_l), M, z[i].copy(), (E_r.shape[2], 1))
+            downdate(P, V)
             retract(atoms, x, correction, np.zeros(0))
     return e, z, Z, d2, near, healthy
 
@@ -383,12 +278,11 @@ def first_estimates(
         return e, z, Z, d2, near, healthy
     index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
     H = stacked(E_r[near], E_l[near])
-    Z_all = H @ (submatrix(P, index) @ H.T)
-    add_blocks(Z_all, R[near])
-    M, positive = cholesky_inverse(Z_all)
+    sizes = E_r.shape[2], len(H) // R.shape[1]
+    M, positive = cholesky_inverse(joint_innovation(H, submatrix(P, index), R[near], sizes[0])[1])
     if positive:
-        W, correction = gain(P, n, index, H, M, z[near].ravel())
-        downdate(P, W)
+        V, correction = gain(P, n, index, H, M, z[near].ravel(), sizes)
+        downdate(P, V)
         retract(atoms, x, correction, np.zeros(0))
     return e, z, Z, d2, near, positive
 

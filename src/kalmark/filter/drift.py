@@ -24,6 +24,9 @@ NO_NUMBERS = np.zeros(0)
 NO_ROWS = np.zeros(0, dtype=np.int64)
 
 
+TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
+
+
 class Watch(NamedTuple):
     """Numbers of a block in the active map, where they were at rest, and one over their sigmas."""
 
@@ -33,9 +36,17 @@ class Watch(NamedTuple):
 
 
 @compiled
-def is_farther(limit: float, x: Array, standing: Watch, G: Array, s: Array, per_sigma: Array) -> bool:
-    """Return whether a number is more than `limit` sigmas from where it was: of those that stand, or among G s."""
-    at, frozen, per = standing
+def is_farther(
+    P: Array, turn: Index, x: Array, at: Index, frozen: Array, per: Array, G: Array, s: Array, per_sigma: Array
+) -> bool:  # fmt: skip
+    """Return whether a number is more than so many sigmas from where it was: of those that stand, or among G s.
+
+    So many are TAU over the sigma of the robot's turn, whose rows of P are `turn`.
+    """
+    variance = 1e-300
+    for i in range(max(0, len(turn) - 3), len(turn)):
+        variance += P[turn[i], turn[i]]
+    limit = TAU / math.sqrt(variance)
     for i in range(len(at)):
         if abs(x[at[i]] - frozen[i]) * per[i] > limit:
             return True
@@ -92,10 +103,11 @@ class Drift:
             self._per_sigma = np.concatenate([self._per_sigma, watch.per_sigma[: len(rows)]])
             self._rest = None
 
-    def is_beyond(self, limit: float, x: Array, s: Array, read: Callable[[Index, int], Array]) -> bool:
-        """Return whether a block is farther than `limit` sigmas from where it was.
+    def is_beyond(self, P: Array, turn: Index, x: Array, s: Array, read: Callable[[Index, int], Array]) -> bool:
+        """Return whether the rest has moved too far for the coordinates in which its errors were left.
 
-        x is the mean of the active map, s that of its shadows; `read` returns rows' covariance at rest with the shadows
+        P and x are the covariance and the mean of the active map, `turn` the rows there of what turns the world with
+        the robot that corrects, s the mean of the shadows; `read` returns rows' covariance at rest with the shadows
         from a first one on.
         """
         if self._all is None:
@@ -105,4 +117,4 @@ class Drift:
             self._rest = read(self._rows, 0)
         elif self._rest.shape[1] < len(s):
             self._rest = np.hstack([self._rest, read(self._rows, self._rest.shape[1])])
-        return bool(is_farther(limit, x, self._all, self._rest, s, self._per_sigma))
+        return bool(is_farther(P, turn, x, *self._all, self._rest, s, self._per_sigma))

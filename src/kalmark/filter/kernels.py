@@ -40,8 +40,8 @@ llvmlite.binding.add_symbol("kalmark_dsyrk", get_cython_function_address(_BLAS, 
 llvmlite.binding.add_symbol("kalmark_dgemm", get_cython_function_address(_BLAS, "dgemm"))
 _dsyrk = types.ExternalFunction("kalmark_dsyrk", types.void(*[types.intp] * 10))
 _dgemm = types.ExternalFunction("kalmark_dgemm", types.void(*[types.intp] * 13))
-_UPPER_TRANS = np.array([ord("U"), ord("T")], dtype=np.uint8)
-_TRANS_NO = np.array([ord("T"), ord("N")], dtype=np.uint8)
+_UPPER_NO = np.array([ord("U"), ord("N")], dtype=np.uint8)
+_TRANS_NO = np.array([ord("T"), ord("N"), ord("T")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
 CACHED = 256  # rows of a covariance that stays in a cache between one pass over it and the next
@@ -54,17 +54,17 @@ def one_thread() -> Any:
 
 
 @compiled
-def columns(P: Array, index: Index, n: int) -> Array:
-    """Return P[:n, index] (n, k)."""
+def rows_of(P: Array, index: Index, n: int) -> Array:
+    """Return P[index, :n] (k, n)."""
     k = len(index)
-    C = np.empty((n, k))
-    for c in range(k):
-        j = index[c]
-        for i in range(j):
-            C[i, c] = P[j, i]
-        for i in range(j, n):
-            C[i, c] = P[i, j]
-    return C
+    B = np.empty((k, n))
+    for a in range(k):
+        i = index[a]
+        for j in range(i):
+            B[a, j] = P[i, j]
+        for j in range(i, n):
+            B[a, j] = P[j, i]
+    return B
 
 
 @compiled
@@ -81,30 +81,51 @@ def submatrix(P: Array, index: Index) -> Array:
 
 
 @compiled
-def set_columns(P: Array, index: Index, C: Array) -> None:
-    """Write P[:, index] = C (n, k) and its mirror."""
-    for c in range(len(index)):
-        j = index[c]
-        for i in range(len(C)):
-            if i >= j:
-                P[i, j] = C[i, c]
-            else:
-                P[j, i] = C[i, c]
+def set_rows(P: Array, index: Index, B: Array) -> None:
+    """Write P[index, :n] = B (k, n) and its mirror."""
+    for a in range(len(index)):
+        i = index[a]
+        for j in range(i):
+            P[i, j] = B[a, j]
+        for j in range(i, B.shape[1]):
+            P[j, i] = B[a, j]
+
+
+@compiled
+def product(A: Array, B: Array) -> Array:
+    """Return A B, for an A (m, k) that is so small that a call of BLAS would cost more than the sum."""
+    out = np.zeros((len(A), B.shape[1]))
+    for i in range(len(A)):
+        for k in range(len(B)):
+            a = A[i, k]
+            for j in range(B.shape[1]):
+                out[i, j] += a * B[k, j]
+    return out
+
+
+@compiled
+def quadratic(A: Array, S: Array) -> Array:
+    """Return A S A', symmetric to the last bit."""
+    C = product(product(A, S), A.T.copy())
+    return 0.5 * (C + C.T)
+
+
+@compiled
+def moved_noise(moved: Array, F: Array, R_u: Array, N: Array) -> tuple[Array, bool]:
+    """Return Q = R_u N R_u', and whether that and what a motion has come to are finite numbers."""
+    Q = quadratic(R_u, N)
+    return Q, bool(np.isfinite(moved).all() and np.isfinite(F).all() and np.isfinite(Q).all())
 
 
 @compiled
 def predict(P: Array, n: int, index: Index, F: Array, Q: Array) -> None:
     """P <- F P F' + Q, F and Q (k, k) acting on the rows `index`.  [S] (15)-(17).  O(n)."""
-    C = columns(P, index, n) @ F.T
-    k = len(index)
-    block = np.empty((k, k))
-    for a in range(k):
-        block[a] = C[index[a]]
-    block = F @ block + Q
-    for a in range(k):
-        for b in range(k):
-            C[index[a], b] = 0.5 * (block[a, b] + block[b, a])
-    set_columns(P, index, C)
+    B = product(F, rows_of(P, index, n))
+    block = quadratic(F, submatrix(P, index)) + Q
+    for a in range(len(index)):
+        for b in range(len(index)):
+            B[a, index[b]] = 0.5 * (block[a, b] + block[b, a])
+    set_rows(P, index, B)
 
 
 @compiled
@@ -114,12 +135,12 @@ def augment(P: Array, n: int, at: int, index: Index, G: Array, Q: Array) -> None
     for a in range(d):
         P[at + a, : at + d] = 0.0
         P[at + d : n, at + a] = 0.0
-    C = columns(P, index, n) @ G.T
+    B = G @ rows_of(P, index, n)
     P_LL = G @ (submatrix(P, index) @ G.T) + Q
     for a in range(d):
         for b in range(d):
-            C[at + a, b] = 0.5 * (P_LL[a, b] + P_LL[b, a])
-    set_columns(P, np.arange(at, at + d), C)
+            B[a, at + b] = 0.5 * (P_LL[a, b] + P_LL[b, a])
+    set_rows(P, np.arange(at, at + d), B)
 
 
 @compiled
@@ -131,22 +152,21 @@ def clear(P: Array, n: int, at: int, d: int) -> None:
 
 
 @compiled
-def downdate(P: Array, W: Array) -> None:
-    """P <- P - W W', W (n, q), on the lower triangle.  [S] (30) with K Z K' = W W', W = P H' L^-T.  O(n^2 q)."""
-    n, q = W.shape
+def downdate(P: Array, V: Array) -> None:
+    """P <- P - V' V, V (q, n), on the lower triangle.  [S] (30) with K Z K' = V' V, V = L^-1 H P.  O(n^2 q)."""
+    q, n = V.shape
     if n <= 40:  # below, the call costs more than the sum
-        for i in range(n):
-            for j in range(i + 1):
-                s = 0.0
-                for k in range(q):
-                    s += W[i, k] * W[j, k]
-                P[i, j] -= s
+        for k in range(q):
+            for i in range(n):
+                v = V[k, i]
+                for j in range(i + 1):
+                    P[i, j] -= v * V[k, j]
         return
-    sizes = np.array([n, q, q, P.shape[1]], dtype=np.int32)
+    sizes = np.array([n, q, P.shape[1]], dtype=np.int32)
     at = sizes.ctypes.data
-    chars, numbers = _UPPER_TRANS.ctypes.data, _MINUS_ONE_ONE.ctypes.data
-    _dsyrk(chars, chars + 1, at, at + 4, numbers, W.ctypes.data, at + 8, numbers + 8, P.ctypes.data, at + 12)
-    sizes[0] = W.shape[0]  # keeps both alive until the call is over
+    chars, numbers = _UPPER_NO.ctypes.data, _MINUS_ONE_ONE.ctypes.data
+    _dsyrk(chars, chars + 1, at, at + 4, numbers, V.ctypes.data, at, numbers + 8, P.ctypes.data, at + 8)
+    sizes[0] = V.shape[0]  # keeps both alive until the call is over
 
 
 @compiled
@@ -163,14 +183,14 @@ def add_square(P: Array, D: Array) -> None:
 def transport(P: Array, a: Array, theta: int) -> None:
     """P <- A P A' with A = I + a e_theta', a (n, 1 or 3): P += a w' + w a', w = P[:, theta] + a P[theta, theta] / 2."""
     n, axes = a.shape
-    rows = np.arange(theta, theta + axes)
-    w = columns(P, rows, n) + a @ (0.5 * submatrix(P, rows))
+    at = np.arange(theta, theta + axes)
+    a_T = a.T.copy()
+    w_T = rows_of(P, at, n) + product(0.5 * submatrix(P, at), a_T)
     for c in range(axes):
-        a_c, w_c = a[:, c].copy(), w[:, c].copy()
         for i in range(n):
-            a_i, w_i = a_c[i], w_c[i]
+            a_i, w_i = a_T[c, i], w_T[c, i]
             for j in range(i + 1):
-                P[i, j] += a_i * w_c[j] + w_i * a_c[j]
+                P[i, j] += a_i * w_T[c, j] + w_i * a_T[c, j]
 
 
 @compiled
@@ -183,54 +203,62 @@ def subtract_product(C: int, stride: int, L: int, rows: int, R: int, columns: in
 
 
 @compiled
-def downdate_and_transport(P: Array, W: Array, a: Array, theta: int) -> None:
-    """P <- A (P - W W') A', `downdate` and `transport` in one pass over a P that is larger than a cache."""
+def subtract_outer(C: int, stride: int, L: int, rows: int, R: int, columns: int, q: int, n: int) -> None:
+    """C -= L' R for L (q, rows) and R (q, columns), of n numbers a row, and C, of `stride`, at those addresses."""
+    sizes = np.array([columns, rows, q, stride, n], dtype=np.int32)
+    at, chars, numbers = sizes.ctypes.data, _TRANS_NO.ctypes.data + 1, _MINUS_ONE_ONE.ctypes.data
+    _dgemm(chars, chars + 1, at, at + 4, at + 8, numbers, R, at + 16, L, at + 16, numbers + 8, C, at + 12)
+    sizes[0] = rows  # keeps them alive until the call is over
+
+
+@compiled
+def downdate_and_transport(P: Array, V: Array, a: Array, theta: int) -> None:
+    """P <- A (P - V' V) A', `downdate` and `transport` in one pass over a P that is larger than a cache."""
     n, axes = a.shape
     if n <= CACHED:
-        downdate(P, W)
+        downdate(P, V)
         transport(P, a, theta)
         return
-    q, rows = W.shape[1], np.arange(theta, theta + axes)
-    L, R = np.empty((n, q + 2 * axes)), np.empty((n, q + 2 * axes))
-    w = columns(P, rows, n) - W @ W[theta : theta + axes].T
-    w += a @ (0.5 * w[theta : theta + axes])
-    L[:, :q], L[:, q : q + axes], L[:, q + axes :] = W, -w, -a
-    R[:, :q], R[:, q : q + axes], R[:, q + axes :] = W, a, w
+    q, at = len(V), np.arange(theta, theta + axes)
+    L, R = np.empty((q + 2 * axes, n)), np.empty((q + 2 * axes, n))
+    V_theta, a_T = V[:, theta : theta + axes].copy(), a.T.copy()
+    w = rows_of(P, at, n) - V_theta.T @ V
+    w += product(0.5 * w[:, theta : theta + axes], a_T)
+    L[:q], L[q : q + axes], L[q + axes :] = V, -w, -a_T
+    R[:q], R[q : q + axes], R[q + axes :] = V, a_T, w
     for first in range(0, n, BAND):
         last = min(first + BAND, n)
-        C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[0]
-        subtract_product(C, P.shape[1], here, last - first, R.ctypes.data, last, L.shape[1])
+        C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[1]
+        subtract_outer(C, P.shape[1], here, last - first, R.ctypes.data, last, len(L), n)
     L[0], R[0] = 0.0, 0.0  # keeps them alive until the calls are over
 
 
 @compiled
 def cholesky_inverse(S: Array) -> tuple[Array, bool]:
-    """Return L^-1 with L L' = S, and whether S is positive definite."""
+    """Return L^-1 with L L' = S, and whether S is positive definite.
+
+    Elimination of [S, 1], each row by those above it, four at a time: what is left of S is L', what has become of 1 is
+    L^-1.
+    """
     n = len(S)
-    L = np.zeros((n, n))
-    for j in range(n):
-        for i in range(j, n):
-            s = S[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i > j:
-                L[i, j] = s / L[j, j]
-            elif s > 0.0:
-                L[j, j] = np.sqrt(s)
-            else:
-                return L, False
-    M = np.zeros((n, n))
-    for j in range(n):
-        M[j, j] = 1.0 / L[j, j]
-        for i in range(j + 1, n):
-            s = 0.0
-            for k in range(j, i):
-                s += L[i, k] * M[k, j]
-            M[i, j] = -s / L[i, i]
-    return M, True
-
-
-@compiled
-def all_finite(a: Array, B: Array, C: Array) -> bool:
-    """Return whether a vector and two matrices hold finite numbers only."""
-    return bool(np.isfinite(a).all() and np.isfinite(B).all() and np.isfinite(C).all())
+    T = np.zeros((n, 2 * n))
+    T[:, :n] = S
+    for i in range(n):
+        j = 0
+        while j + 4 <= i:
+            a, b, c, d = T[j, i], T[j + 1, i], T[j + 2, i], T[j + 3, i]
+            for k in range(i, n + j + 4):
+                T[i, k] -= a * T[j, k] + b * T[j + 1, k] + c * T[j + 2, k] + d * T[j + 3, k]
+            j += 4
+        while j < i:
+            a = T[j, i]
+            for k in range(i, n + j + 1):
+                T[i, k] -= a * T[j, k]
+            j += 1
+        if not T[i, i] > 0.0:
+            return T[:, n:].copy(), False
+        scale = 1.0 / np.sqrt(T[i, i])
+        T[i, n + i] = 1.0
+        for k in range(i, n + i + 1):
+            T[i, k] *= scale
+    return T[:, n:].copy(), True

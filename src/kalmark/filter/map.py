@@ -49,16 +49,24 @@ class Layout:
         self.n = 0  # rows of P in use
         self.x_n = 0  # numbers of x in use
         self._free: dict[tuple[int, ...], list[int]] = {}
+        self._rows: dict[int, Index] = {}  # and the numbers, by slot, as far as anyone has asked for them
+        self._numbers: dict[int, slice] = {}
 
     def rows(self, slot: int) -> Index:
-        """Return the rows of P of a block."""
-        at = self.blocks[slot, P_AT]
-        return np.arange(at, at + self.blocks[slot, P_SIZE])
+        """Return the rows of P of a block, to be read only."""
+        rows = self._rows.get(slot)
+        if rows is None:
+            at = self.blocks[slot, P_AT]
+            rows = self._rows[slot] = np.arange(at, at + self.blocks[slot, P_SIZE])
+        return rows
 
     def numbers(self, slot: int) -> slice:
         """Return where a block's mean is in x."""
-        at = int(self.blocks[slot, X_AT])
-        return slice(at, at + int(self.blocks[slot, X_SIZE]))
+        where = self._numbers.get(slot)
+        if where is None:
+            at = int(self.blocks[slot, X_AT])
+            where = self._numbers[slot] = slice(at, at + int(self.blocks[slot, X_SIZE]))
+        return where
 
     def _place(self, space: Space, mean: Array) -> int:
         """Return a slot for a block, its mean written, its rows of P not yet."""
@@ -174,7 +182,7 @@ class StochasticMap(Layout):
     def reset(self) -> None:
         """Forget all blocks, keep the room."""
         self.blocks, self.atoms, self.spaces, self.used = self.blocks[:0], self.atoms[:0], [], 0
-        self.n, self.x_n, self._free = 0, 0, {}
+        self.n, self.x_n, self._free, self._rows, self._numbers = 0, 0, {}, {}, {}
 
     def _reserve(self, size: int) -> None:
         super()._reserve(size)

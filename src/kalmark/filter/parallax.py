@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Index, columns, submatrix
+from kalmark.filter.kernels import Index, rows_of, submatrix
 from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, VECTOR, X_AT, Table
 
 Array = npt.NDArray[np.float64]
@@ -121,11 +121,11 @@ def transport_parallax(P: Array, n: int, head: Index, table: Table, C: Array) ->
     h, count = len(head), len(table)
     size = C.shape[1] - h - 1
     X = np.empty((count, n))  # (T - I) P at the rows of rho
-    common = columns(P, head, n)
+    common = rows_of(P, head, n)
     for i in range(count):
         anchor = np.arange(table[i, ANCHOR_P], table[i, ANCHOR_P] + size)
-        own = columns(P, table[i, RHO_P : RHO_P + 1], n)
-        X[i] = common @ C[i, :h] + columns(P, anchor, n) @ C[i, h : h + size] + own[:, 0] * (C[i, -1] - 1.0)
+        own = rows_of(P, table[i, RHO_P : RHO_P + 1], n)
+        X[i] = C[i, :h] @ common + C[i, h : h + size] @ rows_of(P, anchor, n) + own[0] * (C[i, -1] - 1.0)
     D = np.empty((count, count))  # (T - I) P (T - I)'
     for i in range(count):
         for j in range(count):

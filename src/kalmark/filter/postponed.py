@@ -12,7 +12,6 @@ shadows.  When the dense map has grown too large, a flush writes everything back
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -30,8 +29,6 @@ from kalmark.geometry.spaces import RHO, Rn, Space
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-
-TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
 
 NO_ROWS = np.zeros(0, dtype=np.int64)
 scalars = lru_cache(maxsize=64)(Rn)
@@ -69,6 +66,7 @@ class PostponedMap(Layout):
         self._shadows: dict[int, int] = {}  # slots in the active map, by slot: in the order of A0
         self._gone: list[tuple[int, Space]] = []  # removed, their shadows are still here
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
+        self._turns: dict[tuple[int, int], Index] = {}  # and the rows of what turned the world with them
         self._drift, self._pace = Drift(), Pace(self.most)
         self._before: dict[int, Array] = {}
 
@@ -170,10 +168,13 @@ class PostponedMap(Layout):
 
     def _turn_rows(self, robot: int) -> Index:
         """Return the rows of what turns the world with a robot: of its orientation, or its whole pose."""
-        space = self.spaces[robot]
-        assert space is not None
-        last = int(self.active.blocks[self._owners[robot], P_AT]) + (3 if space.axes == 1 else 6)
-        return np.arange(last - self.axes, last)
+        rows = self._turns.get((robot, self.axes))
+        if rows is None:
+            space = self.spaces[robot]
+            assert space is not None
+            last = int(self.active.blocks[self._owners[robot], P_AT]) + (3 if space.axes == 1 else 6)
+            rows = self._turns[robot, self.axes] = np.arange(last - self.axes, last)
+        return rows
 
     def _read(self, rows: Index, columns: Index) -> Array:
         return self.storage.get(rows, columns) if self._job is None else self._job.read(rows, columns)
@@ -285,22 +286,24 @@ class PostponedMap(Layout):
         if mount >= 0:
             self._enter(mount)
         at = self._at[slots]
-        if len(at) and at.min() < 0:
+        if -1 in at.tolist():
             for slot in slots.tolist():
                 self._enter(slot)
             at = self._at[slots]
-        self._before = {r: self.active.mean(self._owners[r]) for r in (*self._moved, robot)}
+        self._before = {r: self.active.mean(self._owners[r]) for r in dict.fromkeys((*self._moved, robot))}
         return self.active, self._owners[robot], self._owners.get(mount, -1), at
 
     def corrected(self, robot: int, transports: bool) -> None:
         """Take note that `robot` has corrected what `opened` returned, transporting its covariance or not."""
+        m = self.active
         if transports and len(self._A0):
-            s, before = self.active.x[self._s_x], self._moved.get(robot, 0.0)
-            self._moved[robot] = now = s - sum(moved for other, moved in self._moved.items() if other != robot)
+            s, before = m.x[self._s_x], self._moved.get(robot, 0.0)
+            others = [moved for other, moved in self._moved.items() if other != robot]
+            self._moved[robot] = now = s - sum(others) if others else s
             if len(self._owners) < self.used and self._far(robot, s):
                 self.flush(robot, now - before)
-        self._pace.count(self.active.n)
-        self.active.prepare()
+        self._pace.count(m.n)
+        m.prepare()
         if (job := self._job) is not None:
             job.advance(self._pace.due(self._progress(), job.spent, job.work))
             self._job = None if job.done else job
@@ -352,9 +355,10 @@ class PostponedMap(Layout):
 
     def _far(self, robot: int, s: Array) -> bool:
         """Return whether the rest has moved too far for the coordinates in which its errors were left."""
-        turned = sum(self.active.P[i, i] for i in self._turn_rows(robot)[-3:].tolist())
-        limit = TAU / math.sqrt(max(1e-300, turned))
-        return self._drift.is_beyond(limit, self.active.x, s, lambda rows, i: self._read(rows, self._A0[i:]))
+        m = self.active
+        return self._drift.is_beyond(
+            m.P, self._turn_rows(robot), m.x, s, lambda rows, first: self._read(rows, self._A0[first:])
+        )
 
     # ------------------------------------------------------------------ flushing
     def _progress(self) -> float:

@@ -71,9 +71,10 @@ def constant(variances: tuple[float, ...], count: int) -> Array:
 
 def refuse_negative_ranges(y: Array) -> None:
     """Refuse a measurement whose first component, a range, is negative."""
-    for i, value in enumerate(y[:, 0].tolist()):
-        if value < 0:
-            raise EventError(f"observation {i}: range is {value} m, expected at least 0")
+    ranges = y[:, 0].tolist()
+    if min(ranges, default=0.0) < 0:
+        i, value = next((i, value) for i, value in enumerate(ranges) if value < 0)
+        raise EventError(f"observation {i}: range is {value} m, expected at least 0")
 
 
 class Planar:

@@ -57,7 +57,7 @@ def average(slam: Slam, event: Scan, view: View, decisions: Sequence[Decision], 
             continue  # it is rather of something else
         shares = {names[c]: float(weights[numbers[:, i] == c].sum()) for c in set(numbers[:, i].tolist()) if c >= 0}
         likely = sorted(shares.items(), key=lambda share: -share[1])
-        slam.members.count(likely[0][0])
+        slam.members.count([likely[0][0]])
         own = None if np.isnan(d2[i]) else float(d2[i])
         why = "averaged: " + ", ".join(f"{name!r} {share:.2f}" for name, share in likely)
         yield Observation(k, None, "associated", likely[0][0], own, why if len(likely) > 1 else "", tuple(likely))

@@ -7,9 +7,7 @@ a control, which changes its velocity at its time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +35,10 @@ class Part(NamedTuple):
 
 
 class Drive:
-    """The control in force of one robot and how far it has been acted upon."""
+    """The control in force of one robot and how far it has been acted upon.
+
+    As a context manager it puts the clock back if what the robot is told turns out to be impossible.
+    """
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
@@ -46,6 +47,15 @@ class Drive:
         self.u: Array | None = None
         self.N: Array | None = None
         self.fresh = True
+        self._before: tuple[Any, ...] = ()
+
+    def __enter__(self) -> Self:
+        self._before = self.t_ns, self.u, self.N, self.fresh
+        return self
+
+    def __exit__(self, kind: Any, *_: object) -> None:
+        if kind is not None and issubclass(kind, EventError):
+            self.t_ns, self.u, self.N, self.fresh = self._before
 
     def advance(self, to_ns: int, last: bool = False) -> Part | None:
         """Return the part from where the robot stands to `to_ns`, or None if it does not move."""
@@ -64,16 +74,6 @@ class Drive:
             return None
         k = len(self.motion.columns)
         return Part(np.zeros(k), np.zeros((k, k)), (to_ns - t_ns) * 1e-9, True, True)
-
-    @contextmanager
-    def kept_on_error(self) -> Iterator[None]:
-        """Put the clock back if what the robot is told turns out to be impossible."""
-        state = self.t_ns, self.u, self.N, self.fresh
-        try:
-            yield
-        except EventError:
-            self.t_ns, self.u, self.N, self.fresh = state
-            raise
 
     def accept(self, control: Control) -> list[Part]:
         """Take a new control; return the parts of motion it closes."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -63,7 +63,7 @@ class Members:
 
     def slots_of(self, names: Sequence[Any]) -> npt.NDArray[np.int64]:
         """Return the slots (K,) of blocks that are in the map."""
-        return np.array([self.slots[name] for name in names])
+        return np.fromiter(map(self.slots.__getitem__, names), np.int64, len(names))
 
     def place(self, name: Id, slot: int, kind: Landmark) -> None:
         """Enter a landmark, or give one another slot and kind."""
@@ -88,9 +88,11 @@ class Members:
         self.names = {slots[name]: name for name in kinds if name in slots}
         self.sorts = {name: kind.kind for name, kind in kinds.items()} | dict.fromkeys(self.robots, ROBOT)
 
-    def count(self, name: Id) -> None:
-        """Count an observation of a landmark or a robot that was used."""
-        self.seen[name] = self.seen.get(name, 0) + 1
+    def count(self, names: Iterable[Any]) -> None:
+        """Count an observation that was used of each of some landmarks or robots."""
+        seen = self.seen
+        for name in names:
+            seen[name] = seen.get(name, 0) + 1
 
     def learn(self, outcomes: Sequence[Observation]) -> None:
         """Remember how much of a scan was in the map, the less so the longer ago."""
@@ -131,14 +133,17 @@ class Members:
 
     def known_to(self, view: View, robot: str, names: Sequence[Any]) -> list[int]:
         """Return the indices of those names that a sensor of this robot can observe in the map."""
-        return [i for i, name in enumerate(names) if self.sorts.get(name) in view.looks and name != robot]
+        sorts = list(map(self.sorts.get, names))
+        if view.looks.keys() >= set(sorts) and robot not in names:
+            return list(range(len(names)))
+        return [i for i, sort in enumerate(sorts) if sort in view.looks and names[i] != robot]
 
     def by_look(self, view: View, names: Sequence[Id]) -> list[tuple[Look, list[int]]]:
         """Return the indices of names grouped by how a sensor looks at them, points of known depth first."""
-        looks = [view.looks[self.sorts[name]] for name in names]
-        if len({id(look) for look in looks}) == 1:
-            return [(looks[0], list(range(len(names))))]
+        sorts = list(map(self.sorts.__getitem__, names))
+        if len(set(sorts)) == 1:
+            return [(view.looks[sorts[0]], list(range(len(names))))]
         groups: dict[int, tuple[Look, list[int]]] = {}
-        for i, look in enumerate(looks):
+        for i, look in enumerate(view.looks[sort] for sort in sorts):
             groups.setdefault(id(look), (look, []))[1].append(i)
         return sorted(groups.values(), key=lambda group: group[0].landmark.kind not in EUCLIDEAN)

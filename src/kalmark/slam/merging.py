@@ -58,8 +58,6 @@ class Difference:
 def note(slam: Slam, outcomes: Sequence[Observation]) -> list[Id]:
     """Note which landmarks were seen in one scan, and so are different; return those without an id in the log."""
     members = slam.members
-    if all(o.id is not None for o in outcomes):
-        return []
     seen: list[Any] = [o.landmark for o in outcomes if o.outcome in ("associated", "new")]
     names = [name for name in seen if name in members.kinds]
     for name in names:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import EventError
-from kalmark.filter.kernels import all_finite
+from kalmark.filter.kernels import moved_noise
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.slam.drive import Part, body_axes
 from kalmark.slam.events import seconds
@@ -51,11 +51,11 @@ def predict(slam: Slam, name: str, part: Part) -> None:
     r, u = map_.mean(slot), sum((map_.mean(block) for block in added), start=part.u)
     moved, F, R_u = motion.move(r, u, part.dt_s)
     F = slam.estimator.pose_jacobian(map_, slot, F)
-    Q = R_u @ part.N @ R_u.T
-    if not all_finite(moved, F, Q):
+    Q, finite = moved_noise(moved, F, R_u, part.N)
+    if not finite:
         what = f"{name!r} at t={seconds(slam.t_ns or 0)} s"
         raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
-    if error is None and part.N.any() and not (part.first and part.last):
+    if error is None and not (part.first and part.last) and part.N.any():
         slam._errors[name] = map_.add(Rn(len(u)), np.zeros(len(u)), part.N)
         added.append(slam._errors[name])
     if name in slam._errors:

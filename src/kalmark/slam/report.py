@@ -47,13 +47,24 @@ class Candidate(NamedTuple):
     place: Array
 
 
-def judged(index: int, id_: Id | None, name: Any, d2: float, fused: bool, gate: float) -> Observation:
-    """Return what became of an observation that was compared with the landmark `name`; NaN if it could not be."""
-    if fused:
-        return Observation(index, id_, "associated", name, d2, "")
-    if math.isnan(d2):
-        return Observation(index, id_, "rejected", name, None, "nothing can be expected of it from here")
-    return Observation(index, id_, "rejected", name, d2, f"outside the gate of {gate:.2f}")
+def judged(
+    rows: Sequence[int], ids: Sequence[Id | None], names: Sequence[Any], done: Correction, gate: float
+) -> list[Observation]:
+    """Return what became of the observations `rows` that were compared with those landmarks; NaN if they could not be.
+
+    `ids` are those of the whole scan.
+    """
+    d2, fused = done.d2.tolist(), done.fused.tolist()
+    outcomes = [Observation(k, ids[k], "associated", name, d, "") for k, name, d in zip(rows, names, d2, strict=True)]
+    if all(fused):
+        return outcomes
+    return [seen if used else _rejected(seen, gate) for seen, used in zip(outcomes, fused, strict=True)]
+
+
+def _rejected(seen: Observation, gate: float) -> Observation:
+    if seen.d2 is None or math.isnan(seen.d2):
+        return seen._replace(outcome="rejected", d2=None, reason="nothing can be expected of it from here")
+    return seen._replace(outcome="rejected", reason=f"outside the gate of {gate:.2f}")
 
 
 class Report:

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from kalmark.errors import ModelError
 from kalmark.filter import kernels
-from kalmark.filter.corrections import add_blocks, innovation, observed_block
 from kalmark.filter.estimators import Map
+from kalmark.filter.observed import add_blocks, innovation, observed_block
 from kalmark.models import landmarks as kinds
 from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Tag
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of

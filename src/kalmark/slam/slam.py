@@ -124,7 +124,7 @@ class Slam:
         drive = self._drives[event.robot]
         refuse_bad_control(event, drive.motion.columns)
         self.t_ns = event.t_ns
-        with drive.kept_on_error():
+        with drive:
             for part in drive.accept(event):
                 predict(self, event.robot, part)
         forget_error(self, event.robot)
@@ -144,7 +144,7 @@ class Slam:
         if len(event.y) == 0:
             return lifecycle.tidied(self, view, event, Report(event))
         ids = event.ids or (None,) * len(event.y)
-        for i in ids:
+        for i in ids if len(self.robots) > 1 else ():
             if i in self.robots:
                 self._advance(i)
         scene = Scene(self, view, event, ids, R)
@@ -169,8 +169,7 @@ class Slam:
     def _advance(self, name: str) -> None:
         """Move a robot up to now by the control it holds."""
         assert self.t_ns is not None
-        drive = self._drives[name]
-        with drive.kept_on_error():
+        with self._drives[name] as drive:
             part = drive.advance(self.t_ns)
             if part is not None:
                 predict(self, name, part)
@@ -216,7 +215,7 @@ class Slam:
         decisions: Sequence[Decision], R: Array,
     ) -> Iterator[Observation]:  # fmt: skip
         """Fuse the observations `known` of landmarks in the map, those of one type at once.  [S] (26)-(30)."""
-        names: list[Id] = [decisions[k][0] for k in known]  # type: ignore[misc]
+        names: list[Any] = [decisions[k][0] for k in known]
         robot = self.members.slots[event.robot]
         groups = [(look, [known[i] for i in rows]) for look, rows in self.members.by_look(view, names)]
         if view.attention.updates is not None and len(known) > view.attention.updates:
@@ -228,16 +227,19 @@ class Slam:
         if not len(report.e) and (len(groups) != 1 or len(groups[0][1]) < len(report.y)):
             report.blank(view.dof)
         for look, rows in [group for group in groups if group[1]]:
-            slots, y = self.members.slots_of([decisions[k][0] for k in rows]), event.y[rows]
-            approach(self, view, robot, look, slots, y, R[rows])
-            noise = view.noise(self.map, robot, look, slots, R[rows], event)
+            if len(rows) < len(event.y):
+                y, noise, names = event.y[rows], R[rows], [decisions[k][0] for k in rows]
+            else:  # all, in their order
+                y, noise = event.y, R
+            slots = self.members.slots_of(names)
+            approach(self, view, robot, look, slots, y, noise)
+            noise = view.noise(self.map, robot, look, slots, noise, event)
             done = self.estimator.correct(self.map, look.view, robot, view.mount, slots, look.d, y, noise, view.gate)
             self.refuse_sick(done.healthy, event)
             report.fill(rows, done)
-            for k, d2, fused in zip(rows, done.d2.tolist(), done.fused.tolist(), strict=True):
-                if fused:
-                    self.members.count(decisions[k][0])  # type: ignore[arg-type]
-                yield judged(k, ids[k], decisions[k][0], d2, fused, view.gate)
+            outcomes = judged(rows, ids, names, done, view.gate)
+            self.members.count(seen.landmark for seen in outcomes if seen.outcome == "associated")
+            yield from outcomes
         if view.averages:
             yield from average(self, event, view, decisions, R)
 

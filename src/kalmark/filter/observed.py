@@ -1,0 +1,208 @@
+"""What a scan observes: a block of a few rows of the map, how its measurements depend on it, and what is expected.
+
+The head of the observed block is the observing robot's pose and, if it is in the map, the sensor's mount; the first
+numbers of K landmarks follow.  An observation is of the head and of one landmark: of its rows of a Jacobian H, all else
+is zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.compiled import compiled
+from kalmark.filter.kernels import Index, submatrix
+from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table
+
+Array = npt.NDArray[np.float64]
+Linear = tuple[Array, Array, Array, Array]  # of all observations at once: innovation v (K p,), H, H P, Z
+
+
+@compiled
+def head_sizes(blocks: Table, atoms: Table, robot: int, mount: int) -> tuple[int, int]:
+    """Return the numbers of a robot's pose, and those of the head: the pose and, if it is in the map, the mount.
+
+    With the mount come the parameters that its sensor has in the map.
+    """
+    pose = 3 if atoms[blocks[robot, 4] + 1, 0] == HEADING else 7
+    return pose, pose if mount < 0 else pose + blocks[mount, 1]
+
+
+@compiled
+def observed_block(
+    x: Array, blocks: Table, atoms: Table, robot: int, mount: int, slots: Index, d: int
+) -> tuple[Index, Table, Array]:
+    """Return the rows in P, the atoms and the mean of the head and of the first d numbers of K landmarks."""
+    pose, head = head_sizes(blocks, atoms, robot, mount)
+    before = 1 if mount < 0 else 2  # blocks in the head
+    size = head + d * len(slots)
+    index, mean = np.empty(size, np.int64), np.empty(size)
+    table = np.empty((size, 3), np.int64)
+    count = x_to = p_to = 0
+    for i in range(before + len(slots)):
+        slot, width = (robot, pose) if i == 0 else ((mount, head - pose) if i < before else (slots[i - before], d))
+        x_at, p_at, first = blocks[slot, 0], blocks[slot, 2], blocks[slot, 4]
+        mean[x_to : x_to + width] = x[x_at : x_at + width]
+        rows = 0
+        for a in range(first, first + blocks[slot, 5]):
+            if atoms[a, 1] - x_at < width:
+                table[count, 0] = atoms[a, 0]
+                table[count, 1], table[count, 2] = x_to + atoms[a, 1] - x_at, p_to + rows
+                rows += ERROR_SIZE[atoms[a, 0]]
+                count += 1
+        for j in range(rows):
+            index[p_to + j] = p_at + j
+        x_to, p_to = x_to + width, p_to + rows
+    return index[:p_to], table[:count], mean
+
+
+@compiled
+def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array, bool]:
+    """Return each observation's innovation covariance Z (K, p, p), its d2 (K,), and whether the filter is sound.
+
+    [S] (27), (83); `squared_distances`.
+    """
+    k, p, d = E_l.shape
+    head = E_r.shape[2]
+    Z = np.empty((k, p, p))
+    rows = np.empty(head + d, np.int64)
+    rows[:head] = index[:head]
+    for i in range(k):
+        rows[head:] = index[head + i * d : head + (i + 1) * d]
+        Z[i] = linearized(z[i : i + 1], E_r[i : i + 1], E_l[i : i + 1], submatrix(P, rows), R[i : i + 1])[3]
+    d2, healthy = squared_distances(Z, z)
+    return Z, d2, healthy
+
+
+@compiled
+def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
+    """Return d2 = z' Z^-1 z (K,) of innovations z (K, p) with their covariances Z (K, p, p).
+
+    d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a Z is not positive
+    definite: the filter is broken.
+    """
+    k, p = z.shape
+    d2, healthy = np.zeros(k), True
+    L, w = np.empty((p, p)), np.empty(p)
+    for i in range(k):
+        positive = True
+        for a in range(p):  # Z = L L', w = L^-1 z, row by row
+            w[a] = z[i, a]
+            for b in range(a + 1):
+                s = Z[i, a, b]
+                for c in range(b):
+                    s -= L[a, c] * L[b, c]
+                if b < a:
+                    L[a, b] = s / L[b, b]
+                    w[a] -= L[a, b] * w[b]
+                else:
+                    positive = positive and s > 0.0
+                    L[a, a] = np.sqrt(s) if s > 0.0 else 1.0
+            w[a] /= L[a, a]
+            d2[i] += w[a] * w[a]
+        if not positive:
+            d2[i] = np.nan
+            healthy = healthy and not np.isfinite(Z[i]).all()
+    return d2, healthy
+
+
+@compiled
+def stacked(E_r: Array, E_l: Array) -> Array:
+    """Return the Jacobian H (K p, head + K d) of all observations of a scan with respect to the observed block."""
+    k, p, d = E_l.shape
+    head = E_r.shape[2]
+    H = np.zeros((k * p, head + k * d))
+    for i in range(k):
+        for a in range(p):
+            for c in range(head):
+                H[i * p + a, c] = E_r[i, a, c]
+            for c in range(d):
+                H[i * p + a, head + i * d + c] = E_l[i, a, c]
+    return H
+
+
+@compiled
+def sparse_product(H: Array, S: Array, head: int, k: int) -> Array:
+    """Return H S, H being zero but in the columns of the head and, for each of K observations, of its landmark."""
+    p, n = len(H) // k, S.shape[1]
+    d = (H.shape[1] - head) // k
+    out = np.zeros((len(H), n))
+    for r in range(len(H)):
+        own = r // p * d
+        for i in range(head + d):
+            c = i if i < head else own + i
+            h = H[r, c]
+            for j in range(n):
+                out[r, j] += h * S[c, j]
+    return out
+
+
+@compiled
+def add_blocks(S: Array, R: Array) -> None:
+    """S += blockdiag(R), R (K, p, p)."""
+    k, p, _ = R.shape
+    for i in range(k):
+        for a in range(p):
+            for b in range(p):
+                S[i * p + a, i * p + b] += R[i, a, b]
+
+
+@compiled
+def linearized(z: Array, E_r: Array, E_l: Array, P_ss: Array, R: Array) -> Linear:
+    """Return a scan whose innovations are z (K, p), Jacobians E_r and E_l and noise R (K, p, p) as one observation.
+
+    P_ss is the covariance of the observed block.
+    """
+    H = stacked(E_r, E_l)
+    HP, Z = joint_innovation(H, P_ss, R, E_r.shape[2])
+    return z.copy().ravel(), H, HP, Z
+
+
+@compiled
+def joint_innovation(H: Array, P_ss: Array, R: Array, head: int) -> tuple[Array, Array]:
+    """Return H P and Z = H P H' + blockdiag(R) of all observations, R (K, p, p)."""
+    HP = sparse_product(H, P_ss, head, len(R))
+    Z = sparse_product(H, HP.T.copy(), head, len(R))
+    add_blocks(Z, R)
+    return HP, Z
+
+
+@compiled
+def diagonal_blocks(Z: Array, p: int) -> Array:
+    """Return the blocks (K, p, p) on the diagonal of Z (K p, K p)."""
+    blocks = np.empty((len(Z) // p, p, p))
+    for i in range(len(blocks)):
+        for a in range(p):
+            for b in range(p):
+                blocks[i, a, b] = Z[i * p + a, i * p + b]
+    return blocks
+
+
+@compiled
+def least_squares(HP: Array, M: Array, v: Array) -> Array:
+    """Return P H' Z^-1 v for HP = H P (m, n) and M = L^-1, L L' = Z."""
+    m, n = HP.shape
+    weights, step = np.zeros(m), np.zeros(n)
+    for i in range(m):
+        u = 0.0
+        for j in range(i + 1):
+            u += M[i, j] * v[j]
+        for j in range(i + 1):
+            weights[j] += M[i, j] * u
+    for i in range(m):
+        for j in range(n):
+            step[j] += weights[i] * HP[i, j]
+    return step
+
+
+@compiled
+def settled(table: Table, change: Array, P: Array, tolerance: float) -> bool:
+    """Return whether each atom of a mean changes by less than that many of its sigmas, however the world is turned."""
+    for i in range(len(table)):
+        size, variance = 0.0, 0.0
+        for j in range(table[i, 2], table[i, 2] + ERROR_SIZE[table[i, 0]]):
+            size += change[j] ** 2
+            variance += P[j, j]
+        if size > tolerance**2 * variance:
+            return False
+    return True
