@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.filter.fresh import Fresh
 from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, Layout
 from kalmark.filter.storage import PANEL, Stored, Triangle, subtract
 from kalmark.geometry.angles import wrap
@@ -23,8 +24,9 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 ROWS = 8  # of the active blocks, to write at once
-SOME = 32  # rows to know at once
-FRESH = 400  # multiplications that take as long as to write a number there: memory is used for the first time
+WRITING = 60  # multiplications that take as long as to write a number there
+GATHERING = 600  # and as to gather a number from the storage
+MORE = 1.5  # times the memory that a flush has needed: the next one may
 
 
 @compiled
@@ -146,14 +148,21 @@ def _turn(before: Array, after: Array, axes: int) -> Array:
 class Room:
     """Memory that one flush leaves to the next: to use it for the first time takes longer than all else."""
 
-    def __init__(self) -> None:
+    def __init__(self, fresh: Fresh) -> None:
+        self.fresh = fresh
         self._numbers: dict[str, Array] = {}
+        self._used: dict[str, int] = {}  # of these, or soon
 
     def array(self, name: str, shape: tuple[int, ...]) -> Array:
         """Return an array of that shape, holding anything."""
         size, kept = math.prod(shape), self._numbers.get(name)
         if kept is None or len(kept) < size:
             kept = self._numbers[name] = np.empty(4 * size)  # what is not used takes no memory
+            self._used[name] = 0
+        used, more = max(size, self._used[name]), int(MORE * size)
+        if more > used:
+            self.fresh.put(kept, used, more)
+            self._used[name] = more
         return kept[:size].reshape(shape)
 
 
@@ -176,10 +185,10 @@ class Flush:
         self.V[gaps // PANEL, :, gaps % PANEL] = 0.0
         self.panel = self.column = self.row = 0
         self.cost = PANEL * max(1, self.R.shape[1])  # of a column of a panel, in multiplications
-        self.aside = 10 * PANEL  # to know a panel, for each row there is
+        self.aside = PANEL * len(phase.A0) * (len(phase.A) + self.q + GATHERING)  # to know a panel
         panels = range(0, self.n, PANEL)
-        self.work = sum(self.cost * min(k + PANEL, self.n) + self.aside * self.n for k in panels)
-        self.work += FRESH * int(phase.A.sum())
+        self.work = float(sum(self.cost * min(k + PANEL, self.n) + self.aside for k in panels))
+        self.work += WRITING * int(phase.A.sum())
         self.spent = 0.0
 
     @property
@@ -205,9 +214,9 @@ class Flush:
             fill(panel, begin, self.row, self.phase.A, self.where, self.V, self.phase.P_AA)
             if self.row == last:
                 self.panel, self.column = self.panel + 1, 0
-            return FRESH * last * int((self.where[begin : self.row] >= 0).sum())
+            return WRITING * last * int((self.where[begin : self.row] >= 0).sum())
         if self.column == 0 and self._know_more(first, last):
-            return self.aside * self.n * SOME // PANEL
+            return self.aside
         start, self.column = self.column, min(last, self.column + PANEL * max(1, tiles))
         if self.R.shape[1]:
             W, m = self.R[first:last, : self.q], len(self.phase.thetas)
@@ -230,11 +239,10 @@ class Flush:
             self._know(slot, slot + 1)
 
     def _know_more(self, first: int, last: int) -> bool:
-        """Know the next blocks at rest among the rows first..last; return whether there were any."""
+        """Know the blocks at rest among the rows first..last; return whether any were unknown."""
         unknown = np.flatnonzero(self.resting[first:last] & ~self.known[first:last])
         if len(unknown):
-            begin = first + unknown[0]
-            self._know(*np.searchsorted(self.map.blocks[:, P_AT], [begin, min(begin + SOME, last)]))
+            self._know(*np.searchsorted(self.map.blocks[:, P_AT], [first + unknown[0], last]))
         return len(unknown) > 0
 
     def _know(self, slot: int, end: int) -> None:

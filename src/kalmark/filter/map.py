@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from kalmark.errors import MapError
 from kalmark.filter import kernels
+from kalmark.filter.fresh import Fresh
 from kalmark.geometry.spaces import REMOVED, Space, Table
 
 Array = npt.NDArray[np.float64]
@@ -22,9 +23,6 @@ Index = npt.NDArray[np.int64]
 CAPACITY = 72  # an odd number of cache lines, and so its successors: rows of 2^k keep a column in few places of a cache
 
 X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
-
-
-BIT, PAGE = 1 << 16, 512  # numbers of a buffer to use at once, and in a page
 
 
 def next_capacity(capacity: int) -> int:
@@ -126,7 +124,7 @@ class StochasticMap(Layout):
         super().__init__(capacity)
         self.P: Array = np.zeros((capacity, capacity))
         self._next: Array | None = None  # a larger one
-        self._touched = 0  # numbers of it
+        self.fresh = Fresh()
 
     # ------------------------------------------------------------------ reading
     def index(self, slot: int) -> Index:
@@ -195,13 +193,12 @@ class StochasticMap(Layout):
             self.P = P
 
     def prepare(self) -> None:
-        """Have a larger buffer ready in time, its memory used bit by bit: the first use is what takes long."""
+        """Have a larger buffer ready in time."""
         if self._next is None and 2 * self.n > len(self.P):
             size = next_capacity(len(self.P))
-            self._next, self._touched = np.zeros((size, size)), 0
-        if self._next is not None and self._touched < self._next.size:
-            self._next.ravel()[self._touched : self._touched + BIT : PAGE] = 0.0
-            self._touched += BIT
+            self._next = np.zeros((size, size))
+            self.fresh.put(self._next, 0, size * size)
+        self.fresh.use_some()
 
     # ------------------------------------------------------------------ moving
     def predict(self, index: Index, F: Array, Q: Array) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-SLICE = 1.5e8  # multiplications of a flush to do after a correction at most, some 8 ms: less falls behind and hurries
+SLICE = 1.2e8  # multiplications of a flush to do after a correction at most, some 6 ms: less falls behind and hurries
 DEAR = 80.0  # multiplications of a flush that take as long as a correction of one more element of the active map
 START = 5e7  # multiplications that take as long as to begin a flush
 MOST = 1000  # rows of the active map, besides those it began with

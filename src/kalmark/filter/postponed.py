@@ -49,7 +49,7 @@ class PostponedMap(Layout):
         self.phase = 0  # number of flushes
         self._at: Index = np.full(64, -1)  # slot in the active map, -1 at rest
         self._job: Flush | None = None
-        self._room = Room()
+        self._room = Room(self.storage.fresh)
         self._anchored: set[int] = set()  # blocks with inverse distances
         super().__init__()
         self._begin()
@@ -304,6 +304,7 @@ class PostponedMap(Layout):
                 self.flush(robot, now - before)
         self._pace.count(m.n)
         m.prepare()
+        self.storage.fresh.use_some()
         if (job := self._job) is not None:
             job.advance(self._pace.due(self._progress(), job.spent, job.work))
             self._job = None if job.done else job
@@ -370,7 +371,7 @@ class PostponedMap(Layout):
     def finish(self) -> None:
         """Finish a flush that is under way, and give back the memory that it needed."""
         self._complete()
-        self._room = Room()
+        self._room = Room(self.storage.fresh)
 
     def _complete(self) -> None:
         if self._job is not None:

@@ -18,6 +18,7 @@ from numba.extending import intrinsic
 
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
+from kalmark.filter.fresh import Fresh
 from kalmark.filter.kernels import subtract_product
 
 Array = npt.NDArray[np.float64]
@@ -92,6 +93,7 @@ class Triangle:
         self.panels: list[Stored] = []
         self.addresses: Index = np.zeros(16, dtype=np.int64)
         self.limit_bytes = limit_bytes
+        self.fresh = Fresh()
 
     @property
     def nbytes(self) -> int:
@@ -107,6 +109,7 @@ class Triangle:
                 self.addresses = np.concatenate([self.addresses, np.zeros(k, dtype=np.int64)])
             panel = np.zeros((PANEL, (k + 1) * PANEL), dtype=self.like.dtype)
             self.panels.append(panel)
+            self.fresh.put(panel, 0, panel.size)
             self.addresses[k] = panel.ctypes.data
 
     def _refuse_too_much(self, k: int) -> None:

@@ -1,0 +1,38 @@
+"""Memory that is used bit by bit ahead of time: its first use is what takes long, some milliseconds for 2 MB."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+from weakref import ref
+
+import numpy.typing as npt
+
+Numbers = npt.NDArray[Any]
+
+BIT, PAGE = 1 << 19, 4096  # bytes to use at once, and of a page of memory
+
+
+class Fresh:
+    """Parts of arrays whose memory nobody has used yet, as long as somebody keeps the array, in the order of need."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[ref[Numbers], int, int]] = deque()
+
+    def put(self, array: Numbers, first: int, last: int) -> None:
+        """Have the numbers first..last of a contiguous array be used in time; what is in them stays."""
+        self._waiting.append((ref(array), first, last))
+
+    def use_some(self) -> None:
+        """Use the next bit of memory."""
+        if not self._waiting:
+            return
+        kept, first, last = self._waiting.popleft()
+        array = kept()
+        if array is None:
+            return
+        end = min(last, first + BIT // array.itemsize)
+        here = array.reshape(-1)[first : end : PAGE // array.itemsize]
+        here[:] = here.copy()
+        if end < last:
+            self._waiting.appendleft((kept, end, last))
