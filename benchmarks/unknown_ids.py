@@ -17,7 +17,9 @@ from kalmark.cli.run import run_log
 from kalmark.results.align import rigid, rmse
 from kalmark.results.evaluate import known_landmarks
 from kalmark.results.run import Run
+from kalmark.results.scoring import FUSED, known_as
 
+BESIDE_M = 0.5
 COMMON = ("log.robots",)  # settings that hold for the run with ids as well
 
 
@@ -30,6 +32,18 @@ def compared(known: Run, hidden: Run) -> tuple[int, float, float]:
     both = sorted(maps[0].keys() & maps[1].keys())
     one, other = (np.array([each[name] for name in both]) for each in maps)
     return len(both), rmse(other - one), rmse(rigid(other, one)(other) - one)
+
+
+def misplaced(known: Run, hidden: Run) -> int:
+    """Return how many of the wrong pairs are of landmarks farther apart than `BESIDE_M` in the map with ids."""
+    landmarks, history = known_landmarks(known), hidden.history
+    at = dict(zip(map(str, landmarks.ids), landmarks.positions()[0], strict=True))
+    names, count = known_as(history), 0
+    mine = np.isin(history.outcome, FUSED) & (history.id == "")
+    for landmark, true in zip(history.landmark[mine].tolist(), history.true_id[mine].tolist(), strict=True):
+        taken = names.get(landmark, true)
+        count += taken in at and true in at and float(np.linalg.norm(at[taken] - at[true])) > BESIDE_M
+    return count
 
 
 def main() -> None:
@@ -49,6 +63,7 @@ def main() -> None:
     print(f"landmarks: {one['landmarks']} with ids, {two['landmarks']} without, {count} in both")
     print(f"difference of the maps, RMS: {raw:.3f} m, {aligned:.3f} m after a rigid alignment")
     print(f"wrong: {two['wrong']} of {two['judged']} ({two['wrong'] / max(two['judged'], 1):.2%})")
+    print(f"of these, of landmarks more than {BESIDE_M} m apart: {misplaced(known, hidden)}")
     print(f"duplicates: {two['duplicates']}; CPU: {middle - start:.0f} s with ids, {end - middle:.0f} s without")
     if two["nameless"]:
         out = 1 - two["nameless_fused"] / two["nameless"]

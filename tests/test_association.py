@@ -25,6 +25,13 @@ METHODS = (
     km.association.Automatic(),
 )
 ORIGIN = np.zeros(3)
+RANGING = km.sensors.RangeBearing(0.1, 0.05)
+OTHERS = np.array([[4.0, 0.0], [5.0, 3.0], [6.0, -2.0]])
+
+
+def pairwise_m(points: np.ndarray) -> np.ndarray:
+    """Return how far points (N, 2) are from each other, sorted."""
+    return np.sort(np.linalg.norm(points[:, None] - points, axis=2)[np.triu_indices(len(points), 1)])
 
 
 def seen_from(truth: np.ndarray, points: np.ndarray, cov: np.ndarray, method: object, seen: list[int]) -> list[object]:
@@ -323,3 +330,42 @@ def test_a_bad_setting_is_refused() -> None:
         km.association.GlobalAssignment(gate=2)
     with pytest.raises(km.KalmarkError, match="most_nodes is 0, expected at least 1"):
         km.association.JointCompatibility(most_nodes=0)
+
+
+def test_one_landmark_in_the_map_is_recognised_again_and_another_beside_it_is_new() -> None:
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=1e-6 * np.eye(3), sensors={"s": km.Mount(RANGING)})
+    slam, rng = km.Slam([robot], km.association.Automatic()), np.random.default_rng(1)
+    posts = np.array([[5.0, 0.0], [5.0, 1.5]])
+    outcomes = []
+    for t in range(60):
+        y = km.geometry.observe(ORIGIN, posts)[0] + rng.normal(size=(2, 2)) * [0.1, 0.05]
+        outcomes.append([o.outcome for o in slam.process(km.Scan(t, "r", "s", y[: 1 + t // 30])).observations])
+    assert outcomes[20:30].count(["associated"]) >= 9
+    assert len(slam.landmarks()) == 2
+    assert sum(both == ["associated", "associated"] for both in outcomes[40:]) >= 14
+
+
+def lost(hold_back: bool) -> tuple[km.Slam, list[str]]:
+    """Return what a robot, lost among six posts, makes of three others that it sees again and again."""
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([9.0, 9.0, 0.1]), sensors={"s": km.Mount(RANGING)})
+    slam = km.Slam([robot], km.association.Automatic(), upkeep=km.Upkeep(hold_back=hold_back))
+    for i, post in enumerate(np.random.default_rng(3).uniform(-6, 6, (6, 2))):
+        slam.add_landmark(i, post, 1e-4 * np.eye(2))
+    rng, outcomes = np.random.default_rng(4), []
+    for t in range(20):
+        slam.process(km.Control(t, "r", [0.05, 0.0, 0.0], cov=1e-4 * np.eye(3)))
+        y = km.geometry.observe(np.array([0.05 * t, 0, 0]), OTHERS)[0] + rng.normal(size=(3, 2)) * [0.1, 0.05]
+        outcomes += [o.outcome for o in slam.process(km.Scan(t, "r", "s", y[[t % 3]])).observations]
+    return slam, outcomes
+
+
+def test_a_robot_that_is_lost_holds_back_what_it_sees_or_if_told_to_maps_anew() -> None:
+    slam, outcomes = lost(hold_back=False)
+    assert set(outcomes) == {"deferred"}
+    assert len(slam.landmarks()) == 6
+
+    slam, outcomes = lost(hold_back=True)
+    assert len(slam.landmarks()) == 9
+    assert outcomes[-6:] == ["associated"] * 6
+    found = [np.array(slam.mean(name)) for name in slam.landmarks().ids[6:]]
+    np.testing.assert_allclose(pairwise_m(np.array(found)), pairwise_m(OTHERS), atol=0.3)

@@ -145,7 +145,7 @@ class UpkeepConfig(Section):
     merge: bool = True
     """Merge landmarks that turn out to be one."""
     hold_back: bool = False
-    """Hold back pairings that are not beyond doubt (`nearest`, `global`, `jcbb`), and map anew what is held back."""
+    """Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it anew."""
     odds: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 100.0
     """So many times likelier than chance is beyond doubt."""
     p_detect: Probability | None = None

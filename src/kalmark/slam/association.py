@@ -16,11 +16,13 @@ from scipy.optimize import linear_sum_assignment
 from kalmark.errors import ModelError
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.slam.decisions import (
+    ANEW,
     DEFERRED,
     FRESH,
     HELD_BACK,
     MIXED,
     NEW,
+    STRANGE,
     Association,
     Decision,
     Matched,
@@ -29,19 +31,20 @@ from kalmark.slam.decisions import (
 )
 from kalmark.slam.events import Id
 from kalmark.slam.joint import best_matching
-from kalmark.slam.posterior import Posterior, added, agreeing, crowd, posterior
+from kalmark.slam.posterior import JUST_SEEN, Posterior, added, agreeing, crowd, posterior
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 __all__ = [
-    "DEFERRED", "NEW", "Association", "Automatic", "Averaged", "ByIdentity", "Cliques", "Decision", "GlobalAssignment",
-    "JointCompatibility", "NearestNeighbour", "Query", "Sampled",
+    "ANEW", "DEFERRED", "NEW", "Association", "Automatic", "Averaged", "ByIdentity", "Cliques", "Decision",
+    "GlobalAssignment", "JointCompatibility", "NearestNeighbour", "Query", "Sampled",
 ]  # fmt: skip
 
 FORBIDDEN = 1e6  # times the gate: a pair outside
 CLEAR = 0.05  # landmarks in a gate by chance, up to which each observation can be told by itself
+NONE = 0.99  # how likely an observation must be of nothing in the map to be of something new
 BY_CHANCE = 1e-3  # matchings as good to be expected by chance where there is more than one landmark in a gate
 WIDEST = 256  # candidates for an observation
 
@@ -113,8 +116,9 @@ class _Gated:
         gate, far = chi2_gate(self.gate, query.dof()), chi2_gate(self.new_gate, query.dof())
         names, d2 = self.near(query, open_, gate) if len(open_) else ([], np.zeros((0, 0)))
         if not names:
+            query.learn(0.0, float(len(open_)))
             return answers
-        pairs, reasons, mixed = self.match(query, open_, names, d2, gate)
+        pairs, reasons, mixed, known = self.match(query, open_, names, d2, gate)
         mixture = None if mixed is None else Mixture(open_, names, mixed)
         for row, k in enumerate(open_.tolist()):
             least = int(np.argmin(d2[row]))
@@ -126,10 +130,15 @@ class _Gated:
                 answers[k] = (mixture, reasons[row])
             elif pairs[row] == FRESH:
                 answers[k] = (NEW, reasons[row])
+            elif pairs[row] == STRANGE:
+                answers[k] = (ANEW, reasons[row])
             elif d2[row, least] <= gate:
                 answers[k] = (None, reasons.get(row, f"its nearest landmark {names[least]!r} is another observation's"))
             elif d2[row, least] <= far:
                 answers[k] = (None, f"between {names[least]!r} and a new landmark: d2 {d2[row, least]:.1f}")
+        if known is None:
+            known = np.where(pairs >= 0, 1.0, np.where(d2.min(axis=1) > far, 0.0, np.nan))
+        query.learn(float(np.nansum(known)), float(np.nansum(1.0 - known)))
         return answers
 
     def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
@@ -219,7 +228,8 @@ class JointCompatibility(_Gated):
 class _Joint(_Gated):
     """Matchings as wholes, of landmarks however many are inside a gate.
 
-    Where there is more than one on average, the robot is lost: pairs are then not held against the pose one by one.
+    What is likely not to be in the map, by all matchings together, is new.  Where a gate holds more than one landmark
+    on average, not counting those just seen, the robot is lost: pairs are then not held against the pose one by one.
     """
 
     most_nodes: int = 5_000_000
@@ -248,21 +258,40 @@ class _Joint(_Gated):
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair one by one where each observation can be told by itself, jointly elsewhere."""
-        crowded = crowd(d2, gate, query.dof()).max()
-        if crowded <= CLEAR:
-            return GlobalAssignment.match(self, query, open_, names, d2, gate)  # type: ignore[arg-type]
-        lost = crowded > 1
         together = query.together(names)
         if together is None:
             return JointCompatibility(self.gate, self.new_gate).match(query, open_, names, d2, gate)
+        rows, columns = np.nonzero(np.isfinite(d2))
+        just = np.zeros(d2.shape, dtype=np.bool_)
+        just[rows, columns] = together.room(open_[rows], columns) <= JUST_SEEN
+        crowded, fit = crowd(np.where(just, np.inf, d2), gate, query.dof()).max(), d2 <= gate
+        if crowded <= CLEAR and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
+            return GlobalAssignment.match(self, query, open_, names, d2, gate)  # type: ignore[arg-type]
+        lost = crowded > 1
         far = chi2_gate(self.new_gate, query.dof())
-        near: Flags = np.isfinite(d2) if lost else d2 <= gate  # far off, the distances themselves are not to be trusted
+        near: Flags = np.isfinite(d2) if lost else fit  # far off, the distances themselves are not to be trusted
         found = posterior(together, open_, d2, near, query.dof(), self.gate, self.most_nodes, query.experience())
-        pairs, reasons, mixed = self.choose(query, names, found, np.asarray(near.any(axis=1)), lost)
+        told = np.asarray(near.any(axis=1))
+        pairs, reasons, mixed, _ = self.choose(query, names, found, told, lost)
+        none = np.where(told, found.none(), np.where(d2.min(axis=1) > far, 1.0, np.nan))
+        if lost and (pairs == HELD_BACK).all():
+            return self.anew(np.where(just, d2, np.inf), gate, far, reasons)
+        for row in np.flatnonzero(told & (none >= NONE)).tolist() if not lost else ():
+            pairs[row], reasons[row] = FRESH, "no landmark is likely there"
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
             if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
                 pairs[row], reasons[row] = FRESH, "no landmark fits there, from where the others are seen"
-        return Matched(pairs, reasons, mixed)
+        return Matched(pairs, reasons, mixed, 1.0 - none)
+
+    def anew(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:
+        """Pair what a lost robot sees with what it has just seen, at these d2 (K, L); the rest is strange to it."""
+        cost = np.full((len(d2), d2.shape[1] + len(d2)), gate)
+        cost[:, : d2.shape[1]] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
+        columns = linear_sum_assignment(cost)[1]
+        pairs = np.where(columns < d2.shape[1], columns, np.where(d2.min(axis=1) > far, STRANGE, HELD_BACK))
+        for row in np.flatnonzero(pairs == STRANGE).tolist():
+            reasons[row] = f"mapped anew: {reasons[row]}"
+        return Matched(pairs, reasons, None, np.full(len(d2), np.nan))
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
         """Choose from the matchings; `near` tells which observations any landmark could be."""

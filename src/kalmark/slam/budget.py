@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.slam.decisions import DEFERRED, Decision
+from kalmark.slam.decisions import ANEW, DEFERRED, Decision
 from kalmark.slam.events import Scan
 from kalmark.slam.scene import Look, View
 
@@ -38,6 +38,8 @@ def starts(
     slam: Slam, view: View, new: list[int], known: list[int], y: Array, decisions: Sequence[Decision]
 ) -> dict[int, str]:
     """Return why some of the observations that could start landmarks do not."""
-    wanted = [k for k in new if decisions[k][0] not in (None, DEFERRED) and decisions[k][0] not in slam.members.slots]
+    wanted = [
+        k for k in new if decisions[k][0] not in (None, DEFERRED, ANEW) and decisions[k][0] not in slam.members.slots
+    ]
     image, empty = getattr(view.sensor, "image", None), not slam.members.kinds
     return view.attention.worth_a_start(wanted, known, y, image, empty)

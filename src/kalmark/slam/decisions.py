@@ -1,7 +1,7 @@
 """What an association may ask about a scan and what it may answer.
 
-It answers for each observation with a landmark's id, `NEW`, `DEFERRED`, a `Mixture` of landmarks, or None (leave it
-alone), and why.
+It answers for each observation with a landmark's id, `NEW`, `ANEW`, `DEFERRED`, a `Mixture` of landmarks, or None
+(leave it alone), and why.
 """
 
 from __future__ import annotations
@@ -17,11 +17,14 @@ from kalmark.slam.posterior import Posterior, Together
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-HELD_BACK, FRESH, MIXED = -2, -3, -4  # in the place of a pair
+HELD_BACK, FRESH, MIXED, STRANGE = -2, -3, -4, -5  # in the place of a pair
 
 
 class New:
-    """The answer for an observation of something that is not in the map yet."""
+    """The answer for an observation of something that is not in the map yet: `NEW`.
+
+    `ANEW` is that of a robot that is lost, for what it has not just seen: in the map or not, it may be mapped anew.
+    """
 
 
 class Deferred:
@@ -38,7 +41,7 @@ class Mixture:
         self.rows, self.names, self.pairs, self.weights = rows, names, found.pairs, found.weights
 
 
-NEW, DEFERRED = New(), Deferred()
+NEW, ANEW, DEFERRED = New(), New(), Deferred()
 Decision = tuple[Id | New | Deferred | Mixture | None, str]
 
 
@@ -65,6 +68,9 @@ class Query(Protocol):
     def experience(self) -> tuple[float, float]:
         """Return how many of the last observations without ids were of landmarks of the map, and how many were not."""
 
+    def learn(self, known: float, unknown: float) -> None:
+        """Remember how many observations without ids are likely of landmarks of the map, and how many are not."""
+
     def key(self) -> tuple[int, ...]:
         """Return numbers, at least 0, that tell this scan from all others."""
 
@@ -72,12 +78,14 @@ class Query(Protocol):
 class Matched(NamedTuple):
     """The number of the landmark paired with each observation (K,), or -1 for none and its like; some with reasons.
 
-    `mixed` are the matchings to average over for those that are MIXED.
+    `mixed` are the matchings to average over for those that are MIXED, `known` (K,) how likely each observation is of a
+    landmark of the map, nan where that cannot be said; None where only pairs tell.
     """
 
     pairs: Index
     reasons: dict[int, str]
     mixed: Posterior | None = None
+    known: Array | None = None
 
 
 class Association(Protocol):

@@ -68,12 +68,9 @@ def review(slam: Slam, view: View, event: Scan, outcomes: Sequence[Observation])
 
 def tidied(slam: Slam, view: View, event: Scan, report: Report) -> Report:
     """Tidy up after a scan: landmarks that are gone, that are one, tentative ones without hope; return its report."""
-    unnamed = event.ids is None or None in event.ids
-    if unnamed:
-        slam.members.learn(report.observations)
     if view.upkeep.p_detect is not None:
         report.removed += tuple(existence.gone(slam, view, event, report))
-    if unnamed:
+    if event.ids is None or None in event.ids:
         report.merged = tuple(merging.merge(slam, view, event.robot, report.observations))
     return tentative.dropped(slam, view, event, report) if slam.members.tentative else report
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,6 @@ from kalmark.slam.initialization import Unlocated
 from kalmark.slam.robot import Robot
 from kalmark.slam.scene import EUCLIDEAN, ROBOT, Look, View
 from kalmark.slam.tentative import Tentative
-
-if TYPE_CHECKING:
-    from kalmark.slam.report import Observation
 
 Array = npt.NDArray[np.float64]
 
@@ -94,11 +91,9 @@ class Members:
         for name in names:
             seen[name] = seen.get(name, 0) + 1
 
-    def learn(self, outcomes: Sequence[Observation]) -> None:
+    def learn(self, known: float, unknown: float) -> None:
         """Remember how much of a scan was in the map, the less so the longer ago."""
-        known = sum(o.outcome == "associated" for o in outcomes if o.id is None)
-        unknown = sum(o.outcome in ("tentative", "new") for o in outcomes if o.id is None)
-        if known or unknown:
+        if known + unknown > 0:
             self.experience = [FADES * self.experience[0] + known, FADES * self.experience[1] + unknown]
 
     def forget(self, name: Id) -> None:

@@ -23,6 +23,7 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Experience = tuple[float, float]
 
+JUST_SEEN = math.log(16.0)  # |Z| / |R| up to which the robot knows the place of a landmark
 SLACK = 1  # pairs that a matching may have less than the largest
 KEEP = 200  # matchings to look at
 
@@ -35,6 +36,9 @@ class Together(Protocol):
 
     def fit(self, rows: Index, columns: Index) -> tuple[float, float]:
         """Return d2 and log |Z| of pairs of an observation and a landmark, all at once."""
+
+    def room(self, rows: Index, columns: Index) -> Array:
+        """Return log |Z| / |R| of each pair: how much less is known of where it is seen than a sensor tells."""
 
 
 class Posterior(NamedTuple):
@@ -53,12 +57,21 @@ class Posterior(NamedTuple):
         """Return of each observation's pair in the likeliest matching how likely it is (K,)."""
         return self.weights @ (self.pairs == self.pairs[0])
 
+    def none(self) -> Array:
+        """Return how likely each observation is of no landmark (K,)."""
+        return self.weights @ (self.pairs < 0)
+
     def why(self, row: int, names: Sequence[object]) -> str:
         """Return what an observation may be, for a reason."""
         shares = {c: float(self.weights[self.pairs[:, row] == c].sum()) for c in self.pairs[:, row].tolist()}
         likely = sorted(shares.items(), key=lambda one: -one[1])[:3]
         said = ", ".join(f"{'none' if c < 0 else repr(names[c])} {share:.2f}" for c, share in likely)
         return f"ambiguous: {said}" + ("" if self.finished else ", and the search was not finished")
+
+
+def room(Z: Array, R: Array) -> Array:
+    """Return log |Z| / |R| (M,): how much less is known of where a landmark is seen than the sensor tells."""
+    return np.asarray(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(R)[1])
 
 
 def crowd(d2: Array, gate: float, p: int) -> Array:

@@ -20,6 +20,7 @@ from kalmark.models.observe import composed, is_built_in, landmark_at, linearize
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.models.sensors import TagPose
 from kalmark.slam.candidates import Waiting
+from kalmark.slam.decisions import ANEW, DEFERRED, NEW, Association
 from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.initialization import initialization_of
@@ -27,6 +28,7 @@ from kalmark.slam.nearby import has_place
 from kalmark.slam.report import Candidate, Report
 from kalmark.slam.robot import Mount
 from kalmark.slam.together import Landmarks
+from kalmark.slam.upkeep import Upkeep
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
@@ -86,6 +88,7 @@ class View:
         self.association = mount.association or slam.association
         self.upkeep = mount.upkeep or slam.upkeep
         self.averages = getattr(self.association, "averages", False)
+        self.starts = _starts(self.association, self.upkeep)
         self.looks = self._looks()
         self._refuse_misfit()
         self.dof = self._dof()
@@ -259,6 +262,16 @@ def _natural(mount: Mount) -> Landmark:
     return kinds.Homogeneous() if mount.cov is None else kinds.AnchoredHomogeneous()
 
 
+def _starts(association: Association, upkeep: Upkeep) -> tuple[Any, ...]:
+    """Return the answers to an observation without an id that start a landmark.
+
+    An association that weighs matchings defers what may be one of several landmarks: that is none to be mapped anew.
+    """
+    if not upkeep.hold_back:
+        return (NEW,)
+    return (NEW, ANEW) if getattr(association, "weighs", False) else (NEW, ANEW, DEFERRED)
+
+
 class Scene:
     """One scan before it is fused: the association's window on the map."""
 
@@ -277,6 +290,10 @@ class Scene:
         """Return how many of the last observations without ids were of landmarks of the map, and how many were not."""
         known, unknown = self._slam.members.experience
         return known, unknown
+
+    def learn(self, known: float, unknown: float) -> None:
+        """Remember how many observations without ids are likely of landmarks of the map, and how many are not."""
+        self._slam.members.learn(known, unknown)
 
     def key(self) -> tuple[int, ...]:
         """Return numbers, at least 0, that tell this scan from all others."""

@@ -27,7 +27,7 @@ from kalmark.slam.approach import approach
 from kalmark.slam.association import ByIdentity
 from kalmark.slam.averaging import average, refuse_postponed
 from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
-from kalmark.slam.decisions import DEFERRED, NEW, Association, Decision
+from kalmark.slam.decisions import ANEW, DEFERRED, NEW, Association, Decision
 from kalmark.slam.doubts import MIRRORED
 from kalmark.slam.drive import Drive
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
@@ -247,7 +247,7 @@ class Slam:
         self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
     ) -> Observation:
         """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
-        if name is None or (name is DEFERRED and not view.upkeep.hold_back):
+        if name is None or (name in (DEFERRED, ANEW) and name not in view.starts):
             return Observation(k, id_, "ignored" if name is None else "deferred", None, None, reason)
         if name == event.robot:
             return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
@@ -265,8 +265,8 @@ class Slam:
             return Observation(k, id_, "ignored", None, None, found)
         if not (np.isfinite(l).all() and np.isfinite(L_h).all() and np.isfinite(Q).all()):
             return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
-        held, unproven = name is DEFERRED, name is DEFERRED or (name is NEW and view.upkeep.confirm > 1)
-        name = self.members.new_name() if name in (NEW, DEFERRED) else name
+        held, unproven = name is DEFERRED, name is DEFERRED or (name in (NEW, ANEW) and view.upkeep.confirm > 1)
+        name = self.members.new_name() if name in (NEW, ANEW, DEFERRED) else name
         G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
         try:
             slot = self.map.augment(view.landmark.space, l, index, G, Q)

@@ -18,8 +18,9 @@ from scipy.optimize import linear_sum_assignment
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import Landmark
 from kalmark.slam.association import FORBIDDEN
-from kalmark.slam.decisions import DEFERRED, NEW, Decision
+from kalmark.slam.decisions import ANEW, Decision
 from kalmark.slam.events import Id, Scan
+from kalmark.slam.posterior import JUST_SEEN, room
 from kalmark.slam.report import Observation, Report
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 NEAREST = 4  # tentative landmarks an observation is compared with
 OUT_OF_VIEW = 20  # times `within` scans without a sighting, in view or not: dropped
@@ -57,14 +59,14 @@ def sightings(
     Return those that are still tentative or left alone, and the decisions about those that confirm a landmark, which is
     one from here on.
     """
-    use = (NEW, DEFERRED) if view.upkeep.hold_back else (NEW,)
-    rows = [k for k in new if decisions[k][0] in use]
+    rows = [k for k in new if decisions[k][0] in view.starts]
     names = [name for name, t in slam.members.tentative.items() if t.kind.kind in view.looks]
     seen: dict[int, Observation] = {}
     confirmed: dict[int, Decision] = {}
     if not rows or not names:
         return seen, confirmed
-    d2 = _distances(slam, view, event, rows, names, R)
+    lost = np.array([decisions[k][0] is ANEW for k in rows])
+    d2 = _distances(slam, view, event, rows, names, R, lost)
     gate, far = _gates(view)
     cost = np.full((len(rows), len(names) + len(rows)), gate)
     cost[:, : len(names)] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
@@ -147,8 +149,13 @@ def _gates(view: View) -> tuple[float, float]:
     return gate, max(gate, chi2_gate(new_gate, view.dof))
 
 
-def _distances(slam: Slam, view: View, event: Scan, rows: Sequence[int], names: Sequence[Id], R: Array) -> Array:
-    """Return d2 (K, L) of observations from tentative landmarks, inf where they are not among the nearest."""
+def _distances(
+    slam: Slam, view: View, event: Scan, rows: Sequence[int], names: Sequence[Id], R: Array, lost: Flags
+) -> Array:  # fmt: skip
+    """Return d2 (K, L) of observations from tentative landmarks, inf where they are not among the nearest.
+
+    Those of a robot that is `lost` are of none whose place it does not know.
+    """
     map_, robot = slam.map, slam.members.slots[event.robot]
     tentative = [slam.members.tentative[name] for name in names]
     near = np.ones((len(rows), len(names)), dtype=np.bool_)
@@ -163,6 +170,7 @@ def _distances(slam: Slam, view: View, event: Scan, rows: Sequence[int], names: 
         if len(i):
             k, slots, look = np.asarray(rows)[i], np.array([tentative[n].slot for n in j.tolist()]), view.looks[kind]
             noise = view.noise(map_, robot, look, slots, R[k], event)
-            d2[i, j] = view.predict(map_, robot, look, slots, event.y[k], noise)[1]
+            Z, d2[i, j] = view.predict(map_, robot, look, slots, event.y[k], noise)
+            d2[i, j] = np.where(lost[i] & (room(Z, noise) > JUST_SEEN), np.inf, d2[i, j])
     d2[np.isnan(d2)] = np.inf
     return d2

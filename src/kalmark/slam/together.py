@@ -11,6 +11,7 @@ from kalmark.filter import corrections, kernels
 from kalmark.filter.map import P_AT
 from kalmark.slam.events import Id
 from kalmark.slam.matchings import Places
+from kalmark.slam.posterior import room
 
 if TYPE_CHECKING:
     from kalmark.slam.scene import View
@@ -50,3 +51,12 @@ class Landmarks:
         scan = robot, mount, here[columns], look.d, y, np.ascontiguousarray(R), np.inf
         d2, log_det = run(look.view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, LIMITS)
         return float(d2), float(log_det)
+
+    def room(self, rows: Index, columns: Index) -> Array:
+        """Return log |Z| / |R| of each pair: how much less is known of where it is seen than a sensor tells."""
+        if not len(rows):
+            return np.zeros(0)
+        view, map_, slots = self._view, self._slam.map, self._slots[columns]
+        R = view.noise(map_, self._robot, self._look, slots, self._R[rows], self._event)
+        Z, _ = view.predict(map_, self._robot, self._look, slots, self._event.y[rows], R)
+        return room(Z, R)

@@ -18,7 +18,7 @@ class Upkeep:
 
     With `merge`, two landmarks that turn out to be one are merged (`slam/merging.py`) when that is `odds` times
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
-    (`slam/ambiguity.py`); what is held back, by this or by the association, is mapped anew until then.
+    (`slam/ambiguity.py`); what is held back by that is mapped anew until then, as is what a robot that is lost sees.
 
     With `p_detect`, the probability that the sensor sees a landmark in its view, one that should be seen and is not is
     removed when it is `odds` times likelier that it is gone (`slam/existence.py`); `p_false` is the probability that
