@@ -15,6 +15,7 @@ from kalmark import presets
 from kalmark.config.building import build_slam, config_dict
 from kalmark.config.reading import load_config
 from kalmark.errors import ConfigError
+from kalmark.simulate import load_world, simulate
 
 
 def yaml_text(content: dict[str, Any]) -> str:
@@ -28,9 +29,9 @@ def test_every_number_of_a_preset_names_its_source(name: str) -> None:
     preset = presets.ALL[name]
     plain = type(preset.sensor)()
     own = {f.name for f in dataclasses.fields(plain) if getattr(preset.sensor, f.name) != getattr(plain, f.name)}
-    assert set(preset.sources) >= (own | {"rate_hz"}) - {"sigma_range_m"}
+    assert set(preset.sources) == own | {"rate_hz", "dropouts"}
     assert all(len(source) > 20 for source in preset.sources.values())
-    assert ("sigma_range_m" in preset.sources) == (getattr(preset.sensor, "sigma_range_m", 0.0) > 0)
+    assert 0 < preset.dropouts < 1
     km.Slam([km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(preset.sensor)})])
 
 
@@ -44,8 +45,35 @@ def test_a_configuration_takes_what_it_does_not_say_from_a_preset(tmp_path: Path
     assert build_slam(load_config(tmp_path / "again.yaml")).robots["robot"].sensors["s"].sensor == sensor
 
 
-def test_a_preset_of_another_type_of_sensor_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("type_", "preset"), [("bearing", "sonar"), ("range", "rfid"), ("position", "laser")])
+def test_a_preset_of_another_type_of_sensor_is_refused(type_: str, preset: str, tmp_path: Path) -> None:
     path = tmp_path / "preset.yaml"
-    path.write_text("robots: {each: {sensors: {s: {type: bearing, preset: sonar}}}}\n")
-    with pytest.raises(ConfigError, match=r"preset.yaml:1:.*sonar is a range_bearing"):
+    path.write_text(f"robots: {{each: {{sensors: {{s: {{type: {type_}, preset: {preset}}}}}}}}}\n")
+    with pytest.raises(ConfigError, match=rf"preset.yaml:1:.*{preset} is a range_bearing"):
         load_config(path)
+
+
+def test_ranges_alone_do_not_make_a_sensor_of_ranges_and_bearings(tmp_path: Path) -> None:
+    path = tmp_path / "preset.yaml"
+    path.write_text("robots: {each: {sensors: {s: {type: range_bearing, preset: arva}}}}\n")
+    with pytest.raises(ConfigError, match=r"preset.yaml:1:.*arva is a range$"):
+        load_config(path)
+
+
+def test_a_world_takes_rate_and_dropouts_from_a_preset_unless_it_says_otherwise() -> None:
+    log = simulate(load_world("rfid", ["steps=100"]), seed=1)
+    scans = [event for event in log.events if isinstance(event, km.Scan)]
+    assert {scan.t_ns % 1_000_000_000 for scan in scans} == {0}  # once a second, of steps of 0.1 s
+    keys = ["steps=100", "robots.robot.sensing={rfid: {every: 1, dropouts: 0.0}}"]
+    every = [event for event in simulate(load_world("rfid", keys), seed=1).events if isinstance(event, km.Scan)]
+    there = {event.t_ns: len(event.y) for event in every}
+    assert len(there) == 100
+    reported = sum(len(scan.y) for scan in scans) / sum(there[scan.t_ns] for scan in scans)
+    assert reported == pytest.approx(1 - presets.RFID.dropouts, abs=0.12)
+
+
+@pytest.mark.parametrize("name", presets.ALL)
+def test_every_preset_has_its_world(name: str) -> None:
+    world = load_world(name)
+    sensor = build_slam(world.config(), simulate(world, seed=0)).robots["robot"].sensors[name].sensor
+    assert sensor == presets.ALL[name].sensor

@@ -184,3 +184,36 @@ def test_ranges_without_an_id_start_nothing_and_other_sensors_take_no_initializa
         km.initialization.Trilateration(poses=2)
     with pytest.raises(ModelError, match=r"odds is 1\.5"):
         km.initialization.Hypotheses(odds=1.5)
+
+
+def test_ranges_whose_noise_grows_with_them_do_not_draw_beacons_near() -> None:
+    """Too long and too short by the same share, in turn: weighed by the noise of what was measured, short ones win."""
+    beacon = np.array([25.0, 15.0])
+    sensor = km.Mount(km.sensors.Range(sigma_range_m=0.0, sigma_range_rel=0.1))
+    slam = km.Slam([km.Robot("r", km.motion.Odometry2D(0, 0, 0), sensors={"radio": sensor})])
+    pose, u = np.zeros(3), np.array([4.0, 0.0, 4 / 15])
+    for t in range(20):
+        pose, _, _ = km.motion.Odometry2D().move(pose, u, 1.0)
+        slam.process(km.Control(t_s=float(t), robot="r", u=u))
+        y = np.hypot(*(beacon - pose[:2])) * (1.1 if t % 2 else 0.9)
+        report = slam.process(km.Scan(t_s=float(t), robot="r", sensor="radio", y=[[y]], ids=[0]))
+        if report.observations[0].outcome == "new":
+            break
+    assert np.linalg.norm(slam.mean(0) - beacon) < 0.2  # otherwise 0.5
+
+
+def test_the_valley_that_an_unknown_scale_bends_is_no_gaussian_and_waits() -> None:
+    """From a circle a beacon inside and its inverse point outside look alike but for the scale."""
+    rng, beacon, count = np.random.default_rng(0), np.array([0.0, 27.0]), 8
+    sensor = km.Mount(km.sensors.Range(sigma_range_m=0.0, sigma_range_rel=0.1, sigma_scale=0.144))
+    slam = km.Slam([km.Robot("r", km.motion.Odometry2D(0, 0, 0), sensors={"radio": sensor})])
+    pose, u = np.zeros(3), np.array([1.0, 0.0, 1 / 15])
+    for t in range(60):  # round the circle of 15 m about (0, 15), ranges 10 % long
+        pose, _, _ = km.motion.Odometry2D().move(pose, u, 1.0)
+        slam.process(km.Control(t_s=float(t), robot="r", u=u))
+        if t % 3 == 0:
+            y = 1.1 * np.hypot(*(beacon - pose[:2])) * (1 + 0.1 * rng.normal(size=count))
+            slam.process(km.Scan(t_s=float(t), robot="r", sensor="radio", y=y[:, None], ids=range(count)))
+    for name in slam.landmarks().ids:
+        d = slam.mean(name) - beacon
+        assert float(d @ np.linalg.solve(slam.covariance(name), d)) < 13.8  # 99.9 %

@@ -1,10 +1,12 @@
-"""Sensors of [S] Table 2 with noise, field of view, range and rate as documented: every number names its source.
+"""Sensors of [S] Table 2 with noise, field of view, range, rate and dropouts: every number names its source.
 
     laser = km.presets.LASER
-    km.Mount(laser.sensor); laser.rate_hz; laser.sources["range_max_m"]
+    km.Mount(laser.sensor); laser.rate_hz; laser.dropouts; laser.sources["range_max_m"]
 
 A data sheet's accuracy is taken as one sigma.  Where a source gives a width and no noise (the lobe of a sonar), the
-noise is that of a uniform distribution over it, the width by the square root of 12.
+noise is that of a uniform distribution over it, the width by the square root of 12.  What follows from a source by some
+steps is derived in docs/presets.md; what has none is called an assumption there and in `sources`.  `dropouts` is the
+probability that something in view is not reported: worlds take it, and the rate, from a sensor's `preset`.
 """
 
 from __future__ import annotations
@@ -14,24 +16,34 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from kalmark.models.sensors2d import Bearing, RangeBearing
+from kalmark.models.sensors2d import Bearing, Range, RangeBearing
 
 HOKUYO = "Hokuyo, Communication Protocol Specification for SCIP2.0, C-42-03320B"
-WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat: {} (published variance of a laser's sightings of cylinders)"
+WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat, a laser that sees cylinders"
 FAQ = "Devantech, Ultrasonic Rangers FAQ, robot-electronics.co.uk/htm/sonar_faq.htm"
 SRF08 = "Devantech SRF08, technical specifications: range 3 cm to 6 m, robot-italy.com"
 D435 = "Intel, High-speed capture mode of the RealSense depth camera D435, rev. 1.2"
 KINECT = "Khoshelham and Elberink, Accuracy and Resolution of Kinect Depth Data, Sensors 12(2), 2012, mdpi.com"
 FOV = "Kinect's hardware as quoted in a test of it, th4.ilovetranslation.com/boU9rIiFDGL=d: 57 deg horizontally, 640 px"
 PIXEL = "one pixel, the noise of the SLAM toolbox's cameras [TB]"
+STARRY = "T. Barfoot, Starry Night, dataset3.mat"
+RAGNI = "M. Ragni, Autonomous VTOL for avalanche buried searching, Trento 2014"
+BEACON = f"EN 300 718 on avalanche beacons, quoted by {RAGNI}, ch. 1"
+DIPOLE = f"magnetic dipole in the near field, B = mu m / (4 pi r^3) (2 cos, sin): {RAGNI}, 2.1"
+BOUNCE = "readings of one pulse after the other, earnyourturns.com/25247, Digital beacon bounce"
+BACKSCATTER = "Arnitz, Witrisal and Muehlmann, Multifrequency CW radar approach to ranging in passive UHF RFID, 2009"
+ARRIVAL = "Angerer, Langwieser and Rupp, Direction of arrival estimation by phased arrays in RFID, 2010"
+TAGS = "Haehnel, Burgard, Fox, Fishkin and Philipose, Mapping and localization with RFID technology, 2003"
+MULTI_TAG = "Bolotnyy, Krize and Robins, The practicality of multi-tag RFID systems"
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A sensor as documented: `sensor`, its rate, and the source of each number that is not a default."""
+    """A sensor as documented: `sensor`, its rate, its dropouts, and the source of each number that is not a default."""
 
     sensor: Any
     rate_hz: float
+    dropouts: float
     sources: Mapping[str, str]
 
 
@@ -44,13 +56,15 @@ LASER = Preset(
         fov_rad=math.radians(239.77),
     ),
     rate_hz=10.0,
+    dropouts=0.41,
     sources={
-        "sigma_range_m": WOODS.format("r_var = 9.0036e-4"),
-        "sigma_bearing_rad": WOODS.format("b_var = 6.7143e-4"),
+        "sigma_range_m": f"{WOODS}: published variance r_var = 9.0036e-4",
+        "sigma_bearing_rad": f"{WOODS}: published variance b_var = 6.7143e-4",
         "range_min_m": f"{HOKUYO}, 8.12: DMIN 20 mm of the URG-04LX",
         "range_max_m": f"{HOKUYO}, 8.12: DMAX 5600 mm of the URG-04LX",
         "fov_rad": f"{HOKUYO}, Table 2: detection range 239.77 deg of the URG-04LX",
         "rate_hz": f"{HOKUYO}, 8.12: SCAN 600 rpm of the URG-04LX",
+        "dropouts": f"{WOODS}: of those in view, by the true poses, 41 % were not seen",
     },
 )
 """A small laser range finder: range and bearing."""
@@ -64,6 +78,7 @@ SONAR = Preset(
         fov_rad=math.radians(55.0),
     ),
     rate_hz=346.0 / (2 * 6.0),
+    dropouts=0.41,
     sources={
         "sigma_range_m": f"{FAQ}: 'We quote 3-4cm'",
         "sigma_bearing_rad": f"{FAQ}: lobe of the SRF08 55 deg at -6 dB; the echo may come from anywhere in it",
@@ -71,6 +86,7 @@ SONAR = Preset(
         "range_max_m": SRF08,
         "fov_rad": f"{FAQ}: lobe of the SRF08 55 deg at -6 dB",
         "rate_hz": f"{FAQ}: speed of sound 346 m/s, there and back over the 6 m of {SRF08}; the least it can wait",
+        "dropouts": "assumption: as often as the laser",
     },
 )
 """An ultrasonic ranger: good ranges, poor bearings."""
@@ -78,10 +94,12 @@ SONAR = Preset(
 CAMERA = Preset(
     Bearing(sigma_bearing_rad=math.tan(math.radians(45.0)) / 424.0, fov_rad=math.radians(90.0)),
     rate_hz=90.0,
+    dropouts=0.17,
     sources={
         "sigma_bearing_rad": f"{PIXEL}, of 848 over 90 deg ({D435}): focal length 424 px",
         "fov_rad": f"{D435}: about 90 x 58 deg",
         "rate_hz": f"{D435}: 90 fps at 848 x 480",
+        "dropouts": f"{STARRY}: of the markers in the image, by the true poses, 17 % were not seen",
     },
 )
 """A camera, used in the plane: bearings alone."""
@@ -93,13 +111,57 @@ RGBD = Preset(
         fov_rad=math.radians(57.0),
     ),
     rate_hz=30.0,
+    dropouts=0.17,
     sources={
         "sigma_range_m": f"{KINECT}: a few millimetres up to about 4 cm at the maximum range; the most is taken",
         "sigma_bearing_rad": f"{PIXEL}, of 640 over 57 deg ({FOV})",
         "fov_rad": FOV,
         "rate_hz": f"{KINECT}: up to 30 fps",
+        "dropouts": "assumption: as often as the camera",
     },
 )
 """A depth camera (Kinect), used in the plane: range and bearing.  The source does not give its maximum range."""
 
-ALL = {"laser": LASER, "sonar": SONAR, "camera": CAMERA, "rgbd": RGBD}
+ARVA = Preset(
+    Range(
+        sigma_range_m=0.0,
+        sigma_range_rel=math.hypot(0.074, 0.066),
+        range_max_m=40.0,
+        sigma_scale=math.log(2.23 / 0.5) / 3 / math.sqrt(12.0),
+    ),
+    rate_hz=1.0,
+    dropouts=2 / 9,
+    sources={
+        "sigma_range_m": "none beside the part that grows with the range",
+        "sigma_range_rel": f"7.4 % by the unknown orientation ({DIPOLE}), 6.6 % by the scatter of {BOUNCE}",
+        "range_max_m": f"{RAGNI}, 2.1: roughly the maximum distance at which a beacon receives the signal",
+        "sigma_scale": f"{BEACON}: 0.5 to 2.23 uA/m at 10 m; its cube root, uniform in the logarithm",
+        "rate_hz": f"{BEACON}: period 1000 +- 300 ms",
+        "dropouts": f"2 of the 9 {BOUNCE}, are blank",
+    },
+)
+"""An avalanche transceiver: ranges by field strength, true but for a factor, the strength of the beacons."""
+
+RFID = Preset(
+    RangeBearing(
+        sigma_range_m=0.0,
+        sigma_range_rel=0.15 * math.sqrt(math.pi / 2),
+        sigma_bearing_rad=math.radians(3.3),
+        range_max_m=6.0,
+        fov_rad=math.pi,
+    ),
+    rate_hz=1.0,
+    dropouts=0.34,
+    sources={
+        "sigma_range_m": "none beside the part that grows with the range",
+        "sigma_range_rel": f"{BACKSCATTER}: mean errors below 15 % in typical fading, as a Gaussian's sigma",
+        "sigma_bearing_rad": f"{ARRIVAL}: 3.3 deg rms with two antennas in line of sight",
+        "range_max_m": f"{TAGS}: the detection range is approximately 6 m",
+        "fov_rad": "two antennas half a wavelength apart tell directions from -90 to 90 deg",
+        "rate_hz": "assumption: one inventory a second",
+        "dropouts": f"{MULTI_TAG}: detection probability can be as low as 66 %",
+    },
+)
+"""A reader of passive UHF tags with two antennas: poor ranges, fair bearings."""
+
+ALL = {"laser": LASER, "sonar": SONAR, "camera": CAMERA, "rgbd": RGBD, "arva": ARVA, "rfid": RFID}

@@ -89,7 +89,16 @@ def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordin
     if hasattr(model, "to_point") and len(mean) > len(truth) and not is_known(point, F @ P @ F.T, eye):
         return None
     own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
+    if model.kind == "polar":  # its Gaussian is on an arc: so is its error
+        return Judged(unrolled(mean, own), unrolled(mean, world), F, point[None], truth[None])
     return Judged(own, world, F, point[None], truth[None])
+
+
+def unrolled(l: Array, error: Array) -> Array:
+    """Return the error (2,) of a polar point l (4,) with its way along the arc about the anchor unrolled."""
+    u, d = np.array([np.cos(l[2]), np.sin(l[2])]), l[3]
+    n, w = np.array([-u[1], u[0]]), d * u + error
+    return d * np.arctan2(w @ n, w @ u) * n + (np.linalg.norm(w) - d) * u
 
 
 def is_known(point: Array, P: Array, eye: Array) -> bool:

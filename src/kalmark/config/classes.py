@@ -41,6 +41,7 @@ CLASSES: dict[str, Callable[..., Any]] = {
     "tag_corners": sensors.TagCorners,
     "point": landmarks.Point2D,
     "point_signature": landmarks.PointSignature2D,
+    "polar": landmarks.Polar2D,
     "inverse_depth": landmarks.InverseDepth2D,
     "anchored_homogeneous": landmarks.AnchoredHomogeneous,
     "homogeneous": landmarks.Homogeneous,

@@ -21,6 +21,12 @@ class PointSignatureLandmark(Section):
     type: Literal["point_signature"] = "point_signature"
 
 
+class PolarLandmark(Section):
+    """A point of the plane by anchor, direction and distance (4 numbers), for ranges with poor bearings."""
+
+    type: Literal["polar"] = "polar"
+
+
 class _Depth(Section):
     prior_rho_per_m: Number = 0.01
     """Inverse distance expected where the sensor sees none."""
@@ -117,6 +123,7 @@ class HomogeneousLineLandmark(_Depths):
 Landmark = Annotated[
     Annotated[PointLandmark, Tag("point")]
     | Annotated[PointSignatureLandmark, Tag("point_signature")]
+    | Annotated[PolarLandmark, Tag("polar")]
     | Annotated[InverseDepthLandmark, Tag("inverse_depth")]
     | Annotated[AnchoredHomogeneousLandmark, Tag("anchored_homogeneous")]
     | Annotated[HomogeneousLandmark, Tag("homogeneous")]

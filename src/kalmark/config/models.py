@@ -74,13 +74,14 @@ PlaneMotions = (
 )
 Motion = Annotated[PlaneMotions | SpaceMotions, Discriminator(type_or())]
 _IN_SPACE = set(types(Motion)).difference(types(Annotated[PlaneMotions, None]))
+_UNITS = {"range": "m", "bearing": "rad"}
 
 
 class _Sector(Ranging, PlaneMounted):
     fov_rad: Positive = 2 * math.pi
     """Field of view, centred forward."""
-    preset: Literal["laser", "sonar", "camera", "rgbd"] | None = None
-    """Take what is not given from a documented sensor of `km.presets`: camera for bearing, others for range_bearing."""
+    preset: Literal["laser", "sonar", "camera", "rgbd", "arva", "rfid"] | None = None
+    """Take what is not given from a documented sensor: camera for bearing, arva for range, others for range_bearing."""
 
     @model_validator(mode="before")
     @classmethod
@@ -91,11 +92,10 @@ class _Sector(Ranging, PlaneMounted):
             return value
         sensor = presets.ALL[value["preset"]].sensor
         own = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
-        if not own.keys() <= cls.model_fields.keys() or ("sigma_range_m" in own) != (
-            "sigma_range_m" in cls.model_fields
-        ):
-            kind = "range_bearing" if "sigma_range_m" in own else "bearing"
-            raise expected(f"a preset of this type of sensor: {value['preset']} is a {kind}", "preset")
+        measured = [part for part in ("range", "bearing") if f"{part}_{_UNITS[part]}" in sensor.columns]
+        fits = all((f"sigma_{part}_{unit}" in cls.model_fields) == (part in measured) for part, unit in _UNITS.items())
+        if not fits:
+            raise expected(f"a preset of this type of sensor: {value['preset']} is a {'_'.join(measured)}", "preset")
         return own | value
 
 

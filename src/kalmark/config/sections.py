@@ -20,7 +20,7 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 LATER: dict[str, tuple[str, ...]] = {
     "motion": ("inertial",),
     "sensor": ("position_fix",),
-    "landmark": ("polar",),
+    "landmark": (),
     "association": (),
     "estimator": (),
     "map": (),

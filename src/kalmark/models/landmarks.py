@@ -1,4 +1,4 @@
-"""Landmarks, and how they look from a pose: Euclidean points, points of unknown depth, tags, lines.
+"""Landmarks, and how they look from a pose: Euclidean and polar points, points of unknown depth, tags, lines.
 
 A landmark of a kind that has a prior can be started by a sensor that does not see all of it: the prior says what is
 expected of the rest.  How they look from a sensor is in `landmarks2d`, `landmarks3d`, `lines` and `tags`.
@@ -33,6 +33,8 @@ from kalmark.models.parameters import check_parameters
 
 Array = npt.NDArray[np.float64]
 
+TINY_M = 1e-12
+
 
 @dataclass(frozen=True)
 class Point2D:
@@ -57,6 +59,31 @@ class PointSignature2D(Point2D):
 
     kind: ClassVar[str] = "point_signature"
     space: ClassVar[Space] = Space("point_signature", (VECTOR, SCALAR))
+
+
+@dataclass(frozen=True)
+class Polar2D:
+    """Anchor, direction alpha and distance (4), for ranges with poor bearings: an arc of errors.  [S] 2.3.5."""
+
+    kind: ClassVar[str] = "polar"
+    space: ClassVar[Space] = Space("polar", (VECTOR, HEADING, SCALAR))
+    look: ClassVar[Any] = staticmethod(landmarks2d.polar_seen_from)
+
+    def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
+        """Return v (K, 2), V_T (K, 2, 3), V_l (K, 2, 4)."""
+        return landmarks2d.polar_seen_from(T, np.ascontiguousarray(l))
+
+    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return l (K, 4), L_T (K, 4, 3), L_v (K, 4, 2)."""
+        return landmarks2d.polar_from_view(T, np.ascontiguousarray(v))
+
+    def to_point(self, l: Array) -> tuple[Array, Array]:
+        """Return the Euclidean points p (K, 2) and P_l (K, 2, 4)."""
+        return landmarks2d.polar_to_point(np.ascontiguousarray(l))
+
+    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
+        """Return how far the arc of a sigma leaves its tangent, in sigmas of the distance (K,); `sigmas` (K, 4)."""
+        return np.asarray(0.5 * l[:, 3] * sigmas[:, 2] ** 2 / np.maximum(sigmas[:, 3], TINY_M))
 
 
 class _Spatial:
@@ -158,9 +185,9 @@ class InverseDepth2D(_Depth):
     _from_view = landmarks2d.inverse_depth_from_view
     _to_point = landmarks2d.inverse_depth_to_point
 
-    def linearity(self, T: Array, l: Array, sigma_rho: Array) -> Array:
-        """Return the linearity indices (K,) seen from T."""
-        return landmarks2d.inverse_depth_linearity(T, l, sigma_rho)
+    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
+        """Return the linearity indices (K,) seen from T; `sigmas` (K, n)."""
+        return landmarks2d.inverse_depth_linearity(T, l, sigmas[:, -1].copy())
 
 
 @dataclass(frozen=True)
@@ -173,9 +200,9 @@ class InverseDepth3D(_Depth):
     _from_view = landmarks3d.inverse_depth_from_view
     _to_point = landmarks3d.inverse_depth_to_point
 
-    def linearity(self, T: Array, l: Array, sigma_rho: Array) -> Array:
-        """Return the linearity indices (K,) seen from T."""
-        return landmarks3d.inverse_depth_linearity(T, l, sigma_rho)
+    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
+        """Return the linearity indices (K,) seen from T; `sigmas` (K, n)."""
+        return landmarks3d.inverse_depth_linearity(T, l, sigmas[:, -1].copy())
 
 
 @dataclass(frozen=True)
@@ -188,9 +215,9 @@ class AnchoredHomogeneous(_Depth):
     _from_view = landmarks3d.anchored_from_view
     _to_point = landmarks3d.anchored_to_point
 
-    def linearity(self, T: Array, l: Array, sigma_rho: Array) -> Array:
-        """Return the linearity indices (K,) seen from T."""
-        return landmarks3d.anchored_linearity(T, l, sigma_rho)
+    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
+        """Return the linearity indices (K,) seen from T; `sigmas` (K, n)."""
+        return landmarks3d.anchored_linearity(T, l, sigmas[:, -1].copy())
 
 
 @dataclass(frozen=True)
@@ -345,4 +372,4 @@ class HomogeneousLine(_DepthsPrior):
 
 POINTS = (Point3D, InverseDepth3D, AnchoredHomogeneous, Homogeneous)
 LINES = (PlueckerLine, AnchoredPlueckerLine, InverseDepthLine, AnchoredHomogeneousLine, HomogeneousLine)
-BUILT_IN = (Point2D, PointSignature2D, InverseDepth2D, *POINTS, Tag, *LINES)
+BUILT_IN = (Point2D, PointSignature2D, Polar2D, InverseDepth2D, *POINTS, Tag, *LINES)

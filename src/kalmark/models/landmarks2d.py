@@ -4,10 +4,12 @@
 type                 state l                               the point
 ===================  ====================================  ===================================
 Euclidean            p (2), attributes                     p
+polar                anchor (2), direction alpha, d        anchor + d (cos alpha, sin alpha)
 inverse depth        anchor (2), direction alpha, rho      anchor + (cos alpha, sin alpha) / rho
 ===================  ====================================  ===================================
 
-The second is for sensors that see no depth.  What such a sensor sees of it is v = rho (point - position of T) in its
+The second is for sensors whose bearings are so poor that what they see is an arc and no ellipse: [S] 2.3.5.  The
+third is for sensors that see no depth.  What such a sensor sees of it is v = rho (point - position of T) in its
 frame: the ray to the point, regular for points at infinity, rho = 0, too.
 """
 
@@ -115,3 +117,44 @@ def inverse_depth_linearity(T: Array, l: Array, sigma_rho: Array) -> Array:
         along = abs(x * math.cos(l[i, 2]) + y * math.sin(l[i, 2]))
         index[i] = 4 * sigma_rho[i] / (rho * rho) * along / (x * x + y * y)
     return index
+
+
+@compiled
+def polar_to_point(l: Array) -> tuple[Array, Array]:
+    """Return the Euclidean points p (K, 2) of polar points l (K, 4), and P_l (K, 2, 4)."""
+    p, P_l = np.empty((len(l), 2)), np.zeros((len(l), 2, 4))
+    for i in range(len(l)):
+        c, s, d = math.cos(l[i, 2]), math.sin(l[i, 2]), l[i, 3]
+        p[i, 0], p[i, 1] = l[i, 0] + d * c, l[i, 1] + d * s
+        P_l[i, 0, 0] = P_l[i, 1, 1] = 1.0
+        P_l[i, 0, 2], P_l[i, 1, 2] = -d * s, d * c
+        P_l[i, 0, 3], P_l[i, 1, 3] = c, s
+    return p, P_l
+
+
+@compiled
+def polar_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return v (K, 2) of polar points l (K, 4), V_T (K, 2, 3) and V_l (K, 2, 4)."""
+    p, P_l = polar_to_point(l)
+    v, V_T, V_p = to_frame_many(T, p)
+    V_l = np.empty((len(l), 2, 4))
+    for i in range(len(l)):
+        for a in range(2):
+            for b in range(4):
+                V_l[i, a, b] = V_p[i, a, 0] * P_l[i, 0, b] + V_p[i, a, 1] * P_l[i, 1, b]
+    return v, V_T, V_l
+
+
+@compiled
+def polar_from_view(T: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Return polar points l (K, 4) anchored at T that look like v (K, 2) from it, L_T (K, 4, 3), L_v (K, 4, 2)."""
+    k = len(v)
+    l, L_T, L_v = np.empty((k, 4)), np.zeros((k, 4, 3)), np.zeros((k, 4, 2))
+    for i in range(k):
+        x, y = v[i]
+        d = math.hypot(x, y)
+        l[i, 0], l[i, 1], l[i, 2], l[i, 3] = T[0], T[1], wrap(T[2] + math.atan2(y, x)), d
+        L_T[i, 0, 0] = L_T[i, 1, 1] = L_T[i, 2, 2] = 1.0
+        L_v[i, 2, 0], L_v[i, 2, 1] = -y / (d * d), x / (d * d)
+        L_v[i, 3, 0], L_v[i, 3, 1] = x / d, y / d
+    return l, L_T, L_v

@@ -32,6 +32,7 @@ TYPES = {
     "TagCorners": "tag_corners",
     "Point2D": "point",
     "Point3D": "point",
+    "Polar2D": "polar",
     "InverseDepth2D": "inverse_depth",
     "InverseDepth3D": "inverse_depth",
     "AnchoredHomogeneous": "anchored_homogeneous",

@@ -172,7 +172,8 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
         at, cov = np.array(mount.at), getattr(mount, "cov", None)
         if cov is not None:
             at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(cov, chance.mounts))
-        sensors[key] = SimSensor(true_sensor(mount.sensor, chance.mounts), at, simulated.sensing.get(key, Sensing()))
+        sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
+        sensors[key] = SimSensor(true_sensor(mount.sensor, chance.mounts), at, sensing)
     driver = simulated.route.driver(motion, world.dt_s, area, chance.route)
     return SimRobot(name, motion, state, driver, sensors)
 
@@ -216,7 +217,7 @@ def scans(
     """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
     found = []
     for name, carried in robot.sensors.items():
-        if k % carried.sensing.every:
+        if k % (carried.sensing.every or 1):
             continue
         sensor, there = carried.sensor, things[looks_for(carried.sensor)]
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}

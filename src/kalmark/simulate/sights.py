@@ -16,6 +16,7 @@ from numpy.random import Generator
 from pydantic import Field
 from scipy.spatial import cKDTree
 
+from kalmark import presets
 from kalmark.config.sections import Section
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import matrix
@@ -55,10 +56,10 @@ class Sighted(NamedTuple):
 class Sensing(Section):
     """How a simulated sensor departs from its model: a slower rate, and faults."""
 
-    every: Annotated[int, Field(ge=1)] = 1
-    """A scan at every so manieth step."""
-    dropouts: Share = 0.0
-    """Probability that something seen is not reported."""
+    every: Annotated[int, Field(ge=1)] | None = None
+    """A scan at every so manieth step: at every one, or as the sensor's `preset` says."""
+    dropouts: Share | None = None
+    """Probability that something seen is not reported: 0, or as the sensor's `preset` says."""
     outliers: Share = 0.0
     """Probability that a measurement is false: of a place drawn from all that the sensor sees."""
     swapped: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
@@ -67,6 +68,14 @@ class Sensing(Section):
     """Ids that are never reported."""
     faults_from_step: Annotated[int, Field(ge=1)] = 1
     """All is well before this step."""
+
+    def of(self, section: Any, dt_s: float) -> Sensing:
+        """Return it with what it leaves open taken from the `preset` of the sensor's section, if that has one."""
+        preset = presets.ALL.get(getattr(section, "preset", None) or "")
+        if preset is None:
+            return self
+        usual = {"every": max(1, round(1 / (preset.rate_hz * dt_s))), "dropouts": preset.dropouts}
+        return self.model_copy(update={key: value for key, value in usual.items() if getattr(self, key) is None})
 
     @property
     def has_faults(self) -> bool:
@@ -204,7 +213,7 @@ def faulty(
         found, y = elsewhere(sensor, v[wrong], sizes[wrong], min(sensor_reach(sensor), things.extent()), rng)
         e[wrong[found]] = y[found]
         real = [None if i in wrong[found] else name for i, name in enumerate(real)]
-    kept = rng.random(len(ids)) >= sensing.dropouts
+    kept = rng.random(len(ids)) >= (sensing.dropouts or 0.0)
     swapped: dict[Id, Id] = dict([*sensing.swapped, *((b, a) for a, b in sensing.swapped)])
     rows = [i for i, name in enumerate(ids) if kept[i] and name not in sensing.hidden]
     told = [swapped.get(ids[i], ids[i]) for i in rows]

@@ -21,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import ModelError
-from kalmark.geometry.spaces import HEADING, POINT2, SCALAR, VECTOR, Space
+from kalmark.geometry.spaces import POINT2
+from kalmark.models.landmarks import Polar2D
 from kalmark.models.observe import composed, linearize
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-POLAR = Space("polar", (VECTOR, HEADING, SCALAR))
+POLAR = Polar2D.space
 SPREAD = 0.5  # of the hypotheses' means, in units of their covariance: so much may be left of their being several
 BULGE = 0.5  # how far the arc may leave its tangent within a sigma, in sigmas of the distance
 

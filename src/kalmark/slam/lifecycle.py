@@ -76,7 +76,7 @@ def tidied(slam: Slam, view: View, event: Scan, report: Report) -> Report:
 
 
 def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:
-    """Make Euclidean points of those whose depth has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4.
+    """Make Euclidean points of those whose depth or direction has become clear: p, P_pp = P_l P_ll P_l'.  [TB] 4.4.
 
     Where the map has no room for another block, they stay what they are.
     """
@@ -87,9 +87,9 @@ def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> 
             continue
         slot = members.slots[name]
         l, index = map_.mean(slot)[None], map_.index(slot)
-        sigma = np.sqrt(np.maximum(map_.covariance([slot])[-1, -1:], 0.0))
+        sigmas = np.sqrt(np.maximum(np.diag(map_.covariance([slot])), 0.0))[None]
         T = view.pose(map_, members.slots[robot])
-        if l[0, -1] > 0 and kind.linearity(T, l, sigma)[0] < slam.reparametrize:
+        if l[0, -1] > 0 and kind.linearity(T, l, sigmas)[0] < slam.reparametrize:
             p, P_l = kind.to_point(l)
             point: Landmark = Point2D() if len(p[0]) == 2 else Point3D()
             try:

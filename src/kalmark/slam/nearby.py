@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from kalmark.filter.map import X_AT
 from kalmark.filter.postponed import PostponedMap
-from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
+from kalmark.geometry.spaces import HEADING, RHO, VECTOR, VECTOR3, Space
 from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ AT_REST = 8  # looked up in the tree: their means have moved on by what is pendi
 
 def has_place(space: Space) -> bool:
     """Return whether the first numbers of a block are where it is."""
-    return space.kinds[0] in (VECTOR, VECTOR3) and RHO not in space.kinds
+    return space.kinds[0] in (VECTOR, VECTOR3) and not {RHO, HEADING} & set(space.kinds)
 
 
 class Nearby:

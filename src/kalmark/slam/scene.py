@@ -15,7 +15,7 @@ from kalmark.filter import kernels
 from kalmark.filter.estimators import Map
 from kalmark.filter.observed import add_blocks, innovation, observed_block
 from kalmark.models import landmarks as kinds
-from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Tag
+from kalmark.models.landmarks import InverseDepth2D
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor
 from kalmark.models.sensors import TagPose
@@ -24,6 +24,7 @@ from kalmark.slam.decisions import ANEW, DEFERRED, NEW, Association
 from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.initialization import initialization_of
+from kalmark.slam.natural import natural
 from kalmark.slam.nearby import has_place
 from kalmark.slam.report import Candidate, Report
 from kalmark.slam.robot import Mount
@@ -80,7 +81,7 @@ class View:
         self.sensor, self.attention, self.detector = mount.sensor, mount.attention, mount.detector
         self.at: Array = np.array(mount.at)  # writable, like all else: numba compiles per kind of array
         self.mount = slot  # of the mount in the map, -1 if it is not there
-        self.landmark: Landmark = mount.landmark or landmarks or _natural(mount)
+        self.landmark: Landmark = mount.landmark or landmarks or natural(mount)
         late = mount.initialization
         self.delayed, self.waiting = late if isinstance(late, Delayed) else None, Waiting()
         slam.refuse_other_world(type(self.sensor).__name__, getattr(self.sensor, "world", ""))
@@ -89,7 +90,8 @@ class View:
         self.upkeep = mount.upkeep or slam.upkeep
         self.averages = getattr(self.association, "averages", False)
         self.starts = _starts(self.association, self.upkeep)
-        self.looks = self._looks()
+        mounts = [mount for robot in slam.robots.values() for mount in robot.sensors.values()]
+        self.looks = self._looks(any((m.landmark or landmarks or natural(m)).kind == "polar" for m in mounts))
         self._refuse_misfit()
         self.dof = self._dof()
         self.gate = self.association.threshold(self.dof, slam.estimator.default_gate)
@@ -106,9 +108,12 @@ class View:
         if hasattr(self.sensor, "is_far"):
             self.rough = Look(self.landmark, TagPose(), self.at)
 
-    def _looks(self) -> dict[str, Look]:
+    def _looks(self, polar: bool) -> dict[str, Look]:
         """Return the looks at all kinds of blocks that this sensor can see: its own landmarks and those like them."""
-        types = [BY_KIND[kind]() for kind in getattr(self.sensor, "sees_kinds", ()) if kind != self.landmark.kind]
+        seen = [*getattr(self.sensor, "sees_kinds", ())]
+        if self.landmark.kind == "polar" or (self.landmark.kind == "point" and polar):  # whichever a sensor starts
+            seen = list(dict.fromkeys([*seen, "point", "polar"]))
+        types = [BY_KIND[kind]() for kind in seen if kind != self.landmark.kind]
         looks: dict[str, Look] = {}
         for landmark in (*types, self.landmark):
             look = Look(landmark, self.sensor, self.at)
@@ -129,7 +134,9 @@ class View:
         seen = getattr(self.sensor, "sees_kinds", None)
         if seen is not None and kind not in seen:
             raise ModelError(f"a {sensor} does not see a landmark of the type {kind}, expected {' or '.join(seen)}")
-        numbers = 3 if "signature" in self.sensor.columns else 2
+        if kind == "polar" and tuple(self.sensor.columns) != ("range_m", "bearing_rad"):
+            raise ModelError(f"a {sensor} does not start polar points, expected a sensor of ranges and bearings")
+        numbers = 3 if "signature" in self.sensor.columns else 4 if kind == "polar" else 2
         if seen is None and numbers != self.landmark.space.size:
             raise ModelError(f"a {sensor} finds {numbers} numbers, a {kind} has {self.landmark.space.size}")
 
@@ -240,26 +247,6 @@ class View:
         if len(head) > 2 * size:  # y = h(v, p) stays what it is: V_p = -V_y E_p
             L_h = np.concatenate([L_h, -L_y[0] @ sensor.parameters_jacobian(v)[0]], axis=1)
         return l[0], L_h, L_y[0] @ R @ L_y[0].T + prior[0]
-
-
-def _natural(mount: Mount) -> Landmark:
-    """Return the type of landmark that a sensor starts if nobody says which.
-
-    Homogeneous points go along with steps of the robot (`generator`), not with those of a mount: a mount's place that
-    cannot be observed would seem to be.
-    """
-    if "size_m" in mount.sensor.columns or "qw" in mount.sensor.columns:
-        return Tag()
-    if len(mount.at) == 3:
-        if not getattr(mount.sensor, "finds_depth", True) and mount.initialization is None:
-            return InverseDepth2D()
-        return PointSignature2D() if "signature" in mount.sensor.columns else Point2D()
-    seen = getattr(mount.sensor, "sees_kinds", ("point3",))
-    if "point3" not in seen:
-        return kinds.AnchoredHomogeneousLine()
-    if getattr(mount.sensor, "finds_depth", True):
-        return Point3D()
-    return kinds.Homogeneous() if mount.cov is None else kinds.AnchoredHomogeneous()
 
 
 def _starts(association: Association, upkeep: Upkeep) -> tuple[Any, ...]:

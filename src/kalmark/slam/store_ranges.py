@@ -20,7 +20,7 @@ def ranges_described(unlocated: Mapping[Id, Unlocated]) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for name, known in unlocated.items():
         if isinstance(known, Ranges):
-            kept = [[each.slot, each.y, each.variance] for each in known.kept]
+            kept = [list(each) for each in known.kept]
             rows.append([name, "ranges", known.robot, known.sensor, known.spacing, kept])
         else:
             hypotheses = [known.slots, known.log_weights.tolist()]
@@ -33,7 +33,7 @@ def ranges_restored(rows: list[list[Any]]) -> dict[Id, Unlocated]:
     unlocated: dict[Id, Unlocated] = {}
     for name, what, robot, sensor, first, rest in rows:
         if what == "ranges":
-            kept = [Kept(slot, float(y), float(variance)) for slot, y, variance in rest]
+            kept = [Kept(slot, float(y), float(variance), *varies) for slot, y, variance, *varies in rest]
             unlocated[name] = Ranges(robot, sensor, float(first), kept)
         else:
             slots, log_weights = rest

@@ -36,15 +36,20 @@ SETTLED = 1e-7  # which is over when they are shorter, m
 OUTLIER = 0.9999  # a set of ranges that fits worse than this probability has one that is wrong
 BULGE = 0.03  # how far a circle may leave its tangent within a sigma of the position, in sigmas of the range
 OUT = 3.0  # sigmas from the minimum at which its shape is looked at,
+AROUND = 2 * np.pi * np.arange(24) / 24  # in these directions (0: the longest axis),
 SHAPE = 2.0  # and by how much less the likelihood may fall off there than a Gaussian's, OUT^2
 
 
 class Kept(NamedTuple):
-    """A range, its variance, and the block of the place it was taken from."""
+    """A range, its variance, and the block of the place it was taken from.
+
+    `varies`: the variance is that of a range like it; the distance that it comes from will tell it.
+    """
 
     slot: int
     y: float
     variance: float
+    varies: bool = False
 
 
 @dataclass
@@ -60,8 +65,8 @@ class Ranges:
 class Fits(NamedTuple):
     """How J positions l (J, 2) fit n ranges: `cost` = -2 log likelihood and chi-square (J,), residuals z (J, n).
 
-    `H` (J, n, 2) is with respect to the position, `H_x` (J, n, .) to what the map has of sensor and places, and
-    `inverse` (J, n, n) that of the covariance.
+    `H` (J, n, 2) is with respect to the position, `H_x` (J, n, .) to what the map has of sensor and places, `inverse`
+    (J, n, n) that of the covariance, and `R` (J, n) the ranges' variances, as the position would have them.
     """
 
     l: Array
@@ -71,6 +76,7 @@ class Fits(NamedTuple):
     H: Array
     H_x: Array
     inverse: Array
+    R: Array
 
     def only(self, which: Any) -> Fits:
         """Return some of them."""
@@ -109,7 +115,8 @@ class Trilateration:
         elif np.linalg.norm(here - slam.map.mean(known.kept[-1].slot)) < known.spacing:
             why = f"within {known.spacing:.2f} m of where the last range kept was taken"
             return Observation(k, id_, "deferred", None, None, why)
-        known.kept.append(Kept(_place(slam, view, event), float(event.y[k, 0]), float(R[0, 0])))
+        varies = view.noise_at is not None and event.cov is None
+        known.kept.append(Kept(_place(slam, view, event), float(event.y[k, 0]), float(R[0, 0]), varies))
         found = self._answer(slam, view, known) if len(known.kept) > 2 else "it takes three ranges to tell"
         if isinstance(found, str):
             self._thin(slam, known)
@@ -142,15 +149,15 @@ class Trilateration:
             _release(slam, [worst])
             return f"a range of {worst.y:.2f} m does not fit the others and is left out"
         information = best.H.T @ best.inverse @ best.H
-        if not (_flat(best, S, places, known.kept) and _gaussian(fit, best, information)):
+        bent = len(index) > 2 * len(known.kept) or any(each.varies for each in known.kept)
+        if not (_flat(best, S, places) and _gaussian(fit, best, information, bent)):
             return f"{len(known.kept)} ranges do not tell yet where it is"
         gaps = minima.l - best.l
         apart = np.einsum("ji,ik,jk->j", gaps, information, gaps) > 1.0
         if (apart & (minima.cost - best.cost < -2 * math.log(self.odds))).any():
             return f"{len(known.kept)} ranges fit two positions"
         W = np.linalg.solve(information, best.H.T @ best.inverse)
-        variances = np.array([each.variance for each in known.kept])
-        return best.l, index, -W @ best.H_x, (W * variances) @ W.T
+        return best.l, index, -W @ best.H_x, (W * best.R) @ W.T
 
 
 def _place(slam: Slam, view: View, event: Scan) -> int:
@@ -191,7 +198,7 @@ def _problem(slam: Slam, view: View, kept: list[Kept]) -> tuple[Index, Array, Ca
     for _ in range(2):  # to ask for a block may move those asked for before
         index = np.concatenate([map_.index(slot) for slot in blocks])
     S, first, rows = map_.covariance(blocks), len(index) - 2 * n, np.arange(n)
-    y, R = np.array([each.y for each in kept]), np.diag([each.variance for each in kept])
+    y, variance, varies = (np.array(column) for column in list(zip(*kept, strict=True))[1:])
 
     def fit(l: Array) -> Fits:
         v = (l[:, None] - places).reshape(-1, 2)
@@ -201,10 +208,11 @@ def _problem(slam: Slam, view: View, kept: list[Kept]) -> tuple[Index, Array, Ca
             H_x[:, rows, first + 2 * rows + axis] = -H[:, :, axis]
         if own:
             H_x[:, :, first - own : first] = sensor.parameters_jacobian(v).reshape(-1, n, own)
-        Sigma = H_x @ S @ H_x.transpose(0, 2, 1) + R
+        R = np.where(varies, sensor.range_variance(e).reshape(-1, n), variance)
+        Sigma = H_x @ S @ H_x.transpose(0, 2, 1) + R[:, :, None] * np.eye(n)
         z, inverse = y - e.reshape(-1, n), np.asarray(np.linalg.inv(Sigma), dtype=np.float64)
         chi2 = np.einsum("ji,jik,jk->j", z, inverse, z)
-        return Fits(l, chi2 + np.linalg.slogdet(Sigma)[1], chi2, z, H, H_x, inverse)
+        return Fits(l, chi2 + np.linalg.slogdet(Sigma)[1], chi2, z, H, H_x, inverse, R)
 
     return index, S, fit, places
 
@@ -227,26 +235,29 @@ def _search(fit: Callable[[Array], Fits], starts: Array) -> Fits:
     return now
 
 
-def _flat(best: Fits, S: Array, places: Array, kept: list[Kept]) -> bool:
+def _flat(best: Fits, S: Array, places: Array) -> bool:
     """Return whether circles are as good as straight within a sigma of the position, as seen from the places.
 
     What all places have in common does not bend a circle: the position is taken relative to them, its errors those of
     the ranges and of the sensor's parameters alone, S (., .) being the covariance of sensor and places.
     """
-    own = len(S) - 2 * len(kept)
-    variances = np.array([each.variance for each in kept])
+    own = len(S) - 2 * len(places)
     H_x = best.H_x[:, :own]
-    information = best.H.T @ np.linalg.solve(H_x @ S[:own, :own] @ H_x.T + np.diag(variances), best.H)
+    information = best.H.T @ np.linalg.solve(H_x @ S[:own, :own] @ H_x.T + np.diag(best.R), best.H)
     values = np.linalg.eigvalsh(information)
     if not np.isfinite(values).all() or values[0] <= 0:
         return False
     bulge = 0.5 / values[0] / np.hypot(*(best.l - places).T)
-    return bool(np.median(bulge / np.sqrt(variances)) < BULGE)
+    return bool(np.median(bulge / np.sqrt(best.R)) < BULGE)
 
 
-def _gaussian(fit: Callable[[Array], Fits], best: Fits, information: Array) -> bool:
-    """Return whether the likelihood falls off along its longest axis at least as that of a Gaussian does."""
+def _gaussian(fit: Callable[[Array], Fits], best: Fits, information: Array, bent: bool) -> bool:
+    """Return whether the likelihood falls off at least as that of a Gaussian does.
+
+    A scale that is not known, and noise that grows with the range, make valleys that are `bent`: they leave the longest
+    axis and are found beside it only.
+    """
     values, vectors = np.linalg.eigh(information)
-    axis = OUT / math.sqrt(values[0]) * vectors[:, 0]
-    ends = fit(np.array([best.l + axis, best.l - axis]))
-    return bool((ends.cost - best.cost > OUT**2 - SHAPE).all())
+    angles = AROUND if bent else AROUND[[0, len(AROUND) // 2]]
+    steps = OUT * np.column_stack([np.cos(angles), np.sin(angles)]) / np.sqrt(values)
+    return bool((fit(best.l + steps @ vectors.T).cost - best.cost > OUT**2 - SHAPE).all())
