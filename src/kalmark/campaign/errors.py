@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, exp, log, multiply
+from kalmark.models.landmarks import Polar2D
 from kalmark.results.consistency import point_error, pose_error, rotation_error
 
 Array = npt.NDArray[np.float64]
@@ -89,7 +90,7 @@ def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordin
     if hasattr(model, "to_point") and len(mean) > len(truth) and not is_known(point, F @ P @ F.T, eye):
         return None
     own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
-    if model.kind == "polar":  # its Gaussian is on an arc: so is its error
+    if isinstance(model, Polar2D):  # its Gaussian is on an arc: so is its error
         return Judged(unrolled(mean, own), unrolled(mean, world), F, point[None], truth[None])
     return Judged(own, world, F, point[None], truth[None])
 
