@@ -103,15 +103,15 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     (arguments.out / "loop_closing.json").write_text(json.dumps({"runs": arguments.runs, "per_cent": table}, indent=1))
     mpl.use("agg")
-    figure, axes = plt.subplots(figsize=(6, 2.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(6, 2.8), layout="constrained")
     left = np.zeros(len(table))
     for end, colour in (("closed", "tab:green"), ("open", "lightgrey"), ("wrong", "tab:red")):
         widths = np.array([row[end] for row in table.values()])
         axes.barh(list(table), widths, left=left, color=colour, label=end)
         left += widths
-    axes.set(xlabel="runs, %", title="Loops closed from three landmark spacings off")
+    axes.set(xlabel="runs, %")
     axes.invert_yaxis()
-    axes.legend(loc="lower right")
+    figure.legend(loc="outside upper center", ncols=3, title="Loops closed from three landmark spacings off")
     figure.savefig(arguments.out / "loop_closing.png", dpi=120)
 
 
