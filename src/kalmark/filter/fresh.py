@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 Numbers = npt.NDArray[Any]
 
-BIT, PAGE = 1 << 19, 4096  # bytes to use at once, and of a page of memory
+BIT, PAGE = 1 << 21, 4096  # bytes to use at once, a large page of memory, and of a small one
 
 
 class Fresh:
@@ -23,16 +23,17 @@ class Fresh:
         """Have the numbers first..last of a contiguous array be used in time; what is in them stays."""
         self._waiting.append((ref(array), first, last))
 
-    def use_some(self) -> None:
-        """Use the next bit of memory."""
+    def use_some(self) -> int:
+        """Use the next bit of memory; return how many bytes."""
         if not self._waiting:
-            return
+            return 0
         kept, first, last = self._waiting.popleft()
         array = kept()
         if array is None:
-            return
+            return 0
         end = min(last, first + BIT // array.itemsize)
         here = array.reshape(-1)[first : end : PAGE // array.itemsize]
         here[:] = here.copy()
         if end < last:
             self._waiting.appendleft((kept, end, last))
+        return (end - first) * int(array.itemsize)

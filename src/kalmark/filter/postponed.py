@@ -23,7 +23,7 @@ from kalmark.filter import kernels
 from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Phase, Room, displaced, leap_of
 from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
-from kalmark.filter.pace import Pace
+from kalmark.filter.pace import USING, Pace
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import RHO, Rn, Space
 
@@ -304,9 +304,9 @@ class PostponedMap(Layout):
                 self.flush(robot, now - before)
         self._pace.count(m.n)
         m.prepare()
-        self.storage.fresh.use_some()
+        used = self.storage.fresh.use_some()
         if (job := self._job) is not None:
-            job.advance(self._pace.due(self._progress(), job.spent, job.work))
+            job.advance(self._pace.due(self._progress(), job.spent, job.work) - USING * used)
             self._job = None if job.done else job
 
     def _enter(self, slot: int) -> None:
