@@ -128,14 +128,14 @@ class Leap:
 
 def leap_of(robot: int, ds: Array, moved: dict[int, tuple[Array, Array]], robots: list[int], axes: int) -> Leap:
     """Return a robot's last correction as one that turns the world; `moved` has the means before and after it."""
-    turns = {r: _turn(before, after, axes) for r, (before, after) in moved.items()}
+    turns = {r: turn_of(before, after, axes) for r, (before, after) in moved.items()}
     turn = turns[robot].copy()
     if axes == 6:
         turn[:3] += np.cross(moved[robot][0][:3], turn[3:])
     return Leap(robots.index(robot), ds, turn, np.concatenate([turns[r] for r in robots]))
 
 
-def _turn(before: Array, after: Array, axes: int) -> Array:
+def turn_of(before: Array, after: Array, axes: int) -> Array:
     """Return what a correction did to the turn (axes,) of a robot that stood at `before` and stands at `after`."""
     if axes == 1:
         return np.array([wrap(after[2] - before[2])])

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from kalmark.filter import kernels
 from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Phase, Room, displaced, leap_of
+from kalmark.filter.leap import leapt
 from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
 from kalmark.filter.pace import USING, Pace
 from kalmark.filter.storage import PANEL, Triangle
@@ -93,13 +94,13 @@ class PostponedMap(Layout):
 
     def mean(self, slot: int) -> Array:
         """Return a copy of a block's mean."""
-        at = self._owners.get(slot)
-        return self.active.mean(at) if at is not None else self._preview(slot)[0]
+        return self._preview(slot)[0] if (at := self._owners.get(slot)) is None else self.active.mean(at)
 
     def first(self, slot: int) -> Array:
         """Return a copy of a block's first estimate, of a robot its last predicted one."""
-        at = self._owners.get(slot)
-        return self.active.first(at) if at is not None else self.x_first[self.numbers(slot)].copy()
+        return (
+            self.x_first[self.numbers(slot)].copy() if (at := self._owners.get(slot)) is None else self.active.first(at)
+        )
 
     def covariance(self, slots: Sequence[int]) -> Array:
         """Return the joint covariance of blocks, in the order given.  Blocks at rest stay there."""
@@ -163,7 +164,7 @@ class PostponedMap(Layout):
         return m, copied[robot], copied.get(mount, -1), here  # type: ignore[return-value]
 
     def _resting_rows(self) -> Index:
-        """Return the rows of the active map that blocks at rest depend on: the shadows and the robots' turns."""
+        """Return the rows of the active map that blocks at rest depend on: shadows, robots' turns."""
         return np.concatenate([self._s, *(self._turn_rows(robot) for robot in self._moved)])
 
     def _turn_rows(self, robot: int) -> Index:
@@ -300,7 +301,8 @@ class PostponedMap(Layout):
             s, before = m.x[self._s_x], self._moved.get(robot, 0.0)
             others = [moved for other, moved in self._moved.items() if other != robot]
             self._moved[robot] = now = s - sum(others) if others else s
-            if len(self._owners) < self.used and self._far(robot, s):
+            leaps = leapt(m, self._owners[robot], self._before[robot], self._owners.values(), TAU)
+            if len(self._owners) < self.used and (leaps or self._far(robot, s)):
                 self.flush(robot, now - before)
         self._pace.count(m.n)
         m.prepare()

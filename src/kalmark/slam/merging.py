@@ -73,13 +73,29 @@ def merge(slam: Slam, view: View, robot: str, outcomes: Sequence[Observation]) -
     mine = note(slam, outcomes)
     if not view.upkeep.merge:
         return
-    again = False
+    again, kept = False, list[Id]()
     for name in mine:
         due = again or members.seen.get(name, 0) % EVERY == 0
         if due and name in members.kinds and _fits(members.kinds[name].space):
             for merged in _merge_with(slam, view, robot, name):
                 again = True  # now the others are known better to each other
+                kept.append(merged[1])
                 yield merged
+    yield from _follow(slam, view, robot, kept)
+
+
+def _follow(slam: Slam, view: View, robot: str, merged: list[Id]) -> Iterator[tuple[Id, Id, str]]:
+    """Look at what was seen with merged landmarks before the loop closed, each once, and merge it as well."""
+    members, tried = slam.members, set(slam.members.lately)
+    while merged:
+        at = merged.pop(0)
+        around = sorted((n for n in members.together.get(at, ()) if n not in tried), key=str)
+        tried.update(around)
+        for name in around:
+            if name in members.kinds and _fits(members.kinds[name].space):
+                for found in _merge_with(slam, view, robot, name):
+                    merged.append(found[1])
+                    yield found
 
 
 def _fits(space: Space) -> bool:
@@ -128,7 +144,7 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     possible = [l for l in possible if far[l] <= reach]
     if not possible:
         return
-    company = [n for n in members.lately if n != name and n in members.kinds and members.kinds[n].kind == kind]
+    company = _company(slam, name, d)
     mine = slam.map.means(members.slots_of(company), d) if company else np.zeros((0, d))
     moved = mine[:, None] + (places[possible] - at)  # (C, L, d): the company, were the landmark the l-th that it may be
     gaps: Any = cKDTree(places).query(moved)
@@ -148,6 +164,18 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
                     pairs.append(pair)
                     used |= {*pair}
             yield pairs
+
+
+def _company(slam: Slam, name: Id, d: int) -> list[Id]:
+    """Return what must find its own if a landmark does: what was seen lately, or, if it was not, once, with it."""
+    members, kinds = slam.members, slam.members.kinds
+    lately = name in members.lately
+    others = [n for n in (members.lately if lately else sorted(members.together[name], key=str)) if n != name]
+    others = [n for n in others if n in kinds and kinds[n].kind == kinds[name].kind]
+    if lately or len(others) <= COMPANY:
+        return others
+    far = np.linalg.norm(slam.map.means(members.slots_of(others), d) - slam.mean(name)[:d], axis=1)
+    return [others[i] for i in np.argsort(far, kind="stable")[:COMPANY].tolist()]
 
 
 def _differences(slam: Slam, pairs: Sequence[tuple[Id, Id]]) -> tuple[Array, Array]:

@@ -1,0 +1,62 @@
+"""A correction that turns the world leaves what is at rest where the dense filter would have it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.filter import leap
+from kalmark.filter.map import StochasticMap
+from kalmark.filter.postponed import PostponedMap
+
+WORLD = np.column_stack([np.arange(0.0, 40.0, 2.0), np.tile([1.5, -1.5], 10)])
+
+
+def robot_of(cov: Any) -> km.Robot:
+    """Return a robot that sees landmarks well and drives straight ahead."""
+    lidar = km.Mount(km.sensors.RangeBearing(0.02, 0.005, range_max_m=4.0))
+    return km.Robot("r", km.motion.Odometry2D(0.01, 0.0, 0.002), sensors={"lidar": lidar}, cov=cov)
+
+
+def passes(slam: km.Slam, most: int | None) -> km.Slam:
+    """Drive 20 m among WORLD from an uncertain start, learning then by two fixes where that was, turned by .2 rad."""
+    if most is not None:
+        slam.map = PostponedMap.from_dense(slam.map, most=most)
+    rng, truth = np.random.default_rng(4), np.zeros(3)
+    for t in range(1, 101):
+        u = np.array([0.2, 0.0, 0.0])
+        truth = km.geometry.compose(truth, u)[0]
+        slam.process(km.Control(float(t), "r", u))
+        near = np.flatnonzero(np.hypot(*(WORLD - truth[:2]).T) < 4.0)
+        y = km.geometry.observe(truth, WORLD[near])[0] + rng.normal(size=(len(near), 2)) * [0.02, 0.005]
+        slam.process(km.Scan(float(t), "r", "lidar", y, near.tolist()))
+        if t in (1, 100):
+            slam.process(km.Fix(float(t), "r", km.geometry.rotation(0.2) @ truth[:2], np.eye(2) * 1e-4))
+    return slam
+
+
+@pytest.mark.parametrize("most", [25, 60])
+def test_landmarks_at_rest_turn_with_a_large_correction_as_in_the_dense_map(most: int) -> None:
+    cov = np.diag([5.0, 5.0, 0.15]) ** 2
+    dense = passes(km.Slam([robot_of(cov)], km.association.ByIdentity("off"), map="dense"), None)
+    postponed = passes(km.Slam([robot_of(cov)], km.association.ByIdentity("off"), map="dense"), most)
+    assert isinstance(postponed.map, PostponedMap)
+    off = [np.abs(dense.mean(i) - postponed.mean(i)).max() for i in ("r", *dense.landmarks().ids)]
+    assert max(off) < 1e-3, "they are known from each other to 2 cm"
+    turned = WORLD @ km.geometry.rotation(0.2).T
+    wrong = [np.linalg.norm(postponed.mean(i) - turned[i]) for i in postponed.landmarks().ids]
+    assert max(wrong) < 0.15
+
+
+def test_a_leap_is_told_by_what_it_parts_and_not_by_how_far_it_goes() -> None:
+    map_ = StochasticMap()
+    robot = map_.add(km.geometry.SE2, [3.0, 1.0, 0.1], np.diag([2.0, 2.0, 0.1]) ** 2)
+    rows = map_.index(robot)
+    point = map_.augment(km.landmarks.Point2D().space, np.array([4.0, 1.0]), rows, np.eye(2, 3), np.eye(2) * 0.01**2)
+    straight, turned, little = np.array([0.0, 1.0, 0.1]), np.array([0.0, 1.0, 0.3]), np.array([2.999, 1.0, 0.101])
+    told = [leap.leapt(map_, robot, before, [robot, point], 0.05) for before in (straight, turned, little)]
+    assert told == [False, True, False], "3 m without a turn part nothing, 3 m and .2 rad .3 m, 1 mm and 1 mrad .5 um"
+    assert not leap.leapt(map_, robot, turned, [robot], 0.05), "nothing is known from the robot"
