@@ -142,6 +142,8 @@ class UpkeepConfig(Section):
     """A tentative landmark becomes one when it was seen so often; 1: at its first sighting."""
     within: Count = 10
     """It is dropped if that did not happen in so many scans in which it was in view."""
+    keep_poses: Annotated[int, Field(ge=0)] = 0
+    """Its sightings are kept with so many past poses, and fused when it is one; 0: they are not used."""
     merge: bool = True
     """Merge landmarks that turn out to be one."""
     hold_back: bool = False

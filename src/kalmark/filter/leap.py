@@ -12,6 +12,7 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.filter.drift import TAU
 from kalmark.filter.flush import turn_of
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry.spaces import VECTOR, VECTOR3
@@ -21,15 +22,15 @@ Array = npt.NDArray[np.float64]
 EXACT_M = 1e-4  # nothing is known better than that
 
 
-def leapt(active: StochasticMap, robot: int, before: Array, others: Iterable[int], share: float) -> bool:
+def leapt(active: StochasticMap, robot: int, before: Array, others: Iterable[int]) -> bool:
     """Return whether the correction that has moved a robot from `before` parts active blocks from those at rest.
 
-    By more than a `share` of the least sigma of a point among the `others` (slots), as seen from the robot.
+    By more than TAU of the least sigma of a point among the `others` (slots), as seen from the robot.
     """
     after, d = active.mean(robot), 2 if active.axes == 1 else 3
     turn = turn_of(before, after, active.axes)[-3:].tolist()
     apart = 0.5 * math.hypot(*turn) * math.dist(after[:d].tolist(), before[:d].tolist())
-    if apart <= share * EXACT_M:
+    if apart <= TAU * EXACT_M:
         return False
     points = [active.rows(slot)[:d] for slot in others if _is_point(active, slot)]
     if not points:
@@ -37,7 +38,7 @@ def leapt(active: StochasticMap, robot: int, before: Array, others: Iterable[int
     l, r = np.array(points), active.rows(robot)[:d]
     P = active.P
     variances = P[l, l] + P[r, r] - 2.0 * P[np.maximum(l, r), np.minimum(l, r)]
-    return apart > share * max(EXACT_M, float(np.sqrt(np.maximum(variances.sum(axis=1), 0.0)).min()))
+    return apart > TAU * max(EXACT_M, float(np.sqrt(np.maximum(variances.sum(axis=1), 0.0)).min()))
 
 
 def _is_point(active: StochasticMap, slot: int) -> bool:

@@ -301,7 +301,7 @@ class PostponedMap(Layout):
             s, before = m.x[self._s_x], self._moved.get(robot, 0.0)
             others = [moved for other, moved in self._moved.items() if other != robot]
             self._moved[robot] = now = s - sum(others) if others else s
-            leaps = leapt(m, self._owners[robot], self._before[robot], self._owners.values(), TAU)
+            leaps = leapt(m, self._owners[robot], self._before[robot], self._owners.values())
             if len(self._owners) < self.used and (leaps or self._far(robot, s)):
                 self.flush(robot, now - before)
         self._pace.count(m.n)

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Known = Mapping[Id, tuple[Any, Any]]
-USED = ("associated", "new")
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +126,7 @@ class _Replay:
                 self._node_at(landmark, scan.t_ns)
                 landmark = f"\0{self.courses[landmark].node}"  # no id begins so
             else:
-                self._check(landmark, self.history.outcome[row] == "new")
+                self._check(landmark, self.history.outcome[row] != "associated")
             if self.history.sensor[row] != scan.sensor or index >= len(scan.y):
                 raise KalmarkError(
                     f"batch solution: scan at t={scan.t_s:.9g} s is not the one of the run, expected its log"
@@ -276,6 +275,6 @@ class _Replay:
 def _used(history: History) -> dict[int, list[int]]:
     """Return the rows of the observations that the filter used, by step."""
     rows: dict[int, list[int]] = {}
-    for row in np.flatnonzero(np.isin(history.outcome, USED)):
+    for row in np.flatnonzero(history.fused):
         rows.setdefault(int(history.step[row]), []).append(int(row))
     return rows

@@ -19,6 +19,7 @@ from kalmark.slam.events import Id
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Texts = npt.NDArray[np.str_]
+Flags = npt.NDArray[np.bool_]
 
 
 class Start(NamedTuple):
@@ -89,7 +90,8 @@ class History:
     Observations: `step` is the row of the step, `id`, `landmark` and `true_id`, what the log knows and the filter may
     not, are texts ("" for none), `kind` is that of the landmark after the scan, `d2` is NaN where there is none;
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
-    NaN where robots or sensors differ in size.  `left_px` (O,) is what the corners of tags are off by after the scan
+    NaN where robots or sensors differ in size.  `late` (O,) says which tentative ones
+    were fused when their landmark was confirmed.  `left_px` (O,) is what the corners of tags are off by after the scan
     (`kalmark.results.corners`); `decisions` has what they were compared with.
     """
 
@@ -120,6 +122,13 @@ class History:
     biases: tuple[Biased, ...] = ()
     true_id: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
     decisions: Decisions = field(default_factory=Decisions)
+    late: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+
+    @property
+    def fused(self) -> Flags:
+        """Which observations (O,) have corrected or started what is in the map."""
+        late = self.late if len(self.late) else np.zeros(len(self.outcome), dtype=np.bool_)
+        return np.isin(self.outcome, ("associated", "new")) | late
 
     @property
     def in_space(self) -> bool:
@@ -152,7 +161,7 @@ class History:
         """Return everything as named arrays, those of the contract (t in seconds) first."""
         named = {"t": self.t_ns * 1e-9} | {key: getattr(self, key) for key in ("robot", "mean", "covariance")}
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
-        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px", "true_id")}
+        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px", "true_id", "late")}
         named |= self.decisions.arrays()
         return (
             named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._sensor_arrays()
@@ -192,6 +201,7 @@ class History:
             key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)
         }
         columns |= {"kind": kind, "left_px": left, "true_id": named.get("true_id", named["id"])}
+        columns["late"] = named.get("late", np.zeros(count, dtype=np.bool_))
         columns |= {"maps": maps, "starts": starts, "mounts": mounts, "biases": _biases(named)}
         return cls(**columns, inputs=inputs, cameras=cameras, decisions=Decisions.from_arrays(named))
 

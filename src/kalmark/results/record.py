@@ -26,7 +26,7 @@ from kalmark.slam.events import Control, Event, Fix, Id, Scan
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
-    from kalmark.slam.report import Report
+    from kalmark.slam.report import Observation, Report
     from kalmark.slam.slam import Slam
 
 SNAPSHOTS = 60
@@ -164,6 +164,11 @@ class _Recorder:
         pairs = zip(told, self.reports, strict=True)
         return texts([None if ids is None else ids[o.index] for ids, report in pairs for o in report.observations])
 
+    def _late(self, seen: list[tuple[int, Scan, Observation]]) -> npt.NDArray[np.bool_]:
+        """Return which observations were fused after their scan."""
+        told = {one for report in self.reports for one in report.late}
+        return np.array([(scan.t_ns, scan.robot, scan.sensor, o.index) in told for _, scan, o in seen], dtype=np.bool_)
+
     def _history(self, log: Any) -> History:
         steps = self.reports
         seen = [
@@ -197,6 +202,7 @@ class _Recorder:
             starts=self.starts,
             inputs=Inputs(self.controls, tuple(self.fixes)),
             kind=texts(list(self.kinds)),
+            late=self._late(seen),
             left_px=np.concatenate([np.empty(0), *self.left]),
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),

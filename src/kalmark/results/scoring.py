@@ -10,13 +10,11 @@ import numpy as np
 from kalmark.results.history import History, as_id
 from kalmark.slam.events import Id
 
-FUSED = ("associated", "new")
-
 
 def known_as(history: History) -> dict[str, str]:
     """Return what the log calls each landmark that the filter named: what most observations fused with it are."""
     seen: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    mine = np.isin(history.outcome, FUSED) & (history.true_id != "") & (history.id == "")
+    mine = history.fused & (history.true_id != "") & (history.id == "")
     for landmark, true in zip(history.landmark[mine].tolist(), history.true_id[mine].tolist(), strict=True):
         seen[landmark][true] += 1
     return {landmark: counts.most_common(1)[0][0] for landmark, counts in seen.items()}
@@ -43,7 +41,7 @@ def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]
     hidden = (history.id == "") & (history.true_id != "")
     if not hidden.any():
         return {}
-    names, fused = known_as(history), np.isin(history.outcome, FUSED)
+    names, fused = known_as(history), history.fused
     judged = fused & hidden
     own = [names[landmark] for landmark in history.landmark[judged].tolist()]
     nameless = history.true_id == ""

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
+Late = tuple[int, str, str, int]
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
 NOTHING = np.zeros((0, 0))
 NOTHING.flags.writeable = False
@@ -73,17 +74,20 @@ class Report:
     `y` and the expectation `e` are (K, m), the innovation `z` (K, p) and its covariance `Z` (K, p, p), with p = m but
     for sensors that measure more than can be innovated; rows of observations that were not compared with a landmark
     are NaN.  `removed` are landmarks given up and tentative ones dropped, each with the reason, and
-    `merged` are those that are gone, the ones they turned out to be, and why.  `candidates` are the landmarks that
-    observations without an id were compared with, `seen_at` (K, 2 or 3) is where these seemed to come from.
+    `merged` are those that are gone, the ones they turned out to be, and why.  `late` are earlier
+    observations, tentative then, that this scan has let be fused: time, robot, sensor and number in its scan of each.
+    `candidates` are the landmarks that observations without an id were compared with, `seen_at` (K, 2 or 3) is where
+    these seemed to come from.
     """
 
-    __slots__ = ("Z", "candidates", "e", "event", "merged", "observations", "removed", "seen_at", "y", "z")
+    __slots__ = ("Z", "candidates", "e", "event", "late", "merged", "observations", "removed", "seen_at", "y", "z")
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
         self.observations: tuple[Observation, ...] = ()
         self.removed: tuple[tuple[Id, str], ...] = ()
         self.merged: tuple[tuple[Id, Id, str], ...] = ()
+        self.late: tuple[Late, ...] = ()
         self.candidates: list[Candidate] = []
         self.seen_at: Array = NOTHING
         self.y = y

@@ -202,7 +202,7 @@ class Slam:
         decisions: Sequence[Decision], R: Array,
     ) -> Iterator[tuple[int, Observation]]:  # fmt: skip
         """Count the sightings of tentative landmarks; fuse those that confirm one."""
-        seen, confirmed = tentative.sightings(self, view, event, new, decisions, R)
+        seen, confirmed = tentative.sightings(self, view, event, report, new, decisions, R)
         yield from seen.items()
         left = [k for k in new if k not in seen and k not in confirmed]
         yield from delayed.sightings(self, view, event, left, decisions, R)
@@ -273,7 +273,7 @@ class Slam:
         except MapError as full:
             return Observation(k, id_, "ignored", None, None, str(full))
         if unproven:
-            return tentative.started(self, view, k, name, slot, reason, held)
+            return tentative.started(self, view, event, k, name, slot, reason, held)
         self.members.start(name, slot, view.landmark)
         return Observation(k, id_, "new", name, None, reason)
 

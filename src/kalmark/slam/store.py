@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from kalmark.errors import KalmarkError, MapError
 from kalmark.filter.estimators import Estimator
-from kalmark.geometry.spaces import SE2, Rn, Space
+from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.models.protocols import Landmark
 from kalmark.slam.decisions import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
@@ -30,7 +30,7 @@ from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
 from kalmark.slam.store_map import map_arrays, map_described, map_restored
 from kalmark.slam.store_ranges import ranges_described, ranges_owners, ranges_restored
-from kalmark.slam.store_waiting import waiting_described, waiting_restored
+from kalmark.slam.store_waiting import check_kept, kept_described, kept_restored, waiting_described, waiting_restored
 from kalmark.slam.tentative import Tentative
 from kalmark.slam.upkeep import CAREFUL
 
@@ -82,7 +82,8 @@ def _state(slam: Slam) -> State:
         "unlocated": ranges_described(slam.members.unlocated),
         "here": slam.members.here,
         "tentative": [
-            [name, t.slot, described(t.kind), t.hits, t.chances, t.unseen] for name, t in slam.members.tentative.items()
+            [name, t.slot, described(t.kind), t.hits, t.chances, t.unseen, kept_described(t)]
+            for name, t in slam.members.tentative.items()
         ],
         "waiting": waiting_described(slam),
         "seen": [[_id(name), count] for name, count in slam.members.seen.items()],
@@ -202,6 +203,7 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.here = None if state.get("here") is None else tuple(state["here"])
     slam.members.tentative = {i: _tentative(i, own, *rest) for i, *rest in state.get("tentative", ())}
     waiting_restored(slam, state.get("waiting", []))
+    check_kept(slam)
     slam.members.unnamed = _count(state["unnamed"], "unnamed")
     slam.members.experience = [float(count) for count in state.get("experience", (0.0, 0.0))]
     slam.t_ns = _time(state["t_ns"])
@@ -242,7 +244,8 @@ def _check_owners(slam: Slam) -> None:
     owners += ranges_owners(slam.members.unlocated)
     owners += [(f"tentative {name!r}", t.slot, t.kind.space) for name, t in slam.members.tentative.items()]
     for view in slam._views.values():
-        owners += [(f"kept pose {n}", slot, SE2) for n, slot in view.waiting.poses.items()]
+        pose = SE2 if len(view.at) == 3 else SE3
+        owners += [(f"kept pose {n}", slot, pose) for n, slot in view.waiting.poses.items()]
     for name, slot in slam._errors.items():
         owners.append((f"the error of {name!r}", slot, Rn(len(slam.robots[name].motion.columns))))
     used = [i for i, space in enumerate(slam.map.spaces) if space is not None]
@@ -261,9 +264,11 @@ def _doubt(name: Id, poses: Any, evidence: Any, t_ns: Any) -> Doubt:
     return Doubt(found, evidence, _count(t_ns, f"the time of the doubt about {name!r}"))
 
 
-def _tentative(name: Id, own: list[Landmark], slot: Any, kind: State, *counts: Any) -> Tentative:
+def _tentative(name: Id, own: list[Landmark], slot: Any, kind: State, *rest: Any) -> Tentative:
+    counts, kept = rest[:3], rest[3] if len(rest) > 3 else {}
     hits, chances, unseen = (_count(n, f"sightings of the tentative {name!r}") for n in counts)
-    return Tentative(_count(slot, f"slot of the tentative {name!r}"), _kind(name, kind, own), hits, chances, unseen)
+    slot = _count(slot, f"slot of the tentative {name!r}")
+    return Tentative(slot, _kind(name, kind, own), hits, chances, unseen, **kept_restored(kept))
 
 
 def _count(value: Any, what: str) -> int:

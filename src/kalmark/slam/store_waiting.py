@@ -9,10 +9,12 @@ import numpy as np
 from kalmark.errors import MapError
 from kalmark.slam.candidates import Candidate, Sight, Waiting
 from kalmark.slam.describe import State
-from kalmark.slam.events import Id
+from kalmark.slam.events import Id, Scan
+from kalmark.slam.kept import Kept
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
+    from kalmark.slam.tentative import Tentative
 
 
 def waiting_described(slam: Slam) -> list[Any]:
@@ -20,7 +22,7 @@ def waiting_described(slam: Slam) -> list[Any]:
     return [
         [robot, sensor, _described(view.waiting)]
         for (robot, sensor), view in slam._views.items()
-        if view.delayed is not None
+        if view.delayed is not None or view.upkeep.keep_poses
     ]
 
 
@@ -48,7 +50,7 @@ def waiting_restored(slam: Slam, state: list[Any]) -> None:
     """Give each sensor back what waits of it.  Raises MapError if it is not what such a sensor keeps."""
     for robot, sensor, description in state:
         view = slam._views.get((robot, sensor))
-        if view is None or view.delayed is None:
+        if view is None or (view.delayed is None and not view.upkeep.keep_poses):
             raise MapError(f"measurements of {robot!r}, {sensor!r} wait, expected a sensor that starts landmarks late")
         view.waiting = _restored(description, len(view.sensor.columns), f"what waits of {robot!r}, {sensor!r}")
 
@@ -77,6 +79,36 @@ def _restored(state: State, m: int, what: str) -> Waiting:
     if bad or odd or any(type(n) is not int or n > state["numbered"] for n in numbers):
         raise MapError(f"{what} does not fit together")
     return Waiting(poses, candidates, state["numbered"])
+
+
+def kept_described(t: Tentative) -> State:
+    """Return the sightings kept of a tentative landmark."""
+    rows = [
+        [one.at, one.k, one.scan.t_ns, one.scan.robot, one.scan.sensor, one.scan.y.tolist(), one.R.tolist(),
+         one.scan.cov is not None]
+        for one in t.kept
+    ]  # fmt: skip
+    return {"first": t.first, "kept": rows}
+
+
+def kept_restored(state: State) -> dict[str, Any]:
+    """Return the sightings kept of a tentative landmark, and its first one, by their names in `Tentative`."""
+    kept = []
+    for at, k, t_ns, robot, sensor, y, R_, given in state.get("kept", ()):
+        R = np.array(R_, dtype=np.float64)
+        scan = Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=y, cov=R[None] if given else None)
+        kept.append(Kept(at, k, scan, R))
+    first = state.get("first")
+    return {"kept": kept, "first": None if first is None else tuple(first)}
+
+
+def check_kept(slam: Slam) -> None:
+    """Raise MapError if a sighting that is kept was made from a pose that is not."""
+    for name, t in slam.members.tentative.items():
+        for one in t.kept:
+            view = slam._views.get((one.scan.robot, one.scan.sensor))
+            if view is None or one.at not in view.waiting.poses or one.R.shape != (view.dof, view.dof):
+                raise MapError(f"a sighting of the tentative {name!r} does not fit the poses that are kept")
 
 
 def _name(name: Any, what: str) -> Id | None:

@@ -8,7 +8,7 @@ one fused.  No association looks at them: an observation is compared with them w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,11 +17,12 @@ from scipy.optimize import linear_sum_assignment
 
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import Landmark
+from kalmark.slam import kept
 from kalmark.slam.association import FORBIDDEN
 from kalmark.slam.decisions import ANEW, Decision
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.posterior import JUST_SEEN, room
-from kalmark.slam.report import Observation, Report
+from kalmark.slam.report import Late, Observation, Report
 
 if TYPE_CHECKING:
     from kalmark.slam.scene import View
@@ -46,13 +47,15 @@ class Tentative:
     hits: int = 1
     chances: int = 1
     unseen: int = 0
+    kept: list[kept.Kept] = field(default_factory=list)
+    first: Late | None = None  # the observation that has started it, if its sightings are kept
 
 
 Sightings = tuple[dict[int, Observation], dict[int, Decision]]
 
 
 def sightings(
-    slam: Slam, view: View, event: Scan, new: Sequence[int], decisions: Sequence[Decision], R: Array
+    slam: Slam, view: View, event: Scan, report: Report, new: Sequence[int], decisions: Sequence[Decision], R: Array
 ) -> Sightings:
     """Compare the observations that belong to no landmark with the tentative ones.
 
@@ -63,6 +66,7 @@ def sightings(
     names = [name for name, t in slam.members.tentative.items() if t.kind.kind in view.looks]
     seen: dict[int, Observation] = {}
     confirmed: dict[int, Decision] = {}
+    waiting: dict[int, Id] = {}
     if not rows or not names:
         return seen, confirmed
     lost = np.array([decisions[k][0] is ANEW for k in rows])
@@ -74,23 +78,25 @@ def sightings(
         least = int(np.argmin(d2[i]))
         if column < len(names):
             name = names[column]
-            told = _sighted(slam, view, name)
+            told = _sighted(slam, view, report, name)
             if told:
                 confirmed[k] = (name, told)
             else:
                 t, u = slam.members.tentative[name], view.upkeep
                 why = f"seen in {t.hits} of {t.chances} scans, {u.confirm} of {u.within} make a landmark"
                 seen[k] = Observation(k, None, "tentative", name, float(d2[i, column]), why)
+                waiting[k] = name
         elif d2[i, least] <= gate:
             why = f"its nearest tentative landmark {names[least]!r} is another observation's"
             seen[k] = Observation(k, None, "ignored", None, float(d2[i, least]), why)
         elif d2[i, least] <= far:
             why = f"between {names[least]!r}, which is tentative, and a new one: d2 {d2[i, least]:.1f}"
             seen[k] = Observation(k, None, "ignored", None, float(d2[i, least]), why)
+    kept.keep(slam, view, event, waiting, R)
     return seen, confirmed
 
 
-def _sighted(slam: Slam, view: View, name: Id) -> str:
+def _sighted(slam: Slam, view: View, report: Report, name: Id) -> str:
     """Count a sighting; make a landmark of a tentative one that was seen often enough and say why."""
     members = slam.members
     t = members.tentative[name]
@@ -99,12 +105,15 @@ def _sighted(slam: Slam, view: View, name: Id) -> str:
         return ""
     del members.tentative[name]
     members.start(name, t.slot, t.kind)
+    report.late += (*(() if t.first is None else (t.first,)), *kept.fuse(slam, view, report.robot, t, name))
     return f"confirmed: seen in {t.hits} of {t.chances} scans"
 
 
-def started(slam: Slam, view: View, k: int, name: Id, slot: int, reason: str, held: bool) -> Observation:
+def started(slam: Slam, view: View, event: Scan, k: int, name: Id, slot: int, reason: str, held: bool) -> Observation:
     """Enter the block that observation k has started as a tentative landmark; one that was `held` back is deferred."""
-    slam.members.tentative[name] = Tentative(slot, view.landmark, unseen=-1)
+    t = slam.members.tentative[name] = Tentative(slot, view.landmark, unseen=-1)
+    if view.upkeep.keep_poses:
+        t.first = event.t_ns, event.robot, event.sensor, k
     if held:
         return Observation(k, None, "deferred", name, None, reason)
     return Observation(k, None, "tentative", name, None, f"first sighting: {reason}" if reason else "first sighting")
@@ -126,6 +135,7 @@ def dropped(slam: Slam, view: View, event: Scan, report: Report) -> Report:
             slam.map.remove(t.slot)
             del members.tentative[name]
     report.removed += tuple(gone)
+    kept.forget(slam)
     return report
 
 

@@ -14,7 +14,8 @@ class Upkeep:
 
     An observation without an id that belongs to no landmark starts a *tentative* one, which becomes a landmark when it
     was seen `confirm` times within `within` scans in which it was in the sensor's view, and is dropped when that cannot
-    be any more.  With `confirm` 1 it is one at once.
+    be any more.  With `confirm` 1 it is one at once.  Its sightings are kept with the last `keep_poses` poses they were
+    made from, and fused when it is confirmed (`slam/kept.py`); with 0, the first and the confirming one alone count.
 
     With `merge`, two landmarks that turn out to be one are merged (`slam/merging.py`) when that is `odds` times
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
@@ -32,12 +33,15 @@ class Upkeep:
     odds: float = 100.0
     p_detect: float | None = None
     p_false: float = 0.05
+    keep_poses: int = 0
 
     def __post_init__(self) -> None:
         for name in ("confirm", "within"):
             value = getattr(self, name)
             if type(value) is not int or value < 1:
                 raise ModelError(f"Upkeep: {name} is {value!r}, expected a whole number of at least 1")
+        if type(self.keep_poses) is not int or self.keep_poses < 0:
+            raise ModelError(f"Upkeep: keep_poses is {self.keep_poses!r}, expected a whole number of at least 0")
         if self.within < self.confirm:
             raise ModelError(f"Upkeep: within is {self.within}, expected at least confirm, {self.confirm}")
         if not 1 <= self.odds < math.inf:
