@@ -17,7 +17,7 @@ from kalmark.cli.run import run_log
 from kalmark.results.align import rigid, rmse
 from kalmark.results.evaluate import known_landmarks
 from kalmark.results.run import Run
-from kalmark.results.scoring import FUSED, known_as
+from kalmark.results.scoring import known_as
 
 BESIDE_M = 0.5
 COMMON = ("log.robots",)  # settings that hold for the run with ids as well
@@ -39,7 +39,7 @@ def misplaced(known: Run, hidden: Run) -> int:
     landmarks, history = known_landmarks(known), hidden.history
     at = dict(zip(map(str, landmarks.ids), landmarks.positions()[0], strict=True))
     names, count = known_as(history), 0
-    mine = np.isin(history.outcome, FUSED) & (history.id == "")
+    mine = history.fused & (history.id == "")
     for landmark, true in zip(history.landmark[mine].tolist(), history.true_id[mine].tolist(), strict=True):
         taken = names.get(landmark, true)
         count += taken in at and true in at and float(np.linalg.norm(at[taken] - at[true])) > BESIDE_M
