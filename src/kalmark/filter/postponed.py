@@ -94,13 +94,13 @@ class PostponedMap(Layout):
 
     def mean(self, slot: int) -> Array:
         """Return a copy of a block's mean."""
-        return self._preview(slot)[0] if (at := self._owners.get(slot)) is None else self.active.mean(at)
+        at = self._owners.get(slot)
+        return self.active.mean(at) if at is not None else self._preview(slot)[0]
 
     def first(self, slot: int) -> Array:
         """Return a copy of a block's first estimate, of a robot its last predicted one."""
-        return (
-            self.x_first[self.numbers(slot)].copy() if (at := self._owners.get(slot)) is None else self.active.first(at)
-        )
+        at = self._owners.get(slot)
+        return self.active.first(at) if at is not None else self.x_first[self.numbers(slot)].copy()
 
     def covariance(self, slots: Sequence[int]) -> Array:
         """Return the joint covariance of blocks, in the order given.  Blocks at rest stay there."""
@@ -164,16 +164,14 @@ class PostponedMap(Layout):
         return m, copied[robot], copied.get(mount, -1), here  # type: ignore[return-value]
 
     def _resting_rows(self) -> Index:
-        """Return the rows of the active map that blocks at rest depend on: shadows, robots' turns."""
+        """Return the rows of the active map that blocks at rest depend on: the shadows and the robots' turns."""
         return np.concatenate([self._s, *(self._turn_rows(robot) for robot in self._moved)])
 
     def _turn_rows(self, robot: int) -> Index:
         """Return the rows of what turns the world with a robot: of its orientation, or its whole pose."""
         rows = self._turns.get((robot, self.axes))
         if rows is None:
-            space = self.spaces[robot]
-            assert space is not None
-            last = int(self.active.blocks[self._owners[robot], P_AT]) + (3 if space.axes == 1 else 6)
+            last = int(self.active.blocks[self._owners[robot], P_AT]) + (3 if self.axes == 1 else 6)
             rows = self._turns[robot, self.axes] = np.arange(last - self.axes, last)
         return rows
 
@@ -192,15 +190,13 @@ class PostponedMap(Layout):
 
     def _displacements(self) -> Array:
         """Return the part (A0, R) that each robot's corrections have in the shadows."""
-        if not self._moved:
-            return self.active.x[self._s_x][:, None]
-        return np.column_stack(list(self._moved.values()))
+        moved = list(self._moved.values())
+        return np.column_stack(moved) if moved else self.active.x[self._s_x][:, None]
 
     def _gauges(self) -> tuple[int, Array]:
         """Return the axes of the robots' turns and where the robots stand; without transport there are none."""
-        if not self._moved:
-            return 0, np.zeros((1, 3))
-        return self.axes, np.array([self.active.mean(self._owners[robot])[:3] for robot in self._moved])
+        stand = [self.active.mean(self._owners[robot])[:3] for robot in self._moved]
+        return (self.axes, np.array(stand)) if stand else (0, np.zeros((1, 3)))
 
     # ------------------------------------------------------------------ growing and shrinking
     def add(self, space: Space, mean: Any, cov: Any = None) -> int:
@@ -327,8 +323,7 @@ class PostponedMap(Layout):
         rows = self.active.rows(at)
         shadow = self.active.add(scalars(len(rows)), np.zeros(len(rows)))
         s = self.active.rows(shadow)
-        for i, j in zip(rows, s, strict=True):
-            self.active.P[max(i, j), min(i, j)] = 1.0
+        self.active.P[np.maximum(rows, s), np.minimum(rows, s)] = 1.0
         for name, moved in self._moved.items():
             self._moved[name] = np.concatenate([moved, np.zeros(len(s))])
         self.cast_shadow(slot, shadow)
@@ -352,9 +347,7 @@ class PostponedMap(Layout):
 
     def take_as_moving(self, slot: int) -> None:
         """Take note that an active block moves by itself."""
-        space = self.spaces[slot]
-        assert space is not None
-        self._drift.moves(slot, self.rows(slot)[: 2 if space.axes == 1 else 3])
+        self._drift.moves(slot, self.rows(slot)[: 2 if self.axes == 1 else 3])
 
     def _far(self, robot: int, s: Array) -> bool:
         """Return whether the rest has moved too far for the coordinates in which its errors were left."""
