@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -273,3 +274,32 @@ def test_a_map_known_beforehand_comes_to_rest_as_it_is_read_in() -> None:
         assert slam.map.active.n < 450
     np.testing.assert_array_equal(slam.covariance(7, 399), np.diag([0.01, 0.02, 0.01, 0.02]))
     np.testing.assert_array_equal(slam.mean(7), [7.0, 1.0])
+
+
+def test_a_map_of_many_panels_saved_within_a_flush_goes_on_as_the_one_that_was_not(tmp_path: Path) -> None:
+    rng, side = np.random.default_rng(0), 20
+    points = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2) * 2.0
+    laser = km.Mount(km.sensors.RangeBearing(0.1, 0.02))
+    slam = km.Slam([km.Robot("r", km.motion.Odometry2D(0.01, 0.01, 0.02), sensors={"l": laser})], map="postponed")
+    for i, point in enumerate(points):
+        slam.add_landmark(i, point, 0.01 * np.eye(2))
+    assert isinstance(slam.map, PostponedMap)
+    slam.map.flush()
+    pose, slams = np.zeros(3), [slam]
+    for t in range(120):
+        ahead = pose[:2] + 8 * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        u = np.array([8.0, 0.0, 0.0]) if (ahead > 0).all() and (ahead < 2 * side).all() else np.array([0.0, 0.0, 2.0])
+        pose = km.geometry.compose(pose, u)[0]
+        near = np.argsort(np.linalg.norm(points - pose[:2], axis=1))[:10]
+        y = km.geometry.observe(pose, points[near])[0] + rng.normal(size=(10, 2)) * [0.05, 0.01]
+        y[:, 0] = np.abs(y[:, 0])
+        for each in slams:
+            each.process(km.Control(t, "r", u))
+            each.process(km.Scan(t, "r", "l", y, near.tolist()))
+        if t == 60:
+            slam.save(tmp_path / "map.kmk")
+            slams.append(km.Slam.load(tmp_path / "map.kmk"))
+    assert slams[1].map.phase > 5  # type: ignore[union-attr]  # flushes since
+    for i in range(0, len(points), 7):
+        np.testing.assert_array_equal(slams[1].mean(i), slam.mean(i))
+        np.testing.assert_array_equal(slams[1].covariance("r", i), slam.covariance("r", i))

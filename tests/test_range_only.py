@@ -121,7 +121,7 @@ def test_turning_the_world_turns_the_beacons(way: Any, estimator: Any) -> None:
     assert one.landmarks().ids == other.landmarks().ids != []
     for name in one.landmarks().ids:
         np.testing.assert_allclose(other.mean(name), E @ one.mean(name), atol=1e-6)
-        np.testing.assert_allclose(other.covariance(name), E @ one.covariance(name) @ E.T, atol=1e-6)
+        np.testing.assert_allclose(other.covariance(name), E @ one.covariance(name) @ E.T, rtol=1e-5, atol=1e-6)
 
 
 @way
@@ -213,7 +213,7 @@ def test_the_valley_that_an_unknown_scale_bends_is_no_gaussian_and_waits() -> No
         slam.process(km.Control(t_s=float(t), robot="r", u=u))
         if t % 3 == 0:
             y = 1.1 * np.hypot(*(beacon - pose[:2])) * (1 + 0.1 * rng.normal(size=count))
-            slam.process(km.Scan(t_s=float(t), robot="r", sensor="radio", y=y[:, None], ids=range(count)))
-    for name in slam.landmarks().ids:
-        d = slam.mean(name) - beacon
-        assert float(d @ np.linalg.solve(slam.covariance(name), d)) < 13.8  # 99.9 %
+            scan = km.Scan(t_s=float(t), robot="r", sensor="radio", y=y[:, None], ids=range(count))
+            outcomes = [o.outcome for o in slam.process(scan).observations]
+    assert outcomes == ["deferred"] * count
+    assert len(slam.landmarks()) == 0

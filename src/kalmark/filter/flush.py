@@ -159,7 +159,7 @@ class Room:
         if kept is None or len(kept) < size:
             kept = self._numbers[name] = np.empty(4 * size)  # what is not used takes no memory
             self._used[name] = 0
-        used, more = max(size, self._used[name]), int(MORE * size)
+        used, more = max(size, self._used[name]), min(int(MORE * size), len(kept))
         if more > used:
             self.fresh.put(kept, used, more)
             self._used[name] = more

@@ -23,6 +23,10 @@ class Fresh:
         """Have the numbers first..last of a contiguous array be used in time; what is in them stays."""
         self._waiting.append((ref(array), first, last))
 
+    def forget(self) -> None:
+        """Have nothing wait any more: what is used from here on does not depend on what was before."""
+        self._waiting.clear()
+
     def use_some(self) -> int:
         """Use the next bit of memory; return how many bytes."""
         if not self._waiting:

@@ -364,8 +364,9 @@ class PostponedMap(Layout):
         return bool(self._owners) and self._progress() > (1.0 if self._job is None else 2.0)
 
     def finish(self) -> None:
-        """Finish a flush that is under way, and give back the memory that it needed."""
+        """Finish a flush that is under way, and give back the memory that it needed.  A saved map begins from here."""
         self._complete()
+        self.storage.fresh.forget()
         self._room = Room(self.storage.fresh)
 
     def _complete(self) -> None:
@@ -380,8 +381,7 @@ class PostponedMap(Layout):
         if robot is not None and ds is not None:
             went = {r: (before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
             leap = leap_of(robot, ds, went, list(self._moved), self.axes)
-        m = self.active
-        slots = list(self._owners)
+        m, slots = self.active, list(self._owners)
         A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
         here = np.concatenate([NO_ROWS, *(m.rows(self._owners[slot]) for slot in slots)])
         where = {row: i for i, row in enumerate(here.tolist())}

@@ -24,6 +24,8 @@ TIMES = 3.0  # a window's NIS over the median window's
 LEFT_OUT = 0.5  # share of a window's observations that fit nothing, where the median window has less than half of it
 CORRELATED = 0.5  # by which a window's autocorrelation of innovations exceeds the median window's
 PAIRS = 60  # of successive innovations in a window
+SCANS = 10  # at least, as good as, in a window: the observations of one share the error of the pose
+SCANS_PAIRED = 30  # in a window of pairs
 MOST_GAP_STEPS = 5
 
 
@@ -60,7 +62,7 @@ def nis_windows(history: History) -> list[Window]:
     """Return the NIS per degree of freedom of windows of at least so many degrees, one after the other."""
     used = history.outcome == "associated"
     value, dof = nis(history.z[used], history.Z[used])
-    return _windows(history, history.step[used], np.nan_to_num(value), dof, DEGREES)
+    return _windows(history, history.step[used], np.nan_to_num(value), dof, DEGREES, SCANS)
 
 
 def left_out_windows(history: History) -> list[Window]:
@@ -71,7 +73,7 @@ def left_out_windows(history: History) -> list[Window]:
         history.reason[mine], "it does not"
     )
     wrong = (out | told).astype(np.float64)
-    return _windows(history, history.step[mine], wrong, np.ones(len(wrong), dtype=np.int64), OBSERVATIONS)
+    return _windows(history, history.step[mine], wrong, np.ones(len(wrong), dtype=np.int64), OBSERVATIONS, SCANS)
 
 
 def autocorrelations(history: History) -> list[Window]:
@@ -90,7 +92,7 @@ def autocorrelations(history: History) -> list[Window]:
     both = np.nansum(a * b, axis=1)
     size = np.sqrt(np.nansum(a**2, axis=1) * np.nansum(b**2, axis=1))
     ones = np.ones(len(both), dtype=np.int64)
-    products, sizes = (_windows(history, step, value, ones, PAIRS) for value in (both, size))
+    products, sizes = (_windows(history, step, value, ones, PAIRS, SCANS_PAIRED) for value in (both, size))
     return [
         Window(p.start_s, p.end_s, p.value / max(s.value, 1e-300), p.number)
         for p, s in zip(products, sizes, strict=True)
@@ -108,20 +110,24 @@ def _whitened(history: History, rows: Ints) -> Array:
     return out
 
 
-def _windows(history: History, step: Ints, value: Array, weight: Ints, least: int) -> list[Window]:
-    """Return sums of values over sums of weights, cut each time the weights add up to so much."""
+def _windows(history: History, step: Ints, value: Array, weight: Ints, least: int, scans: int) -> list[Window]:
+    """Return sums of values over sums of weights, cut each time the weights add up to so much.
+
+    A scan counts for no more than one of so many `scans` of a window.
+    """
     if not len(step):
         return []
-    total = np.cumsum(weight)
-    number = (total - weight) // least
+    _, scan = np.unique(step, return_inverse=True)
+    counts = weight * np.minimum(1.0, least / scans / np.maximum(np.bincount(scan, weight), 1.0))[scan]
+    number = ((np.cumsum(counts) - counts) / least + 1e-9).astype(np.int64)
     t = (history.t_ns - history.t_ns[0]) * 1e-9
     out = []
     for i in range(int(number[-1]) + 1):
         mine = number == i
-        if weight[mine].sum() >= 0.9 * least:
+        if counts[mine].sum() >= 0.9 * least:
             first, last = step[mine][0], step[mine][-1]
             share = float(value[mine].sum() / weight[mine].sum())
-            out.append(Window(float(t[first]), float(t[last]), share, int(weight[mine].sum())))
+            out.append(Window(float(t[first]), float(t[last]), share, round(counts[mine].sum())))
     return out
 
 

@@ -274,7 +274,7 @@ class _Joint(_Gated):
         told = np.asarray(near.any(axis=1))
         pairs, reasons, mixed, _ = self.choose(query, names, found, told, lost)
         none = np.where(told, found.none(), np.where(d2.min(axis=1) > far, 1.0, np.nan))
-        if lost and (pairs == HELD_BACK).all():
+        if lost and (pairs == STRANGE).all():  # it has not recognised anything
             return self.anew(np.where(just, d2, np.inf), gate, far, reasons)
         for row in np.flatnonzero(told & (none >= NONE)).tolist() if not lost else ():
             pairs[row], reasons[row] = FRESH, "no landmark is likely there"
@@ -320,7 +320,7 @@ class Automatic(_Joint):
         count = int((found.pairs[0] >= 0).sum())
         if lost and (found.chance > BY_CHANCE or 2 * count <= len(near)):
             why = f"its scan is ambiguous: {count} pairs, {found.chance:.1g} matchings as good are expected by chance"
-            return Matched(np.full(len(near), HELD_BACK), dict.fromkeys(range(len(near)), why))
+            return Matched(np.full(len(near), STRANGE), dict.fromkeys(range(len(near)), why))
         pairs, shares = found.pairs[0].copy(), found.shares()
         unsure = ((shares < self.confidence) | (not found.finished)) & near
         reasons = {row: found.why(row, names) for row in np.flatnonzero(unsure).tolist()}

@@ -38,8 +38,7 @@ def starts(
     slam: Slam, view: View, new: list[int], known: list[int], y: Array, decisions: Sequence[Decision]
 ) -> dict[int, str]:
     """Return why some of the observations that could start landmarks do not."""
-    wanted = [
-        k for k in new if decisions[k][0] not in (None, DEFERRED, ANEW) and decisions[k][0] not in slam.members.slots
-    ]
+    held = [None, *(answer for answer in (DEFERRED, ANEW) if answer not in view.starts)]
+    wanted = [k for k in new if decisions[k][0] not in held and decisions[k][0] not in slam.members.slots]
     image, empty = getattr(view.sensor, "image", None), not slam.members.kinds
     return view.attention.worth_a_start(wanted, known, y, image, empty)

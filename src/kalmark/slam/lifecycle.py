@@ -16,7 +16,7 @@ from kalmark.filter.storage import Triangle
 from kalmark.geometry.spaces import RHO
 from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.protocols import Landmark
-from kalmark.slam import existence, merging, tentative
+from kalmark.slam import existence, kept, merging, tentative
 from kalmark.slam.ends import extended_ends
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.report import Observation, Report
@@ -72,7 +72,11 @@ def tidied(slam: Slam, view: View, event: Scan, report: Report) -> Report:
         report.removed += tuple(existence.gone(slam, view, event, report))
     if event.ids is None or None in event.ids:
         report.merged = tuple(merging.merge(slam, view, event.robot, report.observations))
-    return tentative.dropped(slam, view, event, report) if slam.members.tentative else report
+    if slam.members.tentative:
+        report = tentative.dropped(slam, view, event, report)
+    if view.waiting.poses:
+        kept.forget(slam)
+    return report
 
 
 def simplify(slam: Slam, view: View, robot: str, names: Sequence[Id | None]) -> None:

@@ -80,14 +80,17 @@ class Slam:
         self._views: dict[tuple[str, str], View] = {}
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
         for robot in robots:
+            if robot.name in self.robots:
+                raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
+            self.robots[robot.name] = robot
+        for robot in self.robots.values():
             self._place(robot, landmarks)
         if not self.robots:
             raise ModelError("a Slam needs at least one robot, got none")
 
     def _place(self, robot: Robot, landmarks: Landmark | None) -> None:
-        if robot.name in self.robots:
-            raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
-        self.robots[robot.name] = robot
+        if robot.name in self.members.slots:
+            raise ModelError(f"robot {robot.name!r} has the name of another's bias or mount, expected different names")
         self.refuse_other_world(f"robot {robot.name!r}", robot.motion.space.world)
         self.members.place_robot(robot.name, self.map.add(robot.motion.space, robot.start, robot.cov))
         self._drives[robot.name] = Drive(robot.motion)

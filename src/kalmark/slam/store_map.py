@@ -122,6 +122,7 @@ def _postponed(state: State, phase: State, read: Read) -> PostponedMap:
     for i in range(m.n):
         m.storage.panels[i // PANEL][i % PANEL, : i + 1] = P[i * (i + 1) // 2 : (i + 1) * (i + 2) // 2]
     _activate(m, _dense(phase["active"], read, "active_"), phase, read)
+    m.storage.fresh.forget()  # as where it was saved
     return m
 
 

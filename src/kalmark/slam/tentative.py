@@ -135,7 +135,6 @@ def dropped(slam: Slam, view: View, event: Scan, report: Report) -> Report:
             slam.map.remove(t.slot)
             del members.tentative[name]
     report.removed += tuple(gone)
-    kept.forget(slam)
     return report
 
 
