@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from kalmark.results.explain import Explanation
+from kalmark.results.explain import Compared, Explanation, Fate
 from kalmark.results.history import Array
 from kalmark.results.picture import INK, ellipses
 
@@ -25,6 +25,7 @@ OUTCOME = {
 FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
 PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
+FAR = 30.0  # d2 of a landmark that an observation cannot be of, by whatever gate: it is not drawn, but for the nearest
 ON_LINE: dict[str, Any] = {"ha": "center", "va": "center", "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
@@ -39,7 +40,8 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
     """Return the figure of one scan, from above: axes in metres, in the frame of the map.
 
     Crosses are the observations where they seem to come from before the scan, squares the landmarks they were compared
-    with then; a full line goes to the landmark that was decided on, dotted ones to the others, each with its d2.
+    with then, but for those too far off; a full line goes to the landmark that was decided on, dotted ones to the
+    others, each with its d2.
     """
     figure = Figure(figsize=(9.5, 8.5), layout="constrained", facecolor="white")
     axes = figure.subplots()
@@ -53,7 +55,7 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
         at = float(fate.seen_at[0]), float(fate.seen_at[1])
         axes.plot(*at, "x", color=colour, ms=9, mew=2, zorder=5)
         axes.annotate(str(fate.index), at, (5, 5), textcoords="offset points", color=colour, fontsize=9, zorder=6)
-        for other in fate.compared:
+        for other in _near(fate):
             chosen, there = other.landmark == fate.landmark, (float(other.place[0]), float(other.place[1]))
             axes.plot(*zip(at, there, strict=True), "-" if chosen else ":", color=colour, lw=2 if chosen else 1)
             axes.plot(*there, "s", color=INK, mfc="none", ms=8, zorder=4)
@@ -72,6 +74,12 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
     axes.set_title("\n".join(lines[1:3] if told.gates else lines[1:2]), loc="left", fontsize=9, color=INK)
     figure.legend(handles=_legend(told), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
+
+
+def _near(fate: Fate) -> list[Compared]:
+    """Return what an observation was compared with and may be of, the landmark decided on, and the nearest."""
+    least = min((other.d2 for other in fate.compared), default=0.0)
+    return [c for c in fate.compared if c.d2 <= max(FAR, least) or c.landmark == fate.landmark]
 
 
 def _between(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
@@ -102,7 +110,7 @@ def _landmarks(axes: Axes, run: Run, told: Explanation, low: Array, high: Array)
 def _extent(told: Explanation) -> tuple[Array, Array]:
     """Return the corners (2,) of what is drawn."""
     points = [told.pose[:2], *(f.seen_at[:2] for f in told.fates)]
-    points += [c.place[:2] for f in told.fates for c in f.compared]
+    points += [c.place[:2] for f in told.fates for c in _near(f)]
     shown = np.array([p for p in points if np.isfinite(p).all()])
     low, high = shown.min(axis=0), shown.max(axis=0)
     middle, half = (low + high) / 2, 0.58 * max(float((high - low).max()), LEAST_M)

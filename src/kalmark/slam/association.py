@@ -289,8 +289,6 @@ class _Joint(_Gated):
         cost[:, : d2.shape[1]] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
         columns = linear_sum_assignment(cost)[1]
         pairs = np.where(columns < d2.shape[1], columns, np.where(d2.min(axis=1) > far, STRANGE, HELD_BACK))
-        for row in np.flatnonzero(pairs == STRANGE).tolist():
-            reasons[row] = f"mapped anew: {reasons[row]}"
         return Matched(pairs, reasons, None, np.full(len(d2), np.nan))
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
@@ -320,6 +318,7 @@ class Automatic(_Joint):
         count = int((found.pairs[0] >= 0).sum())
         if lost and (found.chance > BY_CHANCE or 2 * count <= len(near)):
             why = f"its scan is ambiguous: {count} pairs, {found.chance:.1g} matchings as good are expected by chance"
+            why = why if count else "no matching of its scan is likely"
             return Matched(np.full(len(near), STRANGE), dict.fromkeys(range(len(near)), why))
         pairs, shares = found.pairs[0].copy(), found.shares()
         unsure = ((shares < self.confidence) | (not found.finished)) & near
