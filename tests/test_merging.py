@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.slam import merging
 from kalmark.slam.ambiguity import doubtful, gains
 
 ESTIMATORS = [km.estimators.Ekf(), km.estimators.Invariant()]  # for `Fej` the first estimates must be good
@@ -115,3 +116,12 @@ def test_a_merge_resumes_bit_for_bit(tmp_path: Path) -> None:
     assert any(told[0])
     everything = ["cart", *slam.landmarks().ids]
     np.testing.assert_array_equal(slam.covariance(*everything), again.covariance(*everything))
+
+
+def test_a_landmark_seen_without_any_other_may_still_be_one_of_the_map() -> None:
+    slam = slam_of()
+    for name, x in (("u1", 5.0), ("u2", 5.05)):
+        slam.add_landmark(name, [x, 0.0], 0.01 * np.eye(2))
+        slam.members.together[name] = {name}
+    slam.members.lately = ["u2"]
+    assert list(merging._hypotheses(slam, "u2", 2)) == [[("u2", "u1")]]

@@ -149,7 +149,8 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     moved = mine[:, None] + (places[possible] - at)  # (C, L, d): the company, were the landmark the l-th that it may be
     gaps: Any = cKDTree(places).query(moved)
     found, nearest = gaps[0], gaps[1]
-    alone = np.array([[o in together[c] or o == c for o in others] for c in company]).reshape(len(company), len(others))
+    alone = np.array([[o in together[c] or o == c for o in others] for c in company], dtype=np.bool_)
+    alone = alone.reshape(len(company), len(others))
     found[np.take_along_axis(alone, nearest, axis=1)] = np.inf
     slack = SLACK_M + SLACK_RAD * np.linalg.norm(mine - at, axis=1)[:, None]
     score = np.maximum(1.0 - found / slack, 0.0).sum(axis=0)
