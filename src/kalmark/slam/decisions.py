@@ -17,7 +17,7 @@ from kalmark.slam.posterior import Posterior, Together
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-HELD_BACK, FRESH, MIXED, STRANGE = -2, -3, -4, -5  # in the place of a pair
+HELD_BACK, FRESH, MIXED, STRANGE = -2, -3, -4, -5  # in the place of a pair: DEFERRED, NEW, a Mixture, ANEW
 
 
 class New:
