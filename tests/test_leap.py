@@ -57,6 +57,9 @@ def test_a_leap_is_told_by_what_it_parts_and_not_by_how_far_it_goes() -> None:
     rows = map_.index(robot)
     point = map_.augment(km.landmarks.Point2D().space, np.array([4.0, 1.0]), rows, np.eye(2, 3), np.eye(2) * 0.01**2)
     straight, turned, little = np.array([0.0, 1.0, 0.1]), np.array([0.0, 1.0, 0.3]), np.array([2.999, 1.0, 0.101])
-    told = [leap.leapt(map_, robot, before, [robot, point]) for before in (straight, turned, little)]
+    points = leap.Points()
+    told = [points.parted(map_, robot, before) for before in (straight, turned, little)]
     assert told == [False, True, False], "3 m without a turn part nothing, 3 m and .2 rad .3 m, 1 mm and 1 mrad .5 um"
-    assert not leap.leapt(map_, robot, turned, [robot]), "nothing is known from the robot"
+    map_.remove(point)
+    points.look_again()
+    assert not points.parted(map_, robot, turned), "nothing is known from the robot"

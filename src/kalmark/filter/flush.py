@@ -7,6 +7,7 @@ corrected by what is still to come; that makes a slice as long or as short as on
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ Index = npt.NDArray[np.int64]
 
 ROWS = 8  # of the active blocks, to write at once
 WRITING = 60  # multiplications that take as long as to write a number there
-GATHERING = 600  # and as to gather a number from the storage
+GATHERING = 1500  # and as to gather a number from the storage
 MORE = 1.5  # times the memory that a flush has needed: the next one may
 
 
@@ -53,6 +54,39 @@ def turned(atoms: Table, x: Array, d: Array, turn: Array, axes: int, origin: Arr
     x, a = x.copy(), -generator(atoms, x, len(d), axes, origin)
     retract(atoms, x, d, turn)
     return x, a + generator(atoms, x, len(d), axes, origin)
+
+
+@dataclass(frozen=True)
+class Leap:
+    """A correction that is applied as in the dense filter: by which robot (its column of S), what the corrections
+    before it had displaced, S (A0, R), the shadows' part ds, how it turns the world, and what it did to the robots'
+    turns, e' d (R axes,).  Of shadows and robots there may be more since.
+    """
+
+    robot: int
+    S: Array
+    ds: Array
+    turn: Array
+    turns: Array
+
+
+def carried(
+    atoms: Table, x: Array, G: Array, S: Array, leaps: Sequence[Leap], axes: int, origins: Array
+) -> tuple[Array, Array]:
+    """Carry the mean x along with displacements S (A0, R) and leaps among them; return it and a as `displaced` does."""
+    a, before = np.zeros((len(G), S.shape[1] * axes)), np.zeros(S.shape)
+    for leap in leaps:
+        now = np.zeros(S.shape)
+        now[: leap.S.shape[0], : leap.S.shape[1]] = leap.S
+        x, more = displaced(atoms, x, G @ (now - before), axes, origins)
+        a += more
+        d = G[:, : len(leap.ds)] @ leap.ds + a[:, : len(leap.turns)] @ leap.turns
+        x, more = turned(atoms, x, d, leap.turn, axes, origins[leap.robot])
+        a[:, leap.robot * axes : (leap.robot + 1) * axes] += more
+        before = now
+        before[: len(leap.ds), leap.robot] += leap.ds
+    x, more = displaced(atoms, x, G @ (S - before), axes, origins)
+    return x, a + more
 
 
 @compiled
@@ -100,7 +134,8 @@ class Phase:
     """What a phase leaves behind: its rows A0 of the storage and those, A, of its active blocks at the end.
 
     `Psi` (A0, A0), `Phi` (A, A0) and P_AA as in docs/postponed.md, the displacements `S` (A0, R) that each robot's
-    corrections have caused, the rows of A in which the robots' turns are (R axes,), where they stand, and the axes.
+    corrections have caused, the leaps among these, the rows of A in which the robots' turns are (R axes,), where they
+    stand, and the axes.
     """
 
     A0: Index
@@ -109,30 +144,21 @@ class Phase:
     Phi: Array
     P_AA: Array
     S: Array
+    leaps: Sequence[Leap]
     thetas: Index
     origins: Array
     axes: int
 
 
-@dataclass(frozen=True)
-class Leap:
-    """A last correction that is applied as in the dense filter: by which robot (its column of S), the shadows' part ds,
-    how it turns the world, and what it did to the robots' turns, e' d (R axes,).
-    """
-
-    robot: int
-    ds: Array
-    turn: Array
-    turns: Array
-
-
-def leap_of(robot: int, ds: Array, moved: dict[int, tuple[Array, Array]], robots: list[int], axes: int) -> Leap:
+def leap_of(
+    robot: int, S: Array, ds: Array, moved: dict[int, tuple[Array, Array]], robots: list[int], axes: int
+) -> Leap:
     """Return a robot's last correction as one that turns the world; `moved` has the means before and after it."""
     turns = {r: turn_of(before, after, axes) for r, (before, after) in moved.items()}
     turn = turns[robot].copy()
     if axes == 6:
         turn[:3] += np.cross(moved[robot][0][:3], turn[3:])
-    return Leap(robots.index(robot), ds, turn, np.concatenate([turns[r] for r in robots]))
+    return Leap(robots.index(robot), S, ds, turn, np.concatenate([turns[r] for r in robots]))
 
 
 def turn_of(before: Array, after: Array, axes: int) -> Array:
@@ -169,8 +195,8 @@ class Room:
 class Flush:
     """P_BB <- P_BB - W W', P_AB, P_AA and the means, in slices."""
 
-    def __init__(self, map_: Layout, storage: Triangle, phase: Phase, leap: Leap | None, room: Room) -> None:
-        self.map, self.storage, self.phase, self.leap = map_, storage, phase, leap
+    def __init__(self, map_: Layout, storage: Triangle, phase: Phase, room: Room) -> None:
+        self.map, self.storage, self.phase = map_, storage, phase
         self.x_before, self.n = map_.x[: map_.x_n].copy(), map_.n
         self.where: Index = np.full(self.n, -1)
         self.where[phase.A] = np.arange(len(phase.A))
@@ -256,12 +282,7 @@ class Flush:
         atoms = atoms - np.array([0, where.start, first])
         rows = np.arange(first, last)
         G = self.storage.get(rows, p.A0)
-        x, a = displaced(atoms, self.x_before[where], G @ p.S, p.axes, p.origins)
-        if self.leap is not None:
-            leap, columns = self.leap, slice(self.leap.robot * p.axes, (self.leap.robot + 1) * p.axes)
-            d = G @ leap.ds + a @ leap.turns
-            x, a_leap = turned(atoms, x, d, leap.turn, p.axes, p.origins[leap.robot])
-            a[:, columns] += a_leap
+        x, a = carried(atoms, self.x_before[where], G, p.S, p.leaps, p.axes, p.origins)
         V = G @ p.Phi.T
         w = V[:, p.thetas] + a @ (0.5 * p.P_AA[np.ix_(p.thetas, p.thetas)])
         new = ~self.known[rows]

@@ -7,40 +7,56 @@ to |phi| |d| / 2, where they may be known from each other to centimetres.  It ha
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.filter.drift import TAU
-from kalmark.filter.flush import turn_of
-from kalmark.filter.map import StochasticMap
+from kalmark.compiled import compiled
+from kalmark.filter.map import P_AT, StochasticMap
+from kalmark.geometry.angles import wrap
 from kalmark.geometry.spaces import VECTOR, VECTOR3
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
 
-EXACT_M = 1e-4  # nothing is known better than that
-
-
-def leapt(active: StochasticMap, robot: int, before: Array, others: Iterable[int]) -> bool:
-    """Return whether the correction that has moved a robot from `before` parts active blocks from those at rest.
-
-    By more than TAU of the least sigma of a point among the `others` (slots), as seen from the robot.
-    """
-    after, d = active.mean(robot), 2 if active.axes == 1 else 3
-    turn = turn_of(before, after, active.axes)[-3:].tolist()
-    apart = 0.5 * math.hypot(*turn) * math.dist(after[:d].tolist(), before[:d].tolist())
-    if apart <= TAU * EXACT_M:
-        return False
-    points = [active.rows(slot)[:d] for slot in others if _is_point(active, slot)]
-    if not points:
-        return False
-    l, r = np.array(points), active.rows(robot)[:d]
-    P = active.P
-    variances = P[l, l] + P[r, r] - 2.0 * P[np.maximum(l, r), np.minimum(l, r)]
-    return apart > TAU * max(EXACT_M, float(np.sqrt(np.maximum(variances.sum(axis=1), 0.0)).min()))
+PARTED = 0.25  # of the least sigma of an active point as seen from the robot: its variance grows by a sixteenth
 
 
-def _is_point(active: StochasticMap, slot: int) -> bool:
-    space = active.spaces[slot]
-    return space is not None and space.kinds in ((VECTOR,), (VECTOR3,))
+class Points:
+    """The points of an active map, which a correction may part from what is at rest."""
+
+    def __init__(self) -> None:
+        self._rows: Index | None = None  # the first one of each
+
+    def look_again(self) -> None:
+        """Take note that blocks have come or gone."""
+        self._rows = None
+
+    def parted(self, m: StochasticMap, robot: int, before: Array) -> bool:
+        """Return whether the correction of the active map m that has moved a robot from `before` has done so."""
+        if self._rows is None:
+            slots = [slot for slot, space in enumerate(m.spaces) if space is not None and space.kinds in _POINTS]
+            self._rows = m.blocks[np.array(slots, dtype=np.int64), P_AT]
+        r, x = int(m.blocks[robot, P_AT]), m.x[m.numbers(robot)]
+        return bool(_parts(m.P, r, self._rows, before, x, 2 if m.axes == 1 else 3))
+
+
+_POINTS = ((VECTOR,), (VECTOR3,))
+
+
+@compiled
+def _parts(P: Array, r: int, points: Index, before: Array, now: Array, d: int) -> bool:
+    """Return whether a turn and a move part points further than they are known from the robot, whose first row is r."""
+    moved = 0.0
+    for i in range(d):
+        moved += (now[i] - before[i]) ** 2
+    flat = d == 2
+    turn = abs(wrap(now[2] - before[2])) if flat else 2.0 * math.acos(min(1.0, abs((now[3:7] * before[3:7]).sum())))
+    apart = 0.5 * turn * math.sqrt(moved) / PARTED
+    for l in points:
+        variance = 0.0
+        for i in range(d):
+            variance += P[l + i, l + i] + P[r + i, r + i] - 2.0 * P[max(l, r) + i, min(l, r) + i]
+        if variance < apart * apart:
+            return True
+    return False

@@ -192,13 +192,13 @@ class StochasticMap(Layout):
             P[:capacity, :capacity] = self.P
             self.P = P
 
-    def prepare(self) -> None:
-        """Have a larger buffer ready in time."""
+    def prepare(self) -> int:
+        """Have a larger buffer ready in time; return how many bytes of it were used for the first time now."""
         if self._next is None and 2 * self.n > len(self.P):
             size = next_capacity(len(self.P))
             self._next = np.zeros((size, size))
             self.fresh.put(self._next, 0, size * size)
-        self.fresh.use_some()
+        return self.fresh.use_some()
 
     # ------------------------------------------------------------------ moving
     def predict(self, index: Index, F: Array, Q: Array) -> None:

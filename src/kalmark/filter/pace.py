@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-SLICE = 1.2e8  # multiplications of a flush to do after a correction at most, some 6 ms: less falls behind and hurries
+SLICE = 0.9e8  # multiplications of a flush to do after a correction at most, some 6 ms: less falls behind and hurries
 DEAR = 80.0  # multiplications of a flush that take as long as a correction of one more element of the active map
 USING = 45.0  # multiplications that take as long as to use a byte of memory for the first time
 START = 5e7  # multiplications that take as long as to begin a flush

@@ -21,10 +21,11 @@ import numpy.typing as npt
 
 from kalmark.filter import kernels
 from kalmark.filter.drift import Drift
-from kalmark.filter.flush import Flush, Phase, Room, displaced, leap_of
-from kalmark.filter.leap import leapt
+from kalmark.filter.flush import Flush, Leap, Phase, Room, carried, leap_of
+from kalmark.filter.leap import Points
 from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
 from kalmark.filter.pace import USING, Pace
+from kalmark.filter.reading import excerpt, joint
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import RHO, Rn, Space
 
@@ -68,7 +69,8 @@ class PostponedMap(Layout):
         self._gone: list[tuple[int, Space]] = []  # removed, their shadows are still here
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of what turned the world with them
-        self._drift, self._pace = Drift(), Pace(self.most)
+        self._drift, self._pace, self._points = Drift(), Pace(self.most), Points()
+        self._leaps: list[Leap] = []
         self._before: dict[int, Array] = {}
 
     @classmethod
@@ -104,29 +106,7 @@ class PostponedMap(Layout):
 
     def covariance(self, slots: Sequence[int]) -> Array:
         """Return the joint covariance of blocks, in the order given.  Blocks at rest stay there."""
-        ats = [self._owners.get(slot) for slot in slots]
-        if all(at is not None for at in ats):
-            return kernels.submatrix(self.active.P, np.concatenate([self.active.rows(at) for at in ats]))  # type: ignore[arg-type]
-        rows, extra = [self.rows(slot) for slot in slots], self._resting_rows()
-        own = [NO_ROWS if at is None else self.active.rows(at) for at in ats]
-        index = np.concatenate([extra, *own])
-        starts, place = np.cumsum([0, *(len(r) for r in rows)]), len(extra)
-        T, Q = np.zeros((starts[-1], len(index))), np.zeros((starts[-1], starts[-1]))
-        resting = [i for i, at in enumerate(ats) if at is None]
-        if self._job is not None:
-            for i in resting:
-                self._job.know(slots[i])
-        for i, slot in enumerate(slots):
-            here = slice(starts[i], starts[i + 1])
-            if i in resting:
-                T[here, : len(extra)] = self._preview(slot)[1]
-                for j in resting:
-                    Q[here, starts[j] : starts[j + 1]] = self._read(rows[i], rows[j])
-            else:
-                T[here, place : place + len(rows[i])] = np.eye(len(rows[i]))
-                place += len(rows[i])
-        C = T @ (kernels.submatrix(self.active.P, index) @ T.T) + Q
-        return 0.5 * (C + C.T)
+        return joint(self, slots)
 
     def means(self, slots: Index, d: int) -> Array:
         """Return the first d numbers (K, d) of blocks."""
@@ -134,6 +114,8 @@ class PostponedMap(Layout):
 
     def places(self, slots: Index, d: int) -> Array:
         """Return the first d numbers (K, d), a place, of blocks at rest: x_B = x0_B + P0_BA theta."""
+        if self._leaps:
+            return self.means(slots, d)
         rows = (self.blocks[slots, P_AT][:, None] + np.arange(d)).ravel()
         if self._job is not None:
             for slot in slots.tolist():
@@ -152,16 +134,7 @@ class PostponedMap(Layout):
 
     def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
         """Return a dense map to read these blocks from, and their slots there; blocks at rest stay there."""
-        at = self._at[slots]
-        if robot in self._owners and (mount < 0 or mount in self._owners) and (not len(at) or at.min() >= 0):
-            return self.active, self._owners[robot], self._owners.get(mount, -1), at
-        copied, m = dict.fromkeys([robot, *([mount] if mount >= 0 else []), *slots.tolist()]), StochasticMap()
-        for slot in copied:
-            copied[slot] = m.add(self.spaces[slot], self.mean(slot))
-        P = self.covariance(list(copied))
-        m.P[: m.n, : m.n], m.axes = P, self.axes
-        here = np.array([copied[slot] for slot in slots.tolist()], dtype=np.int64)
-        return m, copied[robot], copied.get(mount, -1), here  # type: ignore[return-value]
+        return excerpt(self, robot, mount, slots)
 
     def _resting_rows(self) -> Index:
         """Return the rows of the active map that blocks at rest depend on: the shadows and the robots' turns."""
@@ -185,7 +158,7 @@ class PostponedMap(Layout):
         if self._job is not None:
             self._job.know(slot)
         G = self._read(rows, self._A0)
-        x, a = displaced(space.atoms, self.x[self.numbers(slot)], G @ self._displacements(), *self._gauges())
+        x, a = carried(space.atoms, self.x[self.numbers(slot)], G, self._displacements(), self._leaps, *self._gauges())
         return x, np.hstack([G, a]), self._read(rows, rows)
 
     def _displacements(self) -> Array:
@@ -225,6 +198,7 @@ class PostponedMap(Layout):
             self.active.remove(self._owners.pop(slot))
             self._at[slot] = -1
             self._drift.forget(slot)
+            self._points.look_again()
         space = self.spaces[slot]
         assert space is not None
         self._vacate(slot)
@@ -245,6 +219,7 @@ class PostponedMap(Layout):
     def _activate(self, slot: int, at: int) -> None:
         self._owners[slot] = self._at[slot] = at
         self.active.axes = self.axes
+        self._points.look_again()
 
     def _first_row(self, dof: int) -> int:
         """Return where the rows of a new block begin: no block lies in two panels.  Raises MapError if none fits."""
@@ -297,14 +272,16 @@ class PostponedMap(Layout):
             s, before = m.x[self._s_x], self._moved.get(robot, 0.0)
             others = [moved for other, moved in self._moved.items() if other != robot]
             self._moved[robot] = now = s - sum(others) if others else s
-            leaps = leapt(m, self._owners[robot], self._before[robot], self._owners.values())
-            if len(self._owners) < self.used and (leaps or self._far(robot, s)):
-                self.flush(robot, now - before)
+            parted = self._points.parted(m, self._owners[robot], self._before[robot])
+            if len(self._owners) < self.used and (parted or (not self._leaps and self._far(robot, s))):
+                self.leap(robot, now - before)
+            if self._leaps and self._job is None:
+                self.flush()
         self._pace.count(m.n)
-        m.prepare()
-        used = self.storage.fresh.use_some()
+        used = m.prepare() or self.storage.fresh.use_some()
         if (job := self._job) is not None:
-            job.advance(self._pace.due(self._progress(), job.spent, job.work) - USING * used)
+            progress = max(self._progress(), 1.0 if self._leaps else 0.0)
+            job.advance(self._pace.due(progress, job.spent, job.work) - USING * used)
             self._job = None if job.done else job
 
     def _enter(self, slot: int) -> None:
@@ -356,6 +333,16 @@ class PostponedMap(Layout):
             m.P, self._turn_rows(robot), m.x, s, lambda rows, first: self._read(rows, self._A0[first:])
         )
 
+    def leap(self, robot: int, ds: Array) -> None:
+        """Have the last correction, ds by `robot`, be applied to all blocks at rest as the dense filter does.
+
+        Their means follow at once; a flush comes as soon as none is under way.
+        """
+        went = {r: (before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
+        S = self._displacements()
+        S[:, list(self._moved).index(robot)] -= ds
+        self._leaps.append(leap_of(robot, S, ds, went, list(self._moved), self.axes))
+
     # ------------------------------------------------------------------ flushing
     def _progress(self) -> float:
         return self._pace.progress(self.active.n, len(self._A0), self.n)
@@ -366,6 +353,9 @@ class PostponedMap(Layout):
     def finish(self) -> None:
         """Finish a flush that is under way, and give back the memory that it needed.  A saved map begins from here."""
         self._complete()
+        if self._leaps:
+            self.flush()
+            self._complete()
         self.storage.fresh.forget()
         self._room = Room(self.storage.fresh)
 
@@ -374,24 +364,18 @@ class PostponedMap(Layout):
             self._job.advance(1e300)
         self._job = None
 
-    def flush(self, robot: int | None = None, ds: Array | None = None) -> None:
-        """Bring all blocks to rest.  The last correction, ds by `robot`, is applied as the dense filter does."""
+    def flush(self) -> None:
+        """Bring all blocks to rest."""
         self._complete()
-        leap = None
-        if robot is not None and ds is not None:
-            went = {r: (before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
-            leap = leap_of(robot, ds, went, list(self._moved), self.axes)
         m, slots = self.active, list(self._owners)
         A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
         here = np.concatenate([NO_ROWS, *(m.rows(self._owners[slot]) for slot in slots)])
         where = {row: i for i, row in enumerate(here.tolist())}
         turns = np.array([where[row] for r in self._moved for row in self._turn_rows(r).tolist()], dtype=np.int64)
-        joint = kernels.submatrix(m.P, np.concatenate([here, self._s]))
+        P = kernels.submatrix(m.P, np.concatenate([here, self._s]))
         n, S, (axes, origins) = len(here), self._displacements(), self._gauges()
-        if leap is not None:
-            S[:, leap.robot] -= leap.ds
-        phase = Phase(self._A0, A, -joint[n:, n:], joint[:n, n:], joint[:n, :n], S, turns, origins, axes)
-        self._job = Flush(self, self.storage, phase, leap, self._room)
+        phase = Phase(self._A0, A, -P[n:, n:], P[:n, n:], P[:n, :n], S, self._leaps, turns, origins, axes)
+        self._job = Flush(self, self.storage, phase, self._room)
         for slot in slots:
             at = self._owners[slot]
             self.x[self.numbers(slot)], self.x_first[self.numbers(slot)] = m.mean(at), m.first(at)
