@@ -94,9 +94,9 @@ def test_config_prints_a_shipped_configuration_to_start_from(kalmark: Kalmark, t
 def test_a_truth_of_other_columns_is_told_both_poses(kalmark: Kalmark, tmp_path: Path) -> None:
     log = write_log(tmp_path / "log")
     truth = (log / "truth.csv").read_text()
-    (log / "truth.csv").write_text(truth.replace("theta_rad", "theta", 1))
+    (log / "truth.csv").write_text(truth.replace("theta_rad", "thta_rad", 1))
     assert kalmark("run", "native", "--log", "log").err == (
-        "kalmark: log/truth.csv:1: columns x_m, y_m, theta, expected either x_m, y_m, theta_rad or "
+        "kalmark: log/truth.csv:1: columns x_m, y_m, thta_rad, expected either x_m, y_m, theta_rad or "
         "x_m, y_m, z_m, qx, qy, qz, qw; did you mean 'theta_rad'?\n"
     ).replace("log/", f"{log}/")
 

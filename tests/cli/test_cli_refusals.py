@@ -83,7 +83,8 @@ def test_a_robot_or_sensor_without_configuration_is_refused(kalmark: Kalmark, lo
     config.write_text("log: {path: log}\nrobots:\n  each: {sensors: {radar: {type: range_bearing}}}\n")
     message = refused(kalmark("run", config))
     assert message == (
-        f"{log}: rover has scans of the sensor 'lidar', expected one of radar; add robots.each.sensors.lidar"
+        f"{log / 'scans.csv'}:2: rover has scans of the sensor 'lidar', expected one of radar; "
+        "if it is another one, add robots.each.sensors.lidar"
     )
     assert not (tmp_path / "out").exists()
 
@@ -91,15 +92,60 @@ def test_a_robot_or_sensor_without_configuration_is_refused(kalmark: Kalmark, lo
 def test_a_motion_that_does_not_fit_the_controls_is_refused(kalmark: Kalmark, log: Path) -> None:
     message = refused(kalmark("run", "native", "--log", log, "--set", "robots.each.motion.type=odometry_2d"))
     assert message == (
-        f"{log}: the controls of rover have the columns v_mps, w_radps, expected dx_m, dy_m, dtheta_rad of its motion "
-        "odometry_2d; try --set robots.each.motion.type=unicycle"
+        f"{log / 'controls.csv'}:1: the controls of rover have the columns v_mps, w_radps, expected dx_m, dy_m, "
+        "dtheta_rad of its motion odometry_2d; try --set robots.each.motion.type=unicycle"
     )
     controls = (log / "controls.csv").read_text()
-    (log / "controls.csv").write_text(controls.replace("v_mps", "v", 1))
+    (log / "controls.csv").write_text(controls.replace("v_mps", "v_mp", 1))
     message = refused(kalmark("run", "native", "--log", log))
     assert message == (
-        f"{log}: the controls of rover have the columns w_radps, v, expected v_mps, w_radps of its motion unicycle"
+        f"{log / 'controls.csv'}:1: the controls of rover have the columns w_radps, v_mp, expected v_mps, w_radps of "
+        "its motion unicycle; did you mean v_mps?"
     )
+
+
+def test_scans_that_do_not_fit_their_sensor_are_refused_not_taken_in_another_order(kalmark: Kalmark, log: Path) -> None:
+    message = refused(kalmark("run", "native", "--log", log, "--set", "robots.each.sensors.lidar.type=range"))
+    assert message == (
+        f"{log / 'scans.csv'}:1: the scans of rover by lidar have the columns range_m, bearing_rad, expected range_m "
+        "of its type range; try --set robots.each.sensors.lidar.type=range_bearing"
+    )
+    scans = (log / "scans.csv").read_text()
+    (log / "scans.csv").write_text(scans.replace("range_m", "rage_m", 1))
+    message = refused(kalmark("run", "native", "--log", log))
+    assert message == (
+        f"{log / 'scans.csv'}:1: the scans of rover by lidar have the columns bearing_rad, rage_m, expected range_m, "
+        "bearing_rad of its type range_bearing; did you mean range_m?"
+    )
+
+
+def test_a_misspelt_sensor_in_one_line_is_refused_by_file_and_line(kalmark: Kalmark, log: Path) -> None:
+    lines = (log / "scans.csv").read_text().splitlines()
+    lines[7] = lines[7].replace("lidar", "lidr")
+    (log / "scans.csv").write_text("\n".join(lines) + "\n")
+    assert refused(kalmark("run", "native", "--log", log)) == (
+        f"{log / 'scans.csv'}:8: rover has scans of the sensor 'lidr', expected one of lidar; "
+        "if it is another one, add robots.each.sensors.lidr"
+    )
+
+
+@pytest.mark.parametrize(("name", "line"), [("controls.csv", 5), ("scans.csv", 8)])
+def test_a_misspelt_robot_in_one_line_is_refused_or_left_out(
+    kalmark: Kalmark, log: Path, tmp_path: Path, name: str, line: int
+) -> None:
+    lines = (log / name).read_text().splitlines()
+    lines[line - 1] = lines[line - 1].replace("rover", "rovr")
+    (log / name).write_text("\n".join(lines) + "\n")
+    told = (
+        f"{log / name}:{line}: robot 'rovr' is in no other file of the log, expected 'rover'; "
+        "if both are robots, ask for them: log.robots=[rover,rovr]"
+    )
+    assert refused(kalmark("run", "native", "--log", log)) == told
+    assert not (tmp_path / "out").exists()
+    done = kalmark("run", "native", "--log", log, "--on-error", "skip")
+    assert (done.status, done.out.count(told)) == (0, 1)
+    assert [*json.loads((tmp_path / "out" / "native" / "summary.json").read_text())["robots"]] == ["rover"]
+    assert kalmark("run", "native", "--log", log, "--set", "log.robots=[rover,rovr]").status == 0
 
 
 @pytest.mark.parametrize(
@@ -170,7 +216,7 @@ def test_run_prints_what_to_look_at_twice_after_the_table(kalmark: Kalmark, log:
     (log / "scans.csv").write_text("\n".join(nameless) + "\n")
     done = kalmark("run", "native", "--log", log)
     assert done.status == 0
-    line = "60 observations have no id and were ignored; try --set association.type=nearest"
+    line = "60 observations have no id and were ignored; try --set association.type=auto"
     assert f"warning: {line}" in done.out.splitlines()
     assert line in json.loads((tmp_path / "out" / "native" / "summary.json").read_text())["warnings"]
 

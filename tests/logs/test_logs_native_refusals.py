@@ -76,6 +76,80 @@ def test_a_bad_row_is_refused_with_file_line_value_and_expectation(what: str, tm
     assert "\n" not in message
 
 
+WITHOUT_UNIT = {
+    ("scans", "range_m", "range"): "range_m, in metres",
+    ("scans", "range_m", "range_mm"): "range_m, in metres",
+    ("scans", "range_m", "Range [m]"): "range_m, in metres",
+    ("scans", "bearing_rad", "bearing"): "bearing_rad, in radians",
+    ("scans", "bearing_rad", "bearing_deg"): "bearing_rad, in radians",
+    ("scans", "t_s", "t_ms"): "t_s, in seconds",
+    ("scans", "robot", "Robot"): "robot",
+    ("controls", "v_mps", "v"): "v_mps, in m/s",
+    ("controls", "w_radps", "w_degps"): "w_radps, in rad/s",
+    ("truth", "x_m", "x"): "x_m, in metres",
+    ("truth", "theta_rad", "theta_deg"): "theta_rad, in radians",
+    ("landmarks", "y_m", "y"): "y_m, in metres",
+}
+"""By file, column and what stands for it: what is expected."""
+
+
+@pytest.mark.parametrize(("file", "column", "given"), WITHOUT_UNIT)
+def test_a_column_in_another_unit_or_in_none_is_refused_with_the_one_expected(
+    file: str, column: str, given: str, tmp_path: Path
+) -> None:
+    truth, landmarks = "t_s,robot,x_m,y_m,theta_rad\n0.1,rover,1,2,0\n", "id,x_m,y_m\n7,1,2\n"
+    native(tmp_path, truth=truth, landmarks=landmarks)
+    path = tmp_path / f"{file}.csv"
+    path.write_text(path.read_text().replace(column, given, 1))
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    assert str(refused.value) == (
+        f"{path}:1: column {given!r} is unknown, expected {WITHOUT_UNIT[file, column, given]}"
+    )
+
+
+def test_columns_of_ones_own_sensor_are_read_whatever_they_are_called(tmp_path: Path) -> None:
+    log = open_log(native(tmp_path, scans="t_s,robot,sensor,id,flight_ms,sine\n0.2,rover,sonar,7,25,0.3\n"))
+    assert log.sensor_columns == {("rover", "sonar"): ("flight_ms", "sine")}
+
+
+@pytest.mark.parametrize(("separator", "name"), [(";", "';'"), ("\t", "tabs"), ("|", "'|'"), (" ", "blanks")])
+def test_a_file_separated_by_something_else_than_commas_is_told_so(separator: str, name: str, tmp_path: Path) -> None:
+    native(tmp_path, scans=SCANS.replace(",", separator))
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    assert str(refused.value) == (
+        f"{tmp_path / 'scans.csv'}:1: the cells seem to be separated by {name}, expected commas"
+    )
+
+
+def test_robots_in_one_file_alone_are_their_own_if_numbered_seen_true_or_asked_for(tmp_path: Path) -> None:
+    def controls(*robots: str) -> str:
+        return "t_s,robot,v_mps,w_radps\n" + "".join(f"0.1,{robot},1,0\n" for robot in robots)
+
+    def scans(id_: str) -> str:
+        return f"t_s,robot,sensor,id,range_m,bearing_rad\n0.1,rover_a,lidar,{id_},4,0\n"
+
+    native(tmp_path, controls=controls("rover_a", "rover_b"), scans=scans("7"))
+    with pytest.raises(LogError, match=r"controls.csv:3: robot 'rover_b' is in no other file .*, expected 'rover_a'"):
+        open_log(tmp_path)
+    assert open_log(tmp_path, robots=["rover_a", "rover_b"]).robots == ("rover_a", "rover_b")
+    log = open_log(tmp_path, on_error="skip")
+    assert (log.robots, len(log.skipped)) == (("rover_a",), 1)
+    native(tmp_path, controls=controls("rover_a", "rover_b"), scans=scans("rover_b"))
+    assert open_log(tmp_path).robots == ("rover_a", "rover_b")
+    native(
+        tmp_path,
+        controls=controls("rover_a", "rovers"),
+        scans=scans("7"),
+        truth="t_s,robot,x_m,y_m,theta_rad\n0,rovers,1,2,0\n",
+    )
+    assert open_log(tmp_path).robots == ("rover_a", "rovers")
+    (tmp_path / "truth.csv").unlink()
+    native(tmp_path, controls=controls("rover_1", "rover_2"), scans=scans("7").replace("rover_a", "rover_1"))
+    assert open_log(tmp_path).robots == ("rover_1", "rover_2")
+
+
 OTHER_FILES = {
     "controls.csv": ("t_s,robot,v_mps,w_radps\n0.1,r,nan,0\n", 2, "v_mps is 'nan'"),
     "controls.csv without values": ("t_s,robot,v_mps,w_radps\n0.1,r,,\n", 2, "no value in the row"),
@@ -89,7 +163,7 @@ OTHER_FILES = {
     "truth.csv with a bad quaternion": ("t_s,robot,x_m,y_m,z_m,qx,qy,qz,qw\n1,r,0,0,0,0,0,0,2\n", 2, "norm 2"),
     "landmarks.csv": ("id,x_m,y_m\n1,2,3\n1,4,5\n", 3, "already"),
     "landmarks.csv without id": ("id,x_m,y_m\n,2,3\n", 2, "id is empty"),
-    "landmarks.csv with a typo": ("id,x_m,y_n\n1,2,3\n", 1, "did you mean 'y_n'"),
+    "landmarks.csv with a typo": ("id,x_m,y_n\n1,2,3\n", 1, "did you mean 'y_m'"),
     "gps.csv": ("t_s,robot,x_m,y_m,antenna_x_m,antenna_y_m\n1,r,0,0,1,1\n2,r,0,0,1,2\n", 3, "antenna"),
 }
 

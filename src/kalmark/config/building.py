@@ -8,18 +8,17 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from kalmark.config.classes import CLASSES, covariance_of, model_of, pose_of, velocity_of
-from kalmark.config.models import Motion
+from kalmark.config.classes import covariance_of, model_of, pose_of, velocity_of
+from kalmark.config.misfit import refuse_controls, refuse_scans
 from kalmark.config.opening import described, open_run
 from kalmark.config.reading import did_you_mean, load_config
 from kalmark.config.schema import Config
-from kalmark.config.sections import Section, types
-from kalmark.errors import LogError, ModelError
+from kalmark.config.sections import Section
+from kalmark.errors import ModelError
 from kalmark.logs.log import Log
 from kalmark.logs.start import true_start
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.slam.attention import Attention
-from kalmark.slam.events import Scan
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 from kalmark.slam.upkeep import Upkeep
@@ -78,31 +77,16 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     robot, path = config.robots[key], ("robots", key)
     moves = _build(config, (*path, "motion"), robot.motion)
     start, cov = _start(robot.start, name, log, moves)
-    if log is not None:
-        _refuse_misfit(config, key, name, moves.columns, log)
     world = moves.space.world
+    if log is not None:
+        refuse_controls(config, key, name, moves.columns, log)
     mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
+    if log is not None:
+        refuse_scans(config, key, name, mounts, log)
     try:
         return Robot(name, moves, start=start, sensors=mounts, cov=cov)
     except ModelError as error:
         raise config.error(path, str(error)) from None
-
-
-def _refuse_misfit(config: Config, key: str, name: str, columns: tuple[str, ...], log: Log) -> None:
-    """Refuse controls that the motion does not take and, unless bad input is skipped, sensors not configured."""
-    robot, given = config.robots[key], tuple(log.control_columns.get(name, columns))
-    if given != columns:
-        fitting = [motion for motion in types(Motion) if CLASSES[motion]().columns == given]
-        hint = f"; try --set robots.{key}.motion.type={fitting[0]}" if fitting else ""
-        what = f"the controls of {name} have the columns {', '.join(given)}"
-        raise LogError(f"{log.path}: {what}, expected {', '.join(columns)} of its motion {robot.motion.type}{hint}")
-    if config.log.on_error == "skip":
-        return
-    for event in log.events:
-        if isinstance(event, Scan) and event.robot == name and event.sensor not in robot.sensors:
-            known = f"one of {', '.join(robot.sensors)}" if robot.sensors else "none, as none is configured"
-            what = f"{name} has scans of the sensor {event.sensor!r}, expected {known}"
-            raise LogError(f"{log.path}: {what}; add robots.{key}.sensors.{event.sensor}")
 
 
 def _names(config: Config, log: Log | None) -> list[str]:

@@ -27,7 +27,8 @@ from kalmark.errors import LogError
 from kalmark.logs.log import Array, Log, PositionTrack, Trajectory
 from kalmark.logs.rig import mapping
 from kalmark.logs.source import Format, Request, folder_of, nearest
-from kalmark.logs.table import Row, Table, read_table
+from kalmark.logs.stray import Places, refuse_misspelt
+from kalmark.logs.table import CONTROL, OBSERVATION, Row, Table, read_table
 from kalmark.logs.text import landmark_id, seconds
 from kalmark.slam.events import Control, Event, Fix, Id, Scan, order
 
@@ -46,25 +47,32 @@ def read(path: Path, request: Request) -> Log:
     events: list[Event] = []
     control_columns: dict[str, tuple[str, ...]] = {}
     sensor_columns: dict[tuple[str, str], tuple[str, ...]] = {}
+    places: Places = {}
     if (path / "controls.csv").is_file():
-        events += read_controls(path / "controls.csv", request, control_columns)
+        events += read_controls(path / "controls.csv", request, control_columns, places)
     if (path / "scans.csv").is_file():
-        events += read_scans(path / "scans.csv", request, sensor_columns)
+        events += read_scans(path / "scans.csv", request, sensor_columns, places)
     if (path / "fixes.csv").is_file():
-        events += read_fixes(path / "fixes.csv", request)
+        events += read_fixes(path / "fixes.csv", request, places)
+    truth = optional(path / "truth.csv", read_truth, request)
+    describes = mapping(path / RIG) if (path / RIG).is_file() else {}
+    seen = {name for event in events if isinstance(event, Scan) for name in event.ids or ()}
+    strays = refuse_misspelt(places, {*truth, *describes.get("robots", ()), *map(str, seen)}, request)
+    events = [event for event in events if event.robot not in strays]
     robots = tuple(dict.fromkeys(event.robot for event in events))
     return Log(
         name=path.name,
         path=path,
         robots=robots,
         events=sorted(events, key=order),
-        truth=optional(path / "truth.csv", read_truth, request),
+        truth=truth,
         landmarks=optional(path / "landmarks.csv", read_landmarks, request),
         gps=optional(path / "gps.csv", read_gps, request),
         skipped=request.skipped,
-        control_columns=control_columns,
-        sensor_columns=sensor_columns,
-        describes=mapping(path / RIG) if (path / RIG).is_file() else {},
+        control_columns={robot: names for robot, names in control_columns.items() if robot not in strays},
+        sensor_columns={key: names for key, names in sensor_columns.items() if key[0] not in strays},
+        places={(robot, sensor): (file, line) for (file, robot, sensor), line in reversed(places.items())},
+        describes=describes,
     )
 
 
@@ -73,10 +81,11 @@ def optional(path: Path, reader: Callable[[Path, Request], dict[Any, Any]], requ
     return reader(path, request) if path.is_file() else {}
 
 
-def read_controls(path: Path, request: Request, columns: dict[str, tuple[str, ...]]) -> list[Event]:
-    """Return the controls of `controls.csv` and note the columns of each robot's."""
+def read_controls(path: Path, request: Request, columns: dict[str, tuple[str, ...]], places: Places) -> list[Event]:
+    """Return the controls of `controls.csv` and note the columns of each robot's and where they begin."""
     events: list[Event] = []
-    for row in timed(read_table(path, ("t_s", "robot")), request):
+    for row in timed(read_table(path, ("t_s", "robot"), known=CONTROL), request):
+        places.setdefault((path, row.robot, ""), row.line)
         u = row.values(columns, row.robot, request)
         if u is None:
             continue
@@ -98,11 +107,12 @@ class Rows:
     empty: bool = False
 
 
-def read_scans(path: Path, request: Request, columns: dict[Any, tuple[str, ...]]) -> list[Event]:
-    """Return the scans of `scans.csv`, one a robot, sensor and time, and note the columns of each sensor."""
+def read_scans(path: Path, request: Request, columns: dict[Any, tuple[str, ...]], places: Places) -> list[Event]:
+    """Return the scans of `scans.csv`, one a robot, sensor and time; note each sensor's columns and where it begins."""
     scans: dict[tuple[int, str, str], Rows] = {}
-    table = read_table(path, ("t_s", "robot", "sensor", "id"))
+    table = read_table(path, ("t_s", "robot", "sensor", "id"), known=OBSERVATION)
     for row in timed(table, request, by_sensor=True):
+        places.setdefault((path, row.robot, row.sensor), row.line)
         rows = scans.setdefault((row.t_ns, row.robot, row.sensor), Rows())
         rows.bad |= not add_row(rows, row, request, columns)
     events: list[Event] = []
@@ -145,7 +155,7 @@ def add_row(rows: Rows, row: Row, request: Request, columns: dict[Any, tuple[str
     return True
 
 
-def read_fixes(path: Path, request: Request) -> list[Event]:
+def read_fixes(path: Path, request: Request, places: Places) -> list[Event]:
     """Return the absolute position fixes of `fixes.csv`."""
     table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",))
     if not table.noise_columns:
@@ -153,6 +163,7 @@ def read_fixes(path: Path, request: Request) -> list[Event]:
     columns: dict[str, tuple[str, ...]] = {}
     events: list[Event] = []
     for row in timed(table, request):
+        places.setdefault((path, row.robot, ""), row.line)
         y = row.values(columns, row.robot, request)
         if y is None:
             continue
@@ -166,7 +177,7 @@ def read_fixes(path: Path, request: Request) -> list[Event]:
 
 def read_truth(path: Path, request: Request) -> dict[str, Trajectory]:
     """Return the true trajectory of each robot in `truth.csv`."""
-    table = read_table(path, ("t_s", "robot"))
+    table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3))
     if set(table.value_columns) not in (set(POSE2), set(POSE3)):
         odd = next((name for name in table.value_columns if name not in (*POSE2, *POSE3)), None)
         hint = nearest(odd, (*POSE2, *POSE3)) if odd else ""

@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,17 +19,28 @@ from kalmark.logs.source import Request, nearest
 from kalmark.logs.text import nanoseconds, number, read_text
 
 NAMES = ("t_s", "robot", "sensor", "id")
-CANONICAL = (
+CONTROL = (
     "v_mps", "w_radps", "vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps", "steering_rad",
     "dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps",
     "dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad", "dtheta_rad",
+)  # fmt: skip
+OBSERVATION = (
     "range_m", "bearing_rad", "azimuth_rad", "elevation_rad", "signature",
     "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "x2_m", "y2_m", "z2_m",
     "u_px", "v_px", "ul_px", "vl_px", "ur_px", "vr_px",
     "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
 )  # fmt: skip
+CANONICAL = (*CONTROL, *OBSERVATION)
 """The order in which known columns make a control or an observation, whatever their order in the file."""
 NOT_NEGATIVE = {"range_m": "range", "size_m": "size"}
+UNITS = {"s": "seconds", "m": "metres", "rad": "radians", "px": "pixels", "mps": "m/s", "radps": "rad/s"}
+"""The units of columns, by the end of their names."""
+OTHER_UNITS = {
+    "ms", "us", "ns", "sec", "secs", "seconds", "min", "h", "mm", "cm", "dm", "km", "in", "ft", "meter", "meters",
+    "metre", "metres", "deg", "degree", "degrees", "rads", "radian", "radians", "mrad", "kmh", "kph", "mph", "dps",
+    "degps", "degs", "rpm", "pixel", "pixels", "pix",
+}  # fmt: skip
+SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
 _RANK = {name: rank for rank, name in enumerate(CANONICAL)}
 _COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
@@ -54,11 +66,14 @@ class Table:
             yield Row(self, line, cells)
 
 
-def read_table(path: Path, required: tuple[str, ...], allowed: tuple[str, ...] | None = None) -> Table:
+def read_table(
+    path: Path, required: tuple[str, ...], allowed: tuple[str, ...] | None = None, known: tuple[str, ...] = ()
+) -> Table:
     """Return the table in a CSV file, which must have the columns `required`.
 
-    Other columns must be among `allowed` (None: any); noise columns always may be there.  Raises LogError if the
-    file is missing, empty, has no row after its header, or a header that does not fit.
+    Other columns must be among `allowed` (None: any but those that are one of `known` in another unit or in none);
+    noise columns always may be there.  Raises LogError if the file is missing, empty, has no row after its header, or
+    a header that does not fit.
     """
     reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
     try:
@@ -66,10 +81,19 @@ def read_table(path: Path, required: tuple[str, ...], allowed: tuple[str, ...] |
     except csv.Error as error:
         raise LogError(f"{path}:{reader.line_num}: {error}, expected comma separated values") from None
     start, header = content[0][0], [cell.strip() for cell in content[0][1]]
+    separator = next((what for cut, what in SEPARATORS.items() if cut in header[0]), "")
+    if len(header) == 1 and separator:
+        raise LogError(f"{path}:{start}: the cells seem to be separated by {separator}, expected commas")
+    known = (*required, *(allowed or ()), *known)
+    for name in header:
+        refuse_unit(f"{path}:{start}", name, known)
     wanted = ", ".join(required)
     for name in required:
         if name not in header:
-            raise LogError(f"{path}:{start}: no column {name}, expected {wanted}{nearest(name, header)}")
+            odd = get_close_matches(name, [other for other in header if other not in known], n=1)
+            what = f"column {odd[0]!r} is unknown" if odd else f"no column {name}"
+            hint = f"; did you mean {name!r}?" if odd else ""
+            raise LogError(f"{path}:{start}: {what}, expected {wanted}{hint}")
     for name in header:
         if header.count(name) > 1 or not name:
             raise LogError(
@@ -87,6 +111,18 @@ def read_table(path: Path, required: tuple[str, ...], allowed: tuple[str, ...] |
         raise LogError(f"{path}:{start}: no rows after the header, expected at least one")
     values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
     return Table(path, {name: i for i, name in enumerate(header)}, tuple(values), noise, content[1:])
+
+
+def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
+    """Refuse a column that is one of `known` but for its unit: without it, in another one, or otherwise written."""
+    plain = "_".join(re.findall("[a-z0-9]+", name.lower()))
+    stem, _, unit = plain.rpartition("_")
+    stem = stem if unit in OTHER_UNITS or unit in UNITS else plain
+    meant = [each for each in known if stem == each.rpartition("_")[0] or plain == each]
+    if stem and name not in known and meant:
+        closest = next(iter(get_close_matches(plain, meant, n=1, cutoff=0.0)))
+        measure = UNITS.get(closest.rpartition("_")[2])
+        raise LogError(f"{where}: column {name!r} is unknown, expected {closest}{f', in {measure}' if measure else ''}")
 
 
 class Row:

@@ -56,7 +56,7 @@ def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
             continue
         reason, number = Counter(history.reason[mine].tolist()).most_common(1)[0]
         if reason == NO_ID:
-            yield f"{number} observations have no id and were ignored; try --set association.type=nearest"
+            yield f"{number} observations have no id and were ignored; try --set association.type=auto"
         else:
             yield f"{int(mine.sum())} of {total} observations were {outcome}, most often: {reason or 'no reason given'}"
     if not total:

@@ -1,0 +1,63 @@
+"""Refuse a log whose controls or scans are not what the configured motion and sensors take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kalmark.config.classes import CLASSES
+from kalmark.config.models import Motion, Sensor
+from kalmark.config.reading import did_you_mean
+from kalmark.config.schema import Config
+from kalmark.config.sections import types
+from kalmark.detect.scan import RAW
+from kalmark.errors import LogError
+from kalmark.logs.log import Log
+from kalmark.slam.events import Scan
+from kalmark.slam.robot import Mount
+
+
+def refuse_controls(config: Config, key: str, name: str, columns: tuple[str, ...], log: Log) -> None:
+    """Refuse controls that the motion of a robot does not take."""
+    given = tuple(log.control_columns.get(name, columns))
+    if given != columns:
+        fitting = [motion for motion in types(Motion) if CLASSES[motion]().columns == given]
+        hint = f"; try --set robots.{key}.motion.type={fitting[0]}" if fitting else _meant(given, columns)
+        what = f"the controls of {name} have the columns {', '.join(given)}"
+        wanted = f"{', '.join(columns)} of its motion {config.robots[key].motion.type}"
+        raise LogError(f"{_header(log, name, '')}: {what}, expected {wanted}{hint}")
+
+
+def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], log: Log) -> None:
+    """Refuse observations that a sensor does not take and, unless bad input is skipped, sensors not configured."""
+    for (robot, sensor), given in log.sensor_columns.items():
+        if robot != name or sensor not in mounts:
+            continue
+        raw = mounts[sensor].detector is not None
+        columns = RAW[: max(len(given), 2)] if raw else mounts[sensor].sensor.columns
+        if given != columns:
+            kind = config.robots[key].sensors[sensor].type
+            fitting = [] if raw else [one for one in types(Sensor) if getattr(CLASSES[one], "columns", ()) == given]
+            hint = f"; try --set robots.{key}.sensors.{sensor}.type={fitting[0]}" if fitting else _meant(given, columns)
+            wanted = f"{', '.join(columns)} of {'its beams' if raw else f'its type {kind}'}"
+            what = f"the scans of {name} by {sensor} have the columns {', '.join(given)}"
+            raise LogError(f"{_header(log, name, sensor)}: {what}, expected {wanted}{hint}")
+    if config.log.on_error == "skip":
+        return
+    for event in log.events:
+        if isinstance(event, Scan) and event.robot == name and event.sensor not in mounts:
+            known = f"one of {', '.join(mounts)}" if mounts else "none, as none is configured"
+            file, line = log.places.get((name, event.sensor), (log.path, 0))
+            what = f"{name} has scans of the sensor {event.sensor!r}, expected {known}"
+            hint = f"if it is another one, add robots.{key}.sensors.{event.sensor}"
+            raise LogError(f"{file}{f':{line}' if line else ''}: {what}; {hint}")
+
+
+def _header(log: Log, robot: str, sensor: str) -> str | Path | None:
+    """Return the place of the names of these columns."""
+    return f"{log.places[robot, sensor][0]}:1" if (robot, sensor) in log.places else log.path
+
+
+def _meant(given: tuple[str, ...], columns: tuple[str, ...]) -> str:
+    """Return a hint at the column that was probably meant by one that is too much."""
+    missing = [name for name in columns if name not in given]
+    return next(filter(None, (did_you_mean(name, missing) for name in given if name not in columns)), "")
