@@ -9,6 +9,9 @@ import numpy as np
 
 import kalmark as km
 from kalmark.logs import write_native
+from kalmark.results.by_position import by_position
+from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.picture import headline
 from kalmark.results.run import Run
 
 POINTS = {7: (4.0, 1.0), 8: (6.0, -2.0), 9: (5.0, 4.0)}
@@ -66,3 +69,35 @@ def test_robots_keep_their_names(tmp_path: Path) -> None:
         tmp_path / "two",
     )
     assert [e.ids for e in km.open_log(tmp_path / "two", ids="hidden")] == [("b", None), ("a",)]
+
+
+def without_ids(log: km.Log, **changes: object) -> km.Log:
+    """Return a log that does not know itself which landmark is which."""
+    return replace(log, true_ids={}, **changes)  # type: ignore[arg-type]
+
+
+def test_without_any_id_true_landmarks_are_matched_by_position_and_the_summary_says_so(tmp_path: Path) -> None:
+    run = run_of(without_ids(garden(tmp_path)))
+    summary = run.evaluate()
+    assert summary["landmarks_matched"] == "3 of 3 by position, of 3 true"
+    assert summary["landmarks_compared"] == 3
+    assert summary["landmark_rmse_raw_m"] < 0.02
+    assert "matched by position" in " ".join(headline(run)[1])
+    assert "landmarks_matched" not in run_of(garden(tmp_path / "again")).evaluate(), "there its ids are known"
+
+
+def test_a_true_map_in_another_frame_is_not_scored_by_position(tmp_path: Path) -> None:
+    elsewhere = {i: np.add(p, (30.0, -12.0)) for i, p in POINTS.items()}
+    summary = run_of(without_ids(garden(tmp_path), landmarks=elsewhere)).evaluate()
+    assert "landmarks_matched" not in summary
+    assert summary["landmark_rmse_m"] is None
+    assert [line for line in summary["warnings"] if line.startswith("the landmarks are not scored: no ids tie them")]
+
+
+def test_positions_pair_only_what_is_nearest_to_each_other_and_nearer_than_half_way_to_the_next() -> None:
+    true = {f"t{i}": np.array([4.0 * i, 0.0]) for i in range(6)}
+    at = [(0.1, 0), (4.2, 0), (4.4, 0), (8, 1.9), (12, 2.1), (16, 0)]
+    means = [np.array(p, dtype=np.float64) for p in at]
+    table = MapLandmarks([*"abcdef"], ["point"] * 6, means, [0.01 * np.eye(2)] * 6, [3] * 6)
+    assert by_position(table, true) == {"a": "t0", "b": "t1", "d": "t2", "f": "t4"}
+    assert by_position(table, {i: np.add(p, (0.0, 3.0)) for i, p in true.items()}) == {}

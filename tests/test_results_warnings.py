@@ -49,7 +49,7 @@ def test_observations_without_ids_are_said_to_be_ignored_and_what_helps() -> Non
     log = circle(steps=20)
     lines = warned(log, [scan(e, ids=None) if isinstance(e, Scan) else e for e in log])
     count = sum(len(e.y) for e in log if isinstance(e, Scan))
-    assert f"{count} observations have no id and were ignored; try --set association.type=nearest" in lines
+    assert f"{count} observations have no id and were ignored; try --set association.type=auto" in lines
     assert "no landmark was mapped" in lines
 
 

@@ -21,6 +21,7 @@ TOTALS: tuple[tuple[str, str, str], ...] = (
     ("fixes", "fixes given to the filter", ""),
     ("fixes_rejected", "  rejected by the gate", ""),
     ("fix_nis_per_dof", "  NIS per degree of freedom", ""),
+    ("landmarks_matched", "  matched to true ones", ""),
     ("landmark_rmse_m", "landmark RMSE, aligned", "m"),
     ("landmark_rmse_raw_m", "landmark RMSE, raw", "m"),
     ("corner_rms_px", "reprojection of corners, RMS", "px"),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
+from kalmark.results.by_position import by_position, no_ids
 from kalmark.results.calibration import bias_figures, mount_figures
 from kalmark.results.consistency import diverged, nees, nis, pose_error
 from kalmark.results.history import Array, History, Ints
@@ -59,6 +60,9 @@ def evaluate(run: Run) -> dict[str, Any]:
         summary["stopped"] = run.stopped
     summary["robots"] = robots
     landmarks = known_landmarks(run)
+    if no_ids(run) and landmarks.ids != run.landmarks.ids:
+        found = sum(a != b for a, b in zip(landmarks.ids, run.landmarks.ids, strict=True))
+        summary["landmarks_matched"] = f"{found} of {len(landmarks)} by position, of {len(run.truth.landmarks)} true"
     summary |= association_figures(history, run.landmarks.ids)
     summary |= landmark_figures(landmarks, run.truth) | line_figures(landmarks, run.truth)
     if not np.isnan(history.left_px).all():
@@ -112,8 +116,10 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
 
 
 def known_landmarks(run: Run) -> MapLandmarks:
-    """Return the map at the end with the log's names, where the filter was not told them."""
+    """Return the map at the end with the log's names, where the filter was not told them; without any, by position."""
     names = best_known(run.history, run.landmarks.ids, run.landmarks.observations)
+    if no_ids(run):
+        names = by_position(run.landmarks, run.truth.landmarks_in_map())
     return replace(run.landmarks, ids=[names.get(i, i) for i in run.landmarks.ids])
 
 

@@ -102,7 +102,8 @@ def headline(run: Run) -> tuple[str, list[str]]:
         )
     if summary.get("landmark_rmse_m") is not None:
         raw, aligned = figure(summary["landmark_rmse_raw_m"]), figure(summary["landmark_rmse_m"])
-        parts.append(f"landmarks {raw} m ({aligned} m aligned)")
+        how = ", matched by position" if "landmarks_matched" in summary else ""
+        parts.append(f"landmarks {raw} m ({aligned} m aligned{how})")
     if summary.get("corner_rms_px") is not None:
         batch = f" (batch {figure(summary['batch']['rms_px'])} px)" if "batch" in summary else ""
         parts.append(f"corners {figure(summary['corner_rms_px'])} px{batch}")

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
+from kalmark.results.by_position import LEAST, no_ids
 from kalmark.results.calibration import mount_warnings
 from kalmark.results.inputs import UsedFix
 from kalmark.results.windows import window_warnings
@@ -124,6 +125,11 @@ def _robots(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _truth(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    if no_ids(run) and not summary.get("landmarks_matched"):
+        yield (
+            "the landmarks are not scored: no ids tie them to the true ones, and less than half of them (or less than "
+            f"{LEAST}) are nearer to a true one than half the way to the next: is the truth in the map's frame?"
+        )
     true, mine = set(run.truth.robots), run.history.robots
     for name in run.truth.robots:
         if name not in mine:
