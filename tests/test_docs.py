@@ -37,6 +37,13 @@ def test_an_example_runs(example: Path, tmp_path: Path) -> None:
     assert run([str(example)], tmp_path)
 
 
+def test_pages_call_kalmark_and_python_as_the_readme_says_once_the_environment_is_active() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert readme.index(". .venv/bin/activate") < readme.index("\nkalmark ")
+    for page in PAGES:
+        assert not re.findall(r"\.venv/bin/(?!activate)\S+", page.read_text()), page.name
+
+
 def test_every_page_the_documentation_points_to_exists() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):

@@ -11,7 +11,9 @@ import pytest
 import kalmark as km
 from kalmark.cli import main
 from kalmark.errors import RunError
+from kalmark.geometry.frames import compose
 from kalmark.results.explain import explain
+from kalmark.results.plot_scan import draw_scan
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
 from kalmark.results.series import series
@@ -98,6 +100,43 @@ def test_a_run_with_ids_says_what_it_can(tmp_path: Path) -> None:
     told = explain(Run.load(tmp_path / "run"), 0.0)
     assert [*told.lines()][2] == "   0 (id 7): new 7"
     assert told.gates is None
+
+
+def test_what_has_an_id_is_drawn_with_its_landmark_and_d2_as_what_has_none(tmp_path: Path) -> None:
+    at, rng = (0.5, -0.2, 0.3), np.random.default_rng(3)
+    mount = km.Mount(km.sensors.RangeBearing(0.05, 0.01), at=at)
+    robot = km.Robot("r", km.motion.Odometry2D(), start=(2.0, 1.0, 0.5), sensors={"s": mount})
+    seen_from = compose(np.array([2.0, 1.0, 0.5]), np.array(at))[0]
+    y = km.geometry.observe(seen_from, GARDEN)[0]
+    noise = rng.normal(size=(6, 2)) * [0.05, 0.01]
+    events = [km.Scan(1, "r", "s", y, [*range(6)]), km.Scan(2, "r", "s", y + noise, [*range(6)])]
+    km.record(km.Slam([robot]), events, progress=False).save(tmp_path / "run")
+    run = Run.load(tmp_path / "run")
+    new, told = explain(run, 0.0), explain(run, 1.0)
+    assert [fate.compared for fate in new.fates] == [()] * 6
+    np.testing.assert_allclose([fate.seen_at for fate in new.fates], GARDEN, atol=1e-9)
+    for k, fate in enumerate(told.fates):
+        (landmark,) = fate.compared
+        assert (landmark.landmark, landmark.d2) == (str(k), fate.d2)
+        np.testing.assert_allclose(landmark.place, GARDEN[k], atol=0.05)
+        np.testing.assert_allclose(fate.seen_at, pointed_at(seen_from, (y + noise)[k]), atol=0.05)
+    axes = draw_scan(run, told).axes[0]
+    assert {f"{fate.d2:.3g}" for fate in told.fates} <= {text.get_text() for text in axes.texts}
+    (tmp_path / "run" / "map.kmk").unlink()
+    assert not np.isfinite([fate.seen_at for fate in explain(Run.load(tmp_path / "run"), 1.0).fates]).any()
+
+
+def pointed_at(T: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return where a range and a bearing from T point."""
+    a = T[2] + y[1]
+    return np.array([T[0] + y[0] * np.cos(a), T[1] + y[0] * np.sin(a)])
+
+
+def test_a_sensor_that_does_not_tell_distances_explains_itself_without_places(tmp_path: Path) -> None:
+    robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.Bearing())})
+    km.record(km.Slam([robot]), [km.Scan(1, "r", "s", [[0.1]], [7])] * 2, progress=False).save(tmp_path / "run")
+    assert not np.isfinite(explain(Run.load(tmp_path / "run"), 0.0).fates[0].seen_at).any()
+    assert main(["explain", str(tmp_path / "run"), "--scan", "0"]) == 0
 
 
 def test_a_wrong_map_is_noticed_from_the_time_on_when_it_is_wrong() -> None:

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kalmark.errors import RunError
 from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.results.cameras import mount_now
 from kalmark.results.decisions import Change
 from kalmark.results.files import seconds
 from kalmark.results.history import Array, History, Ints
+from kalmark.results.shapes import LINE
+from kalmark.results.truth import as_rigid
 from kalmark.results.words import count
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
+    from kalmark.slam.slam import Slam
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +105,47 @@ def explain(run: Run, t_s: float, robot: str | None = None) -> Explanation:
     if not -1.0 <= since <= span + 1.0:
         first, last = seconds(history.t_ns[0]), seconds(history.t_ns[-1])
         raise RunError(f"scan is {t_s:g} s, expected 0 to {span:.3f} s, or {first} to {last} s as in the log")
-    return explained(run, int(steps[np.argmin(np.abs(t - since))]))
+    return with_known(run, explained(run, int(steps[np.argmin(np.abs(t - since))])))
+
+
+def with_known(run: Run, told: Explanation) -> Explanation:
+    """Return an explanation that also says where observations with an id were, and where their landmarks were expected.
+
+    Both are seen from the pose after the scan: the way from one to the other is the innovation.  Nothing is added where
+    the run has no map, or the sensor does not tell how far away it sees.
+    """
+    rows = np.flatnonzero(run.history.step == told.step)
+    open_ = [k for k, fate in enumerate(told.fates) if fate.id and not np.isfinite(fate.seen_at).all()]
+    if not open_:
+        return told
+    try:
+        slam = run.final_slam()
+    except RunError:
+        return told
+    places, expected = (_seen(slam, told, values[rows]) for values in (run.history.y, run.history.e))
+    fates = list(told.fates)
+    for k in open_:
+        fate, there = fates[k], np.isfinite(expected[k]).all() and fates[k].landmark
+        compared = (Compared(fate.landmark, fate.d2, expected[k]),) if there and not math.isnan(fate.d2) else ()
+        fates[k] = replace(fate, seen_at=places[k], compared=compared)
+    return replace(told, fates=tuple(fates))
+
+
+def _seen(slam: Slam, told: Explanation, y: Array) -> Array:
+    """Return where measurements y (K, m), NaN where there are none, are from the pose after the scan (K, 2 or 3)."""
+    d = 3 if len(told.pose) == 7 else 2
+    out = np.full((len(y), d), np.nan)
+    mount = slam.robots[told.robot].sensors[told.sensor]
+    sensor: Any = mount.sensor
+    known = np.flatnonzero(np.isfinite(y[:, : len(sensor.columns)]).all(axis=1))
+    if not len(known) or not hasattr(sensor, "invert") or not getattr(sensor, "finds_depth", True):
+        return out
+    v = sensor.invert(np.ascontiguousarray(y[known, : len(sensor.columns)]))[0]
+    if v.shape[1] == LINE:  # both ends of a line: rays
+        return out
+    at = mount_now(slam, told.robot, told.sensor, mount.at)
+    out[known] = as_rigid(told.pose[: len(at)])(as_rigid(at)(v[:, :d]))
+    return out
 
 
 def explained(run: Run, step: int) -> Explanation:

@@ -41,7 +41,7 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
 
     Crosses are the observations where they seem to come from before the scan, squares the landmarks they were compared
     with then, but for those too far off; a full line goes to the landmark that was decided on, dotted ones to the
-    others, each with its d2.
+    others, each with its d2.  Where the id is known both are as seen from the pose after the scan.
     """
     figure = Figure(figsize=(9.5, 8.5), layout="constrained", facecolor="white")
     axes = figure.subplots()
