@@ -1,7 +1,8 @@
 """How far blocks at rest are from where the coordinates of their errors were left, as told by those that are not.
 
 A block at rest moves with the blocks that have entered the active map, and with where the robots were when it came to
-rest: by a correction that is a regression on theirs.  Theirs is looked at, in units of their sigmas at that time.
+rest: by a correction that is a regression on theirs.  Theirs is looked at, in units of the sigmas they have now, or had
+then where they move by themselves.
 """
 
 from __future__ import annotations
@@ -28,16 +29,21 @@ TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may
 
 
 class Watch(NamedTuple):
-    """Numbers of a block in the active map, where they were at rest, and one over their sigmas."""
+    """Numbers of a block in the active map, and where they were at rest.
+
+    And the first row of P of what each is part of, and how many rows that has.
+    """
 
     at: Index
     frozen: Array
-    per_sigma: Array
+    first: Index
+    size: Index
 
 
 @compiled
 def is_farther(
-    P: Array, turn: Index, x: Array, at: Index, frozen: Array, per: Array, G: Array, s: Array, per_sigma: Array
+    P: Array, turn: Index, x: Array, at: Index, frozen: Array, first: Index, size: Index,
+    G: Array, s: Array, per_sigma: Array,
 ) -> bool:  # fmt: skip
     """Return whether a number is more than so many sigmas from where it was: of those that stand, or among G s.
 
@@ -48,7 +54,10 @@ def is_farther(
         variance += P[turn[i], turn[i]]
     limit = TAU / math.sqrt(variance)
     for i in range(len(at)):
-        if abs(x[at[i]] - frozen[i]) * per[i] > limit:
+        own = 0.0
+        for j in range(first[i], first[i] + size[i]):
+            own += P[j, j]
+        if own > 0.0 and (x[at[i]] - frozen[i]) ** 2 > limit * limit * own:
             return True
     for i in range(len(per_sigma)):
         moved = 0.0
@@ -64,24 +73,30 @@ class Drift:
 
     def __init__(self) -> None:
         self._standing: dict[int, Watch] = {}
+        self._at_rest: dict[int, Array] = {}  # one over the sigmas that they had there
         self._all: Watch | None = None
         self.moving: list[int] = []  # the blocks that move by themselves,
         self._rows: Index = NO_ROWS  # the rows of their positions,
         self._per_sigma: Array = NO_NUMBERS  # one over those sigmas,
         self._rest: Array | None = None  # and their covariance at rest with the blocks that have entered
 
-    def watch(self, slot: int, space: Space, at: int, frozen: Array, variances: Array) -> None:
-        """Watch those numbers of a block, `at` and further in the active map, on which its coordinates depend."""
-        where: list[int] = []
-        per_sigma: list[float] = []
+    def watch(self, slot: int, space: Space, at: int, first: int, frozen: Array, variances: Array) -> None:
+        """Watch those numbers of a block on which its coordinates depend.
+
+        They are `at` and further in the active map, their rows from `first` on; `variances` they had at rest.
+        """
+        where, rows, sizes, sigmas = list[int](), list[int](), list[int](), list[float]()
         for kind, offset, row in space.atoms.tolist():
             if kind in (VECTOR, VECTOR3, DIRECTION) or kind >= HOMOGENEOUS:
-                sigma = math.sqrt(max(0.0, variances[row : row + ERROR_SIZE[kind]].sum()))
-                where += range(offset, offset + int(MEAN_SIZE[kind]))
-                per_sigma += [1.0 / sigma if sigma > 0 else 0.0] * int(MEAN_SIZE[kind])
+                count, size = int(MEAN_SIZE[kind]), int(ERROR_SIZE[kind])
+                where += range(offset, offset + count)
+                rows += [first + row] * count
+                sizes += [size] * count
+                sigmas += [math.sqrt(max(0.0, variances[row : row + size].sum()))] * count
         if where:
             index = np.array(where)
-            self._standing[slot] = Watch(index + at, frozen[index], np.array(per_sigma))
+            self._standing[slot] = Watch(index + at, frozen[index], np.array(rows), np.array(sizes))
+            self._at_rest[slot] = np.array([1.0 / sigma if sigma > 0 else 0.0 for sigma in sigmas])
             self._all = None
 
     def stands(self, slot: int) -> bool:
@@ -100,7 +115,7 @@ class Drift:
             self.forget(slot)
             self.moving.append(slot)
             self._rows = np.concatenate([self._rows, rows])
-            self._per_sigma = np.concatenate([self._per_sigma, watch.per_sigma[: len(rows)]])
+            self._per_sigma = np.concatenate([self._per_sigma, self._at_rest[slot][: len(rows)]])
             self._rest = None
 
     def is_beyond(self, P: Array, turn: Index, x: Array, s: Array, read: Callable[[Index, int], Array]) -> bool:
@@ -112,7 +127,9 @@ class Drift:
         """
         if self._all is None:
             parts = zip(*self._standing.values(), strict=True)
-            self._all = Watch(*map(np.concatenate, parts)) if self._standing else Watch(NO_ROWS, NO_NUMBERS, NO_NUMBERS)
+            self._all = (
+                Watch(*map(np.concatenate, parts)) if self._standing else Watch(NO_ROWS, NO_NUMBERS, NO_ROWS, NO_ROWS)
+            )
         if self._rest is None:
             self._rest = read(self._rows, 0)
         elif self._rest.shape[1] < len(s):

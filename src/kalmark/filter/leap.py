@@ -12,14 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.filter.drift import TAU
 from kalmark.filter.map import P_AT, StochasticMap
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.spaces import VECTOR, VECTOR3
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-
-PARTED = 0.25  # of the least sigma of an active point as seen from the robot: its variance grows by a sixteenth
 
 
 class Points:
@@ -46,13 +45,13 @@ _POINTS = ((VECTOR,), (VECTOR3,))
 
 @compiled
 def _parts(P: Array, r: int, points: Index, before: Array, now: Array, d: int) -> bool:
-    """Return whether a turn and a move part points further than they are known from the robot, whose first row is r."""
+    """Return whether a turn and a move part points by more than TAU sigmas as seen from the robot, whose row is r."""
     moved = 0.0
     for i in range(d):
         moved += (now[i] - before[i]) ** 2
     flat = d == 2
     turn = abs(wrap(now[2] - before[2])) if flat else 2.0 * math.acos(min(1.0, abs((now[3:7] * before[3:7]).sum())))
-    apart = 0.5 * turn * math.sqrt(moved) / PARTED
+    apart = 0.5 * turn * math.sqrt(moved) / TAU
     for l in points:
         variance = 0.0
         for i in range(d):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 SLICE = 0.9e8  # multiplications of a flush to do after a correction at most, some 6 ms: less falls behind and hurries
+LEAST = 2e7  # of a flush to do after a correction at least, if any: to begin with it takes time, too
 DEAR = 80.0  # multiplications of a flush that take as long as a correction of one more element of the active map
 USING = 45.0  # multiplications that take as long as to use a byte of memory for the first time
 START = 5e7  # multiplications that take as long as to begin a flush
@@ -34,4 +35,6 @@ class Pace:
     def due(self, progress: float, spent: float, work: float) -> float:
         """Return how much of a flush to do now, in multiplications, so that it will be over before the next one."""
         due = progress / 0.8 * work - spent if progress < 0.8 else math.inf
+        if due < LEAST:
+            return 0.0
         return min(due, SLICE * max(1.0, 32.0 * (progress - 1.0)))

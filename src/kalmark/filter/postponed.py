@@ -24,7 +24,7 @@ from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Leap, Phase, Room, carried, leap_of
 from kalmark.filter.leap import Points
 from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
-from kalmark.filter.pace import USING, Pace
+from kalmark.filter.pace import SLICE, USING, Pace
 from kalmark.filter.reading import excerpt, joint
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import RHO, Rn, Space
@@ -71,6 +71,7 @@ class PostponedMap(Layout):
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of what turned the world with them
         self._drift, self._pace, self._points = Drift(), Pace(self.most), Points()
         self._leaps: list[Leap] = []
+        self._due = False  # whether a flush is to follow as soon as none is under way
         self._before: dict[int, Array] = {}
 
     @classmethod
@@ -272,17 +273,18 @@ class PostponedMap(Layout):
             s, before = m.x[self._s_x], self._moved.get(robot, 0.0)
             others = [moved for other, moved in self._moved.items() if other != robot]
             self._moved[robot] = now = s - sum(others) if others else s
-            parted = self._points.parted(m, self._owners[robot], self._before[robot])
-            if len(self._owners) < self.used and (parted or (not self._leaps and self._far(robot, s))):
+            far = len(self._owners) < self.used and not self._due and self._far(robot, s)
+            if far or self._points.parted(m, self._owners[robot], self._before[robot]):
                 self.leap(robot, now - before)
-            if self._leaps and self._job is None:
-                self.flush()
+            self._due = self._due or far
+            if self._due:
+                self._go_on(SLICE)
+                if self._job is None:
+                    self.flush()
         self._pace.count(m.n)
         used = m.prepare() or self.storage.fresh.use_some()
         if (job := self._job) is not None:
-            progress = max(self._progress(), 1.0 if self._leaps else 0.0)
-            job.advance(self._pace.due(progress, job.spent, job.work) - USING * used)
-            self._job = None if job.done else job
+            self._go_on(self._pace.due(self._progress(), job.spent, job.work) - USING * used)
 
     def _enter(self, slot: int) -> None:
         """Make a block active: augment it from the shadows, and give it a shadow of its own.  O(active^2)."""
@@ -320,7 +322,8 @@ class PostponedMap(Layout):
         if space is not None and at is not None:
             rows = self.rows(slot)
             variances = np.diag(self._read(rows, rows))
-            self._drift.watch(slot, space, self.active.numbers(at).start, self.x[self.numbers(slot)], variances)
+            here = self.active.numbers(at).start, int(self.active.rows(at)[0])
+            self._drift.watch(slot, space, *here, self.x[self.numbers(slot)], variances)
 
     def take_as_moving(self, slot: int) -> None:
         """Take note that an active block moves by itself."""
@@ -334,10 +337,7 @@ class PostponedMap(Layout):
         )
 
     def leap(self, robot: int, ds: Array) -> None:
-        """Have the last correction, ds by `robot`, be applied to all blocks at rest as the dense filter does.
-
-        Their means follow at once; a flush comes as soon as none is under way.
-        """
+        """Have the last correction, ds by `robot`, move all blocks at rest as the dense filter does."""
         went = {r: (before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
         S = self._displacements()
         S[:, list(self._moved).index(robot)] -= ds
@@ -359,10 +359,13 @@ class PostponedMap(Layout):
         self.storage.fresh.forget()
         self._room = Room(self.storage.fresh)
 
-    def _complete(self) -> None:
+    def _go_on(self, work: float) -> None:
         if self._job is not None:
-            self._job.advance(1e300)
-        self._job = None
+            self._job.advance(work)
+            self._job = None if self._job.done else self._job
+
+    def _complete(self) -> None:
+        self._go_on(1e300)
 
     def flush(self) -> None:
         """Bring all blocks to rest."""
