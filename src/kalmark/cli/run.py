@@ -83,10 +83,8 @@ def against_batch(result: Run, summary: dict[str, Any], needed: bool) -> dict[st
 
 
 def finish(result: Run, out: Path, title: str) -> None:
-    """Print a run's figures, what to look at twice, what was left out, and where the run folder is."""
+    """Print a run's figures and warnings, what was left out, and where the run folder is."""
     print_summary(title, result.summary)
-    for line in result.summary.get("warnings", ()):
-        typer.echo(f"warning: {line}")
     if result.skipped:
         typer.echo(f"{len(result.skipped)} left out:")
         for line in result.skipped[:SHOWN]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import typer
+
 TOTALS: tuple[tuple[str, str, str], ...] = (
     ("observations", "observations", ""),
     ("associated", "  associated", ""),
@@ -21,7 +23,7 @@ TOTALS: tuple[tuple[str, str, str], ...] = (
     ("fixes", "fixes given to the filter", ""),
     ("fixes_rejected", "  rejected by the gate", ""),
     ("fix_nis_per_dof", "  NIS per degree of freedom", ""),
-    ("landmarks_matched", "  matched to true ones", ""),
+    ("landmarks_matched", "landmarks matched to true ones", ""),
     ("landmark_rmse_m", "landmark RMSE, aligned", "m"),
     ("landmark_rmse_raw_m", "landmark RMSE, raw", "m"),
     ("corner_rms_px", "reprojection of corners, RMS", "px"),
@@ -41,7 +43,7 @@ _SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes
 
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
-    """Print the key figures of a run's summary; those of other programs on the same log below ours, in brackets."""
+    """Print the key figures of a run's summary and its warnings; other programs on the same log in brackets."""
     from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
 
     rows = [
@@ -65,6 +67,8 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
         print_table("against the batch solution", ("", ""), [(k, number(v)) for k, v in batch.items()], align="<>")
+    for line in summary.get("warnings", ()):
+        typer.echo(f"warning: {line}")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:
