@@ -51,6 +51,17 @@ def test_landmarks_at_rest_turn_with_a_large_correction_as_in_the_dense_map(most
     assert max(wrong) < 0.15
 
 
+def test_leaps_do_not_pile_up_in_a_phase(monkeypatch: pytest.MonkeyPatch) -> None:
+    cov, phases = np.diag([5.0, 5.0, 0.15]) ** 2, []
+    for most in (20, 1):
+        monkeypatch.setattr(leap, "MOST", most)
+        slam = passes(km.Slam([robot_of(cov)], km.association.ByIdentity("off"), map="dense"), 200)
+        assert isinstance(slam.map, PostponedMap)
+        phases.append(slam.map.phase)
+        assert len(slam.map._leaps) < most or slam.map._due
+    assert phases[1] > phases[0]
+
+
 def test_a_leap_is_told_by_what_it_parts_and_not_by_how_far_it_goes() -> None:
     map_ = StochasticMap()
     robot = map_.add(km.geometry.SE2, [3.0, 1.0, 0.1], np.diag([2.0, 2.0, 0.1]) ** 2)

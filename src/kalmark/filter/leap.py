@@ -21,6 +21,9 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+MOST = 20  # leaps in a phase: whatever is read at rest goes through all of them
+
+
 class Points:
     """The points of an active map, which a correction may part from what is at rest."""
 

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.filter import kernels
+from kalmark.filter import kernels, leap
 from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Leap, Phase, Room, carried, leap_of
-from kalmark.filter.leap import Points
 from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
 from kalmark.filter.pace import SLICE, USING, Pace
 from kalmark.filter.reading import excerpt, joint
@@ -69,7 +68,7 @@ class PostponedMap(Layout):
         self._gone: list[tuple[int, Space]] = []  # removed, their shadows are still here
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of what turned the world with them
-        self._drift, self._pace, self._points = Drift(), Pace(self.most), Points()
+        self._drift, self._pace, self._points = Drift(), Pace(self.most), leap.Points()
         self._leaps: list[Leap] = []
         self._due = False  # whether a flush is to follow as soon as none is under way
         self._before: dict[int, Array] = {}
@@ -276,7 +275,7 @@ class PostponedMap(Layout):
             far = len(self._owners) < self.used and not self._due and self._far(robot, s)
             if far or self._points.parted(m, self._owners[robot], self._before[robot]):
                 self.leap(robot, now - before)
-            self._due = self._due or far
+            self._due = self._due or far or len(self._leaps) >= leap.MOST
             if self._due:
                 self._go_on(SLICE)
                 if self._job is None:
