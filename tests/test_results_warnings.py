@@ -57,6 +57,13 @@ def test_a_log_in_which_nothing_was_seen_is_said_to_have_nothing_to_map() -> Non
     assert only(warned(circle(steps=10, landmarks=0))).startswith("no observation was made")
 
 
+def test_true_landmarks_with_other_names_than_the_log_s_are_said_not_to_be_scored() -> None:
+    log = circle(steps=20)
+    other = replace(log, landmarks={f"L{i}": l for i, l in log.landmarks.items()})
+    said = "the log calls them 2, 4, 7, ..., the true ones are L1, L2, L3, ..."
+    assert only(warned(other)) == f"the landmarks are not scored: {said}"
+
+
 def test_a_robot_that_is_never_controlled_is_named() -> None:
     log = circle(robots=("a", "b"), steps=10)
     lines = warned(log, [e for e in log if not (isinstance(e, Control) and e.robot == "b")])

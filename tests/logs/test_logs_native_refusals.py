@@ -123,6 +123,13 @@ def test_a_file_separated_by_something_else_than_commas_is_told_so(separator: st
     )
 
 
+def test_two_letters_that_changed_places_in_a_short_name_are_a_misspelt_robot(tmp_path: Path) -> None:
+    controls = "t_s,robot,v_mps,w_radps\n0.1,bob,1,0\n0.2,bbo,1,0\n"
+    scans = "t_s,robot,sensor,id,range_m,bearing_rad\n0.1,bob,lidar,7,4,0\n"
+    with pytest.raises(LogError, match=r"controls.csv:3: robot 'bbo' is in no other file .*, expected 'bob'"):
+        open_log(native(tmp_path, controls=controls, scans=scans))
+
+
 def test_robots_in_one_file_alone_are_their_own_if_numbered_seen_true_or_asked_for(tmp_path: Path) -> None:
     def controls(*robots: str) -> str:
         return "t_s,robot,v_mps,w_radps\n" + "".join(f"0.1,{robot},1,0\n" for robot in robots)

@@ -12,7 +12,7 @@ from kalmark.logs.source import Request
 Places = dict[tuple[Path, str, str], int]
 """The line where a robot's controls and fixes (sensor "") and its scans by each sensor begin in a file."""
 
-NEAR = 0.7  # of difflib's ratio
+NEAR = 0.65  # of difflib's ratio
 
 
 def refuse_misspelt(places: Places, known: Collection[str], request: Request) -> set[str]:

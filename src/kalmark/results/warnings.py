@@ -130,6 +130,9 @@ def _truth(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
             "the landmarks are not scored: no ids tie them to the true ones, and less than half of them (or less than "
             f"{LEAST}) are nearer to a true one than half the way to the next: is the truth in the map's frame?"
         )
+    told, there = set(run.history.id.tolist()) - {"", *run.history.robots}, {str(i) for i in run.truth.landmarks}
+    if told and there and told.isdisjoint(there):
+        yield f"the landmarks are not scored: the log calls them {_some(told)}, the true ones are {_some(there)}"
     true, mine = set(run.truth.robots), run.history.robots
     for name in run.truth.robots:
         if name not in mine:
@@ -139,6 +142,11 @@ def _truth(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
             yield f"the log has no truth for robot {name}, but for {', '.join(sorted(true))}"
         elif name in true and "ate_m" not in summary["robots"].get(name, {}) and (run.history.robot == name).any():
             yield f"the truth of robot {name} covers none of its scans: are both in seconds?"
+
+
+def _some(names: set[str]) -> str:
+    first = sorted(names, key=lambda name: (len(name), name))[:3]
+    return ", ".join(first) + (", ..." if len(names) > len(first) else "")
 
 
 def _fixes(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
