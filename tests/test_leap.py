@@ -52,14 +52,22 @@ def test_landmarks_at_rest_turn_with_a_large_correction_as_in_the_dense_map(most
 
 
 def test_leaps_do_not_pile_up_in_a_phase(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(leap.Points, "parted", lambda *_: True)
     cov, phases = np.diag([5.0, 5.0, 0.15]) ** 2, []
-    for most in (20, 1):
+    for most in (20, 2):
         monkeypatch.setattr(leap, "MOST", most)
-        slam = passes(km.Slam([robot_of(cov)], km.association.ByIdentity("off"), map="dense"), 200)
+        slam = passes(km.Slam([robot_of(cov)], km.association.ByIdentity("off"), map="dense"), 25)
         assert isinstance(slam.map, PostponedMap)
         phases.append(slam.map.phase)
         assert len(slam.map._leaps) < most or slam.map._due
-    assert phases[1] > phases[0]
+    assert phases[1] > phases[0] > 1
+
+
+def test_where_nothing_is_at_rest_nothing_leaps() -> None:
+    slam = passes(km.Slam([robot_of(np.diag([5.0, 5.0, 0.15]) ** 2)], km.association.ByIdentity("off"), map="dense"), 200)
+    assert isinstance(slam.map, PostponedMap)
+    assert not slam.map._leaps
+    assert slam.map.phase == 1
 
 
 def test_a_leap_is_told_by_what_it_parts_and_not_by_how_far_it_goes() -> None:

@@ -19,7 +19,7 @@ from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, Layou
 from kalmark.filter.storage import PANEL, Stored, Triangle, subtract
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
-from kalmark.geometry.spaces import Table, generator, retract
+from kalmark.geometry.spaces import NO_TURN, Table, generator, retract
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -30,30 +30,28 @@ GATHERING = 1500  # and as to gather a number from the storage
 MORE = 1.5  # times the memory that a flush has needed: the next one may
 
 
-@compiled
 def displaced(atoms: Table, x: Array, D: Array, axes: int, origins: Array) -> tuple[Array, Array]:
     """Add the displacements D (n, R) to the mean x, one robot's after the other's.
 
     Return the mean and a (n, R axes), how the errors' coordinates have turned with each robot's: generator(after) -
     generator(before); without axes nothing turns.  `origins` (R, 3) is where the robots stand.
     """
-    x, a = x.copy(), np.zeros((D.shape[0], D.shape[1] * axes))
+    a = np.empty((D.shape[0], D.shape[1] * axes))
     for r in range(D.shape[1]):
-        d, columns = D[:, r].copy(), slice(r * axes, (r + 1) * axes)
-        if axes > 0:
-            a[:, columns] -= generator(atoms, x, len(d), axes, origins[r])
-        retract(atoms, x, d, np.zeros(0))
-        if axes > 0:
-            a[:, columns] += generator(atoms, x, len(d), axes, origins[r])
+        x, a[:, r * axes : (r + 1) * axes] = turned(atoms, x, D[:, r].copy(), NO_TURN, axes, origins[r])
     return x, a
 
 
 @compiled
 def turned(atoms: Table, x: Array, d: Array, turn: Array, axes: int, origin: Array) -> tuple[Array, Array]:
     """Move the mean x by a correction d that turns the world by `turn`; return it and how the coordinates turned."""
-    x, a = x.copy(), -generator(atoms, x, len(d), axes, origin)
+    x, a = x.copy(), np.zeros((len(d), axes))
+    if axes > 0:
+        a -= generator(atoms, x, len(d), axes, origin)
     retract(atoms, x, d, turn)
-    return x, a + generator(atoms, x, len(d), axes, origin)
+    if axes > 0:
+        a += generator(atoms, x, len(d), axes, origin)
+    return x, a
 
 
 @dataclass(frozen=True)

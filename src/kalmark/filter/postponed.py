@@ -272,8 +272,9 @@ class PostponedMap(Layout):
             s, before = m.x[self._s_x], self._moved.get(robot, 0.0)
             others = [moved for other, moved in self._moved.items() if other != robot]
             self._moved[robot] = now = s - sum(others) if others else s
-            far = len(self._owners) < self.used and not self._due and self._far(robot, s)
-            if far or self._points.parted(m, self._owners[robot], self._before[robot]):
+            rests = len(self._owners) < self.used
+            far = rests and not self._due and self._far(robot, s)
+            if far or (rests and self._points.parted(m, self._owners[robot], self._before[robot])):
                 self.leap(robot, now - before)
             self._due = self._due or far or len(self._leaps) >= leap.MOST
             if self._due:
