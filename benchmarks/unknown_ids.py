@@ -4,6 +4,10 @@
     python benchmarks/unknown_ids.py mrclam mrclam --set log.ids=hidden --set association.type=auto
 
 The map without ids is held against that with ids, of landmarks that have one name in the log the one seen most often.
+
+    python benchmarks/unknown_ids.py mrclam --set "log.robots=[2]"
+
+What could be told at best: all that came before was fused by its true id, and which landmark is the nearest then?
 """
 
 from __future__ import annotations
@@ -12,14 +16,19 @@ import argparse
 import time
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
+import kalmark as km
+from kalmark import config as cfg
 from kalmark.cli.run import run_log
 from kalmark.results.align import rigid, rmse
 from kalmark.results.evaluate import known_landmarks
+from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.scoring import known_as
 
 BESIDE_M = 0.5
+FAR = 1e6  # a d2 of what is no candidate
 COMMON = ("log.robots",)  # settings that hold for the run with ids as well
 
 
@@ -46,13 +55,60 @@ def misplaced(known: Run, hidden: Run) -> int:
     return count
 
 
+class Foreseen(km.association.ByIdentity):
+    """Fuses by the ids of the log, and remembers which landmark would have been the nearest of those in the map.
+
+    `told` has, for each observation of a landmark of the map, whether its nearest is another, whether the one that the
+    best assignment of the scan pairs it with is, and how much greater the d2 of the second nearest is.
+    """
+
+    def __init__(self, gate: float | str) -> None:
+        super().__init__(gate)
+        object.__setattr__(self, "told", [])
+
+    def associate(self, query: km.association.Query) -> list[km.association.Decision]:
+        names = query.candidates(8, np.inf)
+        if len(names) > 1:
+            d2 = np.nan_to_num(query.distances(names), nan=FAR, posinf=FAR)
+            best = linear_sum_assignment(np.hstack([d2, np.full((len(d2), len(d2)), FAR)]))[1]
+            for k, name in enumerate(query.ids):
+                if name in names:
+                    own, (least, second) = names.index(name), np.sort(d2[k])[:2]
+                    self.told.append((np.argmin(d2[k]) != own, best[k] != own, second - least))
+        return super().associate(query)
+
+
+def foresee(config_path: str, overrides: list[str]) -> None:
+    """Print how often the nearest landmark is the right one to a filter that had all ids until then."""
+    config, log = cfg.open_run(config_path, None, overrides)
+    built = cfg.build_slam(config, log)
+    seer = Foreseen(getattr(built.association, "gate", "default"))
+    slam = km.Slam(
+        built.robots.values(), seer, built.estimator, built.landmark_type, built.map_type, upkeep=built.upkeep
+    )
+    record(slam, log, progress=False)
+    nearest, best, gap = np.array(seer.told, dtype=float).T
+    print(f"{len(gap)} observations of landmarks that are in the map, all fused by their ids")
+    print(
+        f"another is the nearest: {nearest.mean():.1%}; the best assignment of the scan takes another: {best.mean():.1%}"
+    )
+    for least in (3, 6, 12):
+        clear = gap > least
+        print(
+            f"the second nearest farther by a d2 of {least}: {clear.sum()} ({clear.mean():.1%}), wrong {nearest[clear].sum():.0f}"
+        )
+
+
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("known")
-    parser.add_argument("hidden")
+    parser.add_argument("hidden", nargs="?")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     given = parser.parse_args()
+    if given.hidden is None:
+        foresee(given.known, given.overrides)
+        return
     start = time.process_time()
     known = run_log(given.known, overrides=[o for o in given.overrides if o.startswith(COMMON)], progress=False)
     middle = time.process_time()
