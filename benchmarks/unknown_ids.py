@@ -89,13 +89,11 @@ def foresee(config_path: str, overrides: list[str]) -> None:
     record(slam, log, progress=False)
     nearest, best, gap = np.array(seer.told, dtype=float).T
     print(f"{len(gap)} observations of landmarks that are in the map, all fused by their ids")
-    print(
-        f"another is the nearest: {nearest.mean():.1%}; the best assignment of the scan takes another: {best.mean():.1%}"
-    )
+    print(f"another is the nearest: {nearest.mean():.1%}, or by the best assignment of the scan: {best.mean():.1%}")
     for least in (3, 6, 12):
-        clear = gap > least
+        clear, wrong = gap > least, nearest[gap > least]
         print(
-            f"the second nearest farther by a d2 of {least}: {clear.sum()} ({clear.mean():.1%}), wrong {nearest[clear].sum():.0f}"
+            f"the second is farther by a d2 of {least}: {clear.mean():.1%} of them; of these wrong: {wrong.mean():.2%}"
         )
 
 

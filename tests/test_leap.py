@@ -64,7 +64,8 @@ def test_leaps_do_not_pile_up_in_a_phase(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_where_nothing_is_at_rest_nothing_leaps() -> None:
-    slam = passes(km.Slam([robot_of(np.diag([5.0, 5.0, 0.15]) ** 2)], km.association.ByIdentity("off"), map="dense"), 200)
+    cov = np.diag([5.0, 5.0, 0.15]) ** 2
+    slam = passes(km.Slam([robot_of(cov)], km.association.ByIdentity("off"), map="dense"), 200)
     assert isinstance(slam.map, PostponedMap)
     assert not slam.map._leaps
     assert slam.map.phase == 1
