@@ -65,7 +65,11 @@ def test_evaluate_and_report_work_from_the_folder_alone(kalmark: Kalmark, log: P
     kalmark("run", "native", "--log", log, "--out", "run")
     figures = json.loads(kalmark("evaluate", "run", "--json").out)
     assert figures["landmarks"] == 3
-    assert "position RMSE" in kalmark("evaluate", "run", "--truth", log).out
+    told = kalmark("evaluate", "run", "--truth", log).out
+    assert "consistent pose NEES: 3 averaged over many runs, up to 9 in a single one\n" in told
+    (heads,) = (line.rstrip() for line in told.splitlines() if "position RMSE" in line)
+    assert heads.endswith("pose NEES")
+    assert len(heads) <= 80
     (tmp_path / "run" / "map.png").unlink()
     assert kalmark("report", "run").status == 0
     assert (tmp_path / "run" / "map.png").is_file()

@@ -34,16 +34,16 @@ TOTALS: tuple[tuple[str, str, str], ...] = (
     ("step_us_p99", "time a step, 99 %", "us"),
 )
 ROBOT: tuple[tuple[str, str, str], ...] = (
-    ("ate_m", "position RMSE, aligned", "m"),
-    ("ate_raw_m", "position RMSE, raw", "m"),
+    ("ate_raw_m", "position RMSE", "m"),
+    ("ate_m", "aligned", "m"),
     ("heading_rmse_deg", "heading RMSE", "deg"),
-    ("pose_nees", "pose NEES (3 is consistent; 6 in space)", ""),
+    ("pose_nees", "pose NEES", ""),
 )
 _SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
-    """Print the key figures of a run's summary and its warnings; other programs on the same log in brackets."""
+    """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
     from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
 
     rows = [
@@ -61,6 +61,8 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         named = [*robots.items(), *((f"({name})", figures) for name, figures in others.items())]
         table = [(name, *(number(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
         print_table("", columns, table, align="<" + ">" * len(shown))
+        if any(key == "pose_nees" for key, _, _ in shown):
+            typer.echo(nees_expected(summary) + "\n")
     mounts = mount_rows(summary)
     if mounts:
         print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")
@@ -69,6 +71,16 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         print_table("against the batch solution", ("", ""), [(k, number(v)) for k, v in batch.items()], align="<>")
     for line in summary.get("warnings", ()):
         typer.echo(f"warning: {line}")
+    for line in summary.get("advice", ()):
+        typer.echo(f"advice: {line}")
+
+
+def nees_expected(summary: Mapping[str, Any]) -> str:
+    """Return what the pose NEES of a consistent filter is, over many runs and in one."""
+    from kalmark.results.warnings import POSE_NEES
+
+    dof = summary.get("pose_dof", 3)
+    return f"consistent pose NEES: {dof} averaged over many runs, up to {POSE_NEES[dof]:g} in a single one"
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:

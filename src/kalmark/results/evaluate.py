@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.results.advice import noise_advice
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
 from kalmark.results.by_position import by_position, no_ids
 from kalmark.results.calibration import bias_figures, mount_figures
@@ -51,6 +52,7 @@ def evaluate(run: Run) -> dict[str, Any]:
         "step_us_median": _quantile(history.step_us[1:], 0.5),
         "step_us_p99": _quantile(history.step_us[1:], 0.99),
         "nis_per_dof": nis_per_dof(history),
+        "pose_dof": 6 if history.in_space else 3,
         "diverged": bool(run.stopped) or any(figures.get("diverged", False) for figures in robots.values()),
     }
     summary |= window_figures(history)
@@ -76,6 +78,7 @@ def evaluate(run: Run) -> dict[str, Any]:
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
+    summary["advice"] = list(noise_advice(run, summary))
     return summary
 
 

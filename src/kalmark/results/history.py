@@ -92,7 +92,8 @@ class History:
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
     NaN where robots or sensors differ in size.  `late` (O,) says which tentative ones
     were fused when their landmark was confirmed.  `left_px` (O,) is what the corners of tags are off by after the scan
-    (`kalmark.results.corners`); `decisions` has what they were compared with.
+    (`kalmark.results.corners`); `decisions` has what they were compared with.  `noise` (O, p) are the sigmas stated of z,
+    NaN where they are not of its numbers.
     """
 
     t_ns: Ints
@@ -123,6 +124,7 @@ class History:
     true_id: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
     decisions: Decisions = field(default_factory=Decisions)
     late: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    noise: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def fused(self) -> Flags:
@@ -161,7 +163,7 @@ class History:
         """Return everything as named arrays, those of the contract (t in seconds) first."""
         named = {"t": self.t_ns * 1e-9} | {key: getattr(self, key) for key in ("robot", "mean", "covariance")}
         named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
-        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px", "true_id", "late")}
+        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px", "true_id", "late", "noise")}
         named |= self.decisions.arrays()
         return (
             named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._sensor_arrays()
@@ -202,6 +204,7 @@ class History:
         }
         columns |= {"kind": kind, "left_px": left, "true_id": named.get("true_id", named["id"])}
         columns["late"] = named.get("late", np.zeros(count, dtype=np.bool_))
+        columns["noise"] = named.get("noise", np.full((count, named["z"].shape[1]), np.nan))
         columns |= {"maps": maps, "starts": starts, "mounts": mounts, "biases": _biases(named)}
         return cls(**columns, inputs=inputs, cameras=cameras, decisions=Decisions.from_arrays(named))
 

@@ -11,6 +11,7 @@ from kalmark.results.align import Rigid, rigid, rigid_robust
 from kalmark.results.evaluate import antenna_path
 from kalmark.results.history import Array
 from kalmark.results.truth import moved
+from kalmark.results.warnings import POSE_NEES
 from kalmark.results.words import count, figure
 from kalmark.slam.events import Id
 
@@ -110,7 +111,9 @@ def headline(run: Run) -> tuple[str, list[str]]:
     if summary.get("fix_median_m") is not None:
         parts.append(f"fixes: median {summary['fix_median_m']:.2f} m, {summary['fix_within_10m']:.1%} within 10 m")
     if any(figures.get("pose_nees") is not None for figures in errors):
-        parts.append(f"pose NEES {figure(_mean(errors, 'pose_nees'))}")
+        dof = 6 if run.history.in_space else 3
+        usual = f"{dof} on average, up to {POSE_NEES[dof]:g} in one run"
+        parts.append(f"pose NEES {figure(_mean(errors, 'pose_nees'))} ({usual})")
     if summary["nis_per_dof"] is not None:
         parts.append(f"NIS/dof {summary['nis_per_dof']:.2f}")
     if summary["diverged"]:

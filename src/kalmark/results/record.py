@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
+from kalmark.results.advice import stated_noise
 from kalmark.results.cameras import biases, cameras, mounts
 from kalmark.results.corners import left_px
 from kalmark.results.decisions import Decisions
@@ -203,6 +204,7 @@ class _Recorder:
             inputs=Inputs(self.controls, tuple(self.fixes)),
             kind=texts(list(self.kinds)),
             late=self._late(seen),
+            noise=padded([stated_noise(self.slam, r) for r in steps], counts, widths[1]),
             left_px=np.concatenate([np.empty(0), *self.left]),
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),

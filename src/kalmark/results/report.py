@@ -47,6 +47,7 @@ def report_html(run: Run) -> str:
         robots=robot_table(run.summary),
         summary=_table([(key, show(value)) for key, value in _flat(run.summary)]),
         warnings="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("warnings", ())),
+        advice="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("advice", ())),
         mounts=_mounts(run.summary),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),
         changes=_changes(run),
@@ -84,7 +85,7 @@ def show(value: Any) -> str:
 def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
-        if (key in ("robots", "warnings") and not prefix) or key == "directions":
+        if (key in ("robots", "warnings", "advice") and not prefix) or key == "directions":
             continue
         out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
     return out
@@ -136,7 +137,7 @@ _TEMPLATE = """<!DOCTYPE html>
 <style>{style}</style>
 </head>
 <body>
-<header><h1>{title}</h1><p class="figures">{figures}</p><ul class="warnings">{warnings}</ul></header>
+<header><h1>{title}</h1><p class="figures">{figures}</p><ul class="warnings">{warnings}</ul><ul class="warnings advice">{advice}</ul></header>
 <main>
 <section><h2>Map <small>{hint}</small></h2>
 <div id="map"></div>

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from kalmark.results.run import Run
 
 NO_ID = "no id in the log"  # the reason that association by identity gives
-POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; at most 3 % of consistent runs are above: constant errors
+POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
 NIS_HIGH, NIS_LOW = 3.0, 0.1  # per degree of freedom
 FIX_NIS_HIGH = 5.0
 FIRST_FIX = {d: float(chi2.ppf(0.9999, d)) for d in (2, 3)}
@@ -180,7 +180,7 @@ def _d2(fix: UsedFix) -> float:
 
 
 def _noise(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
-    dof = 6 if run.history.in_space else 3
+    dof = summary["pose_dof"]
     for name, figures in summary["robots"].items():
         value = figures.get("pose_nees")
         if value is not None and value > POSE_NEES[dof]:

@@ -163,7 +163,7 @@ function drawErrors(robot) {
   if (two) page.xaxis2 = {...axis("time (s)"), anchor: "y6", domain: [0.54, 1], matches: "x"};
   Plotly.react("errors", traces, page, CONFIG);
   const [low, high] = DATA.neesBounds, ends = [robot.t[0], robot.t[robot.t.length - 1]];
-  el("nees-note").textContent = `${DATA.dof} degrees of freedom; the band holds 95 % of the values of a consistent filter`;
+  el("nees-note").textContent = `${DATA.dof} degrees of freedom; the band holds 95 % of a consistent filter's values; errors last, so a run may be outside for long`;
   Plotly.react("nees", [...bounds(ends, [low, low], [high, high]),
     {x: robot.t, y: robot.nees, mode: "lines", line: {color: robot.colour, width: 1.1},
      hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
