@@ -92,8 +92,8 @@ class History:
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
     NaN where robots or sensors differ in size.  `late` (O,) says which tentative ones
     were fused when their landmark was confirmed.  `left_px` (O,) is what the corners of tags are off by after the scan
-    (`kalmark.results.corners`); `decisions` has what they were compared with.  `noise` (O, p) are the sigmas stated of z,
-    NaN where they are not of its numbers.
+    (`kalmark.results.corners`); `decisions` has what they were compared with.  `noise` (O, p) are the sigmas stated
+    of z, NaN where they are not of its numbers.
     """
 
     t_ns: Ints

@@ -137,7 +137,8 @@ _TEMPLATE = """<!DOCTYPE html>
 <style>{style}</style>
 </head>
 <body>
-<header><h1>{title}</h1><p class="figures">{figures}</p><ul class="warnings">{warnings}</ul><ul class="warnings advice">{advice}</ul></header>
+<header><h1>{title}</h1><p class="figures">{figures}</p><ul class="warnings">{warnings}</ul>
+<ul class="warnings advice">{advice}</ul></header>
 <main>
 <section><h2>Map <small>{hint}</small></h2>
 <div id="map"></div>

@@ -1,0 +1,86 @@
+"""Is a sensor's noise stated far too large?  What its innovations are over the whole run, against that noise alone.
+
+An innovation has the noise of its measurement in it, and the uncertainty of pose and map on top: E[z z'] = H P H' + R
+is at least R, whatever P the filter believes in.  Squares of z that add up to far less than R therefore say that R is
+too large, and by how much at least.  They do not say it of errors that last from one sighting to the next: the map
+takes those in, and a larger white noise is a fair price for them.  So nothing is said where the truth shows the filter
+to be sure enough of itself already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.models import sensors
+from kalmark.results.consistency import nis
+from kalmark.results.describe import TYPES
+from kalmark.results.history import Array, History
+from kalmark.results.words import figure
+from kalmark.slam.events import Scan
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+    from kalmark.slam.report import Report
+    from kalmark.slam.slam import Slam
+
+LOW = 0.5  # squares over those of the stated noise: it is 1.4 times too large
+NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
+COLUMNS = {TYPES[cls.__name__]: tuple(cls.columns) for cls in sensors.BUILT_IN if cls.__name__ in TYPES}
+
+
+def stated_noise(slam: Slam, report: Report) -> Array:
+    """Return the sigmas (K, p) of the noise that a scan's observations were given, (K, 0) where they are not of z."""
+    count, width = report.z.shape
+    event = report.event
+    if not count or not isinstance(event, Scan):
+        return np.empty((count, 0))
+    sensor = slam.robots[event.robot].sensors[event.sensor].sensor
+    R = sensor.noise(event.y) if event.cov is None else np.broadcast_to(event.cov, (count, *event.cov.shape[-2:]))
+    if R.shape != (count, width, width):
+        return np.empty((count, 0))
+    return np.sqrt(np.einsum("kii->ki", R))
+
+
+def noise_advice(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    """Return a line for each sensor whose noise is stated far too large."""
+    history = run.history
+    nees = [figures["pose_nees"] for figures in summary["robots"].values() if figures.get("pose_nees") is not None]
+    sure = bool(nees) and float(np.mean(nees)) > summary["pose_dof"]
+    if sure or summary["diverged"] or len(history.noise) != len(history.step):
+        return
+    for sensor in dict.fromkeys(history.sensor.tolist()):
+        mine = (history.outcome == "associated") & (history.sensor == sensor) & np.isfinite(history.noise).any(axis=1)
+        if mine.sum() >= NUMBER and len(set(history.step[mine].tolist())) >= SCANS:
+            yield from _of(history, sensor, mine, _columns(run, sensor))
+
+
+def _of(history: History, sensor: str, mine: Any, columns: tuple[str, ...]) -> Iterator[str]:
+    z, sigma = history.z[mine], history.noise[mine]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squares = np.nanmean((z / sigma) ** 2, axis=0)
+    used = np.isfinite(sigma).any(axis=0)
+    low = np.flatnonzero(used & (squares < LOW))
+    if not len(low):
+        return
+    value, dof = nis(z, history.Z[mine])
+    factors = 1.0 / np.sqrt(np.maximum(squares, 1e-12))
+    if len(columns) == used.sum():
+        told = ", ".join(f"of {columns[k]} about {figure(factors[k], 2)} times" for k in low)
+    elif len(low) < used.sum():
+        return
+    else:
+        told = f"about {figure(float(1.0 / np.sqrt(np.mean(np.maximum(squares[low], 1e-12)))), 2)} times"
+    share = figure(float(np.nansum(value) / dof.sum()), 2)
+    yield (
+        f"sensor {sensor}: NIS {share} where 1 is expected: its noise is stated too large, {told}, "
+        "unless its errors last from one sighting to the next"
+    )
+
+
+def _columns(run: Run, sensor: str) -> tuple[str, ...]:
+    """Return what a sensor of kalmark's own measures, () of others."""
+    sections = [((robot or {}).get("sensors") or {}).get(sensor) for robot in (run.config.get("robots") or {}).values()]
+    return next((COLUMNS.get(str(section.get("type")), ()) for section in sections if section), ())
