@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.errors import MapError
 from kalmark.slam import merging
 from kalmark.slam.ambiguity import doubtful, gains
 
@@ -123,5 +124,68 @@ def test_a_landmark_seen_without_any_other_may_still_be_one_of_the_map() -> None
     for name, x in (("u1", 5.0), ("u2", 5.05)):
         slam.add_landmark(name, [x, 0.0], 0.01 * np.eye(2))
         slam.members.together[name] = {name}
-    slam.members.lately = ["u2"]
+    slam.members.lately, slam.members.unnamed = ["u2"], 2
     assert list(merging._hypotheses(slam, "u2", 2)) == [[("u2", "u1")]]
+
+
+def named_again(slam: km.Slam) -> list[str]:
+    """Map the garden without ids, then by ids in scans that also show something without one."""
+    for t in range(6):
+        look(slam, t, GARDEN)
+    ids = [f"tree{i}" for i in range(len(GARDEN))]
+    y = km.geometry.observe(np.zeros(3), np.vstack([GARDEN, [-5.0, -5.0]]))[0]
+    for t in range(6, 9):
+        slam.process(km.Scan(t, "cart", "lidar", y, ids=[*ids, None]))
+    assert set(ids) < set(slam.landmarks().ids)
+    return ids
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+def test_a_landmark_with_an_id_of_the_log_keeps_it_when_it_is_merged(map_: str) -> None:
+    slam = slam_of(km.estimators.Invariant(), map_)
+    ids = named_again(slam)
+    merged = [pair for t in range(10, 40) for pair in look(slam, t, GARDEN).merged]
+    assert {kept for _, kept, _ in merged} == set(ids)
+    assert {gone for gone, _, _ in merged}.isdisjoint(ids)
+    y = km.geometry.observe(np.zeros(3), GARDEN)[0]
+    report = slam.process(km.Scan(40, "cart", "lidar", y, ids=ids))
+    assert {o.outcome for o in report.observations} == {"associated"}
+
+
+def test_two_ids_of_the_log_are_two_landmarks_wherever_they_are() -> None:
+    slam = slam_of()
+    for t, ids in ((0, [1, None]), (1, [2, None])):
+        slam.process(km.Scan(t, "cart", "lidar", [[5.0, 0.1], [6.0, 1.5]], ids=ids))
+    assert list(merging._hypotheses(slam, 2, 2)) == []
+    slam.members.unnamed = 9
+    slam.add_landmark("u9", slam.mean(1), 0.01 * np.eye(2))
+    slam.members.together["u9"] = {"u9"}
+    assert {pair for pairs in merging._hypotheses(slam, 2, 2) for pair in pairs} == {(2, "u9")}
+
+
+def test_in_a_full_map_nothing_is_merged_and_nothing_lost(tmp_path: Path) -> None:
+    slam = slam_of(km.estimators.Invariant(), "postponed")
+    named_again(slam)
+    slam.map.storage.limit_bytes = slam.map.storage.nbytes  # type: ignore[union-attr]
+    for i in range(1000):
+        try:
+            slam.add_landmark(f"far{i}", [1000.0 + i, 0.0])
+        except MapError:
+            break
+    before = slam.landmarks().ids
+    for t in range(10, 40):
+        report = look(slam, t, GARDEN)
+        assert report.merged == ()
+        assert len(report.observations) == len(GARDEN)
+    assert slam.landmarks().ids == before
+    slam.save(tmp_path / "map.kmk")
+    assert km.Slam.load(tmp_path / "map.kmk").landmarks().ids == before
+
+
+def test_a_landmark_given_again_by_hand_does_not_disturb_the_merging_of_others() -> None:
+    slam = slam_of(km.estimators.Invariant())
+    ids = named_again(slam)
+    mean, cov = slam.mean(ids[0]), slam.covariance(ids[0])
+    slam.remove(ids[0])
+    slam.add_landmark(ids[0], mean, cov)
+    assert any(look(slam, t, GARDEN[1:]).merged for t in range(10, 40))

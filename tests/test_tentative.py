@@ -118,6 +118,22 @@ def test_a_known_id_is_a_landmark_at_once_beside_sightings_without_one() -> None
     assert [(o.outcome, o.landmark) for o in report.observations] == [("new", 17), ("tentative", "u1")]
 
 
+@pytest.mark.parametrize("by", ["scan", "survey"])
+def test_a_tentative_landmark_gives_way_to_one_that_is_called_like_it(by: str, tmp_path: Path) -> None:
+    slam = orchard()
+    for t in range(5):
+        slam.process(km.Scan(t, "cart", "lidar", [[5.0, 0.2]]))
+        if t == 1 and by == "survey":
+            slam.add_landmark("u1", [-7.0, 7.0], 0.01 * np.eye(2))
+        elif t >= 1 and by == "scan":
+            slam.process(km.Scan(t, "cart", "lidar", [[9.9, 2.356]], ids=["u1"]))
+    assert sorted(slam.landmarks().ids) == ["u1", "u2"]
+    np.testing.assert_allclose(slam.mean("u1"), [-7.0, 7.0], atol=0.02)
+    np.testing.assert_allclose(slam.mean("u2"), 5.0 * np.array([np.cos(0.2), np.sin(0.2)]), atol=0.02)
+    slam.save(tmp_path / "map.kmk")
+    assert km.Slam.load(tmp_path / "map.kmk").landmarks().ids == slam.landmarks().ids
+
+
 @pytest.mark.parametrize("map_", ["dense", "postponed"])
 def test_tentative_landmarks_are_saved(map_: str, tmp_path: Path) -> None:
     straight = orchard(map_=map_, upkeep=km.Upkeep(confirm=3, within=7))

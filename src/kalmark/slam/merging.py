@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from kalmark.errors import MapError
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3, Space
 from kalmark.slam.ambiguity import density, gains
@@ -102,6 +103,12 @@ def _fits(space: Space) -> bool:
     return all(kind in LINEAR for kind in space.kinds)
 
 
+def _is_given(slam: Slam, name: Id) -> bool:
+    """Return whether a landmark's name is an id of the log or of a survey, not one made up for what has none."""
+    made_up = isinstance(name, str) and name[:1] == "u" and name[1:].isdecimal()
+    return not (made_up and int(str(name)[1:]) <= slam.members.unnamed)
+
+
 def _merge_with(slam: Slam, view: View, robot: str, name: Id) -> Iterator[tuple[Id, Id, str]]:
     """Merge a landmark, and others seen lately, with what they are, if that is beyond doubt.
 
@@ -136,7 +143,9 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     others = [n for n in around if n in together and n != name and members.kinds[n].kind == kind]
     places = slam.map.means(members.slots_of(others), d) if others else np.zeros((0, d))
     far = np.linalg.norm(places - at, axis=1)
-    possible = sorted((l for l, o in enumerate(others) if o not in together[name]), key=lambda l: far[l])
+    given = {n for n in others if _is_given(slam, n)}
+    apart = together[name] | (given if _is_given(slam, name) else set())  # two ids are two landmarks
+    possible = sorted((l for l, o in enumerate(others) if o not in apart), key=lambda l: far[l])
     if not possible:
         return
     _, Z = _differences(slam, [(name, others[possible[0]])])
@@ -149,7 +158,8 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     moved = mine[:, None] + (places[possible] - at)  # (C, L, d): the company, were the landmark the l-th that it may be
     gaps: Any = cKDTree(places).query(moved)
     found, nearest = gaps[0], gaps[1]
-    alone = np.array([[o in together[c] or o == c for o in others] for c in company], dtype=np.bool_)
+    known = [together[c] | {c} | (given if _is_given(slam, c) else set()) for c in company]
+    alone = np.array([[o in different for o in others] for different in known], dtype=np.bool_)
     alone = alone.reshape(len(company), len(others))
     found[np.take_along_axis(alone, nearest, axis=1)] = np.inf
     slack = SLACK_M + SLACK_RAD * np.linalg.norm(mine - at, axis=1)[:, None]
@@ -172,7 +182,7 @@ def _company(slam: Slam, name: Id, d: int) -> list[Id]:
     members, kinds = slam.members, slam.members.kinds
     lately = name in members.lately
     others = [n for n in (members.lately if lately else sorted(members.together[name], key=str)) if n != name]
-    others = [n for n in others if n in kinds and kinds[n].kind == kinds[name].kind]
+    others = [n for n in others if n in members.together and n in kinds and kinds[n].kind == kinds[name].kind]
     if lately or len(others) <= COMPANY:
         return others
     far = np.linalg.norm(slam.map.means(members.slots_of(others), d) - slam.mean(name)[:d], axis=1)
@@ -198,7 +208,10 @@ def _differences(slam: Slam, pairs: Sequence[tuple[Id, Id]]) -> tuple[Array, Arr
 def _fuse(
     slam: Slam, view: View, robot: str, pairs: Sequence[tuple[Id, Id]], gain: float
 ) -> Iterator[tuple[Id, Id, str]]:
-    """Constrain pairs of landmarks to be equal, through the estimator, and remove the younger of each."""
+    """Constrain pairs of landmarks to be equal, through the estimator, and remove one of each.
+
+    Of an id of the log and a name made up the id stays, else the older one.  In a full map nothing is merged.
+    """
     map_, members = slam.map, slam.members
     slots, space = [], members.kinds[pairs[0][0]].space
     for a, b in pairs:
@@ -206,7 +219,12 @@ def _fuse(
         l, index = map_.mean(other) - map_.mean(one), np.concatenate([map_.index(one), map_.index(other)])
         n = len(index) // 2
         G = np.hstack([-np.eye(n), np.eye(n)])
-        slots.append(map_.augment(Space("difference", space.kinds), l, index, G, np.zeros((n, n))))
+        try:
+            slots.append(map_.augment(Space("difference", space.kinds), l, index, G, np.zeros((n, n))))
+        except MapError:
+            for slot in slots:
+                map_.remove(slot)
+            return
     look: Any = Difference(view.at, space.size)
     y, R = np.zeros((len(pairs), space.size)), np.tile(EQUAL_M**2 * np.eye(space.size), (len(pairs), 1, 1))
     done = slam.estimator.correct(
@@ -215,7 +233,7 @@ def _fuse(
     age = {name: i for i, name in enumerate(members.kinds)}
     for slot, (a, b), d2 in zip(slots, pairs, done.d2.tolist(), strict=True):
         map_.remove(slot)
-        kept, gone = (a, b) if age[a] < age[b] else (b, a)
+        kept, gone = sorted((a, b), key=lambda name: (not _is_given(slam, name), age[name]))
         members.seen[kept] = members.seen.get(kept, 0) + members.seen.get(gone, 0)
         for name in list(members.together.get(gone, ())):
             members.together.setdefault(name, set()).add(kept)

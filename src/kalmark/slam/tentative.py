@@ -62,6 +62,7 @@ def sightings(
     Return those that are still tentative or left alone, and the decisions about those that confirm a landmark, which is
     one from here on.
     """
+    _give_way(slam, event)
     rows = [k for k in new if decisions[k][0] in view.starts]
     names = [name for name, t in slam.members.tentative.items() if t.kind.kind in view.looks]
     seen: dict[int, Observation] = {}
@@ -94,6 +95,13 @@ def sightings(
             seen[k] = Observation(k, None, "ignored", None, float(d2[i, least]), why)
     kept.keep(slam, view, event, waiting, R)
     return seen, confirmed
+
+
+def _give_way(slam: Slam, event: Scan) -> None:
+    """Give other names to tentative landmarks that are called what the log, or a survey, calls another one."""
+    members, ids = slam.members, event.ids or ()
+    for name in [name for name in members.tentative if name in members.slots or name in ids]:
+        members.tentative[members.new_name()] = members.tentative.pop(name)
 
 
 def _sighted(slam: Slam, view: View, report: Report, name: Id) -> str:
