@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.errors import ModelError
+from kalmark.errors import MapError, ModelError
 from kalmark.geometry import V_inverse
 from kalmark.slam.hypotheses import to_point
 
@@ -217,3 +217,27 @@ def test_the_valley_that_an_unknown_scale_bends_is_no_gaussian_and_waits() -> No
             outcomes = [o.outcome for o in slam.process(scan).observations]
     assert outcomes == ["deferred"] * count
     assert len(slam.landmarks()) == 0
+
+
+@way
+def test_in_a_full_map_ranges_are_ignored_with_the_reason_until_there_is_room(way: Any, tmp_path: Path) -> None:
+    events, _, _ = world(7, count=3)
+    slam = km.Slam([robot(way)], map="postponed")
+    slam.map.storage.limit_bytes = slam.map.storage.nbytes  # type: ignore[union-attr]
+    placed: list[int] = []
+    while len(placed) < 70:
+        try:
+            slam.add_landmark(1000 + len(placed), [1000.0 + len(placed), 0.0])
+        except MapError:
+            break
+        placed.append(1000 + len(placed))
+    assert len(placed) < 70
+    told = list(played(slam, events[:20]))
+    assert {o.outcome for o in told} <= {"ignored", "deferred", "tentative"}
+    assert any("the map is full" in o.reason for o in told)
+    for name in placed:
+        slam.remove(name)
+    list(played(slam, events[20:]))
+    assert slam.landmarks().ids or way is WAYS[1], "only blocks of the same shape take the place of those removed"
+    slam.save(tmp_path / "map.kmk")
+    assert km.Slam.load(tmp_path / "map.kmk").landmarks().ids == slam.landmarks().ids

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import ModelError
+from kalmark.errors import MapError, ModelError
 from kalmark.geometry.spaces import POINT2
 from kalmark.models.landmarks import Polar2D
 from kalmark.models.observe import composed, linearize
@@ -79,7 +79,7 @@ class Hypotheses:
             raise ModelError(f"Hypotheses: odds is {self.odds!r}, expected a number between 0 and 1")
 
     def observe(self, slam: Slam, view: View, event: Scan, k: int, id_: Id | None, name: Id, R: Array) -> Observation:
-        """Take a range of a landmark that is not in the map yet."""
+        """Take a range of a landmark that is not in the map yet.  Raises MapError where no other block fits in."""
         unlocated = slam.members.unlocated
         ring = unlocated.get(name)
         if ring is None:
@@ -123,7 +123,12 @@ class Hypotheses:
             if len(head) > 2 * size:  # distance = gain range - offset
                 G[3, 6:] = y[0, 0], -1.0
             l = np.array([*T[:2], T[2] + 2 * math.pi * j / self.count, distance])
-            slots.append(map_.augment(POLAR, l, index, slam.estimator.pose_jacobian(map_, robot, G), Q))
+            try:
+                slots.append(map_.augment(POLAR, l, index, slam.estimator.pose_jacobian(map_, robot, G), Q))
+            except MapError:
+                for slot in slots:
+                    map_.remove(slot)
+                raise
         return slots
 
     def _prune(self, slam: Slam, ring: Ring) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import ModelError
+from kalmark.errors import MapError, ModelError
 from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.hypotheses import Hypotheses, Ring
@@ -56,7 +56,10 @@ class Named:
     def observe(self, slam: Slam, view: View, event: Scan, k: int, id_: Id | None, name: Any, R: Array) -> Observation:
         """Take an observation that has an id."""
         if isinstance(name, int | str):
-            return self.way.observe(slam, view, event, k, id_, name, R)
+            try:
+                return self.way.observe(slam, view, event, k, id_, name, R)
+            except MapError as full:
+                return Observation(k, id_, "ignored", None, None, str(full))
         kind = type(view.sensor).__name__
         return Observation(k, id_, "ignored", None, None, f"a {kind} measurement without an id cannot start a landmark")
 

@@ -104,19 +104,23 @@ class Trilateration:
             raise ModelError(f"Trilateration: odds is {self.odds!r}, expected a number between 0 and 1")
 
     def observe(self, slam: Slam, view: View, event: Scan, k: int, id_: Id | None, name: Id, R: Array) -> Observation:
-        """Take a range of a landmark that is not in the map yet: keep it, and start the landmark if that is enough."""
+        """Take a range of a landmark that is not in the map yet: keep it, and start the landmark if that is enough.
+
+        Raises MapError, the range not kept or the landmark not started, where the map is full.
+        """
         unlocated = slam.members.unlocated
         known = unlocated.get(name)
         here = view.pose(slam.map, slam.members.slots[event.robot])[:2]
         if not isinstance(known, Ranges) or (known.robot, known.sensor) != (event.robot, event.sensor):
             if known is not None:
                 return Observation(k, id_, "ignored", None, None, "another sensor's ranges of it are being kept")
-            known = unlocated[name] = Ranges(event.robot, event.sensor, math.sqrt(R[0, 0]))
+            known = Ranges(event.robot, event.sensor, math.sqrt(R[0, 0]))
         elif np.linalg.norm(here - slam.map.mean(known.kept[-1].slot)) < known.spacing:
             why = f"within {known.spacing:.2f} m of where the last range kept was taken"
             return Observation(k, id_, "deferred", None, None, why)
         varies = view.noise_at is not None and event.cov is None
         known.kept.append(Kept(_place(slam, view, event), float(event.y[k, 0]), float(R[0, 0]), varies))
+        unlocated[name] = known
         found = self._answer(slam, view, known) if len(known.kept) > 2 else "it takes three ranges to tell"
         if isinstance(found, str):
             self._thin(slam, known)
