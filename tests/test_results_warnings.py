@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,16 @@ import pytest
 import results_space
 from kalmark.errors import DivergedError
 from kalmark.logs.log import Log
+from kalmark.models.motion import Unicycle
+from kalmark.models.sensors import RangeBearing
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import load_run
 from kalmark.slam.events import Control, Event, Fix, Scan
+from kalmark.slam.robot import Mount, Robot
+from kalmark.slam.slam import Slam
 from results_space import spiral
-from results_world import STEP_NS, circle, slam_for
+from results_world import STEP_NS, circle, slam_for, start_of
 
 
 def warned(log: Log, events: list[Event] | None = None, **options: Any) -> list[str]:
@@ -129,6 +134,49 @@ def test_noise_that_is_not_the_log_s_is_noticed() -> None:
     lines = warned(log, events)
     assert any(line.startswith("pose NEES ") and "where 3 is consistent" in line for line in lines)
     assert any(line.endswith("the noise is set too small") for line in lines)
+
+
+def advised(log: Log, range_: float, bearing: float, control: float = 1.0) -> list[str]:
+    """Return the advice on a log whose noise is stated so many times what it is."""
+    lidar = RangeBearing(sigma_range_m=0.05 * range_, sigma_bearing_rad=0.02 * bearing)
+    motion = Unicycle(sigma_v_mps=0.05 * control, sigma_w_radps=0.02 * control)
+    start = start_of(("rover",), "rover")
+    slam = Slam([Robot("rover", motion, start=start, sensors={"lidar": Mount(lidar)})])
+    lines: list[str] = record(slam, log, progress=False).evaluate()["advice"]
+    return lines
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_of_a_noise_that_is_far_too_large_it_is_advised_by_how_much_and_of_a_right_one_nothing(seed: int) -> None:
+    log = circle(steps=120, seed=seed)
+    assert advised(log, 1.0, 1.0) == advised(log, 1.25, 1.25) == []
+    line = only(advised(log, 2.3, 2.3))
+    factors = re.fullmatch(
+        r"sensor lidar: NIS 0\.(19|2|21) where 1 is expected: its sigma is stated about (\S+) times \(range_m\), "
+        r"(\S+) times \(bearing_rad\) too large, unless its errors last from one sighting to the next",
+        line,
+    )
+    assert factors is not None, line
+    assert [float(f) for f in factors.groups()[1:]] == pytest.approx([2.3, 2.3], rel=0.15)
+    assert " times (range_m) too large" in only(advised(log, 3.0, 1.0))
+
+
+def test_a_sensor_is_not_blamed_for_controls_whose_noise_is_too_large_nor_by_few_scans_nor_against_the_truth() -> None:
+    log = circle(steps=120)
+    assert advised(log, 1.0, 1.0, control=10.0) == []
+    assert advised(replace(log, events=log.events[:40]), 2.0, 2.0) == []
+    poses = log.truth["rover"].poses * [1.3, 1.3, 1.0]  # the stated noise is large, and yet the filter is too sure
+    assert advised(replace(log, truth={"rover": replace(log.truth["rover"], poses=poses)}), 2.3, 2.3) == []
+
+
+def test_advice_is_kept_with_a_run_and_shown_in_its_report(tmp_path: Path) -> None:
+    log = circle(steps=60)
+    events: list[Event] = [scan(e, cov=np.diag([0.2, 0.1]) ** 2) if isinstance(e, Scan) else e for e in log]
+    run = record(slam_for(log), replace(log, events=events), progress=False)
+    run.save(tmp_path)
+    assert "its sigma is stated" in only(run.summary["advice"])
+    assert load_run(tmp_path).evaluate()["advice"] == run.summary["advice"]
+    assert '<ul class="warnings advice"><li>sensor lidar: ' in (tmp_path / "report.html").read_text()
 
 
 def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(

@@ -4,7 +4,7 @@ An innovation has the noise of its measurement in it, and the uncertainty of pos
 is at least R, whatever P the filter believes in.  Squares of z that add up to far less than R therefore say that R is
 too large, and by how much at least.  They do not say it of errors that last from one sighting to the next: the map
 takes those in, and a larger white noise is a fair price for them.  So nothing is said where the truth shows the filter
-to be sure enough of itself already.
+to be too sure of itself already.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from kalmark.models import sensors
 from kalmark.results.consistency import nis
 from kalmark.results.describe import TYPES
 from kalmark.results.history import Array, History
+from kalmark.results.warnings import POSE_NEES
 from kalmark.results.words import figure
 from kalmark.slam.events import Scan
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 LOW = 0.5  # squares over those of the stated noise: it is 1.4 times too large
+TINY_NIS = 0.1
+TINY = 1e-6  # of those squares, where a log has no noise
 NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
 COLUMNS = {TYPES[cls.__name__]: tuple(cls.columns) for cls in sensors.BUILT_IN if cls.__name__ in TYPES}
 
@@ -44,12 +47,18 @@ def stated_noise(slam: Slam, report: Report) -> Array:
     return np.sqrt(np.einsum("kii->ki", R))
 
 
-def noise_advice(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
-    """Return a line for each sensor whose noise is stated far too large."""
+def advice(run: Run, summary: Mapping[str, Any]) -> list[str]:
+    """Return a line for each sensor whose noise is stated far too large; one if the NIS is tiny for another reason."""
+    lines, nis_ = list(_sensors(run, summary)), summary["nis_per_dof"]
+    if not lines and nis_ is not None and nis_ < TINY_NIS and summary["associated"] >= NUMBER // 2:
+        lines = [f"NIS per degree of freedom {figure(nis_, 2)} where 1 is consistent: the noise is set too large"]
+    return lines
+
+
+def _sensors(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
     history = run.history
     nees = [figures["pose_nees"] for figures in summary["robots"].values() if figures.get("pose_nees") is not None]
-    sure = bool(nees) and float(np.mean(nees)) > summary["pose_dof"]
-    if sure or summary["diverged"] or len(history.noise) != len(history.step):
+    if summary["diverged"] or (nees and float(np.mean(nees)) > POSE_NEES[summary["pose_dof"]]):
         return
     for sensor in dict.fromkeys(history.sensor.tolist()):
         mine = (history.outcome == "associated") & (history.sensor == sensor) & np.isfinite(history.noise).any(axis=1)
@@ -66,16 +75,16 @@ def _of(history: History, sensor: str, mine: Any, columns: tuple[str, ...]) -> I
     if not len(low):
         return
     value, dof = nis(z, history.Z[mine])
-    factors = 1.0 / np.sqrt(np.maximum(squares, 1e-12))
+    factors = 1.0 / np.sqrt(np.maximum(squares, TINY))
     if len(columns) == used.sum():
-        told = ", ".join(f"of {columns[k]} about {figure(factors[k], 2)} times" for k in low)
-    elif len(low) < used.sum():
-        return
+        told = "sigma is", ", ".join(f"{figure(factors[k], 2)} times ({columns[k]})" for k in low)
+    elif len(low) == used.sum():
+        told = "sigmas are", f"{figure(float(1.0 / np.sqrt(np.mean(np.maximum(squares, TINY)))), 2)} times"
     else:
-        told = f"about {figure(float(1.0 / np.sqrt(np.mean(np.maximum(squares[low], 1e-12)))), 2)} times"
+        return
     share = figure(float(np.nansum(value) / dof.sum()), 2)
     yield (
-        f"sensor {sensor}: NIS {share} where 1 is expected: its noise is stated too large, {told}, "
+        f"sensor {sensor}: NIS {share} where 1 is expected: its {told[0]} stated about {told[1]} too large, "
         "unless its errors last from one sighting to the next"
     )
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kalmark.results.advice import noise_advice
+from kalmark.results.advice import advice
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
 from kalmark.results.by_position import by_position, no_ids
 from kalmark.results.calibration import bias_figures, mount_figures
@@ -78,7 +78,7 @@ def evaluate(run: Run) -> dict[str, Any]:
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
-    summary["advice"] = list(noise_advice(run, summary))
+    summary["advice"] = advice(run, summary)
     return summary
 
 
