@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
-from kalmark.results.picture import Picture, ellipses, headline
+from kalmark.results.picture import Picture, ellipses, headline, stretches_of
 from kalmark.results.plot import draw_map, save_map
 from kalmark.results.record import record
 from kalmark.results.report import report_html, show
@@ -180,6 +181,29 @@ def test_the_map_shows_whole_ellipses_but_a_huge_one_does_not_blow_it_up(run: Ru
     huge = replace(run.landmarks, covariances=[1e6 * np.eye(2), *run.landmarks.covariances[1:]])
     (axes,) = draw_map(replace(run, landmarks=huge)).axes
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 2 * (right - left)
+
+
+def test_no_line_is_drawn_across_a_gap_in_time() -> None:
+    log = circle(steps=120)
+    events = [e for e in log if not (isinstance(e, Scan) and 4.05 < e.t_s < 9.0)]
+    run = record(slam_for(log), replace(log, events=events), progress=False)
+    before = int((run.history.t_ns <= 4.05e9).sum())
+    (axes,) = draw_map(run).axes
+    lines = [line.get_xydata() for line in axes.lines if len(line.get_xydata()) == len(run.history.t_ns) + 1]
+    assert len(lines) == 2, "the estimated path and the true one"
+    for points in lines:
+        assert np.flatnonzero(np.isnan(points).any(axis=1)).tolist() == [before]
+    (robot,) = page_data(report_html(run))["robots"]
+    assert robot["gaps"] == [before]
+    assert robot["truth"]["x"][before] is None
+    assert stretches_of(10**9 * np.array([0, 5, 10, 15, 70])).tolist() == [0, 0, 0, 0, 1]
+
+
+def test_the_title_keeps_its_distance_from_the_edge_of_the_picture(run: Run, tmp_path: Path) -> None:
+    save_map(run, tmp_path / "map.png")
+    ink = (imread(tmp_path / "map.png")[..., :3] < 0.9).any(axis=2)
+    assert not ink[:15].any()
+    assert not ink[-15:].any()
 
 
 def test_fixes_that_the_filter_used_are_drawn_where_they_were_measured() -> None:

@@ -14,11 +14,11 @@ import results_space
 from kalmark.errors import DivergedError
 from kalmark.logs.log import Log
 from kalmark.models.motion import Unicycle
-from kalmark.models.sensors import RangeBearing
+from kalmark.models.sensors import Bearing, RangeBearing
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import load_run
-from kalmark.slam.events import Control, Event, Fix, Scan
+from kalmark.slam.events import Control, Event, Fix, Scan, order
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 from results_space import spiral
@@ -167,6 +167,21 @@ def test_a_sensor_is_not_blamed_for_controls_whose_noise_is_too_large_nor_by_few
     assert advised(replace(log, events=log.events[:40]), 2.0, 2.0) == []
     poses = log.truth["rover"].poses * [1.3, 1.3, 1.0]  # the stated noise is large, and yet the filter is too sure
     assert advised(replace(log, truth={"rover": replace(log.truth["rover"], poses=poses)}), 2.3, 2.3) == []
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_two_sensors_the_one_with_the_wrong_noise_is_named() -> None:
+    log = circle(steps=100)
+    sensors = {
+        "lidar": Mount(RangeBearing(sigma_range_m=0.05, sigma_bearing_rad=0.02)),
+        "eye": Mount(Bearing(sigma_bearing_rad=0.06)),
+    }
+    eye = [scan(e, sensor="eye", y=e.y[:, 1:]) for e in log if isinstance(e, Scan) and e.t_ns % (2 * STEP_NS) == 0]
+    events = [e for e in log if not (isinstance(e, Scan) and e.t_ns % (2 * STEP_NS) == 0)]
+    motion = Unicycle(sigma_v_mps=0.05, sigma_w_radps=0.02)
+    slam = Slam([Robot("rover", motion, start=start_of(("rover",), "rover"), sensors=sensors)])
+    run = record(slam, replace(log, events=sorted([*events, *eye], key=order)), progress=False)
+    assert only(run.evaluate()["advice"]).startswith("sensor eye: NIS ")
 
 
 def test_advice_is_kept_with_a_run_and_shown_in_its_report(tmp_path: Path) -> None:

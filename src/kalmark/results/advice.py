@@ -67,18 +67,17 @@ def _sensors(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _of(history: History, sensor: str, mine: Any, columns: tuple[str, ...]) -> Iterator[str]:
+    size = int(np.isfinite(history.noise[mine]).sum(axis=1).max())  # the padding after its numbers is that of others
     z, sigma = history.z[mine], history.noise[mine]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squares = np.nanmean((z / sigma) ** 2, axis=0)
-    used = np.isfinite(sigma).any(axis=0)
-    low = np.flatnonzero(used & (squares < LOW))
+    squares = np.nanmean((z[:, :size] / sigma[:, :size]) ** 2, axis=0)
+    low = np.flatnonzero(squares < LOW)
     if not len(low):
         return
     value, dof = nis(z, history.Z[mine])
     factors = 1.0 / np.sqrt(np.maximum(squares, TINY))
-    if len(columns) == used.sum():
+    if len(columns) == size:
         told = "sigma is", ", ".join(f"{figure(factors[k], 2)} times ({columns[k]})" for k in low)
-    elif len(low) == used.sum():
+    elif len(low) == size:
         told = "sigmas are", f"{figure(float(1.0 / np.sqrt(np.mean(np.maximum(squares, TINY)))), 2)} times"
     else:
         return

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.results.align import Rigid, rigid, rigid_robust
-from kalmark.results.evaluate import antenna_path
-from kalmark.results.history import Array
+from kalmark.results.evaluate import FIX_GAP_S, antenna_path
+from kalmark.results.history import Array, Ints
 from kalmark.results.truth import moved
 from kalmark.results.warnings import POSE_NEES
 from kalmark.results.words import count, figure
@@ -24,13 +24,14 @@ TRUTH_COLOUR = "#8b929c"
 LANDMARK_COLOUR = "#d2691e"
 FIX_COLOUR = "#7a3fa0"
 INK = "#2b2f36"
+GAP_STEPS = 10.0
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
     """By robot: estimated poses (N, 3), true positions (N, 2; NaN: unknown), fixes (N, 2) to score with
     and those `used` by the filter.  True landmarks (2,).  In space poses are (N, 7), positions (N, 3), landmarks
-    places.
+    places.  `stretches` (N,) count the gaps in time up to each of a robot's steps: no line is drawn across them.
     """
 
     paths: dict[str, Array]
@@ -38,6 +39,7 @@ class Picture:
     fixes: dict[str, Array]
     landmarks: dict[Id, Array]
     used: dict[str, Array]
+    stretches: dict[str, Ints]
 
     @classmethod
     def of(cls, run: Run) -> Picture:
@@ -55,13 +57,28 @@ class Picture:
             elif robot in run.truth.fixes:
                 fixes[robot] = _fixes_in_map(run, robot)
         landmarks = {i: l if d == 3 else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()}
-        return cls(paths, truth, fixes, landmarks, _used_fixes(run))
+        stretches = {robot: stretches_of(history.t_ns[history.robot == robot]) for robot in paths}
+        return cls(paths, truth, fixes, landmarks, _used_fixes(run), stretches)
 
     def colour(self, robot: str) -> str:
         """Return the robot's colour; in space, where landmarks are blue or red, the first robot is green."""
         in_space = any(path.shape[1] == 7 for path in self.paths.values())
         colours = SPACE_COLOURS if in_space else COLOURS
         return colours[list(self.paths).index(robot) % len(colours)]
+
+
+def stretches_of(t_ns: Ints) -> Ints:
+    """Return how many gaps are before each of a robot's steps (N,): 3 s, and ten times the median, without a scan."""
+    steps = np.diff(t_ns) * 1e-9
+    if not len(steps):
+        return np.zeros(len(t_ns), dtype=np.int64)
+    return np.append(0, np.cumsum(steps > max(FIX_GAP_S, GAP_STEPS * float(np.median(steps)))))
+
+
+def broken(points: Array, stretches: Ints) -> Array:
+    """Return a path (N, d) with a row of NaN before each new stretch, so that no line is drawn across the gap."""
+    at = np.flatnonzero(np.diff(stretches[: len(points)])) + 1
+    return np.insert(points, at, np.nan, axis=0)
 
 
 def _used_fixes(run: Run) -> dict[str, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,10 +12,22 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.markers import MarkerStyle
+from matplotlib.path import Path
+from matplotlib.transforms import Affine2D
 
 from kalmark.results import plot_space
-from kalmark.results.history import Array
-from kalmark.results.picture import FIX_COLOUR, INK, LANDMARK_COLOUR, TRUTH_COLOUR, Picture, ellipses, headline
+from kalmark.results.history import Array, Ints
+from kalmark.results.picture import (
+    FIX_COLOUR,
+    INK,
+    LANDMARK_COLOUR,
+    TRUTH_COLOUR,
+    Picture,
+    broken,
+    ellipses,
+    headline,
+)
 from kalmark.results.plot_sensor import draw_sensor
 
 if TYPE_CHECKING:
@@ -26,14 +38,14 @@ REACH = 0.2  # an ellipse widens the picture by at most this part of it
 CROWD = 100  # with more landmarks than this, everything about them is drawn thinner
 
 
-def save_map(run: Run, path: str | Path) -> None:
+def save_map(run: Run, path: str | PathLike[str]) -> None:
     """Draw the map of a run and write it as a PNG."""
     figure = draw_map(run)
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=130, format="png")
+    figure.savefig(path, dpi=130, format="png", bbox_inches="tight", pad_inches=0.15)
 
 
-def save_sensor(run: Run, robot: str, sensor: str, path: str | Path, step: int | None = None) -> None:
+def save_sensor(run: Run, robot: str, sensor: str, path: str | PathLike[str], step: int | None = None) -> None:
     """Draw a camera's last scan, or that at a step, and write it as a PNG."""
     figure = draw_sensor(run, robot, sensor, step)
     FigureCanvasAgg(figure)
@@ -65,7 +77,8 @@ def draw_plane(axes: Axes, run: Run, low: Array, high: Array, step: int | None =
     _draw_landmarks(axes, means, covariances)
     for robot in picture.paths:
         mine = history.robot[until] == robot
-        _draw_robot(axes, picture.colour(robot), history.mean[until][mine], history.covariance[until][mine])
+        path, P = history.mean[until][mine], history.covariance[until][mine]
+        _draw_robot(axes, picture.colour(robot), path, P, picture.stretches[robot])
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -140,8 +153,9 @@ def _draw_truth(axes: Axes, picture: Picture, crowded: bool) -> None:
         axes.plot(fixes[:, 0], fixes[:, 1], ".", color=TRUTH_COLOUR, markersize=1.8, zorder=1)
     for fixes in picture.used.values():
         axes.plot(fixes[:, 0], fixes[:, 1], "x", color=FIX_COLOUR, markersize=3.5, markeredgewidth=0.7, zorder=3)
-    for path in picture.truth.values():
-        axes.plot(path[:, 0], path[:, 1], "-", color=TRUTH_COLOUR, linewidth=2.2, alpha=0.6, zorder=2)
+    for robot, path in picture.truth.items():
+        line = broken(path, picture.stretches[robot])
+        axes.plot(line[:, 0], line[:, 1], "-", color=TRUTH_COLOUR, linewidth=2.2, alpha=0.6, zorder=2)
     if picture.landmarks:
         points = np.array(list(picture.landmarks.values()))
         size, width = (4, 0.6) if crowded else (8, 1.0)
@@ -159,23 +173,30 @@ def _draw_landmarks(axes: Axes, means: Array, covariances: Array) -> None:
     axes.plot(means[:, 0], means[:, 1], ".", color=LANDMARK_COLOUR, markersize=1.8 if crowded else 3.5, zorder=5)
 
 
-def _draw_robot(axes: Axes, colour: str, path: Array, P: Array) -> None:
+def _draw_robot(axes: Axes, colour: str, path: Array, P: Array, stretches: Ints) -> None:
     if len(path) == 0:
         return
     width = 0.8 if len(path) > LONG else 1.1
-    axes.plot(path[:, 0], path[:, 1], "-", color=colour, linewidth=width, alpha=0.9, zorder=4)
+    line = broken(path[:, :2], stretches)
+    axes.plot(line[:, 0], line[:, 1], "-", color=colour, linewidth=width, alpha=0.9, zorder=4)
     axes.plot(*path[0, :2], "o", markerfacecolor="white", markeredgecolor=colour, markersize=7, zorder=7)
-    heading = np.degrees(path[-1, 2])
-    marker = (3, 0, heading - 90.0)
-    axes.plot(*path[-1, :2], marker=marker, color=colour, markeredgecolor="white", markersize=11, zorder=8)
+    arrow = _arrow(float(path[-1, 2]))
+    axes.plot(*path[-1, :2], marker=arrow, color=colour, markeredgecolor="white", markersize=15, zorder=8)
     contour = ellipses(path[-1:, :2], P[-1:, :2, :2])[0]
     axes.plot(contour[:, 0], contour[:, 1], "-", color=colour, linewidth=0.9, zorder=7)
 
 
+def _arrow(heading: float) -> MarkerStyle:
+    """Return a dart that points along a heading, about the robot's place."""
+    dart = Path([(0.62, 0.0), (-0.38, 0.36), (-0.16, 0.0), (-0.38, -0.36), (0.62, 0.0)], closed=True)
+    return MarkerStyle(dart, transform=Affine2D().rotate(heading))
+
+
 def _legend(picture: Picture, landmarks: int) -> list[Line2D]:
     several = len(picture.paths) > 1
+    gaps = " (gaps: no scans)" if any(s[-1:].any() for s in picture.stretches.values()) else ""
     handles = [
-        Line2D([], [], color=picture.colour(robot), label=robot if several else "estimated path")
+        Line2D([], [], color=picture.colour(robot), label=robot if several else f"estimated path{gaps}")
         for robot in picture.paths
     ]
     if picture.truth:
@@ -195,5 +216,5 @@ def _legend(picture: Picture, landmarks: int) -> list[Line2D]:
     if any(len(path) for path in picture.paths.values()):
         open_dot: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "linestyle": ""}
         handles.append(Line2D([], [], color=INK, label="start", **open_dot))
-        handles.append(Line2D([], [], color=INK, marker=(3, 0, -90), linestyle="", label="end", markersize=8))
+        handles.append(Line2D([], [], color=INK, marker=_arrow(0.0), linestyle="", label="end", markersize=11))
     return handles

@@ -86,7 +86,7 @@ def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
     axes.set_aspect("equal", adjustable="box")
     _ground(axes, scene, projection)
     floor = ground(scene)
-    shadows = [np.column_stack([path[:, :2], np.full(len(path), floor)]) for path in scene.paths.values()]
+    shadows = [np.column_stack([line[:, :2], np.full(len(line), floor)]) for line in scene.lines.values()]
     if len(scene.ids) <= CROWD:
         standing = scene.shapes.points.means[scene.shapes.group != LINES]
         shadows += [np.array([point, [*point[:2], floor]]) for point in standing]
@@ -167,7 +167,7 @@ def _robot_strokes(scene: Scene, robot: str, path: Array) -> list[tuple[Array, d
     contour = ellipsoids(path[-1:, :3], scene.pose_covariances[robot][-1:, :3, :3])[0]
     frames = scene.frames(robot)
     return [
-        (path[:, :3], {"color": colour, "linewidth": 1.3, "zorder": 6}),
+        (scene.lines[robot], {"color": colour, "linewidth": 1.3, "zorder": 6}),
         (joined(frames), {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}),
         (joined(list(contour)), {"color": POSE_COLOUR, "linewidth": 0.8, "zorder": 7}),
         (path[:1, :3], {**_marks("o", colour, 6, 7), "markerfacecolor": "white"}),

@@ -10,7 +10,7 @@ import numpy as np
 
 from kalmark.results.consistency import anees_interval, nees, nis, pose_error
 from kalmark.results.history import Array, Ints, MapSnapshot
-from kalmark.results.picture import Picture
+from kalmark.results.picture import Picture, broken
 from kalmark.results.series_association import association_series
 from kalmark.results.series_space import space_series
 from kalmark.results.thinned import POINTS, gaussians, significant, thin, xy
@@ -63,10 +63,12 @@ def _robot(run: Run, picture: Picture, robot: str, t: Array) -> dict[str, Any]:
     out: dict[str, Any] = {"name": robot, "colour": picture.colour(robot), "t": significant(t[rows], 7)}
     d = 3 if run.history.in_space else 2
     out |= gaussians(mean[:, :d], P[:, :d, :d])
+    stretches = picture.stretches[robot][thin(len(picture.stretches[robot]))]
+    out["gaps"] = (np.flatnonzero(np.diff(stretches)) + 1).tolist()
     out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
     if robot in picture.truth:
         true = picture.truth[robot]
-        out["truth"] = xy(true[thin(len(true))])
+        out["truth"] = xy(broken(true[thin(len(true))], stretches))
         out |= _errors(run, rows)
     return out
 

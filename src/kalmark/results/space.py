@@ -9,7 +9,7 @@ import numpy as np
 
 from kalmark.geometry.rotations import matrix
 from kalmark.results.history import Array, Camera
-from kalmark.results.picture import Picture
+from kalmark.results.picture import Picture, broken
 from kalmark.results.shapes import EUCLIDEANS, LINE, Shapes, shapes
 from kalmark.slam.events import Id
 
@@ -27,10 +27,12 @@ SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0
 class Scene:
     """A run up to one of its steps: paths by robot, and the map as it was then, sorted by what is to be drawn.
 
-    `paths`, `truth` are poses (N, 7) and positions (N, 3); `ids` are those of the landmarks.
+    `paths` are poses (N, 7), `lines` and `truth` positions (N, 3), NaN in gaps of time; `ids` are those of the
+    landmarks.
     """
 
     paths: dict[str, Array]
+    lines: dict[str, Array]
     truth: dict[str, Array]
     colours: dict[str, str]
     pose_covariances: dict[str, Array]
@@ -55,7 +57,8 @@ class Scene:
         low, high = _box(run, picture)
         return cls(
             {name: path[: until[name]] for name, path in picture.paths.items()},
-            picture.truth,
+            {name: broken(p[: until[name], :3], picture.stretches[name]) for name, p in picture.paths.items()},
+            {name: broken(path, picture.stretches[name]) for name, path in picture.truth.items()},
             {name: picture.colour(name) for name in picture.paths},
             {name: history.pose_covariances[history.robot == name][: until[name]] for name in picture.paths},
             picture.landmarks,

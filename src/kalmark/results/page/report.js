@@ -67,6 +67,12 @@ function upTo(t, now) {
   return low;
 }
 
+/* The first n steps of a robot's path, broken before each step that follows a gap in time. */
+function pathOf(r, n, axes) {
+  const gaps = new Set(r.gaps);
+  return Object.fromEntries(axes.map(k => [k, r[k].slice(0, n).flatMap((v, i) => gaps.has(i) ? [null, v] : [v])]));
+}
+
 function still() {
   const traces = [];
   for (const [robot, f] of Object.entries(DATA.fixes))
@@ -96,7 +102,7 @@ function moving(frame) {
                hovertemplate: "%{text}: %{x:.3f}, %{y:.3f}<br>sigma %{customdata:.3g} m<extra></extra>"});
   for (const r of DATA.robots) {
     const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path";
-    traces.push({x: r.x.slice(0, n), y: r.y.slice(0, n), mode: "lines", line: {color: r.colour, width: 1.6}, name,
+    traces.push({...pathOf(r, n, ["x", "y"]), mode: "lines", line: {color: r.colour, width: 1.6}, name,
                  legendgroup: r.name, hoverinfo: "skip"});
     const at = n ? [n - 1] : [];
     traces.push({...ellipses(r, Math.max(n - 1, 0), n, 48), mode: "lines", line: {color: r.colour, width: 1.4},

@@ -95,7 +95,7 @@ function spatialMoving(frame) {
   traces.push(stroke(boxed(map.lines), GROUPS[2][0], 4, quiet), stroke(map.tags, TAG, 3, quiet));
   DATA.robots.forEach((r, i) => {
     const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path", at = {legendgroup: r.name, ...quiet};
-    traces.push(stroke({x: r.x.slice(0, n), y: r.y.slice(0, n), z: r.z.slice(0, n)}, r.colour, 4, {name, legendgroup: r.name}));
+    traces.push(stroke(pathOf(r, n, ["x", "y", "z"]), r.colour, 4, {name, legendgroup: r.name}));
     traces.push(stroke(n ? placed(DATA.bodies[r.name], r, n - 1) : {x: [], y: [], z: []}, r.colour, 3, at));
     traces.push(stroke(ellipsoids(r, n ? [n - 1] : [], 32), POSE, 2,
                        {name: "robot, 3 sigma", legendgroup: "pose", showlegend: i === 0}));
