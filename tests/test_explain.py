@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ import kalmark as km
 from kalmark.cli import main
 from kalmark.errors import RunError
 from kalmark.geometry.frames import compose
-from kalmark.results.explain import explain
+from kalmark.results.explain import Compared, explain
 from kalmark.results.plot_scan import draw_scan
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
 from kalmark.results.series import series
 from kalmark.results.series_association import change_rows
+from kalmark.results.words import figure
 from test_merging import GARDEN, look, slam_of
 
 
@@ -48,7 +50,7 @@ def test_it_names_the_landmarks_compared_with_their_distances_gates_and_the_deci
     held = explain(run, 7.0)
     assert {f.outcome for f in held.fates} == {"deferred"}
     text = "\n".join(held.lines())
-    assert "cart · lidar · t = 7.000 s (107.000000000 s in the log)" in text
+    assert "cart · lidar · t = 7.000 s (107 s in the log)" in text
     assert "or a new landmark: the odds are" in text
     assert "compared with u" in text
 
@@ -121,7 +123,12 @@ def test_what_has_an_id_is_drawn_with_its_landmark_and_d2_as_what_has_none(tmp_p
         np.testing.assert_allclose(landmark.place, GARDEN[k], atol=0.05)
         np.testing.assert_allclose(fate.seen_at, pointed_at(seen_from, (y + noise)[k]), atol=0.05)
     axes = draw_scan(run, told).axes[0]
-    assert {f"{fate.d2:.3g}" for fate in told.fates} <= {text.get_text() for text in axes.texts}
+    assert {f"{k}: {figure(fate.d2, 2)}" for k, fate in enumerate(told.fates)} <= {t.get_text() for t in axes.texts}
+    assert not any("compared with" in line for line in told.lines()), "the line of the observation says it"
+    far = replace(told.fates[0], landmark="", compared=(Compared("far", 4110.0, np.array([500.0, 0.0])),))
+    lone = draw_scan(run, replace(told, fates=(far, *told.fates[1:]))).axes[0]
+    assert "far" not in {t.get_text() for t in lone.texts}
+    assert lone.get_xlim()[1] < 100.0
     (tmp_path / "run" / "map.kmk").unlink()
     assert not np.isfinite([fate.seen_at for fate in explain(Run.load(tmp_path / "run"), 1.0).fates]).any()
 

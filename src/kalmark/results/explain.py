@@ -17,7 +17,7 @@ from kalmark.results.files import seconds
 from kalmark.results.history import Array, History, Ints
 from kalmark.results.shapes import LINE
 from kalmark.results.truth import as_rigid
-from kalmark.results.words import count
+from kalmark.results.words import count, figure
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -67,15 +67,16 @@ class Explanation:
         d = 3 if len(self.pose) == 7 else 2
         sigma = math.sqrt(max(np.trace(self.covariance[:d, :d]) / d, 0.0))
         at = ", ".join(f"{x:.2f}" for x in self.pose[:d])
-        yield f"{self.robot} · {self.sensor or 'no sensor'} · t = {self.t_s:.3f} s ({self.log_t_s} s in the log)"
+        when = f"t = {self.t_s:.3f} s ({_short(self.log_t_s)} s in the log)"
+        yield f"{self.robot} · {self.sensor or 'no sensor'} · {when}"
         yield f"then at ({at}) m, sigma {sigma:.3g} m; {count(len(self.fates), 'observation')}"
         if self.gates is not None:
             near, far = self.gates
             yield f"paired where d2 is at most {near:.2f}, a new landmark where it is above {far:.2f} from all"
         for fate in self.fates:
             yield self._line(fate)
-            if fate.compared:
-                yield "      compared with " + ", ".join(f"{c.landmark} (d2 {c.d2:.3g})" for c in fate.compared)
+            if fate.compared and [c.landmark for c in fate.compared] != [fate.landmark]:
+                yield "      compared with " + ", ".join(f"{c.landmark} (d2 {figure(c.d2)})" for c in fate.compared)
         for change in self.changes:
             yield f"{change.landmark} {change.what}: {change.reason}"
 
@@ -83,8 +84,12 @@ class Explanation:
     def _line(fate: Fate) -> str:
         name = f" {fate.landmark}" if fate.landmark else ""
         known = f" (id {fate.id})" if fate.id else ""
-        d2 = "" if math.isnan(fate.d2) else f", d2 {fate.d2:.3g}"
+        d2 = "" if math.isnan(fate.d2) else f", d2 {figure(fate.d2)}"
         return f"{fate.index:4d}{known}: {fate.outcome}{name}{d2}{': ' if fate.reason else ''}{fate.reason}"
+
+
+def _short(seconds_: str) -> str:
+    return seconds_.rstrip("0").rstrip(".") if "." in seconds_ else seconds_
 
 
 def explain(run: Run, t_s: float, robot: str | None = None) -> Explanation:

@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from kalmark.results.explain import Compared, Explanation, Fate
 from kalmark.results.history import Array
 from kalmark.results.picture import INK, ellipses
+from kalmark.results.words import figure as figure_of
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -26,6 +27,8 @@ FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
 PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
 FAR = 30.0  # d2 of a landmark that an observation cannot be of, by whatever gate: it is not drawn, but for the nearest
+FARTHEST = 300.0  # d2 of the nearest that is not drawn either
+SHORT = 0.12  # of the picture's width: a line on which no number fits
 ON_LINE: dict[str, Any] = {"ha": "center", "va": "center", "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
@@ -33,15 +36,16 @@ def save_scan(run: Run, told: Explanation, path: str | Path) -> None:
     """Draw one scan of a run and write it as a PNG."""
     figure = draw_scan(run, told)
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=130, format="png")
+    figure.savefig(path, dpi=130, format="png", bbox_inches="tight", pad_inches=0.15)
 
 
 def draw_scan(run: Run, told: Explanation) -> Figure:
     """Return the figure of one scan, from above: axes in metres, in the frame of the map.
 
     Crosses are the observations where they seem to come from before the scan, squares the landmarks they were compared
-    with then, but for those too far off; a full line goes to the landmark that was decided on, dotted ones to the
-    others, each with its d2.  Where the id is known both are as seen from the pose after the scan.
+    with then, but for those too far off; a full line goes to the landmark that was decided on, whose d2 is at the
+    cross, dotted ones to the others, each with its d2.  Where the id is known both are as seen from the pose after
+    the scan.
     """
     figure = Figure(figsize=(9.5, 8.5), layout="constrained", facecolor="white")
     axes = figure.subplots()
@@ -54,15 +58,15 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
             continue
         at = float(fate.seen_at[0]), float(fate.seen_at[1])
         axes.plot(*at, "x", color=colour, ms=9, mew=2, zorder=5)
-        axes.annotate(str(fate.index), at, (5, 5), textcoords="offset points", color=colour, fontsize=9, zorder=6)
+        _beside(axes, at, (5, 5), _label(fate), color=colour, fontsize=9, zorder=6)
         for other in _near(fate):
             chosen, there = other.landmark == fate.landmark, (float(other.place[0]), float(other.place[1]))
             axes.plot(*zip(at, there, strict=True), "-" if chosen else ":", color=colour, lw=2 if chosen else 1)
             axes.plot(*there, "s", color=INK, mfc="none", ms=8, zorder=4)
-            axes.annotate(
-                other.landmark, there, (7, -12), textcoords="offset points", fontsize=8, color=INK, clip_on=True
-            )
-            axes.text(*_between(at, there), f"{other.d2:.3g}", fontsize=8, color=colour, clip_on=True, **ON_LINE)
+            _beside(axes, there, (7, -12), other.landmark, fontsize=8, color=INK)
+            if not chosen:
+                off = _off(at, there) if np.hypot(*np.subtract(there, at)) < SHORT * (high[0] - low[0]) else (0.0, 0.0)
+                _beside(axes, _between(at, there), off, figure_of(other.d2), fontsize=8, color=colour, **ON_LINE)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -78,8 +82,25 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
 
 def _near(fate: Fate) -> list[Compared]:
     """Return what an observation was compared with and may be of, the landmark decided on, and the nearest."""
-    least = min((other.d2 for other in fate.compared), default=0.0)
+    least = min((other.d2 for other in fate.compared if other.d2 <= FARTHEST), default=0.0)
     return [c for c in fate.compared if c.d2 <= max(FAR, least) or c.landmark == fate.landmark]
+
+
+def _label(fate: Fate) -> str:
+    """Return an observation's number, and the d2 of the landmark decided on."""
+    d2 = next((c.d2 for c in fate.compared if c.landmark == fate.landmark), None)
+    return str(fate.index) if d2 is None else f"{fate.index}: {figure_of(d2, 2)}"
+
+
+def _beside(axes: Axes, at: tuple[float, float], off: tuple[float, float], text: str, **style: Any) -> None:
+    axes.annotate(text, at, off, textcoords="offset points", clip_on=True, **style)
+
+
+def _off(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    """Return how far a number is put off a short line, in points, across it."""
+    x, y = other[0] - one[0], other[1] - one[1]
+    size = float(np.hypot(x, y)) or 1.0
+    return -14.0 * abs(y) / size, -11.0 * abs(x) / size
 
 
 def _between(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
@@ -113,16 +134,17 @@ def _extent(told: Explanation) -> tuple[Array, Array]:
     points += [c.place[:2] for f in told.fates for c in _near(f)]
     shown = np.array([p for p in points if np.isfinite(p).all()])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    middle, half = (low + high) / 2, 0.58 * max(float((high - low).max()), LEAST_M)
+    middle, half = (low + high) / 2, 0.62 * max(float((high - low).max()), LEAST_M)
     return middle - half, middle + half
 
 
 def _legend(told: Explanation) -> list[Line2D]:
-    outcomes = dict.fromkeys(f.outcome for f in told.fates)
-    marks = [Line2D([], [], ls="", marker="x", mew=2, color=OUTCOME.get(o, INK), label=o) for o in outcomes]
+    outcomes = {f.outcome: ": d2" if ":" in _label(f) else "" for f in told.fates}
+    mark: dict[str, Any] = {"ls": "", "marker": "x", "mew": 2}
+    marks = [Line2D([], [], **mark, color=OUTCOME.get(o, INK), label=f"{o}{d2}") for o, d2 in outcomes.items()]
     return [
         Line2D([], [], color=ROBOT, marker="o", label="robot after the scan, 3 sigma"),
-        Line2D([], [], ls="", marker="s", color=INK, mfc="none", label="compared with it; d2 on the line"),
+        Line2D([], [], ls="", marker="s", color=INK, mfc="none", label="landmark compared with, d2"),
         Line2D([], [], ls="", marker=".", color=FAINT, label="other landmarks, as kept last"),
         *marks,
     ]
