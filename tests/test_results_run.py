@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from kalmark.config import load_config
-from kalmark.errors import DivergedError, EventError, RunError
+from kalmark.errors import DivergedError, EventError, LogError, RunError
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
+from kalmark.logs import open_log, write_native
 from kalmark.results.record import record
 from kalmark.results.run import Run, load_run, replace_file
 from kalmark.slam.events import Control, Fix, Scan
@@ -268,3 +270,33 @@ def test_evo_reads_the_trajectory_and_finds_the_same_error(run: Run, tmp_path: P
         ape = metrics.APE(metrics.PoseRelation.translation_part)
         ape.process_data((reference, path))
         assert figures[key] == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "misspelt", "told"),
+    [
+        (
+            "scans.csv",
+            "range_m",
+            "rage_m",
+            "scans of rover by lidar have the columns bearing_rad, rage_m, expected range_m, bearing_rad of",
+        ),
+        (
+            "controls.csv",
+            "v_mps",
+            "v_mp",
+            "controls of rover have the columns w_radps, v_mp, expected v_mps, w_radps of",
+        ),
+    ],
+)
+def test_a_misspelt_column_is_no_other_number_of_a_filter_built_in_python(
+    name: str, column: str, misspelt: str, told: str, tmp_path: Path
+) -> None:
+    log = replace(circle(steps=5), control_columns={"rover": ("v_mps", "w_radps")})
+    log = replace(log, sensor_columns={("rover", "lidar"): ("range_m", "bearing_rad")})
+    write_native(log, tmp_path)
+    assert record(slam_for(log), open_log(tmp_path), progress=False).landmarks.ids
+    text = (tmp_path / name).read_text()
+    (tmp_path / name).write_text(text.replace(column, misspelt, 1))
+    with pytest.raises(LogError, match=rf"{name}:1: the {told}.*; did you mean '{column}'\?"):
+        record(slam_for(log), open_log(tmp_path), progress=False)

@@ -83,8 +83,8 @@ def test_a_robot_or_sensor_without_configuration_is_refused(kalmark: Kalmark, lo
     config.write_text("log: {path: log}\nrobots:\n  each: {sensors: {radar: {type: range_bearing}}}\n")
     message = refused(kalmark("run", config))
     assert message == (
-        f"{log / 'scans.csv'}:2: rover has scans of the sensor 'lidar', expected one of radar; "
-        "if it is another one, add robots.each.sensors.lidar"
+        f"{config}:3:27: robots.each.sensors.radar: the log has no scans by it, expected 'lidar' as in "
+        f"{log / 'scans.csv'}:2; if that is another sensor, add robots.each.sensors.lidar"
     )
     assert not (tmp_path / "out").exists()
 
@@ -203,11 +203,11 @@ def test_on_error_skip_counts_and_lists_what_it_leaves_out(kalmark: Kalmark, log
     (log / "scans.csv").write_text("\n".join(lines) + "\n")
     done = kalmark("run", "native", "--log", log, "--on-error", "skip")
     assert done.status == 0
-    assert "3 left out:" in done.out
+    assert "4 records left out:" in done.out
     assert f"{log / 'scans.csv'}:5:" in done.out
     assert "radar" in done.out
     summary = json.loads((tmp_path / "out" / "native" / "summary.json").read_text())
-    assert (summary["skipped"], summary["observations"]) == (3, 56)
+    assert (summary["skipped"], summary["observations"]) == (4, 56)
 
 
 def test_run_prints_what_to_look_at_twice_after_the_table(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:

@@ -143,13 +143,13 @@ def test_robots_and_sensors_of_space_come_back_side_by_side(tmp_path: Path) -> N
         control_columns={robot: SPACE[robot] for robot in robots},
         sensor_columns={("odometry", sensor): SPACE[sensor] for sensor in sensors},
     )
-    again = open_log(write_native(log, tmp_path))
+    again = open_log(write_native(log, tmp_path), robots=robots)
     assert_same_log(log, again)
     scans = (tmp_path / "scans.csv").read_text().splitlines()
     header, *rows = (line.split(",") for line in scans)
     swapped = [",".join(reversed(cells)) for cells in (header, *rows)]
     (tmp_path / "scans.csv").write_text("\n".join(swapped))
-    assert_same_log(log, open_log(tmp_path))
+    assert_same_log(log, open_log(tmp_path, robots=robots))
 
 
 times = st.integers(-(2**62), 2**62)
@@ -227,26 +227,26 @@ def test_columns_may_come_in_any_order(tmp_path: Path) -> None:
 
 
 def test_sensors_leave_each_others_columns_empty(tmp_path: Path) -> None:
-    text = "t_s,robot,sensor,id,range_m,bearing_rad,u_px,v_px\n1,r,lidar,1,4,0.3,,\n1,r,eye,2,,,320,240\n"
+    text = "t_s,robot,sensor,id,range_m,bearing_rad,u_px,v_px\n1,rover,lidar,1,4,0.3,,\n1,rover,eye,2,,,320,240\n"
     log = open_log(native(tmp_path, scans=text))
-    assert log.sensor_columns == {("r", "lidar"): ("range_m", "bearing_rad"), ("r", "eye"): ("u_px", "v_px")}
+    assert log.sensor_columns == {("rover", "lidar"): ("range_m", "bearing_rad"), ("rover", "eye"): ("u_px", "v_px")}
 
 
 def test_observations_may_bring_their_own_noise_as_sigmas_or_covariance(tmp_path: Path) -> None:
     head = "t_s,robot,sensor,id,range_m,bearing_rad"
     by_sigma = native(
-        tmp_path, scans=f"{head},sigma_range_m,sigma_bearing_rad\n1,r,s,1,4,0.3,0.5,0.1\n1,r,s,2,4,0,1,1\n"
+        tmp_path, scans=f"{head},sigma_range_m,sigma_bearing_rad\n1,rover,s,1,4,0.3,0.5,0.1\n1,rover,s,2,4,0,1,1\n"
     )
     scan = open_log(by_sigma).events[-1]
     assert np.allclose(scan.cov, [np.diag([0.25, 0.01]), np.eye(2)])
-    by_cov = native(tmp_path, scans=f"{head},cov_00,cov_01,cov_11\n1,r,s,1,4,0.3,2,0.5,1\n2,r,s,1,4,0.3,,,\n")
+    by_cov = native(tmp_path, scans=f"{head},cov_00,cov_01,cov_11\n1,rover,s,1,4,0.3,2,0.5,1\n2,rover,s,1,4,0.3,,,\n")
     first, second = open_log(by_cov).events[-2:]
     assert first.cov.tolist() == [[[2.0, 0.5], [0.5, 1.0]]]
     assert second.cov is None
 
 
 def test_a_control_may_bring_its_own_noise_even_a_singular_one(tmp_path: Path) -> None:
-    text = "t_s,robot,v_mps,w_radps,sigma_v_mps,sigma_w_radps\n1,r,1,0,0.5,0\n2,r,1,0,,\n"
+    text = "t_s,robot,v_mps,w_radps,sigma_v_mps,sigma_w_radps\n1,rover,1,0,0.5,0\n2,rover,1,0,,\n"
     first, second = open_log(native(tmp_path, controls=text)).events[1:]
     assert first.cov.tolist() == [[0.25, 0.0], [0.0, 0.0]]
     assert second.cov is None

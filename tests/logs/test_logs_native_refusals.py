@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from native_logs import GOOD, HEAD, SCANS, native
 
 from kalmark.errors import LogError
 from kalmark.logs import open_log
+from kalmark.logs.source import records_of
 from kalmark.slam.events import Scan
 
 BAD_ROWS = {
@@ -130,6 +132,29 @@ def test_two_letters_that_changed_places_in_a_short_name_are_a_misspelt_robot(tm
         open_log(native(tmp_path, controls=controls, scans=scans))
 
 
+@pytest.mark.parametrize(("name", "line"), [("controls.csv", 3), ("scans.csv", 3)])
+def test_a_robot_that_is_named_in_one_file_alone_is_refused_however_it_is_called(
+    name: str, line: int, tmp_path: Path
+) -> None:
+    controls = "t_s,robot,v_mps,w_radps\n0.1,rover,1,0\n0.2,rover,1,0\n"
+    scans = "t_s,robot,sensor,id,range_m,bearing_rad\n0.1,rover,lidar,7,4,0\n0.2,rover,lidar,7,4,0\n"
+    native(tmp_path, controls=controls, scans=scans)
+    lines = (tmp_path / name).read_text().splitlines()
+    lines[line - 1] = lines[line - 1].replace("rover", "jackal")
+    (tmp_path / name).write_text("\n".join(lines) + "\n")
+    told = f"{name}:{line}: robot 'jackal' is in no other file of the log, expected 'rover'; if both are robots, ask"
+    with pytest.raises(LogError, match=re.escape(told)):
+        open_log(tmp_path)
+    assert open_log(tmp_path, robots=["rover", "jackal"]).robots == ("rover", "jackal")
+    assert open_log(tmp_path, on_error="skip").robots == ("rover",)
+    (tmp_path / "controls.csv").write_text(controls.replace("rover", "jackal"))
+    (tmp_path / "scans.csv").write_text(scans)
+    with pytest.raises(LogError, match=r"controls.csv:2: robot 'jackal' is in no other file"):
+        open_log(tmp_path)
+    (tmp_path / "controls.csv").unlink()
+    assert open_log(tmp_path).robots == ("rover",)
+
+
 def test_robots_in_one_file_alone_are_their_own_if_numbered_seen_true_or_asked_for(tmp_path: Path) -> None:
     def controls(*robots: str) -> str:
         return "t_s,robot,v_mps,w_radps\n" + "".join(f"0.1,{robot},1,0\n" for robot in robots)
@@ -203,6 +228,7 @@ def test_with_skip_a_bad_row_takes_its_scan_along_and_is_listed(tmp_path: Path) 
     assert len(log.skipped) == 2
     assert "scans.csv:3: range_m is 'nan'" in log.skipped[0]
     assert "t=0.200000000 s" in log.skipped[1]
+    assert [records_of(line) for line in log.skipped] == [1, 1]
 
 
 def test_a_byte_that_is_not_text_is_refused(tmp_path: Path) -> None:

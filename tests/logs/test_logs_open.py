@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from kalmark.errors import LogError
 from kalmark.logs import Trajectory, open_log
+from kalmark.logs.source import records_of
 from kalmark.slam.events import Scan
 
 CONTROLS = "t_s,robot,v_mps,w_radps\n" + "".join(f"{t},{r},1,0\n" for t in range(5, 10) for r in ("a", "b"))
@@ -43,6 +44,7 @@ def test_robots_that_were_not_asked_for_are_left_out_with_their_sightings(folder
     assert log.robots == ("a",) and {event.robot for event in log} == {"a"}
     assert [scan.ids for scan in log if isinstance(scan, Scan)] == [(1,)]
     assert log.skipped == [f"{folder}: 2 sightings of b, which was not asked for"]
+    assert [records_of(line) for line in log.skipped] == [2]
     assert list(log.sensor_columns) == [("a", "s")]
 
 

@@ -84,9 +84,11 @@ def against_batch(result: Run, summary: dict[str, Any], needed: bool) -> dict[st
 
 def finish(result: Run, out: Path, title: str) -> None:
     """Print a run's figures and warnings, what was left out, and where the run folder is."""
+    from kalmark.results.words import count
+
     print_summary(title, result.summary)
     if result.skipped:
-        typer.echo(f"{len(result.skipped)} left out:")
+        typer.echo(f"{count(result.summary['skipped'], 'record')} left out:")
         for line in result.skipped[:SHOWN]:
             typer.echo(f"  {line}")
         if len(result.skipped) > SHOWN:

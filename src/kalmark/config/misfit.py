@@ -10,7 +10,7 @@ from kalmark.config.reading import did_you_mean
 from kalmark.config.schema import Config
 from kalmark.config.sections import types
 from kalmark.detect.scan import RAW
-from kalmark.errors import LogError
+from kalmark.errors import ConfigError, LogError
 from kalmark.logs.log import Log
 from kalmark.slam.events import Scan
 from kalmark.slam.robot import Mount
@@ -43,13 +43,27 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
             raise LogError(f"{_header(log, name, sensor)}: {what}, expected {wanted}{hint}")
     if config.log.on_error == "skip":
         return
+    used = {event.sensor for event in log.events if isinstance(event, Scan) and event.robot == name}
     for event in log.events:
         if isinstance(event, Scan) and event.robot == name and event.sensor not in mounts:
+            idle = [sensor for sensor in mounts if sensor not in used]
+            if idle and not did_you_mean(event.sensor, [sensor for sensor in mounts if sensor in used]):
+                raise _misnamed(config, key, name, idle, event.sensor, log)
             known = f"one of {', '.join(mounts)}" if mounts else "none, as none is configured"
             file, line = log.places.get((name, event.sensor), (log.path, 0))
             what = f"{name} has scans of the sensor {event.sensor!r}, expected {known}"
             hint = f"if it is another one, add robots.{key}.sensors.{event.sensor}"
             raise LogError(f"{file}{f':{line}' if line else ''}: {what}; {hint}")
+
+
+def _misnamed(config: Config, key: str, name: str, idle: list[str], sensor: str, log: Log) -> ConfigError:
+    """Return the error of a sensor that the log has by another name."""
+    meant = next((each for each in idle if did_you_mean(sensor, [each])), idle[0])
+    file, line = log.places.get((name, sensor), (log.path, 0))
+    where = f"{file}{f':{line}' if line else ''}"
+    what = f"the log has no scans by it, expected {sensor!r} as in {where}"
+    hint = f"if that is another sensor, add robots.{key}.sensors.{sensor}"
+    return config.error(("robots", key, "sensors", meant), f"{what}; {hint}")
 
 
 def _header(log: Log, robot: str, sensor: str) -> str | Path | None:

@@ -125,7 +125,7 @@ def keep_robots(log: Log, request: Request) -> Log:
     kept = (without(event, others, left_out) for event in log if event.robot in request.robots)
     events = [event for event in kept if event is not None]
     for robot, count in sorted(left_out.items()):
-        request.skipped.append(f"{log.path}: {count} sightings of {robot}, which was not asked for")
+        request.leave_out(count, f"{log.path}: {count} sightings of {robot}, which was not asked for")
     return replace(
         log,
         robots=tuple(robot for robot in log.robots if robot in request.robots),

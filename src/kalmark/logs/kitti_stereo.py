@@ -50,7 +50,7 @@ def read(path: Path, request: Request, min_disparity_px: Any = 1.0, rates: Any =
     seen = (data["features"] != -1).all(axis=0)
     near = seen & (data["features"][0] - data["features"][2] >= low)
     if (left_out := int(np.count_nonzero(seen & ~near))) > 0:
-        request.skipped.append(f"{path}: {left_out} observations with a disparity below {low:g} px")
+        request.leave_out(left_out, f"{path}: {left_out} observations with a disparity below {low:g} px")
     events: list[Event] = []
     for k, t in enumerate(t_ns.tolist()):
         ids = np.flatnonzero(near[:, k])

@@ -122,9 +122,10 @@ def read_measurements(
         else:
             scans[t_ns + shift_ns][subject] = y
     for barcode, count in sorted(unknown.items()):
-        request.skipped.append(f"{path}:{first[barcode]}: {count} of barcode {barcode}, which no subject carries")
+        told = f"{path}:{first[barcode]}: {count} of barcode {barcode}, which no subject carries"
+        request.leave_out(count, told)
     if sightings:
-        request.skipped.append(f"{path}: {sightings} sightings of robots (robot_sightings is false)")
+        request.leave_out(sightings, f"{path}: {sightings} sightings of robots (robot_sightings is false)")
     return [
         Scan(t_ns=t_ns, robot=robot, sensor=SENSOR, y=list(seen.values()), ids=list(seen))
         for t_ns, seen in scans.items()

@@ -118,7 +118,7 @@ def read_scans(path: Path, request: Request, columns: dict[Any, tuple[str, ...]]
     events: list[Event] = []
     for (t_ns, robot, sensor), rows in scans.items():
         if rows.bad:
-            request.skipped.append(f"{path}: scan of {robot} by {sensor} at t={seconds(t_ns)} s, all of it")
+            request.leave_out(len(rows.lines), f"{path}: scan of {robot} by {sensor} at t={seconds(t_ns)} s, all of it")
             continue
         covs = [cov for cov in rows.covs if cov is not None]
         cov = np.array(covs) if covs else None

@@ -16,6 +16,23 @@ STEP_NS = 1_000_000_000
 """Formats whose steps carry no time get one second a step."""
 
 
+class LeftOut(str):
+    """A line that tells of several `records` left out of a log; a plain text tells of one."""
+
+    records: int
+
+    def __new__(cls, text: str, records: int) -> LeftOut:
+        """Return the line."""
+        line = super().__new__(cls, text)
+        line.records = records
+        return line
+
+
+def records_of(line: str) -> int:
+    """Return how many records a line tells of that were left out."""
+    return line.records if isinstance(line, LeftOut) else 1
+
+
 @dataclass(frozen=True)
 class Request:
     """Hold what the caller of `open_log` asked for: the robots (None: all) and what to do with a bad row.
@@ -26,6 +43,10 @@ class Request:
     robots: tuple[str, ...] | None
     refuse: Refuse
     skipped: list[str]
+
+    def leave_out(self, records: int, line: str) -> None:
+        """List that so many records were left out."""
+        self.skipped.append(LeftOut(line, records))
 
     def wants(self, robot: str) -> bool:
         """Return whether this robot was asked for."""

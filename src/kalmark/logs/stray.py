@@ -1,4 +1,4 @@
-"""Tell a misspelt robot from one of its own: it is in one file of a log alone, and one of nearly its name elsewhere."""
+"""Tell a misspelt robot from one of its own: it is in one file of a log alone, and another is in others."""
 
 from __future__ import annotations
 
@@ -18,33 +18,32 @@ NEAR = 0.65  # of difflib's ratio
 def refuse_misspelt(places: Places, known: Collection[str], request: Request) -> set[str]:
     """Refuse the robots whose name seems misspelt, with file and line, and return them.
 
-    Not those asked for by name, those of `known` and those whose name differs by its digits: they are numbered.
+    Or that have nothing in common with the others: scans without controls, where another robot has controls.  Not those
+    asked for by name, those of `known` and those whose name differs by its digits: they are numbered.
     """
     files: dict[str, dict[Path, int]] = {}
     for (path, robot, _), line in places.items():
         files.setdefault(robot, {}).setdefault(path, line)
     strays: set[str] = set()
     for robot, lines in files.items() if request.robots is None else ():
-        meant = None if len(lines) > 1 or robot in known else _meant(robot, files, strays)
-        if meant is not None:
-            (path, line), both = next(iter(lines.items())), f"[{meant},{robot}]"
+        meant = () if len(lines) > 1 or robot in known else _meant(robot, files, strays)
+        if meant:
+            (path, line), every = next(iter(lines.items())), "both" if len(meant) == 1 else "all"
             request.refuse(
-                f"{path}:{line}: robot {robot!r} is in no other file of the log, expected {meant!r}; "
-                f"if both are robots, ask for them: log.robots={both}"
+                f"{path}:{line}: robot {robot!r} is in no other file of the log, "
+                f"expected {' or '.join(map(repr, meant))}; if {every} are robots, ask for them: "
+                f"log.robots=[{','.join([*meant, robot])}]"
             )
             strays.add(robot)
     return strays
 
 
-def _meant(robot: str, files: Mapping[str, Mapping[Path, int]], strays: set[str]) -> str | None:
-    """Return the robot of nearly this name that is in another file, too."""
-    others = [
-        other
-        for other, lines in files.items()
-        if lines.keys() - files[robot].keys() and other not in strays and _letters(other) != _letters(robot)
-    ]
+def _meant(robot: str, files: Mapping[str, Mapping[Path, int]], strays: set[str]) -> tuple[str, ...]:
+    """Return the robot of nearly this name that is in another file, or else all that are, unless they are numbered."""
+    there = [other for other, lines in files.items() if lines.keys() - files[robot].keys() and other not in strays]
+    others = [other for other in there if _letters(other) != _letters(robot)]
     near = get_close_matches(robot, others, n=1, cutoff=NEAR)
-    return near[0] if near else None
+    return tuple(near) if near or len(others) < len(there) else tuple(others)
 
 
 def _letters(name: str) -> str:

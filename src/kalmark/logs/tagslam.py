@@ -109,7 +109,8 @@ def read(
     received = messages(bag)
     detections = Detections(scene)
     scans = detections.scans(received, {str(known[name]["tagtopic"]).lstrip("/"): name for name in sections})
-    request.skipped.extend(f"{bag}: {count} {reason}" for reason, count in sorted(detections.left_out.items()))
+    for reason, count in sorted(detections.left_out.items()):
+        request.leave_out(count, f"{bag}: {count} {reason}")
     moved = read_odometry(scene, received) if choice(odometry, "odometry", ("auto", "none")) == "auto" else None
     scans = begin(path, scans, reference, moved, request)
     events: list[Event] = [*scans, *(moved.controls(ROBOT, scans) if moved else [])]
@@ -156,7 +157,7 @@ def begin(path: Path, scans: list[Scan], reference: Reference, moved: Odometry |
     kept = [scan for scan in scans if low <= scan.t_ns <= high]
     lost = sum(len(scan.y) > 0 for scan in scans) - sum(len(scan.y) > 0 for scan in kept)
     if lost:
-        request.skipped.append(f"{path}: {lost} scans before the reference or outside the odometry")
+        request.leave_out(lost, f"{path}: {lost} scans before the reference or outside the odometry")
     return kept
 
 

@@ -101,8 +101,8 @@ def slsjf_scans(path: Path, request: Request) -> list[Event]:
         row = int(np.argmax(table[:, 1] < 0)) + 1
         raise LogError(f"{path}: row {row} has range {table[row - 1, 1]}, expected a range of at least 0")
     ids = table[:, 5].astype(np.int64)
-    if (ids == IGNORE).any():
-        request.skipped.append(f"{path}: {int((ids == IGNORE).sum())} detections of poor quality (id -1)")
+    if (poor := int((ids == IGNORE).sum())) > 0:
+        request.leave_out(poor, f"{path}: {poor} detections of poor quality (id -1)")
     table, ids = table[ids != IGNORE], ids[ids != IGNORE]
     t_ns = milliseconds(table[:, 0], path, "t")
     y = np.column_stack([table[:, 1], table[:, 2] - np.pi / 2])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.logs.source import records_of
 from kalmark.results.advice import advice
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
 from kalmark.results.by_position import by_position, no_ids
@@ -47,7 +48,7 @@ def evaluate(run: Run) -> dict[str, Any]:
         "observations": len(history.step),
         **{name: int(np.sum(history.outcome == name)) for name in OUTCOMES},
         "landmarks": len(run.landmarks),
-        "skipped": len(run.skipped),
+        "skipped": sum(map(records_of, run.skipped)),
         "wall_s": run.wall_s,
         "step_us_median": _quantile(history.step_us[1:], 0.5),
         "step_us_p99": _quantile(history.step_us[1:], 0.99),

@@ -17,6 +17,7 @@ from kalmark.results.cameras import biases, cameras, mounts
 from kalmark.results.corners import left_px
 from kalmark.results.decisions import Decisions
 from kalmark.results.describe import describe, plain
+from kalmark.results.fitting import refuse_other_columns
 from kalmark.results.history import Array, History, MapSnapshot, Start, Texts, padded, texts
 from kalmark.results.inputs import Controlled, Inputs, UsedFix
 from kalmark.results.landmarks import MapLandmarks
@@ -46,10 +47,12 @@ def record(
     A bar on standard error appears after two seconds unless `progress` is False.  With `on_error` "skip" an event the
     filter refuses is left out and listed in `run.skipped`.  A filter that diverges so far that it refuses to go on ends
     the run in either case: `run.stopped` says why and the summary has `diverged`.  `config` is what to save as the
-    run's configuration; by default it is read off the filter's models.
+    run's configuration; by default it is read off the filter's models.  Raises LogError if the log has other columns
+    than the filter's motions and sensors.
     """
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
+    refuse_other_columns(slam, log)
     events = log if isinstance(log, list) else list(log)
     recorder = _Recorder(slam, np.linspace(0, sum(type(e) is Scan for e in events) - 1, SNAPSHOTS))
     recorder.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in events)

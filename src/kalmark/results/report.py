@@ -115,7 +115,7 @@ def _skipped(run: Run) -> str:
     if not lines:
         return ""
     shown = "\n".join(html.escape(line) for line in lines[:200])
-    return f"<h2>Left out <small>{len(lines)}</small></h2><pre>{shown}</pre>"
+    return f"<h2>Left out <small>{run.summary['skipped']}</small></h2><pre>{shown}</pre>"
 
 
 def _resource(name: str) -> str:

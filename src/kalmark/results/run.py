@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.errors import RunError
+from kalmark.logs.source import LeftOut, records_of
 from kalmark.results.evaluate import evaluate
 from kalmark.results.files import associations_csv, changes_csv, config_yaml, read_yaml, tum
 from kalmark.results.history import History
@@ -172,7 +173,7 @@ class Run:
                 fixes=summary["fixes"],
                 fixes_rejected=summary["fixes_rejected"],
                 wall_s=summary["wall_s"],
-                skipped=named["skipped"].tolist(),
+                skipped=_skipped(named),
                 stopped=summary.get("stopped", ""),
                 folder=folder,
                 summary=summary,
@@ -185,6 +186,7 @@ class Run:
         skipped = np.array(self.skipped, dtype=np.str_)
         with path.open("wb") as file:
             arrays: dict[str, Any] = {**self.history.arrays(), **self.truth.arrays(), "skipped": skipped}
+            arrays["skipped_records"] = np.array([records_of(line) for line in self.skipped], dtype=np.int64)
             arrays["reference"] = np.array(list(self.reference), dtype=np.str_)
             np.savez_compressed(file, **arrays)
 
@@ -195,6 +197,12 @@ class Run:
             source = self.folder / "map.kmk"
             if source.is_file():
                 replace_file(folder / "map.kmk", lambda path: path.write_bytes(source.read_bytes()))
+
+
+def _skipped(named: dict[str, Any]) -> list[str]:
+    lines = named["skipped"].tolist()
+    records = named["skipped_records"].tolist() if "skipped_records" in named else [1] * len(lines)
+    return [line if n == 1 else LeftOut(line, n) for line, n in zip(lines, records, strict=True)]
 
 
 def load_run(folder: str | Path) -> Run:
