@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,3 +84,30 @@ def test_a_leap_is_told_by_what_it_parts_and_not_by_how_far_it_goes() -> None:
     map_.remove(point)
     points.look_again()
     assert not points.parted(map_, robot, turned), "nothing is known from the robot"
+
+
+def test_a_map_that_remembers_a_leap_and_a_removal_can_be_saved_and_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cov = np.diag([5.0, 5.0, 0.15]) ** 2
+    slam = passes(km.Slam([robot_of(cov)], km.association.ByIdentity("off"), map="dense"), 25)
+    assert isinstance(slam.map, PostponedMap)
+    monkeypatch.setattr(leap.Points, "parted", lambda *_: True)
+    monkeypatch.setattr(PostponedMap, "_far", lambda *_: False)
+    seen = [slam.landmarks().ids[-1], slam.landmarks().ids[0]]
+    for t in (101.0, 102.0):
+        y = km.geometry.observe(slam.mean("r"), np.array([slam.mean(name) for name in seen]))[0] + [0.01, 0.002]
+        slam.process(km.Scan(t, "r", "lidar", y, seen))
+    assert slam.map._leaps
+    slam.remove(seen.pop())
+    assert slam.map._gone, "its shadow is still needed"
+    slam.save(tmp_path / "map.kmk")
+    again = km.Slam.load(tmp_path / "map.kmk")
+    for each in (slam, again):
+        each.add_landmark("new", [3.0, 4.0])
+        each.process(km.Scan(103.0, "r", "lidar", y[:1], seen))
+    names = ["r", *slam.landmarks().ids]
+    assert again.landmarks().ids == slam.landmarks().ids
+    for name in names:
+        np.testing.assert_array_equal(again.mean(name), slam.mean(name))
+    np.testing.assert_array_equal(again.covariance(*names), slam.covariance(*names))

@@ -26,9 +26,10 @@ Read = Callable[[str, tuple[int, ...]], Array]  # a name and the shape expected
 
 def map_described(m: Map) -> State:
     """Return the blocks of a map and, of a postponed one, what is active in it."""
+    if isinstance(m, PostponedMap):
+        m.finish()  # which may be a flush, and frees the slots that are gone
     state = _blocks(m)
     if isinstance(m, PostponedMap):
-        m.finish()
         state["postponed"] = {
             "most": m.most,
             "numbers": m.storage.like.dtype.name,
