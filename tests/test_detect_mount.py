@@ -134,3 +134,12 @@ def rendered(cv2: object, corners: np.ndarray, number: int) -> np.ndarray:
     warp = cv2.getPerspectiveTransform(at, corners.reshape(4, 2).astype(np.float32))
     image = np.full((480, 640), 255, np.uint8)
     return cv2.warpPerspective(print_, warp, (640, 480), image, cv2.INTER_AREA, cv2.BORDER_TRANSPARENT)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_scan_of_one_or_two_returns_shows_nothing_and_is_no_error(count: int) -> None:
+    slam = rover(km.detect.Trunks(range_max_m=80, signature=True))
+    raw = raw_scan(0.0, np.random.default_rng(1))
+    report = slam.process(km.Scan(t_s=0.0, robot="rover", sensor="laser", y=raw.y[:count]))
+    assert report.observations == ()
+    assert slam.t_ns == 0

@@ -78,11 +78,16 @@ class Laser:
         return self._widened(self._find(np.where(returned, r, np.inf), a, i))
 
     def __call__(self, scan: Scan) -> Scan:
-        """Return the scan of what is found in a raw one, whose y (N, 2 or 3) has beams: range, bearing[, intensity]."""
+        """Return the scan of what is found in a raw one, whose y (N, 2 or 3) has beams: range, bearing[, intensity].
+
+        Beams without a return may be left out; in one or two there is nothing to be found.
+        """
         if not len(scan.y):
             return scan
         if scan.y.shape[1] not in (2, 3):
             raise EventError(f"{when(scan)}: y has {scan.y.shape[1]} columns, expected beams: {', '.join(RAW)}")
+        if len(scan.y) < 3:
+            return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor)
         try:
             found = self.detect(*scan.y.T)
         except EventError as error:
