@@ -13,6 +13,8 @@ from kalmark.results.picture import COLOURS
 if TYPE_CHECKING:
     from kalmark.campaign.campaign import Campaign
 
+COARSE, FINE = (1.0, 2.0, 5.0), (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # ticks in a decade
+
 
 def draw(campaign: Campaign, path: Path) -> None:
     """Write the picture to a PNG file.  NEES in the estimator's coordinates, robots averaged, logarithmic."""
@@ -45,7 +47,8 @@ def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
         axis.plot(t_s[some], value[some], color=COLOURS[i % len(COLOURS)], linewidth=0.9, label=label)
     axis.axhline(campaign.ideal(name), color="0.4", linewidth=0.6)
     axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    bottom, top = axis.get_ylim()
+    axis.yaxis.set_major_locator(LogLocator(subs=COARSE if top > 5.0 * bottom else FINE))
     axis.yaxis.set_major_formatter("{x:g}")
     axis.yaxis.set_minor_formatter(NullFormatter())
     axis.set_ylabel(campaign.label(name))

@@ -129,7 +129,7 @@ def headline(run: Run) -> tuple[str, list[str]]:
         parts.append(f"fixes: median {summary['fix_median_m']:.2f} m, {summary['fix_within_10m']:.1%} within 10 m")
     if any(figures.get("pose_nees") is not None for figures in errors):
         dof = 6 if run.history.in_space else 3
-        usual = f"{dof} on average, up to {POSE_NEES[dof]:g} in one run"
+        usual = f"consistent: {dof}, one run up to {POSE_NEES[dof]:g}"
         parts.append(f"pose NEES {figure(_mean(errors, 'pose_nees'))} ({usual})")
     if summary["nis_per_dof"] is not None:
         parts.append(f"NIS/dof {summary['nis_per_dof']:.2f}")

@@ -78,7 +78,7 @@ def show(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:,.4g}" if 1e-3 <= abs(value) < 1e5 or value == 0 else f"{value:.3e}"
     if isinstance(value, list):
-        return ", ".join(str(item) for item in value)
+        return ", ".join(show(item) for item in value)
     return str(value)
 
 
