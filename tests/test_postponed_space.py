@@ -71,7 +71,7 @@ def test_corrections_applied_to_all_blocks_at_rest_are_the_dense_filters(
     monkeypatch.setattr(Pace, "due", lambda *_: 1e300)  # each flush is over by the next correction
     dense, spaces = a_map(stepped, 0.1, 0.1)
     postponed = PostponedMap.from_dense(a_map(stepped, 0.1, 0.1)[0])
-    postponed._far = lambda robot, s: True  # type: ignore[method-assign]
+    postponed._far = lambda robot: True  # type: ignore[method-assign]
     Q = np.diag([0.02] * 3 + [0.01] * 3) ** 2
     for slots, y in scans(dense, 12, 0.1, range(1, 1 + POINTS)):
         for m in (dense, postponed):
@@ -91,7 +91,7 @@ def test_a_standing_robot_learns_nothing_of_its_orientation_from_any_block_at_re
     prior = np.radians(20)
     before, spaces = a_map(stepped, prior, 0.05)
     m = PostponedMap.from_dense(before, most=90)
-    m._far = lambda robot, s: False  # type: ignore[method-assign]
+    m._far = lambda robot: False  # type: ignore[method-assign]
     for slots, y in scans(before, 60, 0.05, range(1, 1 + POINTS)):
         correct(m, slots, y)
     P = m.covariance(range(len(spaces)))

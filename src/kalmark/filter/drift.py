@@ -25,7 +25,7 @@ NO_NUMBERS = np.zeros(0)
 NO_ROWS = np.zeros(0, dtype=np.int64)
 
 
-TAU = 0.05  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
+TAU = 5e-4  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
 
 
 class Watch(NamedTuple):
@@ -42,16 +42,17 @@ class Watch(NamedTuple):
 
 @compiled
 def is_farther(
-    P: Array, turn: Index, x: Array, at: Index, frozen: Array, first: Index, size: Index,
+    P: Array, turn: Index, kept: Index, x: Array, kept_x: Index, at: Index, frozen: Array, first: Index, size: Index,
     G: Array, s: Array, per_sigma: Array,
 ) -> bool:  # fmt: skip
     """Return whether a number is more than so many sigmas from where it was: of those that stand, or among G s.
 
-    So many are TAU over the sigma of the robot's turn, whose rows of P are `turn`.
+    So many are TAU over what is not known of the robot's turn since it was kept, or was corrected of it: `turn` and
+    `kept` are the rows of P, `kept_x` the numbers of what was kept.
     """
     variance = 1e-300
-    for i in range(max(0, len(turn) - 3), len(turn)):
-        variance += P[turn[i], turn[i]]
+    for i in range(len(turn)):
+        variance += P[turn[i], turn[i]] + P[kept[i], kept[i]] - 2.0 * P[kept[i], turn[i]] + x[kept_x[i]] ** 2
     limit = TAU / math.sqrt(variance)
     for i in range(len(at)):
         own = 0.0
@@ -79,6 +80,7 @@ class Drift:
         self._rows: Index = NO_ROWS  # the rows of their positions,
         self._per_sigma: Array = NO_NUMBERS  # one over those sigmas,
         self._rest: Array | None = None  # and their covariance at rest with the blocks that have entered
+        self._left: Array = NO_NUMBERS  # the shadows' mean when the coordinates were left
 
     def watch(self, slot: int, space: Space, at: int, first: int, frozen: Array, variances: Array) -> None:
         """Watch those numbers of a block on which its coordinates depend.
@@ -118,12 +120,20 @@ class Drift:
             self._per_sigma = np.concatenate([self._per_sigma, self._at_rest[slot][: len(rows)]])
             self._rest = None
 
-    def is_beyond(self, P: Array, turn: Index, x: Array, s: Array, read: Callable[[Index, int], Array]) -> bool:
+    def leave(self, x: Array, s: Array) -> None:
+        """Take note that the coordinates are left where all is now: x of the active map, the shadows' mean s."""
+        for slot, watch in self._standing.items():
+            self._standing[slot] = watch._replace(frozen=x[watch.at])
+        self._all, self._left = None, s
+
+    def is_beyond(
+        self, P: Array, turn: Index, kept: Index, x: Array, kept_x: Index, s: Array, read: Callable[[Index, int], Array]
+    ) -> bool:
         """Return whether the rest has moved too far for the coordinates in which its errors were left.
 
-        P and x are the covariance and the mean of the active map, `turn` the rows there of what turns the world with
-        the robot that corrects, s the mean of the shadows; `read` returns rows' covariance at rest with the shadows
-        from a first one on.
+        P and x are the covariance and the mean of the active map, `turn` the rows there of the turn of the robot that
+        corrects, `kept` and `kept_x` the rows and numbers of that kept last, s the mean of the shadows; `read` returns
+        rows' covariance at rest with the shadows from a first one on.
         """
         if self._all is None:
             parts = zip(*self._standing.values(), strict=True)
@@ -134,4 +144,7 @@ class Drift:
             self._rest = read(self._rows, 0)
         elif self._rest.shape[1] < len(s):
             self._rest = np.hstack([self._rest, read(self._rows, self._rest.shape[1])])
-        return bool(is_farther(P, turn, x, *self._all, self._rest, s, self._per_sigma))
+        if len(self._left):
+            s = s.copy()
+            s[: len(self._left)] -= self._left
+        return bool(is_farther(P, turn, kept, x, kept_x, *self._all, self._rest, s, self._per_sigma))

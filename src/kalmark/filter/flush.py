@@ -7,7 +7,6 @@ corrected by what is still to come; that makes a slice as long or as short as on
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +14,9 @@ import numpy.typing as npt
 
 from kalmark.compiled import compiled
 from kalmark.filter.fresh import Fresh
+from kalmark.filter.leap import Way
 from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, Layout
 from kalmark.filter.storage import PANEL, Stored, Triangle, subtract
-from kalmark.geometry.angles import wrap
-from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
-from kalmark.geometry.spaces import NO_TURN, Table, generator, retract
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -28,63 +25,6 @@ ROWS = 8  # of the active blocks, to write at once
 WRITING = 60  # multiplications that take as long as to write a number there
 GATHERING = 1500  # and as to gather a number from the storage
 MORE = 1.5  # times the memory that a flush has needed: the next one may
-
-
-def displaced(atoms: Table, x: Array, D: Array, axes: int, origins: Array) -> tuple[Array, Array]:
-    """Add the displacements D (n, R) to the mean x, one robot's after the other's.
-
-    Return the mean and a (n, R axes), how the errors' coordinates have turned with each robot's: generator(after) -
-    generator(before); without axes nothing turns.  `origins` (R, 3) is where the robots stand.
-    """
-    a = np.empty((D.shape[0], D.shape[1] * axes))
-    for r in range(D.shape[1]):
-        x, a[:, r * axes : (r + 1) * axes] = turned(atoms, x, D[:, r].copy(), NO_TURN, axes, origins[r])
-    return x, a
-
-
-@compiled
-def turned(atoms: Table, x: Array, d: Array, turn: Array, axes: int, origin: Array) -> tuple[Array, Array]:
-    """Move the mean x by a correction d that turns the world by `turn`; return it and how the coordinates turned."""
-    x, a = x.copy(), np.zeros((len(d), axes))
-    if axes > 0:
-        a -= generator(atoms, x, len(d), axes, origin)
-    retract(atoms, x, d, turn)
-    if axes > 0:
-        a += generator(atoms, x, len(d), axes, origin)
-    return x, a
-
-
-@dataclass(frozen=True)
-class Leap:
-    """A correction that is applied as in the dense filter: by which robot (its column of S), what the corrections
-    before it had displaced, S (A0, R), the shadows' part ds, how it turns the world, and what it did to the robots'
-    turns, e' d (R axes,).  Of shadows and robots there may be more since.
-    """
-
-    robot: int
-    S: Array
-    ds: Array
-    turn: Array
-    turns: Array
-
-
-def carried(
-    atoms: Table, x: Array, G: Array, S: Array, leaps: Sequence[Leap], axes: int, origins: Array
-) -> tuple[Array, Array]:
-    """Carry the mean x along with displacements S (A0, R) and leaps among them; return it and a as `displaced` does."""
-    a, before = np.zeros((len(G), S.shape[1] * axes)), np.zeros(S.shape)
-    for leap in leaps:
-        now = np.zeros(S.shape)
-        now[: leap.S.shape[0], : leap.S.shape[1]] = leap.S
-        x, more = displaced(atoms, x, G @ (now - before), axes, origins)
-        a += more
-        d = G[:, : len(leap.ds)] @ leap.ds + a[:, : len(leap.turns)] @ leap.turns
-        x, more = turned(atoms, x, d, leap.turn, axes, origins[leap.robot])
-        a[:, leap.robot * axes : (leap.robot + 1) * axes] += more
-        before = now
-        before[: len(leap.ds), leap.robot] += leap.ds
-    x, more = displaced(atoms, x, G @ (S - before), axes, origins)
-    return x, a + more
 
 
 @compiled
@@ -131,9 +71,8 @@ def corrected(
 class Phase:
     """What a phase leaves behind: its rows A0 of the storage and those, A, of its active blocks at the end.
 
-    `Psi` (A0, A0), `Phi` (A, A0) and P_AA as in docs/postponed.md, the displacements `S` (A0, R) that each robot's
-    corrections have caused, the leaps among these, the rows of A in which the robots' turns are (R axes,), where they
-    stand, and the axes.
+    `Psi` (A0, A0), `Phi` (A, A0) and P_AA as in docs/postponed.md; likewise of the robots' turns, kept at the leaps and
+    of now, `Phi_T` (T, A0), P_TA and P_TT; and the way that blocks at rest have come.
     """
 
     A0: Index
@@ -141,32 +80,10 @@ class Phase:
     Psi: Array
     Phi: Array
     P_AA: Array
-    S: Array
-    leaps: Sequence[Leap]
-    thetas: Index
-    origins: Array
-    axes: int
-
-
-def leap_of(
-    robot: int, S: Array, ds: Array, moved: dict[int, tuple[Array, Array]], robots: list[int], axes: int
-) -> Leap:
-    """Return a robot's last correction as one that turns the world; `moved` has the means before and after it."""
-    turns = {r: turn_of(before, after, axes) for r, (before, after) in moved.items()}
-    turn = turns[robot].copy()
-    if axes == 6:
-        turn[:3] += np.cross(moved[robot][0][:3], turn[3:])
-    return Leap(robots.index(robot), S, ds, turn, np.concatenate([turns[r] for r in robots]))
-
-
-def turn_of(before: Array, after: Array, axes: int) -> Array:
-    """Return what a correction did to the turn (axes,) of a robot that stood at `before` and stands at `after`."""
-    if axes == 1:
-        return np.array([wrap(after[2] - before[2])])
-    turn = log(multiply(after[3:7], conjugate(before[3:7])))
-    if axes == 3:
-        return turn
-    return np.concatenate([np.linalg.solve(left_jacobian(turn), after[:3] - before[:3]), turn])
+    Phi_T: Array
+    P_TA: Array
+    P_TT: Array
+    way: Way
 
 
 class Room:
@@ -200,7 +117,7 @@ class Flush:
         self.where[phase.A] = np.arange(len(phase.A))
         self.L = _root(phase.Psi, storage.diagonal(phase.A0))
         self.q = self.L.shape[1]
-        self.R = room.array("R", (self.n, self.q + 2 * len(phase.thetas)))
+        self.R = room.array("R", (self.n, self.q + 2 * len(phase.P_TT)))
         self.V = room.array("V", (len(range(0, self.n, PANEL)), len(phase.A), PANEL))  # one panel's after the other
         self.known = self.where >= 0
         self.resting = _in_use(map_, self.n) & (self.where < 0)
@@ -243,7 +160,7 @@ class Flush:
             return self.aside
         start, self.column = self.column, min(last, self.column + PANEL * max(1, tiles))
         if self.R.shape[1]:
-            W, m = self.R[first:last, : self.q], len(self.phase.thetas)
+            W, m = self.R[first:last, : self.q], len(self.phase.P_TT)
             L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
             subtract(panel[: last - first], L, self.R, start, self.column)
         return self.cost * (self.column - start)
@@ -280,13 +197,13 @@ class Flush:
         atoms = atoms - np.array([0, where.start, first])
         rows = np.arange(first, last)
         G = self.storage.get(rows, p.A0)
-        x, a = carried(atoms, self.x_before[where], G, p.S, p.leaps, p.axes, p.origins)
-        V = G @ p.Phi.T
-        w = V[:, p.thetas] + a @ (0.5 * p.P_AA[np.ix_(p.thetas, p.thetas)])
+        x, _, a = p.way.carried(atoms, self.x_before[where], G)
+        V = G @ p.Phi.T + a @ p.P_TA
+        w = G @ p.Phi_T.T + a @ (0.5 * p.P_TT)
         new = ~self.known[rows]
         self.R[rows[new]] = np.hstack([G @ self.L, w, a])[new]
         panel = first // PANEL
-        self.V[panel][:, rows[new] - panel * PANEL] = (V + a @ p.P_AA[p.thetas])[new].T
+        self.V[panel][:, rows[new] - panel * PANEL] = V[new].T
         self.known[rows] = True
         for block in blocks:
             if self.where[block[P_AT]] < 0:

@@ -7,21 +7,24 @@ to |phi| |d| / 2, where they may be known from each other to centimetres.  It ha
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
-from kalmark.filter.drift import TAU
 from kalmark.filter.map import P_AT, StochasticMap
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.spaces import VECTOR, VECTOR3
+from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
+from kalmark.geometry.spaces import NO_TURN, VECTOR, VECTOR3, Rn, Table, generator, retract
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
-MOST = 20  # leaps in a phase: whatever is read at rest goes through all of them
+TAU = 0.05  # of the least sigma of a point as seen from the robot, by which a correction may part it from the rest
+MOST = 40  # rows of turns to keep in a phase, of each robot's axes at each leap
 
 
 class Points:
@@ -62,3 +65,166 @@ def _parts(P: Array, r: int, points: Index, before: Array, now: Array, d: int) -
         if variance < apart * apart:
             return True
     return False
+
+
+def turns_of(robot: int, moved: dict[int, tuple[Array, Array]], axes: int) -> tuple[Array, Array]:
+    """Return how a robot's correction turns the world, and what it did to the robots' turns (R axes,).
+
+    `moved` has the robots' means before and after it.
+    """
+    turns = {r: turn_of(before, after, axes) for r, (before, after) in moved.items()}
+    turn = turns[robot].copy()
+    if axes == 6:
+        turn[:3] += np.cross(moved[robot][0][:3], turn[3:])
+    return turn, np.concatenate([*turns.values()])
+
+
+def turn_of(before: Array, after: Array, axes: int) -> Array:
+    """Return what a correction did to the turn (axes,) of a robot that stood at `before` and stands at `after`."""
+    if axes == 1:
+        return np.array([wrap(after[2] - before[2])])
+    turn = log(multiply(after[3:7], conjugate(before[3:7])))
+    if axes == 3:
+        return turn
+    return np.concatenate([np.linalg.solve(left_jacobian(turn), after[:3] - before[:3]), turn])
+
+
+class Carried(NamedTuple):
+    """The mean of blocks at rest, what it was after the last leap, and how their errors depend on the robots' turns.
+
+    `a` (n, T + R axes): on those kept at each leap, of the robots one after the other, and on those of now.
+    """
+
+    x: Array
+    x_left: Array
+    a: Array
+
+
+class Leaps:
+    """The corrections of a phase, in what has to be known of them: those between two leaps together, each leap alone.
+
+    `S` (A0, C) and `U` (T, C) have what displaced blocks at rest, by shadows and by kept turns.  Each leap has so many
+    columns there as there are robots, for what each robot's corrections before it did, and one for itself.
+    """
+
+    def __init__(self) -> None:
+        self.robots = np.zeros((0, 2), dtype=np.int64)  # of each leap: how many there were, and whose it is
+        self.S, self.U = np.zeros((0, 0)), np.zeros((0, 0))
+        self.S_done, self.U_done = np.zeros((0, 1)), np.zeros((0, 1))  # displaced until the last leap, by each robot
+        self.rows, self.numbers = np.zeros((2, 0), dtype=np.int64)  # the kept turns in the active map
+        self.last: dict[int, tuple[Index, Index]] = {}  # of these the last orientation of each robot
+        self.turn: list[Array] = []  # how each turns the world,
+        self.turns: list[Array] = []  # what it did to the robots' turns, e' d (R axes,),
+        self.origins: list[Array] = []  # and where the robots stood (R, 3)
+
+    def __len__(self) -> int:
+        return len(self.robots)
+
+    def add(
+        self, robot: int, S: Array, U: Array, ds: Array, du: Array, turn: Array, turns: Array, origins: Array
+    ) -> None:  # fmt: skip
+        """Add a leap of a robot: S (A0, R) and U (T, R) are all that was displaced before, ds and du what it did."""
+        self.S, self.U = (
+            np.hstack([_padded(old, len(now), old.shape[1]), now - _padded(done, *now.shape), d[:, None]])
+            for old, now, done, d in ((self.S, S, self.S_done, ds), (self.U, U, self.U_done, du))
+        )
+        self.S_done, self.U_done = S.copy(), U.copy()
+        self.S_done[:, robot] += ds
+        self.U_done[:, robot] += du
+        self.robots = np.vstack([self.robots, [S.shape[1], robot]])
+        self.turn.append(turn)
+        self.turns.append(turns)
+        self.origins.append(origins)
+
+    def keep(self, m: StochasticMap, turns: dict[int, Index]) -> int:
+        """Keep the robots' turns as they are now, of which these are the rows in the active map; return how many."""
+        index = np.concatenate([*turns.values()])
+        k = len(index)
+        kept = m.augment(Rn(k), np.zeros(k), index, np.eye(k), np.zeros((k, k)))
+        rows, numbers = m.rows(kept), np.arange(k) + m.numbers(kept).start
+        self.rows, self.numbers = np.concatenate([self.rows, rows]), np.concatenate([self.numbers, numbers])
+        ends = np.cumsum([len(of) for of in turns.values()]).tolist()
+        last = [slice(end - min(3, len(of)), end) for end, of in zip(ends, turns.values(), strict=True)]
+        self.last = {robot: (rows[i], numbers[i]) for robot, i in zip(turns, last, strict=True)}
+        return k
+
+
+@dataclass(frozen=True)
+class Way:
+    """How blocks at rest have come from where they were: what shadows and kept turns have displaced, S (A0, R) and
+    U (T, R), the leaps among that, where the robots stand (R, 3), and the axes.
+    """
+
+    S: Array
+    U: Array
+    leaps: Leaps
+    axes: int
+    origins: Array
+
+    def carried(self, atoms: Table, x: Array, G: Array) -> Carried:
+        """Carry blocks of the mean x and the covariance G (n, A0) with the shadows along."""
+        leaps, U = self.leaps, self.U
+        now = (U - _padded(leaps.U_done, *U.shape)) if len(leaps) else U
+        S = (self.S - _padded(leaps.S_done, *self.S.shape)) if len(leaps) else self.S
+        D = np.hstack([G[:, : len(leaps.S)] @ leaps.S, G @ S])
+        U = np.hstack([_padded(leaps.U, len(U), leaps.U.shape[1]), now])
+        turn, turns = (np.concatenate([NO_TURN, *each]) for each in (leaps.turn, leaps.turns))
+        origins = np.concatenate([*leaps.origins, self.origins])
+        return Carried(*_carried(atoms, x, D, U, leaps.robots, turn, turns, origins, self.axes))
+
+
+def _padded(A: Array, rows: int, columns: int) -> Array:
+    out = np.zeros((rows, columns))
+    out[: A.shape[0], : A.shape[1]] = A
+    return out
+
+
+@compiled
+def _carried(
+    atoms: Table, x: Array, D: Array, U: Array, robots: Index, turn: Array, turns: Array, origins: Array, axes: int
+) -> tuple[Array, Array, Array]:
+    """Return `Carried` of displacements D (n, C) + a U, U (T, C), column by column; all else is one leap's after the
+    other's.
+    """
+    a = np.zeros((len(D), len(U) + axes * (D.shape[1] - robots[:, 0].sum() - len(robots))))
+    column = kept = turned_by = stood = 0
+    x, x_left = x.copy(), x
+    for k in range(len(robots) + 1):
+        leaps = k < len(robots)
+        count = robots[k, 0] if leaps else D.shape[1] - column
+        for c in range(count):
+            d = _displacement(D, U, a, column + c, kept)
+            _turn(atoms, x, d, NO_TURN, a, kept + c * axes, axes, origins[stood + c])
+        if leaps:
+            robot, width = robots[k, 1], count * axes
+            d = _displacement(D, U, a, column + count, kept)
+            for i in range(len(d)):
+                for j in range(width):
+                    d[i] += a[i, kept + j] * turns[turned_by + j]
+            by = turn[k * axes : (k + 1) * axes]
+            _turn(atoms, x, d, by, a, kept + robot * axes, axes, origins[stood + robot])
+            column, kept, turned_by, stood = column + count + 1, kept + width, turned_by + width, stood + count
+            x_left = x.copy()
+    return x, x_left, a
+
+
+@compiled
+def _displacement(D: Array, U: Array, a: Array, column: int, kept: int) -> Array:
+    """Return D + a U (n,), of one column and of the turns kept so far."""
+    d = D[:, column].copy()
+    for i in range(len(d)):
+        for j in range(kept):
+            d[i] += a[i, j] * U[j, column]
+    return d
+
+
+@compiled
+def _turn(
+    atoms: Table, x: Array, d: Array, turn: Array, a: Array, column: int, axes: int, origin: Array
+) -> None:  # fmt: skip
+    """Move the mean x by a correction d that turns the world by `turn`, and add to `a` how the coordinates turned."""
+    if axes > 0:
+        a[:, column : column + axes] -= generator(atoms, x, len(d), axes, origin)
+    retract(atoms, x, d, turn)
+    if axes > 0:
+        a[:, column : column + axes] += generator(atoms, x, len(d), axes, origin)

@@ -21,10 +21,10 @@ import numpy.typing as npt
 
 from kalmark.filter import kernels, leap
 from kalmark.filter.drift import Drift
-from kalmark.filter.flush import Flush, Leap, Phase, Room, carried, leap_of
-from kalmark.filter.map import P_AT, X_AT, X_SIZE, Layout, StochasticMap
+from kalmark.filter.flush import Flush, Phase, Room
+from kalmark.filter.map import P_AT, X_SIZE, Layout, StochasticMap
 from kalmark.filter.pace import SLICE, USING, Pace
-from kalmark.filter.reading import excerpt, joint
+from kalmark.filter.reading import excerpt, joint, places
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import RHO, Rn, Space
 
@@ -66,11 +66,10 @@ class PostponedMap(Layout):
         self._s_x: Index = NO_ROWS  # and their numbers
         self._shadows: dict[int, int] = {}  # slots in the active map, by slot: in the order of A0
         self._gone: list[tuple[int, Space]] = []  # removed, their shadows are still here
-        self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows
+        self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows and of these turns
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of what turned the world with them
         self._drift, self._pace, self._points = Drift(), Pace(self.most), leap.Points()
-        self._leaps: list[Leap] = []
-        self._due = False  # whether a flush is to follow as soon as none is under way
+        self._leaps = leap.Leaps()
         self._before: dict[int, Array] = {}
 
     @classmethod
@@ -97,7 +96,7 @@ class PostponedMap(Layout):
     def mean(self, slot: int) -> Array:
         """Return a copy of a block's mean."""
         at = self._owners.get(slot)
-        return self.active.mean(at) if at is not None else self._preview(slot)[0]
+        return self.active.mean(at) if at is not None else self._preview(slot)[0].x
 
     def first(self, slot: int) -> Array:
         """Return a copy of a block's first estimate, of a robot its last predicted one."""
@@ -113,15 +112,8 @@ class PostponedMap(Layout):
         return np.array([self.mean(slot)[:d] for slot in slots.tolist()]).reshape(len(slots), d)
 
     def places(self, slots: Index, d: int) -> Array:
-        """Return the first d numbers (K, d), a place, of blocks at rest: x_B = x0_B + P0_BA theta."""
-        if self._leaps:
-            return self.means(slots, d)
-        rows = (self.blocks[slots, P_AT][:, None] + np.arange(d)).ravel()
-        if self._job is not None:
-            for slot in slots.tolist():
-                self._job.know(slot)
-        moved = self._read(rows, self._A0) @ self._displacements().sum(axis=1)
-        return self.x[self.blocks[slots, X_AT][:, None] + np.arange(d)] + moved.reshape(-1, d)
+        """Return the first d numbers (K, d), a place, of blocks at rest."""
+        return places(self, slots, d)
 
     def awake(self, d: int) -> tuple[Index, Array]:
         """Return the slots (N,) of the active blocks, and their first d numbers (N, d)."""
@@ -137,8 +129,8 @@ class PostponedMap(Layout):
         return excerpt(self, robot, mount, slots)
 
     def _resting_rows(self) -> Index:
-        """Return the rows of the active map that blocks at rest depend on: the shadows and the robots' turns."""
-        return np.concatenate([self._s, *(self._turn_rows(robot) for robot in self._moved)])
+        """Return the rows of the active map that blocks at rest depend on: the shadows and all turns."""
+        return np.concatenate([self._s, self._leaps.rows, *(self._turn_rows(robot) for robot in self._moved)])
 
     def _turn_rows(self, robot: int) -> Index:
         """Return the rows of what turns the world with a robot: of its orientation, or its whole pose."""
@@ -151,25 +143,28 @@ class PostponedMap(Layout):
     def _read(self, rows: Index, columns: Index) -> Array:
         return self.storage.get(rows, columns) if self._job is None else self._job.read(rows, columns)
 
-    def _preview(self, slot: int) -> tuple[Array, Array, Array]:
-        """Return the mean of a block at rest, its Jacobian G in `_resting_rows`, and the covariance it has besides."""
+    def _preview(self, slot: int) -> tuple[leap.Carried, Array, Array]:
+        """Return a block at rest as it is now, its Jacobian G in `_resting_rows`, and the covariance it has besides."""
         space, rows = self.spaces[slot], self.rows(slot)
         assert space is not None
         if self._job is not None:
             self._job.know(slot)
         G = self._read(rows, self._A0)
-        x, a = carried(space.atoms, self.x[self.numbers(slot)], G, self._displacements(), self._leaps, *self._gauges())
-        return x, np.hstack([G, a]), self._read(rows, rows)
+        now = self._way().carried(space.atoms, self.x[self.numbers(slot)], G)
+        return now, np.hstack([G, now.a]), self._read(rows, rows)
 
-    def _displacements(self) -> Array:
-        """Return the part (A0, R) that each robot's corrections have in the shadows."""
-        moved = list(self._moved.values())
-        return np.column_stack(moved) if moved else self.active.x[self._s_x][:, None]
+    def _displacements(self) -> tuple[Array, Array]:
+        """Return the parts (A0, R) and (T, R) that each robot's corrections have in the shadows and the kept turns."""
+        moved = np.column_stack([*self._moved.values()]) if self._moved else self.active.x[self._s_x][:, None]
+        return moved[: len(self._A0)], moved[len(self._A0) :]
 
-    def _gauges(self) -> tuple[int, Array]:
-        """Return the axes of the robots' turns and where the robots stand; without transport there are none."""
-        stand = [self.active.mean(self._owners[robot])[:3] for robot in self._moved]
-        return (self.axes, np.array(stand)) if stand else (0, np.zeros((1, 3)))
+    def _way(self) -> leap.Way:
+        """Return how blocks at rest have come to where they are; without transport nothing turns."""
+        return leap.Way(*self._displacements(), self._leaps, self.axes if self._moved else 0, self._stand())
+
+    def _stand(self) -> Array:
+        """Return where the robots stand (R, 3)."""
+        return np.array([self.active.mean(self._owners[robot])[:3] for robot in self._moved] or np.zeros((1, 3)))
 
     # ------------------------------------------------------------------ growing and shrinking
     def add(self, space: Space, mean: Any, cov: Any = None) -> int:
@@ -269,15 +264,13 @@ class PostponedMap(Layout):
         """Take note that `robot` has corrected what `opened` returned, transporting its covariance or not."""
         m = self.active
         if transports and len(self._A0):
-            s, before = m.x[self._s_x], self._moved.get(robot, 0.0)
+            s, before = m.x[np.concatenate([self._s_x, self._leaps.numbers])], self._moved.get(robot, 0.0)
             others = [moved for other, moved in self._moved.items() if other != robot]
             self._moved[robot] = now = s - sum(others) if others else s
             rests = len(self._owners) < self.used
-            far = rests and not self._due and self._far(robot, s)
-            if far or (rests and self._points.parted(m, self._owners[robot], self._before[robot])):
+            if rests and (self._far(robot) or self._points.parted(m, self._owners[robot], self._before[robot])):
                 self.leap(robot, now - before)
-            self._due = self._due or far or len(self._leaps) >= leap.MOST
-            if self._due:
+            if len(self._leaps.rows) >= leap.MOST:
                 self._go_on(SLICE)
                 if self._job is None:
                     self.flush()
@@ -292,11 +285,11 @@ class PostponedMap(Layout):
             return
         space = self.spaces[slot]
         assert space is not None
-        mean, G, Q = self._preview(slot)
+        now, G, Q = self._preview(slot)
         if len(self._A0):
-            at = self.active.augment(space, mean, self._resting_rows(), G, Q)
+            at = self.active.augment(space, now.x, self._resting_rows(), G, Q)
         else:
-            at = self.active.add(space, mean, Q)
+            at = self.active.add(space, now.x, Q)
         self.active.x_first[self.active.numbers(at)] = self.x_first[self.numbers(slot)]
         self._activate(slot, at)
         rows = self.active.rows(at)
@@ -304,9 +297,9 @@ class PostponedMap(Layout):
         s = self.active.rows(shadow)
         self.active.P[np.maximum(rows, s), np.minimum(rows, s)] = 1.0
         for name, moved in self._moved.items():
-            self._moved[name] = np.concatenate([moved, np.zeros(len(s))])
+            self._moved[name] = np.insert(moved, len(self._A0), np.zeros(len(s)))
         self.cast_shadow(slot, shadow)
-        self.look_after(slot)
+        self.look_after(slot, now.x_left)
 
     def cast_shadow(self, slot: int, at: int) -> None:
         """Take a block of the active map as the shadow of a slot."""
@@ -316,32 +309,43 @@ class PostponedMap(Layout):
         self._s = np.concatenate([self._s, self.active.rows(at)])
         self._s_x = np.concatenate([self._s_x, np.arange(where.start, where.stop)])
 
-    def look_after(self, slot: int) -> None:
-        """Watch how far an active block with a shadow goes from where it was at rest."""
+    def look_after(self, slot: int, left: Array) -> None:
+        """Watch how far an active block with a shadow goes from where the coordinates of errors at rest were left."""
         space, at = self.spaces[slot], self._owners.get(slot)
         if space is not None and at is not None:
             rows = self.rows(slot)
             variances = np.diag(self._read(rows, rows))
             here = self.active.numbers(at).start, int(self.active.rows(at)[0])
-            self._drift.watch(slot, space, *here, self.x[self.numbers(slot)], variances)
+            self._drift.watch(slot, space, *here, left, variances)
 
     def take_as_moving(self, slot: int) -> None:
         """Take note that an active block moves by itself."""
         self._drift.moves(slot, self.rows(slot)[: 2 if self.axes == 1 else 3])
 
-    def _far(self, robot: int, s: Array) -> bool:
+    def _far(self, robot: int) -> bool:
         """Return whether the rest has moved too far for the coordinates in which its errors were left."""
-        m = self.active
-        return self._drift.is_beyond(
-            m.P, self._turn_rows(robot), m.x, s, lambda rows, first: self._read(rows, self._A0[first:])
-        )
+        if robot not in self._leaps.last:
+            return True
+        m, (kept, kept_x) = self.active, self._leaps.last[robot]
+        s, turn = m.x[self._s_x], self._turn_rows(robot)[-len(kept) :]
+        read = lambda rows, first: self._read(rows, self._A0[first:])  # noqa: E731
+        return self._drift.is_beyond(m.P, turn, kept, m.x, kept_x, s, read)
 
-    def leap(self, robot: int, ds: Array) -> None:
-        """Have the last correction, ds by `robot`, move all blocks at rest as the dense filter does."""
-        went = {r: (before, self.active.mean(self._owners[r])) for r, before in self._before.items()}
-        S = self._displacements()
-        S[:, list(self._moved).index(robot)] -= ds
-        self._leaps.append(leap_of(robot, S, ds, went, list(self._moved), self.axes))
+    def leap(self, robot: int, moved: Array) -> None:
+        """Apply the last correction, by which `robot` `moved` shadows and turns, to all at rest as a dense filter does.
+
+        The robots' turns are kept as they are now: by these the coordinates of errors at rest have turned.
+        """
+        robots, count = list(self._moved), len(self._A0)
+        went = {r: (self._before[r], self.active.mean(self._owners[r])) for r in robots}
+        S, U = (D.copy() for D in self._displacements())
+        S[:, robots.index(robot)] -= moved[:count]
+        U[:, robots.index(robot)] -= moved[count:]
+        how = leap.turns_of(robot, went, self.axes)
+        self._leaps.add(robots.index(robot), S, U, moved[:count], moved[count:], *how, self._stand())
+        k = self._leaps.keep(self.active, {r: self._turn_rows(r) for r in robots})
+        self._moved = {r: np.concatenate([D, np.zeros(k)]) for r, D in self._moved.items()}
+        self._drift.leave(self.active.x, self.active.x[self._s_x])
 
     # ------------------------------------------------------------------ flushing
     def _progress(self) -> float:
@@ -373,11 +377,12 @@ class PostponedMap(Layout):
         m, slots = self.active, list(self._owners)
         A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
         here = np.concatenate([NO_ROWS, *(m.rows(self._owners[slot]) for slot in slots)])
-        where = {row: i for i, row in enumerate(here.tolist())}
-        turns = np.array([where[row] for r in self._moved for row in self._turn_rows(r).tolist()], dtype=np.int64)
-        P = kernels.submatrix(m.P, np.concatenate([here, self._s]))
-        n, S, (axes, origins) = len(here), self._displacements(), self._gauges()
-        phase = Phase(self._A0, A, -P[n:, n:], P[:n, n:], P[:n, :n], S, self._leaps, turns, origins, axes)
+        turns = np.concatenate([self._leaps.rows, *(self._turn_rows(r) for r in self._moved)])
+        P = kernels.submatrix(m.P, np.concatenate([here, turns, self._s]))
+        n, t = len(here), len(here) + len(turns)
+        phase = Phase(
+            self._A0, A, -P[t:, t:], P[:n, t:], P[:n, :n], P[n:t, t:], P[n:t, :n], P[n:t, n:t], self._way()
+        )  # fmt: skip
         self._job = Flush(self, self.storage, phase, self._room)
         for slot in slots:
             at = self._owners[slot]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.filter import kernels
-from kalmark.filter.map import StochasticMap
+from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, StochasticMap
 
 if TYPE_CHECKING:
     from kalmark.filter.postponed import PostponedMap
@@ -44,6 +44,28 @@ def joint(map_: PostponedMap, slots: Sequence[int]) -> Array:
             place += len(rows[i])
     C = T @ (kernels.submatrix(map_.active.P, index) @ T.T) + Q
     return 0.5 * (C + C.T)
+
+
+def places(map_: PostponedMap, slots: Index, d: int) -> Array:
+    """Return the first d numbers (K, d) of blocks at rest, all carried along at once."""
+    for slot in slots.tolist() if map_._job is not None else ():
+        map_._job.know(slot)  # type: ignore[union-attr]
+    b = map_.blocks[slots]
+    numbers, rows, atoms = (
+        _spans(b[:, at], b[:, count]) for at, count in ((X_AT, X_SIZE), (P_AT, P_SIZE), (ATOM_AT, ATOMS))
+    )
+    first = np.cumsum(b[:, X_SIZE]) - b[:, X_SIZE]
+    moved = np.column_stack(
+        [np.zeros_like(first), first - b[:, X_AT], np.cumsum(b[:, P_SIZE]) - b[:, P_SIZE] - b[:, P_AT]]
+    )
+    table = map_.atoms[atoms] + np.repeat(moved, b[:, ATOMS], axis=0)
+    now = map_._way().carried(table, map_.x[numbers], map_._read(rows, map_._A0))
+    return now.x[first[:, None] + np.arange(d)]
+
+
+def _spans(first: Index, count: Index) -> Index:
+    """Return first[0], first[0] + 1, ..., so many of each."""
+    return np.repeat(first - np.cumsum(count) + count, count) + np.arange(count.sum())
 
 
 def excerpt(map_: PostponedMap, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:

@@ -153,7 +153,7 @@ def _activate(m: PostponedMap, active: StochasticMap, phase: State, read: Read) 
     ):
         raise MapError(f"the active map has {len(active.spaces)} blocks, expected each to belong to one of the map")
     for slot in m._shadows:
-        m.look_after(slot)
+        m.look_after(slot, m.x[m.numbers(slot)])
     for slot in phase["moving"]:
         if slot in m._owners:
             m.take_as_moving(slot)
