@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.errors import MapError
 from kalmark.filter import postponed as postponed_map
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.pace import Pace
@@ -269,6 +270,22 @@ def test_a_landmark_that_does_not_fit_is_ignored_with_a_reason_and_all_else_goes
     assert max(differences(*slams)) < 1e-9
     with pytest.raises(km.KalmarkError, match="the map is full"):
         slams[0].add_landmark("surveyed", (1.0, 2.0))
+
+
+def test_in_a_map_too_full_for_the_error_of_a_control_the_robot_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    lidar = km.Mount(km.sensors.RangeBearing(0.1, 0.02))
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle(0.05, 0.02), sensors={"l": lidar})], map="postponed")
+
+    def full(*_: Any) -> None:
+        raise MapError("the map is full")
+
+    for t in range(10):
+        slam.process(km.Control(t, "r", (1.0, 0.0)))
+        if t == 5:
+            monkeypatch.setattr(slam.map, "add", full)
+        slam.process(km.Scan(t + 0.5, "r", "l", [], []))  # within the control's interval: both parts have one error
+    assert slam.mean("r")[0] == pytest.approx(9.5)
+    assert slam.covariance("r")[0, 0] == pytest.approx(0.05**2 * (5 + 4 * 0.5 + 0.25))
 
 
 def test_float32_keeps_what_is_at_rest_to_its_precision_in_half_the_memory() -> None:

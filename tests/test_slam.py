@@ -303,6 +303,14 @@ def test_a_control_that_leads_nowhere_finite_is_refused_and_changes_nothing() ->
         assert state(slam) == before
 
 
+def test_a_control_that_no_robot_can_follow_is_refused_before_it_is_held() -> None:
+    for u, cov in (((1e16, 0.0), None), ((1.0, 0.0), np.diag([1e31, 1.0]))):
+        with pytest.raises(
+            EventError, match=r"control of 'rover' at t=1 s: (u|cov) holds 1e\+\d+, expected at most 1e\+"
+        ):
+            km.Control(1, "rover", u, cov)
+
+
 def test_a_users_subclass_of_a_built_in_model_is_not_taken_for_it() -> None:
     class Biased(km.sensors.RangeBearing):
         def expect(self, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

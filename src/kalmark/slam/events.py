@@ -71,6 +71,9 @@ def _nanoseconds(t_s: Any, t_ns: Any) -> int:
     return time
 
 
+HUGE = 1e15  # a control: no robot's
+
+
 def finite(value: Any, what: str, error: type[KalmarkError] = EventError) -> Array:
     """Return a copy of `value` as a float array, or raise `error` if anything in it is not a finite number."""
     try:
@@ -85,6 +88,13 @@ def finite(value: Any, what: str, error: type[KalmarkError] = EventError) -> Arr
     flat = array.ravel()
     if not math.isfinite(sum(flat.tolist())) and not np.isfinite(flat).all():
         raise error(f"{what} holds {flat[~np.isfinite(flat)][0]}, expected finite numbers")
+    return array
+
+
+def _below(most: float, array: Array, what: str) -> Array:
+    """Return a control's numbers; what is larger would move a robot out of all numbers later, when it is too late."""
+    if np.abs(array).max(initial=0.0) > most:
+        raise EventError(f"{what} holds {array.flat[np.abs(array).argmax()]:.3g}, expected at most {most:.0e}")
     return array
 
 
@@ -154,8 +164,8 @@ class Control:
         try:
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
-            set_(self, "u", finite(u, "u"))
-            set_(self, "cov", None if cov is None else finite(cov, "cov"))
+            set_(self, "u", _below(HUGE, finite(u, "u"), "u"))
+            set_(self, "cov", None if cov is None else _below(HUGE**2, finite(cov, "cov"), "cov"))
         except EventError as error:
             raise EventError(f"control of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
 

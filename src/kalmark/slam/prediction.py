@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import EventError
+from kalmark.errors import EventError, MapError
 from kalmark.filter.kernels import moved_noise
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.slam.drive import Part, body_axes
@@ -56,8 +56,11 @@ def predict(slam: Slam, name: str, part: Part) -> None:
         what = f"{name!r} at t={seconds(slam.t_ns or 0)} s"
         raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
     if error is None and not (part.first and part.last) and part.N.any():
-        slam._errors[name] = map_.add(Rn(len(u)), np.zeros(len(u)), part.N)
-        added.append(slam._errors[name])
+        try:
+            slam._errors[name] = map_.add(Rn(len(u)), np.zeros(len(u)), part.N)
+            added.append(slam._errors[name])
+        except MapError:  # it is full: each part has an error of its own
+            pass
     if name in slam._errors:
         Q = np.zeros_like(Q)
     index = map_.index(slot)
