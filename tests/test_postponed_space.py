@@ -86,6 +86,31 @@ def test_corrections_applied_to_all_blocks_at_rest_are_the_dense_filters(
     assert len(postponed._owners) < len(spaces)
 
 
+def test_a_block_that_moves_with_the_whole_pose_may_come_when_others_have_leapt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Pace, "due", lambda *_: 1e300)
+    dense, spaces = a_map(False, 0.1, 0.1)
+    postponed = PostponedMap.from_dense(a_map(False, 0.1, 0.1)[0])
+    postponed._far = lambda robot: True  # type: ignore[method-assign]
+    spaces.append(km.landmarks.Homogeneous().space)
+    G = 0.1 * np.random.default_rng(6).normal(size=(spaces[-1].dof, 6))
+    for i, (slots, y) in enumerate(scans(dense, 12, 0.1, range(1, 1 + POINTS))):
+        for m in (dense, postponed):
+            if i == 6:
+                m.augment(spaces[-1], np.array([1.0, 2.0, 0.5, 0.8]), m.index(0), G, 0.01 * np.eye(len(G)))
+            m.predict(m.index(0), np.eye(6), np.diag([0.02] * 3 + [0.01] * 3) ** 2)
+            correct(m, slots, y)
+        if i == 9:
+            postponed.flush()
+    every = range(len(spaces))
+    P = dense.covariance(every)
+    sigma = np.sqrt(np.diag(P))
+    np.testing.assert_allclose((postponed.covariance(every) - P) / np.outer(sigma, sigma), 0.0, atol=1e-9)
+    for slot, space in enumerate(spaces):
+        np.testing.assert_allclose(space.minus(postponed.mean(slot), dense.mean(slot)), 0.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("stepped", [False, True])
 def test_a_standing_robot_learns_nothing_of_its_orientation_from_any_block_at_rest(stepped: bool) -> None:
     prior = np.radians(20)

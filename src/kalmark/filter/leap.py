@@ -1,7 +1,8 @@
-"""When a correction is so large that what is at rest must turn with it, as in the dense filter, and not only move.
+"""Corrections that are applied to all at rest as the dense filter does: leaps.  docs/postponed.md.
 
-A correction d that turns the world by phi moves an active block by V(phi) d and one at rest by d alone: they part by up
-to |phi| |d| / 2, where they may be known from each other to centimetres.  It happens when a loop closes late.
+A correction d that turns the world by phi moves an active block by V(phi) d and turns the coordinates of its error; one
+at rest is moved by d alone, its error keeps its coordinates.  A large one parts them by up to |phi| |d| / 2, and many
+small ones leave the coordinates behind, while the robot's turn goes on.  A leap makes up for both, and keeps the turn.
 """
 
 from __future__ import annotations
@@ -112,6 +113,7 @@ class Leaps:
         self.S, self.U = np.zeros((0, 0)), np.zeros((0, 0))
         self.S_done, self.U_done = np.zeros((0, 1)), np.zeros((0, 1))  # displaced until the last leap, by each robot
         self.rows, self.numbers = np.zeros((2, 0), dtype=np.int64)  # the kept turns in the active map
+        self.axes = 0  # of the turns: blocks that need more axes come to rest after the phase
         self.last: dict[int, tuple[Index, Index]] = {}  # of these the last orientation of each robot
         self.turn: list[Array] = []  # how each turns the world,
         self.turns: list[Array] = []  # what it did to the robots' turns, e' d (R axes,),
@@ -139,12 +141,11 @@ class Leaps:
     def keep(self, m: StochasticMap, turns: dict[int, Index]) -> int:
         """Keep the robots' turns as they are now, of which these are the rows in the active map; return how many."""
         index = np.concatenate([*turns.values()])
-        k = len(index)
+        k, self.axes = len(index), len(index) // len(turns)
         kept = m.augment(Rn(k), np.zeros(k), index, np.eye(k), np.zeros((k, k)))
         rows, numbers = m.rows(kept), np.arange(k) + m.numbers(kept).start
         self.rows, self.numbers = np.concatenate([self.rows, rows]), np.concatenate([self.numbers, numbers])
-        ends = np.cumsum([len(of) for of in turns.values()]).tolist()
-        last = [slice(end - min(3, len(of)), end) for end, of in zip(ends, turns.values(), strict=True)]
+        last = [slice(end - min(3, self.axes), end) for end in range(self.axes, k + 1, self.axes)]
         self.last = {robot: (rows[i], numbers[i]) for robot, i in zip(turns, last, strict=True)}
         return k
 

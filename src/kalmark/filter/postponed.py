@@ -132,12 +132,17 @@ class PostponedMap(Layout):
         """Return the rows of the active map that blocks at rest depend on: the shadows and all turns."""
         return np.concatenate([self._s, self._leaps.rows, *(self._turn_rows(robot) for robot in self._moved)])
 
+    @property
+    def _axes(self) -> int:
+        """The axes of the turns in this phase: those of its leaps, or of all blocks."""
+        return self._leaps.axes or self.axes
+
     def _turn_rows(self, robot: int) -> Index:
         """Return the rows of what turns the world with a robot: of its orientation, or its whole pose."""
-        rows = self._turns.get((robot, self.axes))
+        rows = self._turns.get((robot, self._axes))
         if rows is None:
-            last = int(self.active.blocks[self._owners[robot], P_AT]) + (3 if self.axes == 1 else 6)
-            rows = self._turns[robot, self.axes] = np.arange(last - self.axes, last)
+            last = int(self.active.blocks[self._owners[robot], P_AT]) + (3 if self._axes == 1 else 6)
+            rows = self._turns[robot, self._axes] = np.arange(last - self._axes, last)
         return rows
 
     def _read(self, rows: Index, columns: Index) -> Array:
@@ -160,7 +165,7 @@ class PostponedMap(Layout):
 
     def _way(self) -> leap.Way:
         """Return how blocks at rest have come to where they are; without transport nothing turns."""
-        return leap.Way(*self._displacements(), self._leaps, self.axes if self._moved else 0, self._stand())
+        return leap.Way(*self._displacements(), self._leaps, self._axes if self._moved else 0, self._stand())
 
     def _stand(self) -> Array:
         """Return where the robots stand (R, 3)."""
@@ -341,7 +346,7 @@ class PostponedMap(Layout):
         S, U = (D.copy() for D in self._displacements())
         S[:, robots.index(robot)] -= moved[:count]
         U[:, robots.index(robot)] -= moved[count:]
-        how = leap.turns_of(robot, went, self.axes)
+        how = leap.turns_of(robot, went, self._axes)
         self._leaps.add(robots.index(robot), S, U, moved[:count], moved[count:], *how, self._stand())
         k = self._leaps.keep(self.active, {r: self._turn_rows(r) for r in robots})
         self._moved = {r: np.concatenate([D, np.zeros(k)]) for r, D in self._moved.items()}
