@@ -25,7 +25,13 @@ Index = npt.NDArray[np.int64]
 
 
 TAU = 0.05  # of the least sigma of a point as seen from the robot, by which a correction may part it from the rest
-MOST = 40  # rows of turns to keep in a phase, of each robot's axes at each leap
+MOST = 40  # rows of turns to keep in a phase, of each robot's axes at each leap,
+MORE = 500  # and one more for so many rows of the map: a flush costs their square
+
+
+def most(n: int) -> int:
+    """Return how many rows of turns to keep in a phase of a map of n rows."""
+    return MOST + n // MORE
 
 
 class Points:

@@ -109,7 +109,11 @@ class PostponedMap(Layout):
 
     def means(self, slots: Index, d: int) -> Array:
         """Return the first d numbers (K, d) of blocks."""
-        return np.array([self.mean(slot)[:d] for slot in slots.tolist()]).reshape(len(slots), d)
+        rest, out = self.is_at_rest(slots), np.empty((len(slots), d))
+        out[~rest] = self.active.means(self._at[slots[~rest]], d)
+        if rest.any():
+            out[rest] = places(self, slots[rest], d)
+        return out
 
     def places(self, slots: Index, d: int) -> Array:
         """Return the first d numbers (K, d), a place, of blocks at rest."""
@@ -275,7 +279,7 @@ class PostponedMap(Layout):
             rests = len(self._owners) < self.used
             if rests and (self._far(robot) or self._points.parted(m, self._owners[robot], self._before[robot])):
                 self.leap(robot, now - before)
-            if len(self._leaps.rows) >= leap.MOST:
+            if len(self._leaps.rows) >= leap.most(self.n):
                 self._go_on(SLICE)
                 if self._job is None:
                     self.flush()
