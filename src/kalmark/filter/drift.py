@@ -25,7 +25,7 @@ NO_NUMBERS = np.zeros(0)
 NO_ROWS = np.zeros(0, dtype=np.int64)
 
 
-TAU = 2e-3  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
+TAU = 5e-4  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
 
 
 class Watch(NamedTuple):
