@@ -25,7 +25,13 @@ NO_NUMBERS = np.zeros(0)
 NO_ROWS = np.zeros(0, dtype=np.int64)
 
 
-TAU = 5e-4  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are
+TAU = 5e-4  # how far, in its sigmas and radians of heading, a block at rest may be from where its coordinates are,
+SMALL = 5000  # in a map of so many rows at most; in a larger one farther by as much, since a flush costs more
+
+
+def tolerance(n: int) -> float:
+    """Return how far a block at rest may be from where its coordinates are, in a map of n rows."""
+    return TAU * max(1.0, n / SMALL)
 
 
 class Watch(NamedTuple):
@@ -43,17 +49,17 @@ class Watch(NamedTuple):
 @compiled
 def is_farther(
     P: Array, turn: Index, kept: Index, x: Array, kept_x: Index, at: Index, frozen: Array, first: Index, size: Index,
-    G: Array, s: Array, per_sigma: Array,
+    G: Array, s: Array, per_sigma: Array, tau: float,
 ) -> bool:  # fmt: skip
     """Return whether a number is more than so many sigmas from where it was: of those that stand, or among G s.
 
-    So many are TAU over what is not known of the robot's turn since it was kept, or was corrected of it: `turn` and
+    So many are tau over what is not known of the robot's turn since it was kept, or was corrected of it: `turn` and
     `kept` are the rows of P, `kept_x` the numbers of what was kept.
     """
     variance = 1e-300
     for i in range(len(turn)):
         variance += P[turn[i], turn[i]] + P[kept[i], kept[i]] - 2.0 * P[kept[i], turn[i]] + x[kept_x[i]] ** 2
-    limit = TAU / math.sqrt(variance)
+    limit = tau / math.sqrt(variance)
     for i in range(len(at)):
         own = 0.0
         for j in range(first[i], first[i] + size[i]):
@@ -127,13 +133,14 @@ class Drift:
         self._all, self._left = None, s
 
     def is_beyond(
-        self, P: Array, turn: Index, kept: Index, x: Array, kept_x: Index, s: Array, read: Callable[[Index, int], Array]
-    ) -> bool:
+        self, P: Array, turn: Index, kept: Index, x: Array, kept_x: Index, s: Array, n: int,
+        read: Callable[[Index, int], Array],
+    ) -> bool:  # fmt: skip
         """Return whether the rest has moved too far for the coordinates in which its errors were left.
 
         P and x are the covariance and the mean of the active map, `turn` the rows there of the turn of the robot that
-        corrects, `kept` and `kept_x` the rows and numbers of that kept last, s the mean of the shadows; `read` returns
-        rows' covariance at rest with the shadows from a first one on.
+        corrects, `kept` and `kept_x` the rows and numbers of that kept last, s the mean of the shadows, n the rows of
+        the whole map; `read` returns rows' covariance at rest with the shadows from a first one on.
         """
         if self._all is None:
             parts = zip(*self._standing.values(), strict=True)
@@ -147,4 +154,4 @@ class Drift:
         if len(self._left):
             s = s.copy()
             s[: len(self._left)] -= self._left
-        return bool(is_farther(P, turn, kept, x, kept_x, *self._all, self._rest, s, self._per_sigma))
+        return bool(is_farther(P, turn, kept, x, kept_x, *self._all, self._rest, s, self._per_sigma, tolerance(n)))

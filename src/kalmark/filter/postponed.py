@@ -69,8 +69,7 @@ class PostponedMap(Layout):
         self._moved: dict[int, Array] = {}  # what each robot's corrections made of the shadows and of these turns
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of what turned the world with them
         self._drift, self._pace, self._points = Drift(), Pace(self.most), leap.Points()
-        self._leaps = leap.Leaps()
-        self._before: dict[int, Array] = {}
+        self._leaps, self._before = leap.Leaps(), dict[int, Array]()
 
     @classmethod
     def from_dense(cls, dense: StochasticMap, storage: Triangle | None = None, most: int | None = None) -> PostponedMap:
@@ -164,8 +163,8 @@ class PostponedMap(Layout):
 
     def _displacements(self) -> tuple[Array, Array]:
         """Return the parts (A0, R) and (T, R) that each robot's corrections have in the shadows and the kept turns."""
-        moved = np.column_stack([*self._moved.values()]) if self._moved else self.active.x[self._s_x][:, None]
-        return moved[: len(self._A0)], moved[len(self._A0) :]
+        D = np.column_stack([*self._moved.values()]) if self._moved else self.active.x[self._s_x][:, None]
+        return D[: len(self._A0)], D[len(self._A0) :]
 
     def _way(self) -> leap.Way:
         """Return how blocks at rest have come to where they are; without transport nothing turns."""
@@ -337,8 +336,8 @@ class PostponedMap(Layout):
             return True
         m, (kept, kept_x) = self.active, self._leaps.last[robot]
         s, turn = m.x[self._s_x], self._turn_rows(robot)[-len(kept) :]
-        read = lambda rows, first: self._read(rows, self._A0[first:])  # noqa: E731
-        return self._drift.is_beyond(m.P, turn, kept, m.x, kept_x, s, read)
+        read = lambda rows, i: self._read(rows, self._A0[i:])  # noqa: E731
+        return self._drift.is_beyond(m.P, turn, kept, m.x, kept_x, s, self.n, read)
 
     def leap(self, robot: int, moved: Array) -> None:
         """Apply the last correction, by which `robot` `moved` shadows and turns, to all at rest as a dense filter does.
