@@ -59,15 +59,16 @@ def places(map_: PostponedMap, slots: Index, d: int) -> Array:
 def joint(map_: PostponedMap, slots: Sequence[int]) -> Array:
     """Return the joint covariance of blocks, in the order given."""
     at_rest = np.array([slot for slot in dict.fromkeys(slots) if slot not in map_._owners], dtype=np.int64)
+    if not len(at_rest):
+        rows = [map_.active.rows(map_._owners[slot]) for slot in slots]
+        return kernels.submatrix(map_.active.P, np.concatenate([NO_ROWS, *rows]))
     return _joint(map_, slots, resting(map_, at_rest), at_rest)
 
 
 def _joint(map_: PostponedMap, slots: Sequence[int], rest: Resting, at_rest: Index) -> Array:
-    """Return it of blocks of which some are at rest: P = T P_active T' + Q."""
+    """Return the joint covariance of blocks of which some, `at_rest`, are not active: P = T P_active T' + Q."""
     m, sizes = map_.active, [map_.blocks[slot, P_SIZE] for slot in slots]
     starts = np.cumsum([0, *sizes])
-    if not len(at_rest):
-        return kernels.submatrix(m.P, np.concatenate([NO_ROWS, *(m.rows(map_._owners[slot]) for slot in slots)]))
     extra = map_._resting_rows()
     own = [m.rows(map_._owners[slot]) if slot in map_._owners else NO_ROWS for slot in slots]
     index, place = np.concatenate([extra, *own]), len(extra)
