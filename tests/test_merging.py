@@ -189,3 +189,25 @@ def test_a_landmark_given_again_by_hand_does_not_disturb_the_merging_of_others()
     slam.remove(ids[0])
     slam.add_landmark(ids[0], mean, cov)
     assert any(look(slam, t, GARDEN[1:]).merged for t in range(10, 40))
+
+
+def test_a_landmark_far_from_all_that_it_may_be_is_looked_at_ever_less_often(tmp_path: Path) -> None:
+    slam, asked = slam_of(), []
+    looked = merging._hypotheses
+
+    def counted(slam: km.Slam, name: km.Id, d: int) -> object:
+        asked.append(name)
+        return looked(slam, name, d)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(merging, "_hypotheses", counted)
+        for t in range(41):
+            look(slam, t, GARDEN[:1])
+        assert asked == ["u1"] * 4, "after 5, 10, 20 and 40 sightings"
+        slam.save(tmp_path / "state.kalmark")
+        slam = km.Slam.load(tmp_path / "state.kalmark")
+        for t in range(41, 79):
+            look(slam, t, GARDEN[:1])
+        assert len(asked) == 4
+        look(slam, 79, GARDEN[:1])
+    assert len(asked) == 5

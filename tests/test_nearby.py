@@ -1,4 +1,4 @@
-"""Association does not look at the whole map, and finds what a look at the whole map would find."""
+"""Which landmarks are near a place: the same, wherever the map keeps them."""
 
 from __future__ import annotations
 
@@ -6,68 +6,60 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.slam.scene import View
-
-SPACING = 2.0
-ONCE = km.Upkeep(confirm=1)  # a sighting is a landmark
+from kalmark.filter.postponed import PostponedMap
+from kalmark.slam.nearby import closest, distances
 
 
-def garden(side: int) -> np.ndarray:
-    """Return landmarks (side^2, 2) about 2 m from each other."""
+def field(map_: str) -> tuple[km.Slam, np.ndarray]:
+    """Return 400 surveyed landmarks, of which a robot has seen some; in a postponed map the others are at rest."""
     rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)
-    return grid * SPACING + rng.uniform(-0.4, 0.4, (side * side, 2))
-
-
-def driven(map_: str, steps: int = 150, side: int = 12) -> tuple[km.Slam, list[list[tuple[str, object]]], int]:
-    """Map a garden by nearest neighbour; return the slam, what it said, and how many landmarks are really there."""
-    rng, points = np.random.default_rng(1), garden(side)
-    lidar = km.Mount(km.sensors.RangeBearing(0.02, 0.01))
-    start = np.array([side, SPACING, 0.0])
-    robot = km.Robot("r", km.motion.Odometry2D(0.005, 0.005, 0.002), start=start, sensors={"lidar": lidar})
-    slam, truth, said, seen = km.Slam([robot], km.association.NearestNeighbour(), map=map_), start, [], set()
-    for t in range(steps):
-        u = np.array([0.4, 0.0, 2 * np.pi / 75])
-        truth = km.geometry.compose(truth, u)[0]
-        near = np.flatnonzero(np.linalg.norm(points - truth[:2], axis=1) < 5.0)
-        seen |= set(near.tolist())
-        y = km.geometry.observe(truth, points[near])[0] + rng.normal(size=(len(near), 2)) * [0.02, 0.01]
-        slam.process(km.Control(t, "r", u + rng.normal(size=3) * [0.005, 0.005, 0.002]))
-        report = slam.process(km.Scan(t, "r", "lidar", y))
-        said.append([(o.outcome, o.landmark) for o in report.observations])
-    return slam, said, len(seen)
+    points = rng.uniform(0, 40, (400, 2))
+    robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.RangeBearing())})
+    slam = km.Slam([robot], map=map_)
+    for i, p in enumerate(points):
+        slam.add_landmark(i, p, 0.01 * np.eye(2))
+    if isinstance(slam.map, PostponedMap):
+        slam.map.flush()
+    near = np.argsort(np.linalg.norm(points, axis=1))[:20].tolist()
+    for t in range(3):
+        slam.process(km.Scan(t, "r", "s", km.geometry.observe(np.zeros(3), points[near])[0], near))
+    return slam, points
 
 
 @pytest.mark.parametrize("map_", ["dense", "postponed"])
-def test_the_near_landmarks_are_found_that_a_look_at_the_whole_map_finds(
-    map_: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    slam, near, count = driven(map_)
-    monkeypatch.setattr(View, "places", lambda *_: None)
-    _, whole, _ = driven(map_)
-    assert near == whole
-    assert len(slam.landmarks()) == count, "a landmark was taken for a new one, or for another"
+def test_the_nearest_are_found_active_or_at_rest(map_: str) -> None:
+    slam, _ = field(map_)
+    p = np.array([[3.0, 4.0], [20.0, 20.0], [np.nan, 0.0], [39.0, 1.0]])
+    rows, names, places = slam.nearby.pairs(slam, frozenset({"point"}), p, 4, 3.0)
+    means = np.array([slam.mean(i) for i in range(400)])
+    for k in range(len(p)):
+        gaps = np.linalg.norm(means - p[k], axis=1)
+        near = [i for i in np.argsort(gaps)[:4].tolist() if gaps[i] <= 3.0 * gaps.min()]
+        assert {names[m] for m in np.flatnonzero(rows == k)} == set(near)
+    np.testing.assert_allclose(places, means[names], atol=1e-12)
+    gaps = np.linalg.norm(means - p[1], axis=1)
+    assert slam.nearby.around(slam, "point", p[1], 30) == np.argsort(gaps)[:30].tolist()
 
 
-def test_a_landmark_that_is_only_looked_at_stays_at_rest() -> None:
-    rng, points = np.random.default_rng(3), garden(10)
-    lidar = km.Mount(km.sensors.RangeBearing(0.02, 0.01))
-    robot = km.Robot("r", km.motion.Odometry2D(0.01, 0.01, 0.01), start=(9.0, 9.0, 0.0), sensors={"lidar": lidar})
-    slam = km.Slam([robot], km.association.NearestNeighbour(new_gate=0.9999), map="postponed", upkeep=ONCE)
-    for i, point in enumerate(points):
-        slam.add_landmark(i, point, 1e-4 * np.eye(2))
-    slam.map.flush()
-    stays = km.Scan(1, "r", "lidar", [[SPACING / 2, 0.3]])  # between the landmarks
-    report = slam.process(stays)
-    assert report.observations[0].outcome == "new"
-    assert {slam.members.names.get(slot) for slot in slam.map._owners} == {None, report.observations[0].landmark}
-    y = km.geometry.observe(np.array([9.0, 9.0, 0.0]), points[[44, 45]])[0] + rng.normal(size=(2, 2)) * 0.01
-    assert [o.landmark for o in slam.process(km.Scan(2, "r", "lidar", y)).observations] == [44, 45]
+@pytest.mark.parametrize("nearest", [1, 3, 50])
+def test_the_least_of_each_row_are_told(nearest: int) -> None:
+    rng = np.random.default_rng(1)
+    p, places = rng.uniform(0, 9, (5, 3)), rng.uniform(0, 9, (40, 3))
+    gaps = distances(p, places)
+    np.testing.assert_allclose(gaps, np.linalg.norm(p[:, None] - places, axis=2))
+    rows, columns = closest(gaps, nearest, 2.0)
+    for k in range(5):
+        wanted = [i for i in np.argsort(gaps[k])[:nearest].tolist() if gaps[k, i] <= 2.0 * gaps[k].min()]
+        assert sorted(columns[rows == k].tolist()) == sorted(wanted)
 
 
-def test_a_sensor_that_does_not_tell_where_things_are_could_have_seen_any() -> None:
-    robot = km.Robot("r", km.motion.Odometry2D(), sensors={"sonar": km.Mount(km.sensors.Range(0.1))})
-    slam = km.Slam([robot], km.association.NearestNeighbour())
-    for i in range(20):
-        slam.add_landmark(i, (3.0 + i, 0.5), 1e-2 * np.eye(2))
-    assert slam.process(km.Scan(1, "r", "sonar", [[17.0]])).observations[0].landmark == 14
+def test_without_landmarks_none_is_near() -> None:
+    rows, columns = closest(np.zeros((3, 0)), 4, 10.0)
+    assert len(rows) == len(columns) == 0
+
+
+@pytest.mark.parametrize("slots", [[5, 0], [0, 399, 5, 200], [300, 301], [7, 7, 250]])
+def test_covariances_of_blocks_active_and_at_rest_are_the_dense_ones(slots: list[int]) -> None:
+    (dense, _), (postponed, _) = field("dense"), field("postponed")
+    pairs = [(slam.map.covariance([slam.slot(i) for i in slots])) for slam in (dense, postponed)]
+    np.testing.assert_allclose(pairs[1], pairs[0], rtol=1e-9, atol=1e-12)

@@ -8,7 +8,6 @@ small ones leave the coordinates behind, while the robot's turn goes on.  A leap
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -121,9 +120,8 @@ class Leaps:
         self.rows, self.numbers = np.zeros((2, 0), dtype=np.int64)  # the kept turns in the active map
         self.axes = 0  # of the turns: blocks that need more axes come to rest after the phase
         self.last: dict[int, tuple[Index, Index]] = {}  # of these the last orientation of each robot
-        self.turn: list[Array] = []  # how each turns the world,
-        self.turns: list[Array] = []  # what it did to the robots' turns, e' d (R axes,),
-        self.origins: list[Array] = []  # and where the robots stood (R, 3)
+        self.turn, self.turns = NO_TURN, NO_TURN  # how each turns the world, what it did to the robots' turns, e' d,
+        self.origins = np.zeros((0, 3))  # and where the robots stood: one after the other
 
     def __len__(self) -> int:
         return len(self.robots)
@@ -140,9 +138,17 @@ class Leaps:
         self.S_done[:, robot] += ds
         self.U_done[:, robot] += du
         self.robots = np.vstack([self.robots, [S.shape[1], robot]])
-        self.turn.append(turn)
-        self.turns.append(turns)
-        self.origins.append(origins)
+        self.turn, self.turns = np.concatenate([self.turn, turn]), np.concatenate([self.turns, turns])
+        self.origins = np.concatenate([self.origins, origins])
+
+    def way(self, S: Array, U: Array, axes: int, origins: Array) -> Way:
+        """Return the way by these leaps to where S (A0, R) and U (T, R) have displaced all, robots at `origins`."""
+        if len(self):
+            before = self.S.shape[1]
+            S = np.hstack([_padded(self.S, len(S), before), S - _padded(self.S_done, *S.shape)])
+            U = np.hstack([_padded(self.U, len(U), before), U - _padded(self.U_done, *U.shape)])
+            origins = np.concatenate([self.origins, origins])
+        return Way(S, U, self.robots, self.turn, self.turns, origins, axes)
 
     def keep(self, m: StochasticMap, turns: dict[int, Index]) -> int:
         """Keep the robots' turns as they are now, of which these are the rows in the active map; return how many."""
@@ -156,28 +162,22 @@ class Leaps:
         return k
 
 
-@dataclass(frozen=True)
-class Way:
-    """How blocks at rest have come from where they were: what shadows and kept turns have displaced, S (A0, R) and
-    U (T, R), the leaps among that, where the robots stand (R, 3), and the axes.
+class Way(NamedTuple):
+    """How blocks at rest have come from where they were: displaced by shadows (A0, C) and by kept turns (T, C), the
+    leaps among that as `Leaps` has them, where the robots stood, and the axes.
     """
 
-    S: Array
-    U: Array
-    leaps: Leaps
-    axes: int
+    shadows: Array
+    kept: Array
+    robots: Index
+    turn: Array
+    turns: Array
     origins: Array
+    axes: int
 
     def carried(self, atoms: Table, x: Array, G: Array) -> Carried:
         """Carry blocks of the mean x and the covariance G (n, A0) with the shadows along."""
-        leaps, U = self.leaps, self.U
-        now = (U - _padded(leaps.U_done, *U.shape)) if len(leaps) else U
-        S = (self.S - _padded(leaps.S_done, *self.S.shape)) if len(leaps) else self.S
-        D = np.hstack([G[:, : len(leaps.S)] @ leaps.S, G @ S])
-        U = np.hstack([_padded(leaps.U, len(U), leaps.U.shape[1]), now])
-        turn, turns = (np.concatenate([NO_TURN, *each]) for each in (leaps.turn, leaps.turns))
-        origins = np.concatenate([*leaps.origins, self.origins])
-        return Carried(*_carried(atoms, x, D, U, leaps.robots, turn, turns, origins, self.axes))
+        return Carried(*_carried(atoms, x, G @ self.shadows, *self[1:]))
 
 
 def _padded(A: Array, rows: int, columns: int) -> Array:

@@ -126,6 +126,13 @@ class StochasticMap(Layout):
         self._next: Array | None = None  # a larger one
         self.fresh = Fresh()
 
+    @classmethod
+    def of(cls, x: Array, P: Array, blocks: Table, atoms: Table, axes: int) -> StochasticMap:
+        """Return a map to be read only, of these arrays."""
+        m = cls(0)
+        m.x, m.P, m.blocks, m.atoms, m.axes, m.n, m.x_n = x, P, blocks, atoms, axes, len(P), len(x)
+        return m
+
     # ------------------------------------------------------------------ reading
     def index(self, slot: int) -> Index:
         """Return the rows of P of a block."""

@@ -168,7 +168,7 @@ class PostponedMap(Layout):
 
     def _way(self) -> leap.Way:
         """Return how blocks at rest have come to where they are; without transport nothing turns."""
-        return leap.Way(*self._displacements(), self._leaps, self._axes if self._moved else 0, self._stand())
+        return self._leaps.way(*self._displacements(), self._axes if self._moved else 0, self._stand())
 
     def _stand(self) -> Array:
         """Return where the robots stand (R, 3)."""

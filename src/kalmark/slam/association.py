@@ -120,25 +120,27 @@ class _Gated:
             return answers
         pairs, reasons, mixed, known = self.match(query, open_, names, d2, gate)
         mixture = None if mixed is None else Mixture(open_, names, mixed)
-        for row, k in enumerate(open_.tolist()):
-            least = int(np.argmin(d2[row]))
-            if pairs[row] >= 0:
-                answers[k] = (names[pairs[row]], reasons.get(row, ""))
-            elif pairs[row] == HELD_BACK:
+        nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
+        for row, (k, pair, d) in enumerate(zip(open_.tolist(), pairs.tolist(), least.tolist(), strict=True)):
+            if pair >= 0:
+                answers[k] = (names[pair], reasons.get(row, ""))
+            elif pair == HELD_BACK:
                 answers[k] = (DEFERRED, reasons[row])
-            elif pairs[row] == MIXED and mixture is not None:
+            elif pair == MIXED and mixture is not None:
                 answers[k] = (mixture, reasons[row])
-            elif pairs[row] == FRESH:
+            elif pair == FRESH:
                 answers[k] = (NEW, reasons[row])
-            elif pairs[row] == STRANGE:
+            elif pair == STRANGE:
                 answers[k] = (ANEW, reasons[row])
-            elif d2[row, least] <= gate:
-                answers[k] = (None, reasons.get(row, f"its nearest landmark {names[least]!r} is another observation's"))
-            elif d2[row, least] <= far:
-                answers[k] = (None, f"between {names[least]!r} and a new landmark: d2 {d2[row, least]:.1f}")
+            elif d <= gate:
+                why = f"its nearest landmark {names[nearest[row]]!r} is another observation's"
+                answers[k] = (None, reasons.get(row, why))
+            elif d <= far:
+                answers[k] = (None, f"between {names[nearest[row]]!r} and a new landmark: d2 {d:.1f}")
         if known is None:
-            known = np.where(pairs >= 0, 1.0, np.where(d2.min(axis=1) > far, 0.0, np.nan))
-        query.learn(float(np.nansum(known)), float(np.nansum(1.0 - known)))
+            known = np.where(pairs >= 0, 1.0, np.where(least > far, 0.0, np.nan))
+        told = known[~np.isnan(known)]
+        query.learn(float(told.sum()), float((1.0 - told).sum()))
         return answers
 
     def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
@@ -146,7 +148,7 @@ class _Gated:
         return self._near(query, open_, self.nearest)
 
     def _near(self, query: Query, open_: Index, nearest: int) -> tuple[list[Id], Array]:
-        named = {i for i in query.ids if i is not None}
+        named = set(query.ids)
         names = [c for c in query.candidates(nearest, self.farther) if c not in named]
         d2 = query.distances(names)[open_] if names else np.zeros((len(open_), 0))
         return names, np.where(np.isnan(d2), np.inf, d2)
@@ -163,11 +165,13 @@ class NearestNeighbour(_Gated):
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair greedily; an observation whose nearest landmark is taken gets none."""
         pairs, reasons, taken = np.full(len(d2), -1), {}, set()
-        for row in np.argsort(d2.min(axis=1), kind="stable").tolist():
-            column = int(np.argmin(d2[row]))
+        nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
+        fits = (least <= gate).tolist()
+        for row in np.argsort(least, kind="stable").tolist():
+            column = nearest[row]
             if column in taken:
                 reasons[row] = f"its nearest landmark {names[column]!r} is taken by a nearer observation"
-            elif d2[row, column] <= gate:
+            elif fits[row]:
                 taken.add(column)
                 pairs[row] = column
         return Matched(pairs, reasons)

@@ -27,7 +27,8 @@ class Members:
 
     `sorts` has the words by which a `View` finds its `looks`: a landmark's kind, or ROBOT.
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
-    found, `together` is what was seen in one scan with it; `lately` are those seen last.  `ends` are the abscissas (2,)
+    found, `together` is what was seen in one scan with it; `lately` are those seen last, and `alone` says how
+    often one far from all that it may be has to be seen before that is looked at again.  `ends` are the abscissas (2,)
     of the segments seen of lines, `doubts` and `tentative` what waits to become a landmark: without a block, and with
     one; `unlocated` what is known of those whose ranges do not tell yet where they are, `here` the last place kept.
     """
@@ -45,6 +46,7 @@ class Members:
         self.tentative: dict[Id, Tentative] = {}
         self.together: dict[Id, set[Id]] = {}
         self.lately: list[Id] = []
+        self.alone: dict[Id, int] = {}
         self.existence: dict[Id, tuple[float, int]] = {}
         self.unlocated: dict[Id, Unlocated] = {}
         self.here: tuple[str, str, int, int] | None = None  # robot, sensor, time: the block of where it was
@@ -110,6 +112,7 @@ class Members:
             self.searched,
             self.ends,
             self.together,
+            self.alone,
             self.existence,
         ):
             table.pop(name, None)

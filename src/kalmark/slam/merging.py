@@ -30,10 +30,11 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-EVERY = 5  # sightings of a landmark, after each of which it is looked at
+EVERY = 5  # sightings of a landmark, after each of which it is looked at; one that is alone after twice as many
 NEAREST = 128  # landmarks near it, among which are those that it may be
 COMPANY = 12  # landmarks seen lately, which must find their own as well
 TRIES = 8  # of what it may be
+ALONE = 2.0  # times that away from all that it may be a landmark is looked at less often
 WIDE = 1.5  # times the gate of the nearest it may be, within which all are that it may be
 SLACK_M, SLACK_RAD = 0.3, 0.3  # by which the company may miss, and by which it may be turned
 GATE = 0.99
@@ -76,7 +77,8 @@ def merge(slam: Slam, view: View, robot: str, outcomes: Sequence[Observation]) -
         return
     again, kept = False, list[Id]()
     for name in mine:
-        due = again or members.seen.get(name, 0) % EVERY == 0
+        seen = members.seen.get(name, 0)
+        due = again or (seen % EVERY == 0 and seen >= members.alone.get(name, 0))
         if due and name in members.kinds and _fits(members.kinds[name].space):
             for merged in _merge_with(slam, view, robot, name):
                 again = True  # now the others are known better to each other
@@ -139,29 +141,32 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     members, together = slam.members, slam.members.together
     at = slam.mean(name)[:d]
     kind = members.kinds[name].kind
-    _, around = slam.nearby.pairs(slam, frozenset((kind,)), at[None], NEAREST, math.inf)
-    others = [n for n in around if n in together and n != name and members.kinds[n].kind == kind]
-    places = slam.map.means(members.slots_of(others), d) if others else np.zeros((0, d))
-    far = np.linalg.norm(places - at, axis=1)
-    given = {n for n in others if _is_given(slam, n)}
-    apart = together[name] | (given if _is_given(slam, name) else set())  # two ids are two landmarks
-    possible = sorted((l for l, o in enumerate(others) if o not in apart), key=lambda l: far[l])
-    if not possible:
+    others = [n for n in slam.nearby.around(slam, kind, at, NEAREST) if n in together and n != name]
+    by_id = _is_given(slam, name)  # two ids are two landmarks
+    possible = [l for l, o in enumerate(others) if o not in together[name] and not (by_id and _is_given(slam, o))]
+    far = np.linalg.norm(_places(slam, [others[l] for l in possible[:TRIES]], d) - at, axis=1)
+    reach = _reach(slam, name, others[possible[np.argmin(far)]]) if possible else 0.0
+    if not (far <= reach).any():
+        if not (far <= ALONE * reach).any():
+            members.alone[name] = 2 * members.seen.get(name, 0)
         return
-    _, Z = _differences(slam, [(name, others[possible[0]])])
-    reach = WIDE * math.sqrt(chi2_gate(GATE, len(Z)) * float(np.linalg.eigvalsh(Z)[-1]))
+    places = _places(slam, others, d)
+    far = np.linalg.norm(places - at, axis=1)
+    possible.sort(key=lambda l: far[l])
+    reach = _reach(slam, name, others[possible[0]])
     possible = [l for l in possible if far[l] <= reach]
     if not possible:
         return
     company = _company(slam, name, d)
-    mine = slam.map.means(members.slots_of(company), d) if company else np.zeros((0, d))
+    mine = _places(slam, company, d)
     moved = mine[:, None] + (places[possible] - at)  # (C, L, d): the company, were the landmark the l-th that it may be
     gaps: Any = cKDTree(places).query(moved)
     found, nearest = gaps[0], gaps[1]
+    given = {n for n in others if _is_given(slam, n)}
     known = [together[c] | {c} | (given if _is_given(slam, c) else set()) for c in company]
-    alone = np.array([[o in different for o in others] for different in known], dtype=np.bool_)
-    alone = alone.reshape(len(company), len(others))
-    found[np.take_along_axis(alone, nearest, axis=1)] = np.inf
+    apart = np.array([[o in different for o in others] for different in known], dtype=np.bool_)
+    apart = apart.reshape(len(company), len(others))
+    found[np.take_along_axis(apart, nearest, axis=1)] = np.inf
     slack = SLACK_M + SLACK_RAD * np.linalg.norm(mine - at, axis=1)[:, None]
     score = np.maximum(1.0 - found / slack, 0.0).sum(axis=0)
     for i in np.argsort(-score, kind="stable")[:TRIES].tolist():
@@ -185,8 +190,19 @@ def _company(slam: Slam, name: Id, d: int) -> list[Id]:
     others = [n for n in others if n in members.together and n in kinds and kinds[n].kind == kinds[name].kind]
     if lately or len(others) <= COMPANY:
         return others
-    far = np.linalg.norm(slam.map.means(members.slots_of(others), d) - slam.mean(name)[:d], axis=1)
+    far = np.linalg.norm(_places(slam, others, d) - slam.mean(name)[:d], axis=1)
     return [others[i] for i in np.argsort(far, kind="stable")[:COMPANY].tolist()]
+
+
+def _places(slam: Slam, names: Sequence[Id], d: int) -> Array:
+    """Return where landmarks are (N, d)."""
+    return slam.map.means(slam.members.slots_of(names), d) if names else np.zeros((0, d))
+
+
+def _reach(slam: Slam, name: Id, nearest: Id) -> float:
+    """Return within which distance a landmark may be another, if this one is the nearest that it may be."""
+    _, Z = _differences(slam, [(name, nearest)])
+    return WIDE * math.sqrt(chi2_gate(GATE, len(Z)) * float(np.linalg.eigvalsh(Z)[-1]))
 
 
 def _differences(slam: Slam, pairs: Sequence[tuple[Id, Id]]) -> tuple[Array, Array]:

@@ -6,11 +6,13 @@ compared; those at rest are found in a tree of the means they had when the phase
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.compiled import compiled
 from kalmark.filter.map import X_AT
 from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.spaces import HEADING, RHO, VECTOR, VECTOR3, Space
@@ -25,13 +27,44 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-TINY_M = 1e-9
+TINY_M, FAR_M = 1e-9, 1e100
 AT_REST = 8  # looked up in the tree: their means have moved on by what is pending
 
 
 def has_place(space: Space) -> bool:
     """Return whether the first numbers of a block are where it is."""
     return space.kinds[0] in (VECTOR, VECTOR3) and not {RHO, HEADING} & set(space.kinds)
+
+
+@compiled
+def distances(p: Array, places: Array) -> Array:
+    """Return how far places (N, d) are from p (K, d): (K, N)."""
+    gaps = np.empty((len(p), len(places)))
+    for k in range(len(p)):
+        for i in range(len(places)):
+            square = 0.0
+            for j in range(p.shape[1]):
+                square += (p[k, j] - places[i, j]) ** 2
+            gaps[k, i] = math.sqrt(square)
+    return gaps
+
+
+@compiled
+def closest(gaps: Array, nearest: int, farther: float) -> tuple[Index, Index]:
+    """Return rows and columns (M,) of the so many least of each row, none so many times as large as the least."""
+    count, n = gaps.shape
+    rows, columns = np.empty(count * min(n, nearest), np.int64), np.empty(count * min(n, nearest), np.int64)
+    found = 0
+    for k in range(count):
+        limit = farther * max(gaps[k].min(), TINY_M) if n else 0.0
+        if n > nearest:
+            limit = min(limit, np.partition(gaps[k], nearest - 1)[nearest - 1])
+        first = found
+        for i in range(n):
+            if gaps[k, i] <= limit and found < first + nearest:
+                rows[found], columns[found] = k, i
+                found += 1
+    return rows[:found], columns[:found]
 
 
 class Nearby:
@@ -44,32 +77,45 @@ class Nearby:
 
     def pairs(
         self, slam: Slam, kinds: frozenset[str], p: Array, nearest: int, farther: float
-    ) -> tuple[Index, list[Id]]:
-        """Return observations (their numbers) and landmarks of `kinds` that may belong together; p (K, 2 or 3)."""
-        map_, names, all_kinds = slam.map, slam.members.names, slam.members.kinds
+    ) -> tuple[Index, list[Id], Array]:
+        """Return observations (M,) and landmarks of `kinds` that may belong together, and where these are (M, 2 or 3).
+
+        That is, to each of the places p (K, 2 or 3), the nearest ones, none so many times farther than the nearest.
+        """
+        map_, names, sorts = slam.map, slam.members.names, slam.members.sorts
         slots, places = map_.awake(p.shape[1])
-        use = [i for i, s in enumerate(slots.tolist()) if s in names and all_kinds[names[s]].kind in kinds]
-        slots, gaps = slots[use], np.linalg.norm(p[:, None] - places[use], axis=2)
+        use = [s in names and sorts[names[s]] in kinds for s in slots.tolist()]
+        slots, places = slots[use], places[use]
         if isinstance(map_, PostponedMap):
-            reach = farther * np.maximum(gaps.min(axis=1, initial=np.inf), TINY_M)
+            reach = farther * np.maximum(distances(p, places).min(axis=1, initial=np.inf), TINY_M)
             resting = self._at_rest(map_, slam.members, p, reach, max(AT_REST, nearest))
-            resting = resting[[s in names and all_kinds[names[s]].kind in kinds for s in resting.tolist()]]
+            resting = resting[[s in names and sorts[names[s]] in kinds for s in resting.tolist()]]
             if len(resting):
-                more = np.linalg.norm(p[:, None] - map_.places(resting, p.shape[1]), axis=2)
-                slots, gaps = np.concatenate([slots, resting]), np.hstack([gaps, more])
-        if len(slots) > nearest:
-            near = np.argpartition(gaps, nearest - 1, axis=1)[:, :nearest]
-            gaps = np.take_along_axis(gaps, near, axis=1)
-            slots = slots[near]
-        else:
-            slots = np.tile(slots, (len(p), 1))
-        rows, columns = np.nonzero(
-            gaps <= farther * np.maximum(gaps.min(axis=1, keepdims=True, initial=np.inf), TINY_M)
-        )
-        return rows, [names[s] for s in slots[rows, columns].tolist()]
+                slots = np.concatenate([slots, resting])
+                places = np.concatenate([places, map_.places(resting, p.shape[1])])
+        rows, columns = closest(distances(p, places), nearest, farther)
+        return rows, [names[s] for s in slots[columns].tolist()], places[columns]
+
+    def around(self, slam: Slam, kind: str, p: Array, count: int) -> list[Id]:
+        """Return the landmarks of a kind nearest to p (2 or 3,), nearest first: at rest as the last flush left them."""
+        map_, names, kinds = slam.map, slam.members.names, slam.members.kinds
+        slots, places = map_.awake(len(p))
+        gaps = np.linalg.norm(places - p, axis=1)
+        if isinstance(map_, PostponedMap):
+            found, at = self._looked_up(map_, slam.members, p[None], count)
+            here = map_.is_at_rest(found[0])
+            slots, gaps = np.concatenate([slots, found[0, here]]), np.concatenate([gaps, at[0, here]])
+        near = [names.get(s) for s in slots[np.argsort(gaps, kind="stable")].tolist()]
+        return [n for n in near if n in kinds and kinds[n].kind == kind][:count]
 
     def _at_rest(self, map_: PostponedMap, members: Members, p: Array, reach: Array, count: int) -> Index:
         """Return the slots of the blocks at rest that were nearest to p, within reach, when they came to rest."""
+        found, gaps = self._looked_up(map_, members, p, count)
+        slots = found[gaps <= reach[:, None]]
+        return np.unique(slots[map_.is_at_rest(slots)])
+
+    def _looked_up(self, map_: PostponedMap, members: Members, p: Array, count: int) -> tuple[Index, Array]:
+        """Return the slots (K, count) that were nearest to p when the phase began, and how far they were."""
         if map_.phase != self._phase:
             from scipy.spatial import cKDTree
 
@@ -77,9 +123,8 @@ class Nearby:
             self._slots, self._phase = np.array(placed, dtype=np.int64), map_.phase
             places = map_.x[map_.blocks[self._slots, X_AT][:, None] + np.arange(p.shape[1])]
             self._tree = cKDTree(places) if placed else None
-        known = np.isfinite(p).all(axis=1)
-        if self._tree is None or not known.any():
-            return self._slots[:0]
-        gaps, found = self._tree.query(p[known], np.arange(1, 1 + min(count, len(self._slots))))
-        slots = self._slots[np.asarray(found)[gaps <= reach[known, None]]]
-        return np.unique(slots[map_.is_at_rest(slots)])
+        if self._tree is None:
+            return np.zeros((len(p), 0), dtype=np.int64), np.zeros((len(p), 0))
+        nearest = np.arange(1, 1 + min(count, len(self._slots)))
+        gaps, found = self._tree.query(np.where(np.isfinite(p), p, FAR_M), nearest)
+        return self._slots[found], gaps

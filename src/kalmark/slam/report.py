@@ -48,6 +48,15 @@ class Candidate(NamedTuple):
     place: Array
 
 
+class Compared(NamedTuple):
+    """What was compared: observations (M,) with landmarks, their squared distances (M,) and places (M, 2 or 3)."""
+
+    rows: npt.NDArray[np.int64]
+    landmarks: list[Id]
+    d2: Array
+    places: Array
+
+
 def judged(
     rows: Sequence[int], ids: Sequence[Id | None], names: Sequence[Any], done: Correction, gate: float
 ) -> list[Observation]:
@@ -76,11 +85,11 @@ class Report:
     are NaN.  `removed` are landmarks given up and tentative ones dropped, each with the reason, and
     `merged` are those that are gone, the ones they turned out to be, and why.  `late` are earlier
     observations, tentative then, that this scan has let be fused: time, robot, sensor and number in its scan of each.
-    `candidates` are the landmarks that observations without an id were compared with, `seen_at` (K, 2 or 3) is where
-    these seemed to come from.
+    `compared` are the landmarks that observations were compared with, `seen_at` (K, 2 or 3) is where these seemed to
+    come from.
     """
 
-    __slots__ = ("Z", "candidates", "e", "event", "late", "merged", "observations", "removed", "seen_at", "y", "z")
+    __slots__ = ("Z", "compared", "e", "event", "late", "merged", "observations", "removed", "seen_at", "y", "z")
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
@@ -88,7 +97,7 @@ class Report:
         self.removed: tuple[tuple[Id, str], ...] = ()
         self.merged: tuple[tuple[Id, Id, str], ...] = ()
         self.late: tuple[Late, ...] = ()
-        self.candidates: list[Candidate] = []
+        self.compared: Compared | None = None
         self.seen_at: Array = NOTHING
         self.y = y
         self.e: Array = NOTHING
@@ -104,6 +113,16 @@ class Report:
     def robot(self) -> str:
         """The event's robot."""
         return self.event.robot
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        """The landmarks that observations without an id were compared with."""
+        if self.compared is None:
+            return []
+        pairs = zip(self.compared.rows.tolist(), self.compared.landmarks, self.compared.d2.tolist(), strict=True)
+        ids = getattr(self.event, "ids", None)
+        open_ = [(*p, at) for p, at in zip(pairs, self.compared.places, strict=True) if not ids or ids[p[0]] is None]
+        return [Candidate(*pair) for pair in open_ if math.isfinite(pair[2])]
 
     def blank(self, p: int) -> None:
         """Enter that nothing was predicted of any observation, whose innovations have p numbers."""

@@ -26,7 +26,7 @@ from kalmark.slam.events import Id, Scan
 from kalmark.slam.initialization import initialization_of
 from kalmark.slam.natural import natural
 from kalmark.slam.nearby import has_place
-from kalmark.slam.report import Candidate, Report
+from kalmark.slam.report import Compared, Report
 from kalmark.slam.robot import Mount
 from kalmark.slam.together import Landmarks
 from kalmark.slam.upkeep import Upkeep
@@ -265,9 +265,9 @@ class Scene:
     def __init__(self, slam: Slam, view: View, event: Scan, ids: tuple[Id | None, ...], R: Array) -> None:
         self.ids, self.y, self.robot = ids, event.y, event.robot
         self._slam, self._view, self._event, self._R = slam, view, event, R
-        self._pairs: tuple[Index, list[Id]] | None = None
+        self._pairs: tuple[Index, list[Id], Array] | None = None
         self.seen_at: Array | None = None  # where the observations seem to come from, once that was asked for
-        self.compared: tuple[list[Id], Array] = ([], np.zeros((0, 0)))  # the last answer of `distances`
+        self.compared: Compared | None = None  # by the last question for `distances`
 
     def dof(self) -> int:
         """Return the size p of one innovation."""
@@ -308,31 +308,23 @@ class Scene:
         map_, members, view, event = self._slam.map, self._slam.members, self._view, self._event
         robot = members.slots[event.robot]
         d2 = np.full((len(event.y), len(candidates)), np.inf)
-        rows, columns = self._near(candidates)
-        for look, which in members.by_look(view, [candidates[c] for c in columns.tolist()]):
-            k, c = rows[which], columns[which]
-            slots = members.slots_of([candidates[i] for i in c.tolist()])
-            R = view.noise(map_, robot, look, slots, self._R[k], event)
-            d2[k, c] = view.predict(map_, robot, look, slots, event.y[k], R)[1]
-        self.compared = candidates, d2
+        rows, columns, places = self._near(candidates)
+        names = [candidates[c] for c in columns.tolist()]
+        slots = members.slots_of(names)
+        for look, which in members.by_look(view, names):
+            k, c, l = (rows, columns, slots) if len(which) == len(rows) else (rows[which], columns[which], slots[which])
+            R = view.noise(map_, robot, look, l, self._R[k], event)
+            d2[k, c] = view.predict(map_, robot, look, l, event.y[k], R)[1]
+        if places is not None:
+            self.compared = Compared(rows, names, d2[rows, columns], places)
         return d2
 
     def report(self) -> Report:
         """Return a report of what was compared, before anything is fused."""
         report = Report(self._event, self.y)
         if self.seen_at is not None:
-            report.seen_at, report.candidates = self.seen_at, self.candidates_of()
+            report.seen_at, report.compared = self.seen_at, self.compared
         return report
-
-    def candidates_of(self) -> list[Candidate]:
-        """Return the landmarks that the observations without an id were compared with, and how far they were."""
-        names, d2 = self.compared
-        near = [k for k in np.argwhere(np.isfinite(d2)).tolist() if self.ids[k[0]] is None]
-        if not near:
-            return []
-        d = 2 if len(self._view.at) == 3 else 3
-        places = self._slam.map.means(self._slam.members.slots_of([names[c] for _, c in near]), d)
-        return [Candidate(k, names[c], float(d2[k, c]), p) for (k, c), p in zip(near, places, strict=True)]
 
     def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
         """Return the innovations z (M, p) of M pairs of an observation and a landmark, and their Z (M p, M p).
@@ -369,12 +361,13 @@ class Scene:
             return None
         return Landmarks(self._slam, self._view, self._event, names, self._R)
 
-    def _near(self, candidates: list[Id]) -> tuple[Index, Index]:
-        """Return the observations and the numbers of candidates that are near each other."""
+    def _near(self, candidates: list[Id]) -> tuple[Index, Index, Array | None]:
+        """Return the observations and the numbers of candidates that are near each other, and where these are."""
         if self._pairs is None:
             rows, columns = np.indices((len(self._event.y), len(candidates)))
-            return rows.ravel(), columns.ravel()
+            return rows.ravel(), columns.ravel(), None
         number = {name: i for i, name in enumerate(candidates)}
-        rows, names = self._pairs
+        rows, names, places = self._pairs
         columns = np.array([number.get(name, -1) for name in names], dtype=np.int64)
-        return rows[columns >= 0], columns[columns >= 0]
+        asked = columns >= 0
+        return rows[asked], columns[asked], places[asked]
