@@ -119,11 +119,19 @@ def fetch(name: str, progress: Progress | None = None) -> Path:
     if own is not None and not wanted:
         raise DataError(f"dataset {own.name!r} cannot be fetched, expected a copy of your own: put {own.put}")
     if not wanted:
-        names = [dataset.name for dataset in list_data()]
-        raise DataError(f"dataset {name!r} is unknown, expected one of {', '.join(names)}{nearest(name, names)}")
+        raise _unknown(name)
     roots = {fetch_one(dataset, progress) for dataset in wanted}
     root = roots.pop() if len(roots) == 1 else cache_folder()
     return root / (wanted[0].log if len(wanted) == 1 else name.strip("/"))
+
+
+def _unknown(name: str) -> DataError:
+    """Return the error of a name that no dataset has, naming those that begin like it, or else the nearest."""
+    names, own = [dataset.name for dataset in list_data()], [copy.name for copy in OWN_COPIES]
+    near = [one for one in (*names, *own) if name and one.lower().startswith(name.strip("/").lower())]
+    hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else nearest(name, (*names, *own))
+    known = f"one of {', '.join(names)}, or, as a copy of your own, {', '.join(own)}"
+    return DataError(f"dataset {name!r} is unknown, expected {known}{hint}")
 
 
 def fetch_one(dataset: Dataset, progress: Progress | None) -> Path:
