@@ -58,10 +58,22 @@ def test_it_names_the_landmarks_compared_with_their_distances_gates_and_the_deci
 def test_the_time_may_be_that_of_the_log(tmp_path: Path) -> None:
     run = lost_run(tmp_path)
     assert explain(run, 107.0).step == explain(run, 7.0).step
-    with pytest.raises(RunError, match=r"scan is 50 s, expected 0 to 19.000 s, or 100.000000000 to 119.000000000 s"):
+    with pytest.raises(RunError, match=r"scan is 50 s, expected 100.000000000 to 119.000000000 s of the log, or 0 to"):
         explain(run, 50.0)
     with pytest.raises(RunError, match="robot is 'ship', expected one of cart"):
         explain(run, 5.0, "ship")
+
+
+def test_a_time_that_the_log_has_is_the_logs_and_the_answer_says_which_it_took(tmp_path: Path) -> None:
+    robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.RangeBearing())})
+    events = [km.Scan(t, "r", "s", [[3.0, 0.1]], [7]) for t in range(10, 40)]
+    km.record(km.Slam([robot]), events, progress=False).save(tmp_path / "run")
+    run = Run.load(tmp_path / "run")
+    told, since = explain(run, 20.0), explain(run, 5.0)
+    assert (told.t_s, since.t_s) == (10.0, 5.0)
+    assert next(told.lines()).endswith("t = 10.000 s (20 s in the log); 20 s in the log was asked for")
+    assert next(since.lines()).endswith("t = 5.000 s (15 s in the log); 5 s since the first scan was asked for")
+    assert explain(run, 39.8).log_t_s == "39.000000000"
 
 
 def test_merged_and_removed_landmarks_are_listed_in_a_file_of_their_own(tmp_path: Path) -> None:
@@ -114,7 +126,7 @@ def test_what_has_an_id_is_drawn_with_its_landmark_and_d2_as_what_has_none(tmp_p
     events = [km.Scan(1, "r", "s", y, [*range(6)]), km.Scan(2, "r", "s", y + noise, [*range(6)])]
     km.record(km.Slam([robot]), events, progress=False).save(tmp_path / "run")
     run = Run.load(tmp_path / "run")
-    new, told = explain(run, 0.0), explain(run, 1.0)
+    new, told = explain(run, 1.0), explain(run, 2.0)
     assert [fate.compared for fate in new.fates] == [()] * 6
     np.testing.assert_allclose([fate.seen_at for fate in new.fates], GARDEN, atol=1e-9)
     for k, fate in enumerate(told.fates):
@@ -130,7 +142,7 @@ def test_what_has_an_id_is_drawn_with_its_landmark_and_d2_as_what_has_none(tmp_p
     assert "far" not in {t.get_text() for t in lone.texts}
     assert lone.get_xlim()[1] < 100.0
     (tmp_path / "run" / "map.kmk").unlink()
-    assert not np.isfinite([fate.seen_at for fate in explain(Run.load(tmp_path / "run"), 1.0).fates]).any()
+    assert not np.isfinite([fate.seen_at for fate in explain(Run.load(tmp_path / "run"), 2.0).fates]).any()
 
 
 def pointed_at(T: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from kalmark.cli.options import RunFolder
 def explain(
     run: RunFolder,
     scan: Annotated[
-        float, typer.Option(metavar="T", help="Seconds since the first scan, or the log's time as in associations.csv.")
+        float, typer.Option(metavar="T", help="The log's time in s, as in associations.csv; else since the first scan.")
     ],
     robot: Annotated[str | None, typer.Option(help="Of this robot. (default: the nearest scan of any)")] = None,
 ) -> None:

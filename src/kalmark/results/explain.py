@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 
+AROUND_S = 1.0  # before the first and after the last scan, a time still means them
+
+
 @dataclass(frozen=True, eq=False)
 class Compared:
     """A landmark that an observation was compared with, and where it was in the map."""
@@ -49,7 +52,10 @@ class Fate:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """One scan of a run: its step, time since the first scan, the robot, the gates on d2, all that was decided."""
+    """One scan of a run: its step, time since the first scan, the robot, the gates on d2, all that was decided.
+
+    `asked` says how the time asked for was taken, where one was.
+    """
 
     step: int
     t_s: float
@@ -61,6 +67,7 @@ class Explanation:
     gates: tuple[float, float] | None
     fates: tuple[Fate, ...]
     changes: tuple[Change, ...]
+    asked: str = ""
 
     def lines(self) -> Iterator[str]:
         """Tell it."""
@@ -68,7 +75,7 @@ class Explanation:
         sigma = math.sqrt(max(np.trace(self.covariance[:d, :d]) / d, 0.0))
         at = ", ".join(f"{x:.2f}" for x in self.pose[:d])
         when = f"t = {self.t_s:.3f} s ({_short(self.log_t_s)} s in the log)"
-        yield f"{self.robot} · {self.sensor or 'no sensor'} · {when}"
+        yield f"{self.robot} · {self.sensor or 'no sensor'} · {when}{'; ' if self.asked else ''}{self.asked}"
         yield f"then at ({at}) m, sigma {sigma:.3g} m; {count(len(self.fates), 'observation')}"
         if self.gates is not None:
             near, far = self.gates
@@ -95,8 +102,8 @@ def _short(seconds_: str) -> str:
 def explain(run: Run, t_s: float, robot: str | None = None) -> Explanation:
     """Return why the scan nearest to a time became what it did.
 
-    `t_s` counts from the first scan, as in the report; one beyond the last scan is a time of the log, as in
-    ``associations.csv``.  Raises RunError if there is no such robot or scan.
+    `t_s` is a time of the log, as in ``associations.csv``; where the log has no scan then, it counts from the first
+    scan, as in the report.  Raises RunError if there is no such robot or scan.
     """
     history = run.history
     if robot is not None and robot not in history.robots:
@@ -104,13 +111,15 @@ def explain(run: Run, t_s: float, robot: str | None = None) -> Explanation:
     steps = np.arange(len(history.t_ns)) if robot is None else np.flatnonzero(history.robot == robot)
     if not len(steps):
         raise RunError("the run has no scan, expected one to explain")
-    t = (history.t_ns[steps] - history.t_ns[0]) * 1e-9
+    begin, t = float(history.t_ns[0]) * 1e-9, (history.t_ns[steps] - history.t_ns[0]) * 1e-9
     span = float((history.t_ns[-1] - history.t_ns[0]) * 1e-9)
-    since = t_s if t_s <= span + 1.0 else t_s - float(history.t_ns[0]) * 1e-9
-    if not -1.0 <= since <= span + 1.0:
+    in_log = -AROUND_S <= t_s - begin <= span + AROUND_S
+    since = t_s - begin if in_log else t_s
+    if not -AROUND_S <= since <= span + AROUND_S:
         first, last = seconds(history.t_ns[0]), seconds(history.t_ns[-1])
-        raise RunError(f"scan is {t_s:g} s, expected 0 to {span:.3f} s, or {first} to {last} s as in the log")
-    return with_known(run, explained(run, int(steps[np.argmin(np.abs(t - since))])))
+        raise RunError(f"scan is {t_s:g} s, expected {first} to {last} s of the log, or 0 to {span:.3f} s since then")
+    told = with_known(run, explained(run, int(steps[np.argmin(np.abs(t - since))])))
+    return replace(told, asked=f"{t_s:.12g} s {'in the log' if in_log else 'since the first scan'} was asked for")
 
 
 def with_known(run: Run, told: Explanation) -> Explanation:
