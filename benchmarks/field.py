@@ -70,8 +70,8 @@ class Field:
         return new_slam(self.start, map_)
 
 
-def new_slam(start: Any, map_: str = "auto") -> km.Slam:
-    """Return the Slam that is timed."""
+def new_slam(start: Any, map_: str = "auto", association: km.association.Association | None = None) -> km.Slam:
+    """Return the Slam that is timed, by default told every id."""
     lidar = km.Mount(km.sensors.RangeBearing(*SIGHT))
     robot = km.Robot("r", km.motion.Odometry2D(*ODOMETRY), start, {"lidar": lidar})
-    return km.Slam([robot], km.association.ByIdentity("off"), map=map_)
+    return km.Slam([robot], association or km.association.ByIdentity("off"), map=map_)

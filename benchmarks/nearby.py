@@ -2,57 +2,84 @@
 
     python benchmarks/nearby.py [--sides 32 100]
 
-A surveyed field of side x side landmarks, 2 m apart; the robot sees the ten nearest at every step.  Median times of a
-control and a scan through `Slam.process`, every outcome read, one thread; the ratio is the result.
+The field of side x side landmarks of `map_growth.py`, mowed once with ids and once without; then steps round a circle
+in a place that is known, ten landmarks in view.  Processor time of one thread, every outcome read; the ratios are the
+result.  Duplicates are looked for, as always where there are no ids.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import time
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
+from field import Field, Step, new_slam
 
 import kalmark as km
 from kalmark.filter.kernels import one_thread
-from kalmark.slam.association import Association
+from kalmark.slam.events import Id
 
-STEPS, WARM_UP, SEEN = 400, 100, 10
+CIRCLE, MEASURED = 3000, 1000
 
 
-def step_s(side: int, association: Association) -> tuple[float, int]:
-    """Return the median seconds of a step, and how many landmarks were taken for others."""
-    rng = np.random.default_rng(1)
-    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2) * 2.0
-    points, truth = grid + rng.uniform(-0.5, 0.5, grid.shape), np.array([side, side, 0.0])
-    mount, motion = km.Mount(km.sensors.RangeBearing(0.05, 0.01)), km.motion.Odometry2D(0.005, 0.005, 0.002)
-    slam = km.Slam([km.Robot("r", motion, start=truth, sensors={"lidar": mount})], association)
-    for i, point in enumerate(points):
-        slam.add_landmark(i, point + rng.normal(size=2) * 0.1, 0.01 * np.eye(2))
-    known = isinstance(association, km.association.ByIdentity)
-    times, wrong = [], 0
-    for t in range(STEPS):
-        u = np.array([0.1, 0.0, 0.05 * np.sin(t / 40)])
-        truth = km.geometry.compose(truth, u)[0]
-        ids = np.argsort(np.linalg.norm(points - truth[:2], axis=1))[:SEEN].tolist()
-        y = km.geometry.observe(truth, points[ids])[0] + rng.normal(size=(SEEN, 2)) * [0.05, 0.01]
-        start = time.perf_counter()
-        slam.process(km.Control(t, "r", u + rng.normal(size=3) * [0.005, 0.005, 0.002]))
-        seen = slam.process(km.Scan(t, "r", "lidar", y, ids if known else None)).observations
-        wrong += sum(o.outcome == "associated" and o.landmark != i for o, i in zip(seen, ids, strict=True))
-        times.append(time.perf_counter() - start)
-    return float(np.median(times[WARM_UP:])), wrong
+class Cost(NamedTuple):
+    """Milliseconds of a step of a mission (mean) and round a circle (median), and what was taken for what."""
+
+    mission_ms: float
+    circle_ms: float
+    landmarks: int
+    wrong: int
+    of: int
+
+
+def take(slam: km.Slam, steps: Iterable[Step], known: bool, true: dict[Id, int]) -> tuple[np.ndarray, int]:
+    """Take steps; return the milliseconds of each, and how many sightings were taken for another landmark's."""
+    spent, wrong = [], 0
+    for control, with_ids in steps:
+        scan = with_ids if known else km.Scan(t_ns=with_ids.t_ns, robot="r", sensor="lidar", y=with_ids.y)
+        begin = time.thread_time_ns()
+        slam.process(control)
+        seen = slam.process(scan).observations
+        spent.append((time.thread_time_ns() - begin) * 1e-6)
+        for o, i in zip(seen, with_ids.ids or (), strict=True):
+            if o.outcome == "new" and o.landmark is not None:
+                true[o.landmark] = int(i)  # type: ignore[arg-type]
+            wrong += o.outcome == "associated" and true[o.landmark] != i  # type: ignore[index]
+    return np.array(spent), wrong
+
+
+def cost(side: int, known: bool) -> Cost:
+    """Mow a field and circle in it."""
+    field, true = Field(side, side), dict[Id, int]()
+    slam = new_slam(
+        field.start, "auto", km.association.ByIdentity("off") if known else km.association.NearestNeighbour()
+    )
+    mission = field.mission()
+    gc.freeze()
+    spent, wrong = take(slam, mission, known, true)
+    circle, more = take(slam, field.circle(CIRCLE), known, true)
+    sightings = sum(len(scan.y) for _, scan in mission) + CIRCLE * 10
+    median = float(np.median(circle[-MEASURED:]))
+    return Cost(float(spent.mean()), median, len(slam.landmarks()), wrong + more, sightings)
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sides", type=int, nargs="+", default=[32, 100])
-    print("| landmarks | known, us | nearest, us | ratio | wrong |\n|---|---|---|---|---|")
-    for side in parser.parse_args().sides:
-        known, nearest = (step_s(side, a) for a in (km.association.ByIdentity(), km.association.NearestNeighbour()))
-        ratio, wrong = nearest[0] / known[0], f"{nearest[1]} of {STEPS * SEEN}"
-        print(f"| {side * side} | {1e6 * known[0]:.0f} | {1e6 * nearest[0]:.0f} | {ratio:.2f} | {wrong} |")
+    sides = parser.parse_args().sides
+    for known in (True, False):
+        cost(9, known)  # loads the compiled code
+    print("| landmarks | mission, ms a step: known, nearest | ratio | in a known place, us | ratio | mapped | wrong |")
+    print("|---|---|---|---|---|---|---|")
+    for side in sides:
+        a, b = cost(side, True), cost(side, False)
+        print(f"| {side**2:,} | {a.mission_ms:.3f}, {b.mission_ms:.3f} | {b.mission_ms / a.mission_ms:.2f}", end=" ")
+        print(f"| {1e3 * a.circle_ms:.0f}, {1e3 * b.circle_ms:.0f} | {b.circle_ms / a.circle_ms:.2f}", end=" ")
+        print(f"| {b.landmarks:,} | {b.wrong:,} of {b.of:,} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -164,6 +164,21 @@ def test_where_two_matchings_are_alike_the_automatic_choice_holds_them_back_and_
         np.testing.assert_array_equal(slam.mean("r"), before)
 
 
+def test_a_search_that_was_not_finished_says_nothing_about_what_is_not_there() -> None:
+    rng = np.random.default_rng(5)
+    points, truth = jittered_grid(rng), np.array([0.2, -0.2, 0.02])
+    mount = km.Mount(km.sensors.Position2D(0.02))
+    for nodes, outcome in ((1, "deferred"), (1_000_000, "associated")):
+        robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([0.25, 0.25, 0.05]) ** 2, sensors={"s": mount})
+        slam = km.Slam([robot], km.association.Automatic(most_nodes=nodes))
+        for i, point in enumerate(points):
+            slam.add_landmark(i, point, 1e-4 * np.eye(2))
+        seen = np.argsort(np.linalg.norm(points, axis=1))[:6]
+        report = slam.process(km.Scan(1, "r", "s", km.geometry.to_frame(truth, points[seen])[0]))
+        assert {o.outcome for o in report.observations} == {outcome}
+        assert (sum(slam.members.experience) > 0) == (nodes > 1)
+
+
 def test_samples_are_drawn_as_often_as_their_matchings_are_likely_and_again_for_the_same_scan() -> None:
     points = np.array([[4.0, 0.0], [4.0, 1.0]])  # one thing is seen, half way between the two
     mount = km.Mount(km.sensors.Position2D(0.05))

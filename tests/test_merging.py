@@ -195,7 +195,7 @@ def test_a_landmark_far_from_all_that_it_may_be_is_looked_at_ever_less_often(tmp
     slam, asked = slam_of(), []
     looked = merging._hypotheses
 
-    def counted(slam: km.Slam, name: km.Id, d: int) -> object:
+    def counted(slam: km.Slam, name: object, d: int) -> object:
         asked.append(slam.members.seen[name])
         return looked(slam, name, d)
 

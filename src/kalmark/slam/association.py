@@ -277,7 +277,7 @@ class _Joint(_Gated):
         found = posterior(together, open_, d2, near, query.dof(), self.gate, self.most_nodes, query.experience())
         told = np.asarray(near.any(axis=1))
         pairs, reasons, mixed, _ = self.choose(query, names, found, told, lost)
-        none = np.where(told, found.none(), np.where(d2.min(axis=1) > far, 1.0, np.nan))
+        none = np.where(told, found.none() if found.finished else np.nan, np.where(d2.min(axis=1) > far, 1.0, np.nan))
         if lost and (pairs == STRANGE).all():  # it has not recognised anything
             return self.anew(np.where(just, d2, np.inf), gate, far, reasons)
         for row in np.flatnonzero(told & (none >= NONE)).tolist() if not lost else ():
