@@ -107,6 +107,14 @@ def test_a_bad_model_is_refused(make: Any, message: str) -> None:
     assert message in str(refused.value)
 
 
+def test_what_is_too_far_off_to_be_compared_says_so_where_there_is_no_gate() -> None:
+    slam = started(association=km.association.ByIdentity(gate="off"))
+    for event in (km.Scan(1.0, "rover", "lidar", [[1e200, 0.3]], [1]), km.Fix(2.0, "rover", [1e200, 0], np.eye(2))):
+        (seen,) = slam.process(event).observations
+        assert (seen.outcome, seen.d2) == ("rejected", np.inf)
+        assert seen.reason == "so far from what is expected that d2 is no number"
+
+
 def test_every_outcome_has_its_reason() -> None:
     slam = started(association=km.association.ByIdentity(gate=0.99))
     report = slam.process(km.Scan(1.0, "rover", "lidar", [[2.0, 0.3], [9.0, 1.0], [4.0, 2.0], [1, 1]], [1, 2, 3, None]))

@@ -74,7 +74,8 @@ def judged(
 def _rejected(seen: Observation, gate: float) -> Observation:
     if seen.d2 is None or math.isnan(seen.d2):
         return seen._replace(outcome="rejected", d2=None, reason="nothing can be expected of it from here")
-    return seen._replace(outcome="rejected", reason=f"outside the gate of {gate:.2f}")
+    far = "so far from what is expected that d2 is no number" if gate == math.inf else f"outside the gate of {gate:.2f}"
+    return seen._replace(outcome="rejected", reason=far)
 
 
 class Report:

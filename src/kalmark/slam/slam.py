@@ -164,8 +164,7 @@ class Slam:
         done = estimator.correct(self.map, view, slot, -1, np.array([slot]), 0, report.y, R, gate)
         self.refuse_sick(done.healthy, event)
         report.e, report.z, report.Z = done.e, done.z, done.Z
-        outcome, reason = ("associated", "") if done.fused[0] else ("rejected", f"outside the gate of {gate:.2f}")
-        report.observations = (Observation(0, event.robot, outcome, event.robot, float(done.d2[0]), reason),)
+        report.observations = tuple(judged([0], [event.robot], [event.robot], done, gate))
         return report
 
     # ------------------------------------------------------------------ motion
