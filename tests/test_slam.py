@@ -84,6 +84,29 @@ def test_a_bad_event_is_refused_with_one_line_and_changes_nothing(name: str) -> 
     [
         (lambda: km.Slam([]), "at least one robot"),
         (lambda: km.Slam([rover(), rover()]), "given twice"),
+        (lambda: km.Slam("rover"), "robots is 'rover', expected a list of Robots"),
+        (lambda: km.Slam(None), "robots is None, expected a list of Robots"),
+        (lambda: km.Slam({"rover": rover()}), "robots: one is 'rover', expected a Robot"),
+        (
+            lambda: km.Slam(rover(), association="auto"),
+            "association is 'auto', expected an object like km.association.A",
+        ),
+        (lambda: km.Slam(rover(), km.association.ByIdentity), "is the class ByIdentity, expected an instance"),
+        (lambda: km.Slam(rover(), estimator="ekf"), "estimator is 'ekf', expected an object like km.estimators.Ekf()"),
+        (lambda: km.Slam(rover(), estimator=km.estimators.Ekf), "estimator is the class Ekf, expected an instance"),
+        (lambda: km.Slam(rover(), landmarks="point"), "landmarks is 'point', expected a landmark model"),
+        (lambda: km.Slam(rover(), upkeep="merge"), "upkeep is 'merge', expected an Upkeep"),
+        (
+            lambda: km.Slam(rover(), reparametrize="off"),
+            "reparametrize is 'off', expected a number of at least 0, or No",
+        ),
+        (lambda: km.Slam(rover()).covariance(), "covariance of nothing was asked for, expected names of robots"),
+        (lambda: km.Slam(rover()).covariance(["rover"]), "['rover'] is not in the map, expected a robot or a landmark"),
+        (lambda: km.Slam(rover()).remove(["rover"]), "['rover'] is not in the map"),
+        (lambda: km.Slam(rover()).add_landmark(1, (0, 0), landmark="point"), "landmark 1 is 'point', expected a landm"),
+        (lambda: km.Mount(km.sensors.Range(), association="auto"), "Mount: association is 'auto', expected an object"),
+        (lambda: km.Mount(km.sensors.Range(), detector="trunks"), "Mount: detector is 'trunks', expected an object"),
+        (lambda: km.Mount(km.sensors.Range(), detector=km.detect.Trunks), "is the class Trunks, expected an instance"),
         (lambda: km.Slam([rover()], map="sparse"), "expected one of auto, dense, postponed"),
         (lambda: km.Robot("", km.motion.Unicycle()), "name is ''"),
         (lambda: km.Robot("r", km.motion.Unicycle(), start=(0, NAN, 0)), "three finite numbers"),
@@ -105,6 +128,10 @@ def test_a_bad_model_is_refused(make: Any, message: str) -> None:
     with pytest.raises(km.KalmarkError, match=r".") as refused:
         make()
     assert message in str(refused.value)
+
+
+def test_one_robot_need_not_be_in_a_list() -> None:
+    assert list(km.Slam(rover()).robots) == list(km.Slam([rover()]).robots) == ["rover"]
 
 
 def test_what_is_too_far_off_to_be_compared_says_so_where_there_is_no_gate() -> None:

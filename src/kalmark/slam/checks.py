@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import EventError, KalmarkError, ModelError
-from kalmark.models.protocols import Sensor
+from kalmark.models.protocols import Landmark, Sensor
 from kalmark.slam.events import Control, Fix, Scan, finite, shown, when
+from kalmark.slam.upkeep import Upkeep
 
 Array = npt.NDArray[np.float64]
 
@@ -29,6 +30,31 @@ def instance(value: Any, protocol: type, what: str, expected: str) -> None:
         raise ModelError(f"{what} is the class {value.__name__}, expected an instance: {value.__name__}(...)")
     if not isinstance(value, protocol):
         raise ModelError(f"{what} is {shown(value)}, expected {expected}")
+
+
+def able(value: Any, methods: tuple[str, ...], what: str, expected: str) -> None:
+    """Raise ModelError if `value` lacks one of these methods, or is a class itself instead of one of its kind."""
+    instance(value, object, what, expected)
+    if not all(callable(getattr(value, method, None)) for method in methods):
+        raise ModelError(f"{what} is {shown(value)}, expected {expected}")
+
+
+def refuse_odd_association(value: Any, what: str) -> None:
+    """Refuse what does not decide which landmark was seen."""
+    expected = "an object like km.association.Automatic(), with threshold and associate"
+    able(value, ("threshold", "associate"), what, expected)
+
+
+def refuse_odd_parts(association: Any, estimator: Any, landmarks: Any, upkeep: Any, reparametrize: Any) -> None:
+    """Refuse what a Slam cannot be made of."""
+    refuse_odd_association(association, "association")
+    like = "an object like km.estimators.Ekf(), with correct, for_fixes and pose_jacobian"
+    able(estimator, ("correct", "for_fixes", "pose_jacobian"), "estimator", like)
+    if landmarks is not None:
+        instance(landmarks, Landmark, "landmarks", "a landmark model")
+    instance(upkeep, Upkeep, "upkeep", "an Upkeep")
+    if reparametrize is not None and not (isinstance(reparametrize, int | float) and reparametrize >= 0):
+        raise ModelError(f"reparametrize is {shown(reparametrize)}, expected a number of at least 0, or None: never")
 
 
 def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[KalmarkError] = EventError) -> None:

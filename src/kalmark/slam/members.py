@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,7 @@ class Members:
 
     def slot(self, name: Id) -> int:
         """Return the slot of a block.  Raises MapError if there is none of that name."""
-        slot = self.slots.get(name)
+        slot = self.slots.get(name) if isinstance(name, Hashable) else None
         if slot is None:
             raise MapError(f"{name!r} is not in the map, expected a robot or a landmark: it has {len(self.kinds)}")
         return slot

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from kalmark.errors import ModelError
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.models.protocols import Landmark, Motion, Sensor
 from kalmark.slam.attention import EVERYTHING, Attention
-from kalmark.slam.checks import covariance, instance
+from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
 from kalmark.slam.decisions import Association
 from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Scan, finite, shown
@@ -72,6 +72,10 @@ class Mount:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
         if self.landmark is not None:
             instance(self.landmark, Landmark, "Mount: landmark", "a landmark model")
+        if self.association is not None:
+            refuse_odd_association(self.association, "Mount: association")
+        if self.detector is not None:
+            able(self.detector, ("__call__",), "Mount: detector", "an object like km.detect.Trunks(), or a function")
         instance(self.attention, Attention, "Mount: attention", "an Attention")
         if self.upkeep is not None:
             instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")
@@ -127,6 +131,20 @@ class Robot:
             mount.covariance(3 if pose == 3 else 6, f"{what}: sensor {name!r}: cov")
         if self.cov is not None:
             object.__setattr__(self, "cov", _cov(self.cov, pose, space, f"{what}: cov"))
+
+
+def robots_given(value: Any) -> list[Robot]:
+    """Return the robots of a Slam: any number of them, or one alone.  Raises ModelError."""
+    if isinstance(value, Robot):
+        return [value]
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise ModelError(f"robots is {shown(value)}, expected a list of Robots")
+    robots = list(value)
+    for robot in robots:
+        instance(robot, Robot, "robots: one", "a Robot")
+    if not robots:
+        raise ModelError("a Slam needs at least one robot, got none")
+    return robots
 
 
 def mount_name(robot: str, sensor: str) -> str:

@@ -26,7 +26,15 @@ from kalmark.slam import ambiguity, budget, delayed, lifecycle, tentative
 from kalmark.slam.approach import approach
 from kalmark.slam.association import ByIdentity
 from kalmark.slam.averaging import average, refuse_postponed
-from kalmark.slam.checks import covariance, measurements, numbers, refuse_bad_control, refuse_bad_fix
+from kalmark.slam.checks import (
+    covariance,
+    instance,
+    measurements,
+    numbers,
+    refuse_bad_control,
+    refuse_bad_fix,
+    refuse_odd_parts,
+)
 from kalmark.slam.decisions import ANEW, DEFERRED, NEW, Association, Decision
 from kalmark.slam.doubts import MIRRORED
 from kalmark.slam.drive import Drive
@@ -35,7 +43,7 @@ from kalmark.slam.members import Members
 from kalmark.slam.nearby import Nearby
 from kalmark.slam.prediction import forget_error, place_bias, predict
 from kalmark.slam.report import LandmarkTable, Observation, Report, judged
-from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.robot import Robot, mount_name, robots_given
 from kalmark.slam.scene import Scene, View
 from kalmark.slam.upkeep import CAREFUL, Upkeep
 
@@ -46,7 +54,7 @@ LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
 class Slam:
-    """Robots and landmarks as one joint Gaussian, corrected event by event.
+    """Robots (or one) and landmarks as one joint Gaussian, corrected event by event.
 
     `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
     what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
@@ -57,7 +65,7 @@ class Slam:
 
     def __init__(
         self,
-        robots: Iterable[Robot],
+        robots: Iterable[Robot] | Robot,
         association: Association | None = None,
         estimator: Estimator | None = None,
         landmarks: Landmark | None = None,
@@ -67,8 +75,9 @@ class Slam:
         upkeep: Upkeep = CAREFUL,
     ) -> None:
         self.robots: dict[str, Robot] = {}
-        self.association: Association = association or ByIdentity()
-        self.estimator: Estimator = estimator or Invariant()
+        self.association: Association = ByIdentity() if association is None else association
+        self.estimator: Estimator = Invariant() if estimator is None else estimator
+        refuse_odd_parts(self.association, self.estimator, landmarks, upkeep, reparametrize)
         self.t_ns: int | None = None
         self.map_type, self.numbers = map, numbers
         self.map: Map = lifecycle.new_map(map, numbers)
@@ -79,14 +88,12 @@ class Slam:
         self._errors: dict[str, int] = {}  # the block of a held control's error, while a scan has split its interval
         self._views: dict[tuple[str, str], View] = {}
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
-        for robot in robots:
+        for robot in robots_given(robots):
             if robot.name in self.robots:
                 raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
             self.robots[robot.name] = robot
         for robot in self.robots.values():
             self._place(robot, landmarks)
-        if not self.robots:
-            raise ModelError("a Slam needs at least one robot, got none")
 
     def _place(self, robot: Robot, landmarks: Landmark | None) -> None:
         if robot.name in self.members.slots:
@@ -291,6 +298,8 @@ class Slam:
 
     def covariance(self, *names: Id) -> Array:
         """Return the joint covariance of robots and landmarks, in the order given, in standard coordinates."""
+        if not names:
+            raise MapError("covariance of nothing was asked for, expected names of robots or landmarks")
         return self.map.covariance([self.slot(name) for name in names])
 
     def landmarks(self) -> LandmarkTable:
@@ -323,6 +332,8 @@ class Slam:
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
         name = checked_id(name, "landmark")
+        if landmark is not None:
+            instance(landmark, Landmark, f"landmark {name!r}", "a landmark model")
         kind = landmark or lifecycle.surveyed(next((v.landmark for v in self._views.values()), Point2D()), mean)
         self.refuse_other_world(kind.kind, kind.space.world)
         if name in self.members.slots:
@@ -335,10 +346,11 @@ class Slam:
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
-        if name in self.members.slots and name not in self.members.kinds:
+        slot = self.slot(name)
+        if name not in self.members.kinds:
             what = "robot" if name in self.robots else "sensor's mount or a control's bias"
             raise MapError(f"{name!r} is a {what}, expected a landmark")
-        self.map.remove(self.slot(name))
+        self.map.remove(slot)
         self.members.forget(name)
 
     def slot(self, name: Id) -> int:
