@@ -9,6 +9,7 @@ import pytest
 
 import kalmark as km
 from kalmark.detect import Corners, Detections, Reflectors, Trunks, Walls
+from kalmark.detect.scan import Laser
 from kalmark.geometry.angles import wrap
 from laser_worlds import FAR_M, LaserWorld, spread
 
@@ -159,12 +160,22 @@ def test_what_is_added_stands_in_the_covariance() -> None:
         ([1.0, 2.0, 3.0], [0.0, 0.1], "angles has shape"),
         ([1.0, -2.0, 3.0], [0.0, 0.1, 0.2], "range 1 is -2.0 m, expected at least 0"),
         ([1.0, 2.0, 3.0], [0.0, 0.2, 0.1], "angle 2 is 0.1 after 0.2 rad, expected increasing angles"),
-        ([1.0, 2.0, 3.0], [0.0, 0.4, 0.8], "the least step between beams is 0.4 rad, expected less than 0.209"),
+        ([1.0, 2.0, 3.0], [0.0, 4.0, 8.0], "the angles go from 0 to 8 rad, expected one turn, 2 pi, at most"),
     ],
 )
 def test_bad_beams_are_refused_with_what_is_wrong(ranges: list, angles: list, message: str) -> None:
     with pytest.raises(km.KalmarkError, match=message):
         Trunks().detect(ranges, angles)
+
+
+@pytest.mark.parametrize("detector", [Trunks(), Reflectors(), Walls(), Corners()])
+@pytest.mark.parametrize("n", [3, 6])
+def test_in_a_few_beams_that_are_far_apart_there_is_nothing(detector: Laser, n: int) -> None:
+    y = np.column_stack([np.full(n, 3.0), np.arange(n) * np.radians(60), np.full(n, 9.0)])
+    assert len(detector.detect(*y.T)) == 0
+    mount = km.Mount(km.sensors.RangeBearing(), detector=detector)
+    slam = km.Slam(km.Robot("r", km.motion.Odometry2D(), sensors={"laser": mount}))
+    assert slam.process(km.Scan(1.0, "r", "laser", y)).observations == ()
 
 
 def test_reflectors_without_intensities_and_bad_parameters_are_refused() -> None:

@@ -16,6 +16,7 @@ from kalmark.slam.events import Scan, when
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+TURN = 2.01 * math.pi
 RAW = ("range_m", "bearing_rad", "intensity")
 
 
@@ -107,16 +108,19 @@ class Laser:
         return Detections(found.columns, found.y, cov, found.beams, found.attributes)
 
     def pieces(self, r: Array, a: Array) -> tuple[Index, float]:
-        """Return the first and last beam (S, 2) of each piece of surface, and the step between beams."""
+        """Return the first and last beam (S, 2) of each piece of surface, and the least step between beams, rad.
+
+        There is none where beams are so far apart that no surface hit under `incidence_deg` joins neighbours.
+        """
         step = float(np.diff(a).min())
         least = math.radians(self.incidence_deg)
-        if not 0 < step < least:
-            raise EventError(f"the least step between beams is {step:.3g} rad, expected less than {least:.3g}")
+        if step >= least:  # neighbours that no surface joins
+            return np.empty((0, 2), np.int64), step
         return segments(r, a, step, least, self.jump_m), step
 
 
 def _beams(ranges: Any, angles: Any, intensities: Any) -> tuple[Array, Array, Array | None]:
-    """Return the beams as arrays of one length, no returns as infinite ranges."""
+    """Return the beams as arrays of one length, no returns as infinite ranges; of one turn of the laser at most."""
     given = {"ranges": ranges, "angles": angles} | ({} if intensities is None else {"intensities": intensities})
     arrays = {name: np.ascontiguousarray(value, dtype=np.float64) for name, value in given.items()}
     r, a = arrays["ranges"], arrays["angles"]
@@ -126,6 +130,8 @@ def _beams(ranges: Any, angles: Any, intensities: Any) -> tuple[Array, Array, Ar
     if not (np.isfinite(a).all() and (np.diff(a) > 0).all()):
         first = int(np.argmin(np.diff(a) > 0)) + 1
         raise EventError(f"angle {first} is {a[first]} after {a[first - 1]} rad, expected increasing angles")
+    if a[-1] - a[0] > TURN:
+        raise EventError(f"the angles go from {a[0]:.6g} to {a[-1]:.6g} rad, expected one turn, 2 pi, at most")
     if (r < 0).any():
         first = int(np.argmax(r < 0))
         raise EventError(f"range {first} is {r[first]} m, expected at least 0")
