@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -176,6 +177,32 @@ def test_in_a_few_beams_that_are_far_apart_there_is_nothing(detector: Laser, n: 
     mount = km.Mount(km.sensors.RangeBearing(), detector=detector)
     slam = km.Slam(km.Robot("r", km.motion.Odometry2D(), sensors={"laser": mount}))
     assert slam.process(km.Scan(1.0, "r", "laser", y)).observations == ()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Trunks(beams="3"), "Trunks: beams is '3', expected a whole number of at least 1"),
+        (lambda: Walls(beams=2.5), "Walls: beams is 2.5, expected a whole number of at least 1"),
+        (lambda: Trunks(beams=0), "Trunks: beams is 0, expected a whole number of at least 1"),
+        (lambda: Trunks(sigma_range_m="fine"), "Trunks: sigma_range_m is 'fine', expected a number"),
+        (lambda: Trunks(range_max_m=None), "Trunks: range_max_m is None, expected a number"),
+        (lambda: Trunks(range_max_m=math.nan), "Trunks: range_max_m is nan, expected at least 0"),
+        (lambda: Corners(gap_m=-0.1), "Corners: gap_m is -0.1, expected at least 0"),
+        (lambda: Walls(jump_m=math.inf), "Walls: jump_m is inf, expected a finite number"),
+        (lambda: Corners(bend_deg=120), "Corners: bend_deg is 120, expected an angle between 0 and 90"),
+        (lambda: Reflectors(signature="yes"), "Reflectors: signature is 'yes', expected True or False"),
+        (lambda: km.detect.Tags(family=["36h11"]), r"Tags: family is \['36h11'\], expected one of"),
+        (lambda: km.detect.Tags(size_m="0.1"), "Tags: size_m is '0.1', expected a positive length"),
+    ],
+)
+def test_a_parameter_that_a_detector_cannot_have_is_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(km.errors.ModelError, match=message):
+        make()
+
+
+def test_parameters_may_be_numbers_of_numpy_and_limits_infinite() -> None:
+    assert Trunks(beams=np.int64(3), sigma_range_m=np.float32(0.1), radius_max_m=math.inf).beams == 3  # type: ignore[arg-type]
 
 
 def test_reflectors_without_intensities_and_bad_parameters_are_refused() -> None:

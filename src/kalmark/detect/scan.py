@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from kalmark.detect.circles import segments
 from kalmark.errors import EventError, ModelError
-from kalmark.slam.events import Scan, when
+from kalmark.slam.events import Scan, shown, when
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -64,13 +64,16 @@ class Laser:
     signature: bool = False
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            low = 0.0 if name != "sigma_range_m" else 1e-6
-            if isinstance(value, float | int) and not value >= low:
-                raise ModelError(f"{type(self).__name__}: {name} is {value}, expected at least {low:g}")
-        if not 0 < self.incidence_deg < 90:
-            what = f"{type(self).__name__}: incidence_deg is {self.incidence_deg}"
-            raise ModelError(f"{what}, expected an angle between 0 and 90")
+        for name, default in ((own.name, own.default) for own in fields(self)):
+            what, value = f"{type(self).__name__}: {name} is {shown(getattr(self, name))}", getattr(self, name)
+            if isinstance(default, bool):
+                if not isinstance(value, bool | np.bool_):
+                    raise ModelError(f"{what}, expected True or False")
+            elif isinstance(default, int):
+                if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                    raise ModelError(f"{what}, expected a whole number of at least 1")
+            elif isinstance(default, float):
+                _refuse_odd_number(what, name, value)
 
     def detect(self, ranges: Any, angles: Any, intensities: Any = None) -> Detections:
         """Return what is found among beams of these ranges (N,) m at these angles (N,) rad.  Raises EventError."""
@@ -117,6 +120,21 @@ class Laser:
         if step >= least:  # neighbours that no surface joins
             return np.empty((0, 2), np.int64), step
         return segments(r, a, step, least, self.jump_m), step
+
+
+def _refuse_odd_number(what: str, name: str, value: Any) -> None:
+    """Refuse a parameter that is no number, or not one that it may be: only limits, `..._max_m`, may be infinite."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise ModelError(f"{what}, expected a number")
+    if name in ("incidence_deg", "bend_deg"):
+        if not 0 < value < 90:
+            raise ModelError(f"{what}, expected an angle between 0 and 90")
+        return
+    low = 0.0 if name != "sigma_range_m" else 1e-6
+    if not value >= low:
+        raise ModelError(f"{what}, expected at least {low:g}")
+    if value == math.inf and not name.endswith("_max_m"):
+        raise ModelError(f"{what}, expected a finite number")
 
 
 def _beams(ranges: Any, angles: Any, intensities: Any) -> tuple[Array, Array, Array | None]:

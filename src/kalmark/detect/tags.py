@@ -40,10 +40,10 @@ class Tags:
     size_m: float = 0.1
 
     def __post_init__(self) -> None:
-        if self.family not in FAMILIES:
+        if not isinstance(self.family, str) or self.family not in FAMILIES:
             raise ModelError(f"Tags: family is {self.family!r}, expected one of {', '.join(FAMILIES)}")
-        if not 0 < self.size_m < math.inf:
-            raise ModelError(f"Tags: size_m is {self.size_m}, expected a positive length")
+        if not isinstance(self.size_m, int | float) or not 0 < self.size_m < math.inf:
+            raise ModelError(f"Tags: size_m is {self.size_m!r}, expected a positive length")
 
     def detect(self, image: Any) -> tuple[Array, list[int]]:
         """Return the corners and the size (K, 9) of the tags in an image (H, W) or (H, W, 3) of bytes, and their ids.
