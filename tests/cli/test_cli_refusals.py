@@ -235,3 +235,44 @@ def test_a_filter_that_stops_leaves_its_folder_and_status_2(
     assert done.status == 2
     assert "warning: the filter stopped: the innovation is absurd" in done.out.splitlines()
     assert (tmp_path / "out" / "native" / "summary.json").is_file()
+
+
+NAMED = "robots: {rover: {motion: {type: unicycle}, sensors: {lidar: {type: range_bearing}}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        (
+            "robots.each.sensors.lidar.sigma_range_m=.3",
+            "robots.each: no robot takes it, as each one is named, expected robots.",
+        ),
+        (
+            "robots.rovre.motion.sigma_v_mps=.3",
+            "robots.rovre: got a robot that is not in this log or run, expected one of rov",
+        ),
+        (
+            "robots.rover.sensors.lidra.sigma_range_m=.3",
+            "robots.rover.sensors.lidra: got {'sigma_range_m': 0.3}, expected ",
+        ),
+    ],
+)
+def test_what_is_set_and_nothing_takes_is_refused(
+    kalmark: Kalmark, log: Path, tmp_path: Path, setting: str, message: str
+) -> None:
+    (tmp_path / "named.yaml").write_text(NAMED)
+    for more in ((), ("--set", "log.robots=[rover]")):
+        said = refused(kalmark("run", tmp_path / "named.yaml", "--log", log, "--set", setting, *more))
+        assert said.startswith(f"--set {setting}: {message}")
+        if "each" not in setting:
+            assert said.endswith("; did you mean rover?" if "rovre" in setting else "; did you mean the sensor lidar?")
+
+
+def test_what_is_configured_and_serves_nothing_is_said_in_one_line(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
+    (tmp_path / "named.yaml").write_text("robots: {each: {}, " + NAMED.removeprefix("robots: {"))
+    run = ("run", tmp_path / "named.yaml", "--log", log)
+    lines = kalmark(*run, "--set", "robots.rover.sensors.lidra.type=range").out.splitlines()
+    assert [line for line in lines if line.startswith("warning")] == [
+        "warning: robots.each of the configuration stands for no robot of the log: each one is named",
+        "warning: no observation is by the sensor lidra of rover, which is configured; did you mean lidar?",
+    ]

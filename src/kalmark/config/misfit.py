@@ -1,19 +1,39 @@
-"""Refuse a log whose controls or scans are not what the configured motion and sensors take."""
+"""Refuse a log whose controls or scans are not what the configured motion and sensors take, and what no robot takes."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from kalmark.config.classes import CLASSES
+from kalmark.config.merging import EACH
 from kalmark.config.models import Motion, Sensor
 from kalmark.config.reading import did_you_mean
 from kalmark.config.schema import Config
 from kalmark.config.sections import types
+from kalmark.config.tree import OVERRIDE, Tree
 from kalmark.detect.scan import RAW
 from kalmark.errors import ConfigError, LogError
 from kalmark.logs.log import Log
 from kalmark.slam.events import Scan
 from kalmark.slam.robot import Mount
+
+
+def refuse_idle(tree: Tree, log: Log) -> None:
+    """Refuse what was set on the command line for robots of which the log has none."""
+    named: Any = tree.values.get("robots")
+    for path, place in tree.places.items() if isinstance(named, dict) else ():
+        if path[:1] != ("robots",) or len(path) < 2 or path[1] in log.robots or not place.startswith(OVERRIDE):
+            continue
+        if path[1] != EACH:
+            near = did_you_mean(path[1], log.robots)
+            wanted = f"one of {', '.join(log.robots)}{near}"
+            raise ConfigError(
+                f"{place}: robots.{path[1]}: got a robot that is not in this log or run, expected {wanted}"
+            )
+        if all(name in named for name in log.robots):
+            names = " or ".join(f"robots.{name}" for name in log.robots)
+            raise ConfigError(f"{place}: robots.each: no robot takes it, as each one is named, expected {names}")
 
 
 def refuse_controls(config: Config, key: str, name: str, columns: tuple[str, ...], log: Log) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from kalmark.config.locate import check_format, find_log
 from kalmark.config.merging import laid_over
+from kalmark.config.misfit import refuse_idle
 from kalmark.config.reading import config_of, resolve_config
 from kalmark.config.schema import Config
 from kalmark.config.tree import Tree, read_tree
@@ -27,6 +28,7 @@ def open_run(
     values = {key: value for key, value in tree.values.items() if key == "log"}
     alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
     log = open_config_log(alone)
+    refuse_idle(tree, log)
     return config_of(laid_over(tree, log), path).model_copy(update={"log": alone.log}), log
 
 

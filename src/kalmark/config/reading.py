@@ -130,6 +130,9 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
         message = _not_one_of(value, _quoted(context["expected"]), path)
     elif kind == "union_tag_not_found":
         message = f"got {show(value)}, expected a mapping with a type: {_one_of(types(_CHOICES[_kind(path)]))}"
+        if _kind(path) == "sensor":
+            others = [name for name in _at(tree.values, path[:-1]) if name != path[-1]]
+            message += did_you_mean(path[-1], others).replace("mean ", "mean the sensor ")
     else:
         message = f"got {show(value)}, expected {_expected(kind, context, error['msg'])}"
     return ConfigError(f"{tree.place(path)}: {'.'.join(path)}: {message}")

@@ -11,6 +11,7 @@ from kalmark.config.landmarks import Association, IdentityAssociation, Landmark
 from kalmark.config.models import Motion, PlaneSensor, SpaceSensor, UnicycleMotion, world_of
 from kalmark.config.mounting import VELOCITY, SpaceStartConfig, StartConfig, UpkeepConfig
 from kalmark.config.sections import Linearity, NotNegative, Number, Positive, RobotName, Section, expected, type_or
+from kalmark.config.tree import OVERRIDE
 from kalmark.errors import ConfigError
 
 
@@ -187,7 +188,7 @@ class Config(Section):
 
     def overridden(self, *path: str) -> bool:
         """Return whether an override gave the value at `path`."""
-        return self._place(path).startswith("--set ")
+        return self._place(path).startswith(OVERRIDE)
 
     def error(self, path: tuple[str, ...], message: str) -> ConfigError:
         """Return the error of the value at `path`, naming the place it was read from."""

@@ -16,6 +16,7 @@ from ruamel.yaml.reader import ReaderError
 
 from kalmark.errors import ConfigError
 
+OVERRIDE = "--set "  # how the place begins of what was set on the command line
 _DEEPEST = 12  # a configuration is 5 levels deep; an alias to its own parent has no end
 
 
@@ -120,7 +121,7 @@ def _item(node: CommentedMap | CommentedSeq, key: Any, path: tuple[str, ...], tr
 
 def _override(tree: Tree, override: str) -> None:
     """Lay one `a.b=value` over the tree; the value is YAML.  Another `type` replaces its section, but for a mount."""
-    where = f"--set {override}"
+    where = f"{OVERRIDE}{override}"
     dotted, equals, text = override.partition("=")
     path = tuple(part.strip() for part in dotted.split("."))
     if not equals or not all(path):
@@ -129,6 +130,7 @@ def _override(tree: Tree, override: str) -> None:
     for depth, part in enumerate(path[:-1], 1):
         if node.get(part) is None:
             node[part] = {}
+            tree.keys[path[:depth]] = tree.places[path[:depth]] = where
         node = node[part]
         if not isinstance(node, dict):
             raise ConfigError(f"{where}: {'.'.join(path[:depth])}: got {show(node)}, expected a mapping of keys")

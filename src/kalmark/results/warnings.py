@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,7 +33,7 @@ FEW_FIXES = 5  # fewer say little of the noise
 
 def warnings(run: Run, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
-    parts = (_lost, _windows, _observations, _robots, _truth, _fixes, _noise)
+    parts = (_lost, _windows, _observations, _robots, _sensors, _truth, _fixes, _noise)
     return [line for part in parts for line in part(run, summary)] + list(mount_warnings(summary))
 
 
@@ -122,6 +123,23 @@ def _robots(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
             share = max(shared, 0) / max(int(scans[-1] - scans[0]), 1)
             if share < 0.5:
                 yield f"controls of robot {name} cover {share:.0%} of the time of its scans: are both in seconds?"
+
+
+def _sensors(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+    """Tell of what is configured and served nothing: sensors that no observation was by, `each` without a robot."""
+    robots: Mapping[str, Any] = run.config.get("robots") or {}
+    rows = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
+    seen = set(rows)
+    for key, given in robots.items() if seen and not run.stopped else ():
+        mine = [name for name in run.log.robots if name == key or (key == "each" and name not in robots)]
+        if key == "each" and run.log.robots and not mine:
+            yield "robots.each of the configuration stands for no robot of the log: each one is named"
+        used = sorted({sensor for robot, sensor in seen if robot in mine})
+        for name in (given or {}).get("sensors") or {} if mine else ():
+            if name not in used:
+                near = get_close_matches(name, used, n=1, cutoff=0.5)
+                hint = f"; did you mean {near[0]}?" if near else ""
+                yield f"no observation is by the sensor {name} of {', '.join(mine)}, which is configured{hint}"
 
 
 def _truth(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
