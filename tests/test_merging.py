@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.errors import MapError
+from kalmark.errors import EventError, MapError
 from kalmark.slam import merging
 from kalmark.slam.ambiguity import doubtful, gains
 
@@ -124,7 +125,8 @@ def test_a_landmark_seen_without_any_other_may_still_be_one_of_the_map() -> None
     for name, x in (("u1", 5.0), ("u2", 5.05)):
         slam.add_landmark(name, [x, 0.0], 0.01 * np.eye(2))
         slam.members.together[name] = {name}
-    slam.members.lately, slam.members.unnamed = ["u2"], 2
+    slam.members.lately = ["u2"]
+    slam.members.theirs.clear()  # as if both had been made up
     assert list(merging._hypotheses(slam, "u2", 2)) == [[("u2", "u1")]]
 
 
@@ -157,10 +159,43 @@ def test_two_ids_of_the_log_are_two_landmarks_wherever_they_are() -> None:
     for t, ids in ((0, [1, None]), (1, [2, None])):
         slam.process(km.Scan(t, "cart", "lidar", [[5.0, 0.1], [6.0, 1.5]], ids=ids))
     assert list(merging._hypotheses(slam, 2, 2)) == []
-    slam.members.unnamed = 9
     slam.add_landmark("u9", slam.mean(1), 0.01 * np.eye(2))
     slam.members.together["u9"] = {"u9"}
+    assert list(merging._hypotheses(slam, 2, 2)) == [], "a survey gave it that name"
+    slam.members.theirs.clear()
     assert {pair for pairs in merging._hypotheses(slam, 2, 2) for pair in pairs} == {(2, "u9")}
+
+
+def seen(slam: km.Slam, t: int, y: list[list[float]], ids: list[Any]) -> list[tuple[str, Any]]:
+    report = slam.process(km.Scan(t, "cart", "lidar", y, ids))
+    return [(o.outcome, o.landmark) for o in report.observations]
+
+
+def test_an_id_of_the_log_is_never_taken_for_a_name_made_up(tmp_path: Path) -> None:
+    slam = slam_of(confirm=1)
+    assert seen(slam, 0, [[5.0, 0.1]], ["u1"]) == [("new", "u1")]
+    assert seen(slam, 1, [[6.0, 1.5], [7.0, -1.5]], ["u3", None]) == [("new", "u3"), ("new", "u2")]
+    slam.remove("u3")
+    assert seen(slam, 2, [[7.0, 2.5]], [None]) == [("new", "u4")], "u3 may come again"
+    slam.save(tmp_path / "map.kmk")
+    for one in (slam, km.Slam.load(tmp_path / "map.kmk")):
+        assert [one.members.made_up(name) for name in ("u1", "u2", "u3", "u4", 1, "tree")] == [
+            False, True, False, True, False, False,
+        ]  # fmt: skip
+        before = one.mean("u2").tolist()
+        with pytest.raises(
+            EventError, match="id 'u2' is what a landmark seen without an id was called, expected an id"
+        ):
+            seen(one, 3, [[9.0, 0.5]], ["u2"])
+        assert one.mean("u2").tolist() == before
+        assert seen(one, 3, [[6.0, 1.5], [9.0, 0.5]], ["u3", None]) == [("new", "u3"), ("new", "u5")]
+
+
+def test_a_run_makes_up_no_name_that_comes_later_in_its_log() -> None:
+    slam = slam_of(confirm=1)
+    events = [km.Scan(t, "cart", "lidar", [[5.0, 0.1 * t]], [i]) for t, i in ((0, None), (20, "u1"), (21, "u1"))]
+    km.record(slam, events, progress=False)
+    assert slam.landmarks().ids == ["u2", "u1"]
 
 
 def test_in_a_full_map_nothing_is_merged_and_nothing_lost(tmp_path: Path) -> None:

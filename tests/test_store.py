@@ -368,6 +368,20 @@ def test_tables_that_do_not_fit_each_other_are_refused(name: str, saved: Path, t
         load(tmp_path / "map.kmk")
 
 
+def test_in_a_map_saved_before_that_was_kept_the_names_made_up_are_those_with_a_small_number(tmp_path: Path) -> None:
+    slam = km.Slam(robots(), km.association.NearestNeighbour(), upkeep=km.Upkeep(confirm=1))
+    slam.add_landmark("u7", (1.0, 2.0))
+    slam.add_landmark("u1", (5.0, 2.0))
+    slam.members.unnamed = 2
+    slam.save(tmp_path / "map.kmk")
+    with zipfile.ZipFile(tmp_path / "map.kmk") as archive:
+        state = json.loads(archive.read("slam.json"))
+    assert state.pop("theirs") == ["u1", "u7"]
+    reseal(tmp_path / "old.kmk", {"slam.json": json.dumps(state).encode()}, tmp_path / "map.kmk")
+    old = load(tmp_path / "old.kmk").members
+    assert [old.made_up(name) for name in ("u1", "u7")] == [True, False]
+
+
 def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"none\.kmk: No such file or directory, expected a map"):
         load(tmp_path / "none.kmk")

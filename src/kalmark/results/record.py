@@ -54,6 +54,10 @@ def record(
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
     refuse_other_columns(slam, log)
     events = log if isinstance(log, list) else list(log)
+    for event in events:
+        if type(event) is Scan and event.ids is not None:
+            known = slam.members
+            known.reserve(i for i in event.ids if i not in known.kinds and i not in known.tentative)
     recorder = _Recorder(slam, np.linspace(0, sum(type(e) is Scan for e in events) - 1, SNAPSHOTS))
     recorder.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in events)
     recorder.starts = _starts(slam, events)

@@ -22,6 +22,10 @@ Array = npt.NDArray[np.float64]
 FADES = 0.9  # of what was learnt, from one scan to the next
 
 
+def _as_if_made_up(name: Id) -> bool:
+    return type(name) is str and name[:1] == "u" and name[1:].isdecimal()
+
+
 class Members:
     """The names of the map's blocks: `slots` of all of them, `kinds` of the landmarks alone, and their `names` by slot.
 
@@ -31,6 +35,7 @@ class Members:
     often one far from all that it may be has to be seen before that is looked at again.  `ends` are the abscissas (2,)
     of the segments seen of lines, `doubts` and `tentative` what waits to become a landmark: without a block, and with
     one; `unlocated` what is known of those whose ranges do not tell yet where they are, `here` the last place kept.
+    `theirs` are ids of the log or of a survey that look like the names made up for what has none: u1, u2, ...
     """
 
     def __init__(self, robots: Mapping[str, Robot]) -> None:
@@ -51,6 +56,7 @@ class Members:
         self.unlocated: dict[Id, Unlocated] = {}
         self.here: tuple[str, str, int, int] | None = None  # robot, sensor, time: the block of where it was
         self.unnamed = 0
+        self.theirs: set[Id] = set()
         self.experience = [0.0, 0.0]  # observations without ids that were lately of landmarks of the map, and were not
 
     def slot(self, name: Id) -> int:
@@ -122,8 +128,16 @@ class Members:
         while True:
             self.unnamed += 1
             name = f"u{self.unnamed}"
-            if name not in self.slots and name not in self.tentative:
+            if name not in self.slots and name not in self.tentative and name not in self.theirs:
                 return name
+
+    def reserve(self, ids: Iterable[Id | None]) -> None:
+        """Keep in mind that names were given by the log or a survey, so that they are not made up."""
+        self.theirs.update(name for name in ids if name is not None and _as_if_made_up(name))
+
+    def made_up(self, name: Id) -> bool:
+        """Return whether a landmark's name was made up, for want of an id."""
+        return _as_if_made_up(name) and name not in self.theirs
 
     def in_reach(self, view: View) -> list[Id]:
         """Return the landmarks that a sensor could see."""

@@ -105,12 +105,6 @@ def _fits(space: Space) -> bool:
     return all(kind in LINEAR for kind in space.kinds)
 
 
-def _is_given(slam: Slam, name: Id) -> bool:
-    """Return whether a landmark's name is an id of the log or of a survey, not one made up for what has none."""
-    made_up = isinstance(name, str) and name[:1] == "u" and name[1:].isdecimal()
-    return not (made_up and int(str(name)[1:]) <= slam.members.unnamed)
-
-
 def _merge_with(slam: Slam, view: View, robot: str, name: Id) -> Iterator[tuple[Id, Id, str]]:
     """Merge a landmark, and others seen lately, with what they are, if that is beyond doubt.
 
@@ -142,8 +136,8 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     at = slam.mean(name)[:d]
     kind = members.kinds[name].kind
     others = [n for n in slam.nearby.around(slam, kind, at, NEAREST) if n in together and n != name]
-    by_id = _is_given(slam, name)  # two ids are two landmarks
-    possible = [l for l, o in enumerate(others) if o not in together[name] and not (by_id and _is_given(slam, o))]
+    by_id = not members.made_up(name)  # two ids are two landmarks
+    possible = [l for l, o in enumerate(others) if o not in together[name] and (members.made_up(o) or not by_id)]
     far = np.linalg.norm(_places(slam, [others[l] for l in possible[:TRIES]], d) - at, axis=1)
     reach = _reach(slam, name, others[possible[np.argmin(far)]]) if possible else 0.0
     if not (far <= reach).any():
@@ -162,8 +156,8 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     moved = mine[:, None] + (places[possible] - at)  # (C, L, d): the company, were the landmark the l-th that it may be
     gaps: Any = cKDTree(places).query(moved)
     found, nearest = gaps[0], gaps[1]
-    given = {n for n in others if _is_given(slam, n)}
-    known = [together[c] | {c} | (given if _is_given(slam, c) else set()) for c in company]
+    given = {n for n in others if not members.made_up(n)}
+    known = [together[c] | {c} | (given if not members.made_up(c) else set()) for c in company]
     apart = np.array([[o in different for o in others] for different in known], dtype=np.bool_)
     apart = apart.reshape(len(company), len(others))
     found[np.take_along_axis(apart, nearest, axis=1)] = np.inf
@@ -249,7 +243,7 @@ def _fuse(
     age = {name: i for i, name in enumerate(members.kinds)}
     for slot, (a, b), d2 in zip(slots, pairs, done.d2.tolist(), strict=True):
         map_.remove(slot)
-        kept, gone = sorted((a, b), key=lambda name: (not _is_given(slam, name), age[name]))
+        kept, gone = sorted((a, b), key=lambda name: (members.made_up(name), age[name]))
         members.seen[kept] = members.seen.get(kept, 0) + members.seen.get(gone, 0)
         for name in list(members.together.get(gone, ())):
             members.together.setdefault(name, set()).add(kept)

@@ -33,6 +33,7 @@ from kalmark.slam.checks import (
     numbers,
     refuse_bad_control,
     refuse_bad_fix,
+    refuse_made_up,
     refuse_odd_parts,
 )
 from kalmark.slam.decisions import ANEW, DEFERRED, NEW, Association, Decision
@@ -149,6 +150,9 @@ class Slam:
         R = measurements(event, view.sensor)
         if view.averages:
             refuse_postponed(self.map, event)
+        if event.ids is not None:
+            refuse_made_up(event, self.members)
+            self.members.reserve(event.ids)
         self.t_ns = event.t_ns
         self._advance(event.robot)
         if len(event.y) == 0:
@@ -342,6 +346,7 @@ class Slam:
         if cov is not None:
             cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         self.members.place(name, self.map.add(kind.space, mean, cov), kind)
+        self.members.reserve([name])
         lifecycle.let_grow(self)
 
     def remove(self, name: Id) -> None:

@@ -91,6 +91,7 @@ def _state(slam: Slam) -> State:
         "errors": slam._errors,
         "drives": [[drive.t_ns, drive.fresh] for drive in slam._drives.values()],
         "unnamed": slam.members.unnamed,
+        "theirs": sorted(map(_id, slam.members.theirs)),
         "experience": slam.members.experience,
         "map": slam.map_type,
         "numbers": slam.numbers,
@@ -207,6 +208,11 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     waiting_restored(slam, state.get("waiting", []))
     check_kept(slam)
     slam.members.unnamed = _count(state["unnamed"], "unnamed")
+    if "theirs" in state:
+        slam.members.reserve(state["theirs"])
+    else:  # written before it was kept: what was made up has a number up to `unnamed`
+        ours = {f"u{i}" for i in range(1, slam.members.unnamed + 1)}
+        slam.members.reserve(name for name in slam.members.kinds if name not in ours)
     slam.members.experience = [float(count) for count in state.get("experience", (0.0, 0.0))]
     slam.t_ns = _time(state["t_ns"])
     _check_owners(slam)
