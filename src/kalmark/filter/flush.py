@@ -198,12 +198,12 @@ class Flush:
         rows = np.arange(first, last)
         G = self.storage.get(rows, p.A0)
         x, _, a = p.way.carried(atoms, self.x_before[where], G)
-        V = G @ p.Phi.T + a @ p.P_TA
+        V = p.Phi @ G.T + p.P_TA.T @ a.T
         w = G @ p.Phi_T.T + a @ (0.5 * p.P_TT)
-        new = ~self.known[rows]
-        self.R[rows[new]] = np.hstack([G @ self.L, w, a])[new]
-        panel = first // PANEL
-        self.V[panel][:, rows[new] - panel * PANEL] = V[new].T
+        new, panel = ~self.known[rows], first // PANEL
+        some = slice(None) if new.all() else new
+        self.R[first:last][some] = np.hstack([G @ self.L, w, a])[some]
+        self.V[panel, :, first - panel * PANEL : last - panel * PANEL][:, some] = V[:, some]
         self.known[rows] = True
         for block in blocks:
             if self.where[block[P_AT]] < 0:

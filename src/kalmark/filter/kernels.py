@@ -46,6 +46,7 @@ _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
 CACHED = 256  # rows of a covariance that stays in a cache between one pass over it and the next
 BAND = 128  # rows of a larger one that do
+TILE = 64  # rows of a tile of which two do
 
 
 def one_thread() -> Any:
@@ -68,15 +69,23 @@ def rows_of(P: Array, index: Index, n: int) -> Array:
 
 
 @compiled
+def copy_submatrix(P: Array, index: Index, S: Array) -> None:
+    """Write P[index][:, index] into S (k, k): in tiles, since a mirror image as a whole goes through no cache."""
+    k = len(index)
+    for first in range(0, k, TILE):
+        for left in range(0, first + 1, TILE):
+            for a in range(first, min(first + TILE, k)):
+                i = index[a]
+                for b in range(left, min(left + TILE, a + 1)):
+                    j = index[b]
+                    S[a, b] = S[b, a] = P[i, j] if i >= j else P[j, i]
+
+
+@compiled
 def submatrix(P: Array, index: Index) -> Array:
     """Return P[index][:, index] (k, k)."""
-    k = len(index)
-    S = np.empty((k, k))
-    for a in range(k):
-        i = index[a]
-        for b in range(a + 1):
-            j = index[b]
-            S[a, b] = S[b, a] = P[i, j] if i >= j else P[j, i]
+    S = np.empty((len(index), len(index)))
+    copy_submatrix(P, index, S)
     return S
 
 

@@ -386,7 +386,9 @@ class PostponedMap(Layout):
         A = np.concatenate([NO_ROWS, *(self.rows(slot) for slot in slots)])
         here = np.concatenate([NO_ROWS, *(m.rows(self._owners[slot]) for slot in slots)])
         turns = np.concatenate([self._leaps.rows, *(self._turn_rows(r) for r in self._moved)])
-        P = kernels.submatrix(m.P, np.concatenate([here, turns, self._s]))
+        index = np.concatenate([here, turns, self._s])
+        P = self._room.array("P", (len(index), len(index)))
+        kernels.copy_submatrix(m.P, index, P)
         n, t = len(here), len(here) + len(turns)
         phase = Phase(
             self._A0, A, -P[t:, t:], P[:n, t:], P[:n, :n], P[n:t, t:], P[n:t, :n], P[n:t, n:t], self._way()

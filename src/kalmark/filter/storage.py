@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
-from kalmark.filter.fresh import Fresh
+from kalmark.filter.fresh import Fresh, zeros
 from kalmark.filter.kernels import subtract_product
 
 Array = npt.NDArray[np.float64]
@@ -43,18 +43,18 @@ def _pointer(_: Any, address: Any) -> Any:
 def gather(addresses: Index, like: Stored, rows: Index, columns: Index) -> Array:
     """Return the elements [rows][:, columns] of the panels at `addresses`, whose numbers are like `like`."""
     C = np.empty((len(rows), len(columns)))
-    for a in range(len(rows)):
+    for a in range(len(rows)):  # row by row as they are stored, or those that are mirrored would wait for memory
         i = rows[a]
-        k = i // PANEL
-        own = carray(_pointer(addresses[k]), (PANEL, (k + 1) * PANEL), like.dtype)
+        own = carray(_pointer(addresses[i // PANEL]), (PANEL, (i // PANEL + 1) * PANEL), like.dtype)
         for b in range(len(columns)):
-            j = columns[b]
-            if j <= i:
-                C[a, b] = own[i - k * PANEL, j]
-            else:
-                c = j // PANEL
-                other = carray(_pointer(addresses[c]), (PANEL, (c + 1) * PANEL), like.dtype)
-                C[a, b] = other[j - c * PANEL, i]
+            if columns[b] <= i:
+                C[a, b] = own[i % PANEL, columns[b]]
+    for b in range(len(columns)):
+        j = columns[b]
+        own = carray(_pointer(addresses[j // PANEL]), (PANEL, (j // PANEL + 1) * PANEL), like.dtype)
+        for a in range(len(rows)):
+            if rows[a] < j:
+                C[a, b] = own[j % PANEL, rows[a]]
     return C
 
 
@@ -107,7 +107,7 @@ class Triangle:
             self._refuse_too_much(k)
             if k == len(self.addresses):
                 self.addresses = np.concatenate([self.addresses, np.zeros(k, dtype=np.int64)])
-            panel = np.zeros((PANEL, (k + 1) * PANEL), dtype=self.like.dtype)
+            panel = zeros((PANEL, (k + 1) * PANEL), self.like.dtype)
             self.panels.append(panel)
             self.fresh.put(panel, 0, panel.size)
             self.addresses[k] = panel.ctypes.data
