@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.errors import EventError, MapError
+from kalmark.errors import MapError
 from kalmark.slam import merging
 from kalmark.slam.ambiguity import doubtful, gains
 
@@ -182,12 +182,8 @@ def test_an_id_of_the_log_is_never_taken_for_a_name_made_up(tmp_path: Path) -> N
         assert [one.members.made_up(name) for name in ("u1", "u2", "u3", "u4", 1, "tree")] == [
             False, True, False, True, False, False,
         ]  # fmt: skip
-        before = one.mean("u2").tolist()
-        with pytest.raises(
-            EventError, match="id 'u2' is what a landmark seen without an id was called, expected an id"
-        ):
-            seen(one, 3, [[9.0, 0.5]], ["u2"])
-        assert one.mean("u2").tolist() == before
+        at = km.geometry.scan(one.mean("u2")[:2])[0]
+        assert seen(one, 3, [at], ["u2"]) == [("associated", "u2")], "whoever feeds it may use its names"
         assert seen(one, 3, [[6.0, 1.5], [9.0, 0.5]], ["u3", None]) == [("new", "u3"), ("new", "u5")]
 
 

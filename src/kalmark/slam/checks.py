@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,9 +11,6 @@ from kalmark.errors import EventError, KalmarkError, ModelError
 from kalmark.models.protocols import Landmark, Sensor
 from kalmark.slam.events import Control, Fix, Scan, finite, shown, when
 from kalmark.slam.upkeep import Upkeep
-
-if TYPE_CHECKING:
-    from kalmark.slam.members import Members
 
 Array = npt.NDArray[np.float64]
 
@@ -99,14 +96,6 @@ def refuse_bad_fix(event: Fix, size: int) -> None:
         expected = "x and y in m" if size == 2 else "x, y and z in m"
         raise EventError(f"{when(event)}: y has shape {event.y.shape}, expected ({size},): {expected}")
     covariance(event.cov, size, f"{when(event)}: cov", definite=True)
-
-
-def refuse_made_up(event: Scan, members: Members) -> None:
-    """Refuse an id that is the name made up for a landmark of the map: it would be taken for that one."""
-    for name in event.ids or ():
-        if name is not None and members.made_up(name) and name in members.kinds:
-            what = f"{when(event)}: id {name!r} is what a landmark seen without an id was called"
-            raise EventError(f"{what}, expected an id that is not u and a number")
 
 
 def measurements(event: Scan, sensor: Sensor) -> Array:

@@ -33,7 +33,6 @@ from kalmark.slam.checks import (
     numbers,
     refuse_bad_control,
     refuse_bad_fix,
-    refuse_made_up,
     refuse_odd_parts,
 )
 from kalmark.slam.decisions import ANEW, DEFERRED, NEW, Association, Decision
@@ -150,9 +149,6 @@ class Slam:
         R = measurements(event, view.sensor)
         if view.averages:
             refuse_postponed(self.map, event)
-        if event.ids is not None:
-            refuse_made_up(event, self.members)
-            self.members.reserve(event.ids)
         self.t_ns = event.t_ns
         self._advance(event.robot)
         if len(event.y) == 0:
@@ -264,6 +260,7 @@ class Slam:
             return Observation(k, id_, "ignored" if name is None else "deferred", None, None, reason)
         if name == event.robot:
             return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
+        self.members.reserve([id_])
         if name in self.members.slots:
             return Observation(k, id_, "rejected", name, None, f"it is no {view.landmark.kind}")
         if view.initialization is not None:
