@@ -22,7 +22,8 @@ _WITH_WORLD = ("pose", "landmarks", "joint")
 class Campaign:
     """N runs of a world, each estimator on the same logs: `scores[estimator][run]`, `t_s` the time of each step.
 
-    `description` is the world as it was in force, in YAML.  Averages of NEES leave out the first `skip` steps.
+    `kind` is "world", or "config" of a log's replay; `description` is it as it was in force, in YAML.  Averages of NEES
+    leave out the first `skip` steps.
     """
 
     world: str
@@ -34,6 +35,7 @@ class Campaign:
     t_s: tuple[float, ...]
     scores: dict[str, tuple[Scores, ...]]
     skip: int = 0
+    kind: str = "world"
 
     def ideal(self, name: str) -> float:
         """Return what the ANEES of a consistent filter would be: its degrees of freedom, 1 for the joint state."""
@@ -47,19 +49,19 @@ class Campaign:
     def summary(self) -> dict[str, Any]:
         """Return the figures of ``summary.json``: a section for each estimator."""
         estimators = {name: figures(scores, self.skip) for name, scores in self.scores.items()}
-        head = {"world": self.world, "seed": self.seed, "runs": self.runs, "steps": len(self.t_s)}
+        head = {self.kind: self.world, "seed": self.seed, "runs": self.runs, "steps": len(self.t_s)}
         dof = {name: self.ideal(name) for name in self._names()}
         tail = {"map_every": self.map_every, "skip": self.skip, "dof": dof, "estimators": estimators}
         return none_for_nan({**head, **tail})
 
     def save(self, folder: str | Path) -> Path:
-        """Write ``summary.json``, ``world.yaml``, ``anees.csv`` (a row an estimator, robot and step), ``anees.png``."""
+        """Write ``summary.json``, ``anees.csv`` (a row an estimator, robot and step), ``anees.png``, description."""
         from kalmark.campaign.picture import draw
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
-        (folder / "world.yaml").write_text(self.description, encoding="utf-8")
+        (folder / f"{self.kind}.yaml").write_text(self.description, encoding="utf-8")
         self._write_steps(folder / "anees.csv")
         draw(self, folder / "anees.png")
         return folder

@@ -1,4 +1,4 @@
-"""Monte Carlo: N runs of a world over processes, every estimator on the same logs.
+"""Monte Carlo: N runs of a world, or of a log's replay, over processes, every estimator on the same logs.
 
 Each run takes its seed from the campaign's by `SeedSequence.spawn` and computes with one BLAS thread, so the numbers
 are the same whatever the number of workers.
@@ -19,15 +19,17 @@ from joblib import Parallel, cpu_count, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
 from kalmark.campaign.campaign import Campaign
+from kalmark.campaign.replay import Replay, replay_of
 from kalmark.campaign.scoring import Scores, score
 from kalmark.config.building import build_slam
-from kalmark.config.reading import did_you_mean, validate
+from kalmark.config.opening import open_run
+from kalmark.config.reading import did_you_mean, resolve_config, resolve_name, shipped_configs, validate
 from kalmark.config.schema import Config
-from kalmark.config.tree import Tree
+from kalmark.config.tree import Tree, read_tree
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.results.progress import track
 from kalmark.simulate.robots import simulation
-from kalmark.simulate.worlds import World, load_world
+from kalmark.simulate.worlds import World, load_world, shipped_worlds
 
 BACKENDS = ("loky", "dask", "ray")
 ESTIMATORS = ("invariant", "ekf", "fej")
@@ -37,20 +39,17 @@ ESTIMATORS = ("invariant", "ekf", "fej")
 class Plan:
     """What every run of a campaign does; sent to the workers."""
 
-    world: World
+    world: World | Replay
     configs: dict[str, Config]
     seed: int
     map_every: int
 
-    def steps(self) -> tuple[int, ...]:
-        """Return the times (ns) of the steps."""
-        return tuple(round(k * self.world.dt_s * 1e9) for k in range(1, self.world.steps + 1))
-
     def run(self, number: int) -> dict[str, Scores]:
         """Simulate run `number` and score every estimator on it."""
         with threadpool_limits(1):
-            simulated = simulation(self.world, np.random.SeedSequence(self.seed, spawn_key=(number,)))
-            steps = self.steps()
+            seed = np.random.SeedSequence(self.seed, spawn_key=(number,))
+            scene, steps = self.world, self.world.times()
+            simulated = scene.simulation(seed) if isinstance(scene, Replay) else simulation(scene, seed)
             return {
                 name: score(build_slam(config, simulated.log), simulated, steps, self.map_every)
                 for name, config in self.configs.items()
@@ -58,7 +57,7 @@ class Plan:
 
 
 def run_campaign(
-    world: World | str | Path,
+    world: World | Replay | str | Path,
     runs: int,
     estimators: Sequence[str] | None = None,
     seed: int = 0,
@@ -68,18 +67,19 @@ def run_campaign(
     map_every: int = 10,
     skip: int = 0,
 ) -> Campaign:
-    """Run a world (or the path or name of one) `runs` times and return the figures of each estimator.
+    """Run a world, or the replay of a log, `runs` times and return the figures of each estimator.
 
+    `world` may be the path or name of a world, or of a configuration that has a log (`open_scene` takes more of it).
     `estimators` are names like "invariant", "ekf" or, with a key of theirs, "invariant:iterations=1"; by default the
-    one in the world's `filter`.  `jobs` is the number of processes (default: one a core).  Landmarks and joint state
-    are scored every `map_every` steps; averages of NEES leave out the first `skip` steps.  Raises ConfigError or
-    KalmarkError on anything that cannot be run.
+    one of the configuration or in the world's `filter`.  `jobs` is the number of processes (default: one a core).
+    Landmarks and joint state are scored every `map_every` steps; averages of NEES leave out the first `skip` steps.
+    Raises ConfigError, LogError or KalmarkError on anything that cannot be run.
     """
-    world = world if isinstance(world, World) else load_world(world)
     limits = (("runs", runs, 1), ("seed", seed, 0), ("map_every", map_every, 1), ("jobs", jobs, 1), ("skip", skip, 0))
     for name, value, least in limits:
         if value is not None and (not isinstance(value, int) or value < least):
             raise KalmarkError(f"campaign: {name} is {value!r}, expected a whole number of at least {least}")
+    world = world if isinstance(world, World | Replay) else open_scene(world, progress=progress)
     configs = configs_of(world, estimators)
     plan = Plan(world, configs, seed, map_every)
     results = list(track(results_of(plan, runs, jobs, backend), f"campaign {world.name}", runs, show=progress))
@@ -90,13 +90,32 @@ def run_campaign(
         runs=runs,
         map_every=map_every,
         robots=tuple(world.robots),
-        t_s=tuple(t * 1e-9 for t in plan.steps()),
+        t_s=tuple(t * 1e-9 for t in world.times()),
         scores={name: tuple(result[name] for result in results) for name in configs},
         skip=skip,
+        kind="world" if isinstance(world, World) else "config",
     )
 
 
-def configs_of(world: World, estimators: Sequence[str] | None) -> dict[str, Config]:
+def open_scene(
+    path_or_name: str | Path, overrides: Sequence[str] = (), log: str | Path | None = None, progress: bool = True
+) -> World | Replay:
+    """Return the world, or the replay of the configuration, at a path or of a shipped name; of both, the world.
+
+    `log` is the log to use instead of the configuration's.  Raises ConfigError, LogError, KalmarkError.
+    """
+    shipped, path = shipped_worlds(), Path(path_or_name)
+    named = str(path_or_name) in shipped or (path.stem in shipped and path.suffix in (".yaml", ".yml"))
+    if "world" in read_tree(path).values if path.is_file() else named and log is None:
+        if log is not None:
+            raise ConfigError(f"--log {log}: {path} is a world, expected a configuration to use it in")
+        return load_world(path_or_name, overrides)
+    resolve_name(path_or_name, shipped_configs() | shipped, "world or a configuration")
+    config, found = open_run(resolve_config(path_or_name), log, overrides)
+    return replay_of(config, found, progress)
+
+
+def configs_of(world: World | Replay, estimators: Sequence[str] | None) -> dict[str, Config]:
     """Return the configuration of each estimator, by its label; the world's own keeps the world's keys.
 
     Raises ConfigError on an unknown one.

@@ -1,4 +1,4 @@
-"""`kalmark campaign`: many runs of a world, estimators side by side."""
+"""`kalmark campaign`: many runs of a world or of a log's replay, estimators side by side."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.options import Overrides, announce_compilation_elsewhere, writable
+from kalmark.cli.options import Overrides, announce_compilation_elsewhere, computing, writable
 from kalmark.cli.tables import number, print_table
 
 if TYPE_CHECKING:
@@ -37,27 +37,31 @@ class Backend(StrEnum):
 
 
 def campaign(
-    world: Annotated[str, typer.Argument(metavar="WORLD", help="A YAML file or a shipped name.")],
+    world: Annotated[str, typer.Argument(metavar="WORLD_OR_CONFIG", help="A YAML file or a shipped name.")],
     runs: Annotated[int, typer.Option(min=1, help="How many runs of each estimator.")],
     estimator: Annotated[
         list[str] | None,
-        typer.Option(help="invariant, ekf, fej, invariant:iterations=1; may be given again. (default: the world's)"),
+        typer.Option(help="invariant, ekf, fej, invariant:iterations=1; may be given again. (default: the file's)"),
     ] = None,
+    log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the campaign.")] = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes. (default: one a core)")] = None,
     backend: Annotated[Backend, typer.Option(help="Who runs the processes.")] = Backend.LOKY,
     skip: Annotated[int, typer.Option(min=0, help="Steps at the beginning that no average of NEES counts.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="The folder to write. (default: out/campaign-WORLD)")] = None,
+    out: Annotated[Path | None, typer.Option(help="The folder to write. (default: out/campaign-NAME)")] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run a world many times: ANEES and its band, RMSE, divergences, estimators side by side."""
+    """Run a world many times, or a log with all noise drawn anew: ANEES and its band, RMSE, divergences.
+
+    A log's route, map and sightings are those that its configured filter finds; all else is simulated by its models.
+    """
     announce_compilation_elsewhere()
-    from kalmark.campaign import run_campaign
-    from kalmark.simulate import load_world
+    from kalmark.campaign import open_scene, run_campaign
 
     out = writable(out or Path("out") / f"campaign-{Path(world).stem}")
-    loaded = load_world(world, overrides or ())
-    result = run_campaign(loaded, runs, estimator, seed=seed, jobs=jobs, backend=backend.value, skip=skip)
+    with computing():
+        scene = open_scene(world, overrides or (), log)
+    result = run_campaign(scene, runs, estimator, seed=seed, jobs=jobs, backend=backend.value, skip=skip)
     result.save(out)
     print_campaign(result)
     typer.echo(f"{out}: summary.json, anees.csv and anees.png")

@@ -37,10 +37,12 @@ from kalmark.simulate.sights import (
     in_frame,
     looks_for,
     noisy,
+    possible,
     things_of,
 )
 from kalmark.simulate.worlds import World
 from kalmark.slam.events import Control, Event, Id, Scan, order
+from kalmark.slam.robot import Mount, Robot
 
 Array = npt.NDArray[np.float64]
 Key = tuple[int, str, str]
@@ -164,18 +166,28 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
     """Put a robot at its start and its sensors on their mounts, drawn around what is configured if that has sigmas."""
     simulated = world.robots[name]
     robot = build_robot(world.models(), name)
-    motion, space = robot.motion, robot.motion.space
-    cov = np.zeros((space.dof, space.dof)) if robot.cov is None else robot.cov
-    state = space.plus(np.array(robot.start), gaussian(cov, chance.route))
+    state = drawn_start(robot, chance.route)
     sensors = {}
     for key, mount in robot.sensors.items():
-        at, cov = np.array(mount.at), getattr(mount, "cov", None)
-        if cov is not None:
-            at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(cov, chance.mounts))
         sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
-        sensors[key] = SimSensor(true_sensor(mount.sensor, chance.mounts), at, sensing)
-    driver = simulated.route.driver(motion, world.dt_s, area, chance.route)
-    return SimRobot(name, motion, state, driver, sensors)
+        sensors[key] = SimSensor(*drawn_mount(mount, chance.mounts), sensing)
+    driver = simulated.route.driver(robot.motion, world.dt_s, area, chance.route)
+    return SimRobot(name, robot.motion, state, driver, sensors)
+
+
+def drawn_start(robot: Robot, rng: Generator) -> Array:
+    """Return where a robot truly starts: drawn around what the estimator is given, if that has sigmas."""
+    space = robot.motion.space
+    cov = np.zeros((space.dof, space.dof)) if robot.cov is None else robot.cov
+    return space.plus(np.array(robot.start), gaussian(cov, rng))
+
+
+def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
+    """Return a sensor as it truly is, and where: drawn around what the estimator is given, if that has sigmas."""
+    at, cov = np.array(mount.at), mount.cov
+    if cov is not None:
+        at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(cov, rng))
+    return true_sensor(mount.sensor, rng), at
 
 
 def true_sensor(sensor: Any, rng: Generator) -> Any:
@@ -193,10 +205,14 @@ def step(robot: SimRobot, world: World, rng: Generator) -> Array:
     told, done = (disturbed, u) if world.noise_on == "control" else (u, disturbed)
     robot.states.append(robot.state)
     robot.state, *_ = robot.motion.move(robot.state, done, world.dt_s)
-    D = robot.motion.diffusion(done, world.dt_s)
-    if D is not None:
-        robot.state = robot.motion.space.plus(robot.state, body_axes(robot.state, len(D)) @ gaussian(D, rng))
+    robot.state = diffused(robot.motion, robot.state, done, world.dt_s, rng)
     return told
+
+
+def diffused(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -> Array:
+    """Return a state disturbed by what the motion diffuses in `dt_s` of the control u, if it does."""
+    D = motion.diffusion(u, dt_s)
+    return state if D is None else motion.space.plus(state, body_axes(state, len(D)) @ gaussian(D, rng))
 
 
 def body_axes(state: Array, size: int) -> Array:
@@ -224,7 +240,7 @@ def scans(
         sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight)
         sighted, real = faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
         y = noisy(sensor, sighted.e, chance.sight)
-        kept = np.flatnonzero((y[:, 0] >= 0) | (sensor.columns[0] != "range_m"))  # the others: noise below zero
+        kept = possible(sensor, y)
         if len(kept):
             told = [sighted.ids[i] for i in kept] if world.ids else None
             scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=told)

@@ -163,17 +163,25 @@ def exact(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
     return inside, e
 
 
-def noisy(sensor: Any, e: Array, rng: Generator) -> Array:
-    """Return noisy measurements of the exact ones e (K, m), angles wrapped, poses turned."""
+def noisy(sensor: Any, e: Array, rng: Generator, cov: Array | None = None) -> Array:
+    """Return noisy measurements of the exact ones e (K, m), angles wrapped, poses turned.
+
+    A covariance `cov` (K, m, m) overrides the sensor's own noise.
+    """
     if len(e) == 0:
         return np.empty((0, len(sensor.columns)))
     noise = getattr(sensor, "start_noise", sensor.noise)  # of what is measured, where innovations are something else
-    n = gaussian(noise(e), rng)
+    n = gaussian(noise(e) if cov is None else cov, rng)
     if e.shape[1] == 7 and n.shape[1] == 6:
         return np.array([SE3.plus(pose, d) for pose, d in zip(e, n, strict=True)])
     y = e.copy()
     y[:, : n.shape[1]] += n  # a tag's size is known, not measured
     return np.where(sensor.angular, wrap(y), y) if len(sensor.angular) == y.shape[1] else y
+
+
+def possible(sensor: Any, y: Array) -> Indices:
+    """Return which noisy measurements y (K, m) a sensor can report: noise may take a range below zero."""
+    return np.flatnonzero((y[:, 0] >= 0) | (sensor.columns[0] != "range_m"))
 
 
 def gaussian(cov: Array, rng: Generator) -> Array:

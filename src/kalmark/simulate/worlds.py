@@ -136,6 +136,10 @@ class World(Section):
         sensors = [sensor for robot in self.robots.values() for sensor in robot.sensors.values()]
         return any(isinstance(sensor, RangeBearingSignatureSensor) for sensor in sensors)
 
+    def times(self) -> tuple[int, ...]:
+        """Return the times (ns) at which its steps end."""
+        return tuple(round(k * self.dt_s * 1e9) for k in range(1, self.steps + 1))
+
     def config(self) -> Config:
         """Return the filter's configuration: the simulated models and noise, with `filter` laid over them.
 
