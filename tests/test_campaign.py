@@ -100,6 +100,18 @@ def test_several_robots_have_a_row_each() -> None:
     assert np.nanmax(series["joint_dof"]) > 6
 
 
+def test_a_robot_that_has_not_been_moved_up_to_a_scan_is_not_held_against_its_truth_of_then(tmp_path: Path) -> None:
+    robot = """{motion: {type: unicycle, sigma_v_mps: 0.02}, route: {type: constant, u: [0.5, 0.1]},
+      start: {x_m: X, y_m: 3}, sensors: {lidar: {type: range_bearing, sigma_range_m: 0.05, range_max_m: 8}}}"""
+    robots = f"robots:\n  a: {robot.replace('X', '3')}\n  b: {robot.replace('X', '8')}\n"
+    path = tmp_path / "two.yaml"
+    path.write_text(f"world: {{type: random_field, count: 20, size_m: 14}}\n{robots}steps: 20\ndt_s: 0.2\n")
+    scores = run_campaign(load_world(path), 3, jobs=1).scores["invariant"]
+    last = np.array([s.series["joint"][:, -1] / s.series["joint_dof"][:, -1] for s in scores])
+    assert (last < 2.5).all(), "no control follows the last step, so the second robot is moved by its own scan alone"
+    assert all(s.series["joint_dof"][0, -1] == s.series["joint_dof"][1, -1] - 3 for s in scores)
+
+
 def test_a_saved_campaign_has_figures_a_row_a_step_and_a_picture(small: Campaign, tmp_path: Path) -> None:
     folder = small.save(tmp_path / "out")
     summary = json.loads((folder / "summary.json").read_text())

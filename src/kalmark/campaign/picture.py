@@ -36,7 +36,7 @@ def draw(campaign: Campaign, path: Path) -> None:
 def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    t_s = np.array(campaign.t_s)
+    t_s = np.array(campaign.t_s) - (campaign.t_s[0] if campaign.kind == "config" else 0.0)  # logs have clocks
     for i, (estimator, scores) in enumerate(campaign.scores.items()):
         anees = Anees(name, scores, campaign.skip)
         value, low, high = (np.nanmean(np.ma.masked_invalid(a), axis=0) for a in (anees.mean, anees.low, anees.high))

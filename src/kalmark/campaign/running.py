@@ -79,6 +79,7 @@ def run_campaign(
     for name, value, least in limits:
         if value is not None and (not isinstance(value, int) or value < least):
             raise KalmarkError(f"campaign: {name} is {value!r}, expected a whole number of at least {least}")
+    refuse_unknown(estimators)
     world = world if isinstance(world, World | Replay) else open_scene(world, progress=progress)
     configs = configs_of(world, estimators)
     plan = Plan(world, configs, seed, map_every)
@@ -115,6 +116,19 @@ def open_scene(
     return replay_of(config, found, progress)
 
 
+def refuse_unknown(estimators: Sequence[str] | None) -> None:
+    """Refuse estimators that there are not, or that are given twice, before anything is simulated."""
+    if estimators is not None and not estimators:
+        raise ConfigError(f"campaign: got no estimator, expected one of {', '.join(ESTIMATORS)}")
+    for i, label in enumerate(estimators or ()):
+        name = label.partition(":")[0]
+        if name not in ESTIMATORS:
+            expected = f"expected one of {', '.join(ESTIMATORS)}{did_you_mean(name, ESTIMATORS)}"
+            raise ConfigError(f"campaign: estimator is {label!r}, {expected}")
+        if label in (estimators or ())[:i]:
+            raise ConfigError(f"campaign: estimator {label!r} is given twice, expected each once")
+
+
 def configs_of(world: World | Replay, estimators: Sequence[str] | None) -> dict[str, Config]:
     """Return the configuration of each estimator, by its label; the world's own keeps the world's keys.
 
@@ -123,20 +137,14 @@ def configs_of(world: World | Replay, estimators: Sequence[str] | None) -> dict[
     base = world.config()
     if estimators is None:
         return {base.estimator.type: base}
-    if not estimators:
-        raise ConfigError(f"campaign: got no estimator, expected one of {', '.join(ESTIMATORS)}")
+    refuse_unknown(estimators)
     configs = {}
     for label in estimators:
         name, _, keys = label.partition(":")
-        if name not in ESTIMATORS:
-            expected = f"expected one of {', '.join(ESTIMATORS)}{did_you_mean(name, ESTIMATORS)}"
-            raise ConfigError(f"campaign: estimator is {label!r}, {expected}")
         same = name == base.estimator.type
         section: dict[str, Any] = base.estimator.model_dump() if same else {"type": name}
         for key, _, value in (pair.partition("=") for pair in keys.split(",") if pair):
             section[key.strip()] = int(value) if value.strip().isdecimal() else value
-        if label in configs:
-            raise ConfigError(f"campaign: estimator {label!r} is given twice, expected each once")
         tree = Tree(values={"estimator": section}, places={(): f"estimator {label}"})
         configs[label] = base.model_copy(update={"estimator": validate(tree, Config).estimator})
     return configs

@@ -122,11 +122,15 @@ class _Scorer:
         return states
 
     def _score_map(self, robot: str, row: int, k: int) -> None:
-        """Score landmarks, mounts and joint state; points turn with the error of the robot that saw last."""
+        """Score landmarks, mounts and joint state; points turn with the error of the robot that saw last.
+
+        Robots that lag behind are left out of the joint state: their truth of that time is not known.
+        """
         slam, coordinates = self.slam, self.slam.estimator.coordinates
         turn = errors.robot_turn(slam.mean(robot), self._state(robot, k))
         judged: dict[Id, Judged] = {}
-        for name in (robot, *(name for name in self.rows if name != robot)):
+        here = [name for name in self.rows if name != robot and not slam._drives[name].lags(slam.t_ns or 0)]
+        for name in (robot, *here):
             mean = slam.mean(name)
             dof = slam.robots[name].motion.space.dof
             judged[name] = errors.robot(mean, self._state(name, k), turn, coordinates, dof)

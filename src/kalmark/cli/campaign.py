@@ -57,8 +57,10 @@ def campaign(
     """
     announce_compilation_elsewhere()
     from kalmark.campaign import open_scene, run_campaign
+    from kalmark.campaign.running import refuse_unknown
 
     out = writable(out or Path("out") / f"campaign-{Path(world).stem}")
+    refuse_unknown(estimator)
     with computing():
         scene = open_scene(world, overrides or (), log)
     result = run_campaign(scene, runs, estimator, seed=seed, jobs=jobs, backend=backend.value, skip=skip)

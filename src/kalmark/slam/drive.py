@@ -67,6 +67,11 @@ class Drive:
         self.t_ns, self.fresh = to_ns, False
         return part
 
+    def lags(self, t_ns: int) -> bool:
+        """Return whether a robot is still where it was before a time: nothing has asked for it yet."""
+        moves = self.coasts or self.u is not None
+        return moves and self.t_ns is not None and t_ns > self.t_ns
+
     def _coast(self, to_ns: int) -> Part | None:
         """Return the part of a robot that needs no control to move, from the first event on."""
         t_ns, self.t_ns = self.t_ns, to_ns
