@@ -17,6 +17,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from kalmark.errors import MapError
+from kalmark.filter import kernels
+from kalmark.filter.map import P_AT, P_SIZE
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3, Space
 from kalmark.slam.ambiguity import density, gains
@@ -34,7 +36,6 @@ EVERY = 5  # sightings of a landmark, after each of which it is looked at; one t
 NEAREST = 128  # landmarks near it, among which are those that it may be
 COMPANY = 12  # landmarks seen lately, which must find their own as well
 TRIES = 8  # of what it may be
-ALONE = 2.0  # times that away from all that it may be a landmark is looked at less often
 WIDE = 1.5  # times the gate of the nearest it may be, within which all are that it may be
 SLACK_M, SLACK_RAD = 0.3, 0.3  # by which the company may miss, and by which it may be turned
 GATE = 0.99
@@ -137,17 +138,14 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     kind = members.kinds[name].kind
     others = [n for n in slam.nearby.around(slam, kind, at, NEAREST) if n in together and n != name]
     by_id = not members.made_up(name)  # two ids are two landmarks
-    possible = [l for l, o in enumerate(others) if o not in together[name] and (members.made_up(o) or not by_id)]
-    far = np.linalg.norm(_places(slam, [others[l] for l in possible[:TRIES]], d) - at, axis=1)
-    reach = _reach(slam, name, others[possible[np.argmin(far)]]) if possible else 0.0
-    if not (far <= reach).any():
-        if not (far <= ALONE * reach).any():
-            members.alone[name] = 2 * members.seen.get(name, 0)
+    possible = [l for l, o in enumerate(others) if o not in together[name] and (not by_id or members.made_up(o))]
+    if not possible or _is_out_of_reach(slam, name, [others[l] for l in possible[:TRIES]], d):
+        members.alone[name] = 2 * members.seen.get(name, 0)
         return
     places = _places(slam, others, d)
     far = np.linalg.norm(places - at, axis=1)
     possible.sort(key=lambda l: far[l])
-    reach = _reach(slam, name, others[possible[0]])
+    reach = _reach(_differences(slam, [(name, others[possible[0]])])[1])
     possible = [l for l in possible if far[l] <= reach]
     if not possible:
         return
@@ -193,26 +191,31 @@ def _places(slam: Slam, names: Sequence[Id], d: int) -> Array:
     return slam.map.means(slam.members.slots_of(names), d) if names else np.zeros((0, d))
 
 
-def _reach(slam: Slam, name: Id, nearest: Id) -> float:
-    """Return within which distance a landmark may be another, if this one is the nearest that it may be."""
-    _, Z = _differences(slam, [(name, nearest)])
+def _reach(Z: Array) -> float:
+    """Return within which distance a landmark may be another, Z (n, n) being that of the nearest that it may be."""
     return WIDE * math.sqrt(chi2_gate(GATE, len(Z)) * float(np.linalg.eigvalsh(Z)[-1]))
+
+
+def _is_out_of_reach(slam: Slam, name: Id, others: Sequence[Id], d: int) -> bool:
+    """Return whether a landmark can be none of some others."""
+    z, Z = _differences(slam, [(name, other) for other in others])
+    far, n = np.linalg.norm(z[:, :d], axis=1), z.shape[1]
+    i = int(np.argmin(far))
+    return bool(far[i] > _reach(Z[i * n : (i + 1) * n, i * n : (i + 1) * n]))
 
 
 def _differences(slam: Slam, pairs: Sequence[tuple[Id, Id]]) -> tuple[Array, Array]:
     """Return the differences z (M, n) of pairs of landmarks and their joint covariance (M n, M n)."""
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
-    slots = slam.members.slots_of(names).tolist()
-    P = slam.map.covariance(slots)
-    n = len(P) // len(names)
-    at = {name: i for i, name in enumerate(names)}
-    means = [slam.map.mean(slot) for slot in slots]
-    z = np.array([means[at[b]] - means[at[a]] for a, b in pairs])
-    J = np.zeros((len(pairs) * n, len(P)))
-    for i, (a, b) in enumerate(pairs):
-        J[i * n : (i + 1) * n, at[a] * n : (at[a] + 1) * n] = -np.eye(n)
-        J[i * n : (i + 1) * n, at[b] * n : (at[b] + 1) * n] = np.eye(n)
-    return z, J @ P @ J.T + EQUAL_M**2 * np.eye(len(J))
+    m, _, _, here = slam.map.excerpt(slam.members.slots[next(iter(slam.robots))], -1, slam.members.slots_of(names))
+    n = int(m.blocks[here[0], P_SIZE])
+    P = kernels.submatrix(m.P, (m.blocks[here, P_AT][:, None] + np.arange(n)).ravel())
+    at, rows = {name: i for i, name in enumerate(names)}, np.arange(len(pairs))
+    of = np.zeros((len(pairs), len(names)))
+    of[rows, [at[b] for _, b in pairs]] = 1.0
+    of[rows, [at[a] for a, _ in pairs]] = -1.0
+    J = np.kron(of, np.eye(n))
+    return of @ m.means(here, n), J @ P @ J.T + EQUAL_M**2 * np.eye(len(J))
 
 
 def _fuse(
