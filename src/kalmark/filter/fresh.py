@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import mmap
 from collections import deque
+from contextlib import suppress
 from typing import Any
 from weakref import ref
 
@@ -22,7 +23,8 @@ def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Numbers:
     if size < BIT or not hasattr(mmap, "MADV_HUGEPAGE"):
         return np.zeros(shape, dtype)
     memory = mmap.mmap(-1, size)
-    memory.madvise(mmap.MADV_HUGEPAGE)
+    with suppress(OSError):  # a system that has none
+        memory.madvise(mmap.MADV_HUGEPAGE)
     return np.frombuffer(memory, dtype).reshape(shape)
 
 
