@@ -12,7 +12,6 @@ import pytest
 import kalmark as km
 from kalmark.errors import MapError
 from kalmark.filter import postponed as postponed_map
-from kalmark.filter.fresh import zeros
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.pace import Pace
 from kalmark.filter.postponed import PostponedMap
@@ -338,12 +337,3 @@ def test_a_map_of_many_panels_saved_within_a_flush_goes_on_as_the_one_that_was_n
     for i in range(0, len(points), 7):
         np.testing.assert_array_equal(slams[1].mean(i), slam.mean(i))
         np.testing.assert_array_equal(slams[1].covariance("r", i), slam.covariance("r", i))
-
-
-def test_large_arrays_begin_as_zeros_that_can_be_written() -> None:
-    for dtype in (np.float64, np.float32):
-        array = zeros((600, 1024), dtype)
-        assert array.dtype == dtype
-        assert not array.any()
-        array[:] = 1.0
-        assert array.sum() == array.size

@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import mmap
 from collections import deque
-from contextlib import suppress
 from typing import Any
 from weakref import ref
 
-import numpy as np
 import numpy.typing as npt
 
 Numbers = npt.NDArray[Any]
 
 BIT, PAGE = 1 << 21, 4096  # bytes to use at once, a large page of memory, and of a small one
-
-
-def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64) -> Numbers:
-    """Return zeros in large pages of memory, where the system has them: the first use of 2 MB takes a tenth as long."""
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size < BIT or not hasattr(mmap, "MADV_HUGEPAGE"):
-        return np.zeros(shape, dtype)
-    memory = mmap.mmap(-1, size)
-    with suppress(OSError):  # a system that has none
-        memory.madvise(mmap.MADV_HUGEPAGE)
-    return np.frombuffer(memory, dtype).reshape(shape)
 
 
 class Fresh:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from kalmark.errors import MapError
 from kalmark.filter import kernels
-from kalmark.filter.fresh import Fresh, zeros
+from kalmark.filter.fresh import Fresh
 from kalmark.geometry.spaces import REMOVED, Space, Table
 
 Array = npt.NDArray[np.float64]
@@ -195,7 +195,7 @@ class StochasticMap(Layout):
         if bigger > capacity:
             P, self._next = self._next, None
             if P is None or len(P) != bigger:
-                P = zeros((bigger, bigger))
+                P = np.zeros((bigger, bigger))
             P[:capacity, :capacity] = self.P
             self.P = P
 
@@ -203,7 +203,7 @@ class StochasticMap(Layout):
         """Have a larger buffer ready in time; return how many bytes of it were used for the first time now."""
         if self._next is None and 2 * self.n > len(self.P):
             size = next_capacity(len(self.P))
-            self._next = zeros((size, size))
+            self._next = np.zeros((size, size))
             self.fresh.put(self._next, 0, size * size)
         return self.fresh.use_some()
 

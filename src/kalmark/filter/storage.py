@@ -18,7 +18,7 @@ from numba.extending import intrinsic
 
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
-from kalmark.filter.fresh import Fresh, zeros
+from kalmark.filter.fresh import Fresh
 from kalmark.filter.kernels import subtract_product
 
 Array = npt.NDArray[np.float64]
@@ -107,7 +107,7 @@ class Triangle:
             self._refuse_too_much(k)
             if k == len(self.addresses):
                 self.addresses = np.concatenate([self.addresses, np.zeros(k, dtype=np.int64)])
-            panel = zeros((PANEL, (k + 1) * PANEL), self.like.dtype)
+            panel = np.zeros((PANEL, (k + 1) * PANEL), dtype=self.like.dtype)
             self.panels.append(panel)
             self.fresh.put(panel, 0, panel.size)
             self.addresses[k] = panel.ctypes.data
