@@ -146,6 +146,7 @@ def test_the_worlds_own_estimator_keeps_its_keys_unless_they_are_given_anew() ->
         ({"runs": 1, "seed": -1}, "seed is -1, expected"),
         ({"runs": 1, "jobs": 0}, "jobs is 0, expected"),
         ({"runs": 1, "map_every": 0}, "map_every is 0, expected"),
+        ({"runs": 1, "skip": 3000}, "skip is 3000, expected less than the [0-9]+ steps"),
         ({"runs": 1, "estimators": ["efk"]}, "estimator is 'efk', expected one of .*did you mean ekf"),
         ({"runs": 1, "estimators": []}, "got no estimator"),
         ({"runs": 1, "estimators": ["ekf", "ekf"]}, "given twice"),

@@ -57,6 +57,7 @@ def test_it_names_the_landmarks_compared_with_their_distances_gates_and_the_deci
 
 def test_the_time_may_be_that_of_the_log(tmp_path: Path) -> None:
     run = lost_run(tmp_path)
+    assert explain(run, float(explain(run, 7.0).in_log)).step == explain(run, 7.0).step
     assert explain(run, 107.0).step == explain(run, 7.0).step
     with pytest.raises(RunError, match=r"scan is 50 s, expected 100.000000000 to 119.000000000 s of the log, or 0 to"):
         explain(run, 50.0)
@@ -163,15 +164,17 @@ def test_a_wrong_map_is_noticed_from_the_time_on_when_it_is_wrong() -> None:
     robot = km.Robot("r", km.motion.Odometry2D(0.02, 0.02, 0.01), sensors={"s": km.Mount(km.sensors.RangeBearing())})
     for wrong in (False, True):
         events = []
-        for t in range(300):
+        for t in range(40, 340):
             events.append(km.Control(t, "r", rng.normal(size=3) * [0.02, 0.02, 0.01]))
             y = km.geometry.observe(np.zeros(3), GARDEN)[0] + rng.normal(size=(6, 2)) * [0.1, 0.02]
-            ids = [0, 1, 2, 3, 4, 5] if not wrong or t < 200 else [1, 0, 2, 3, 4, 5]  # two are taken for each other
+            ids = [0, 1, 2, 3, 4, 5] if not wrong or t < 240 else [1, 0, 2, 3, 4, 5]  # two are taken for each other
             events.append(km.Scan(t, "r", "s", y, ids))
         run = km.record(km.Slam([robot]), events, progress=False)
         lines = [line for line in run.evaluate()["warnings"] if "the map may be wrong from there on" in line]
         assert bool(lines) == wrong, lines
     assert lines[0].startswith("NIS per degree of freedom rises to ")
+    low, high = run.summary["nis_window_max_s"]
+    assert f"from t={low:.1f} to {high:.1f} s ({40 + low:.1f} to {40 + high:.1f} s in the log)" in lines[0]
     low = run.summary["nis_window_max_s"][0]
     assert 180 <= low <= 215
 
@@ -204,6 +207,6 @@ def test_the_page_draws_the_ambiguous_scans_and_lists_what_was_merged(tmp_path: 
 def test_a_scan_can_be_drawn_from_the_folder_alone(tmp_path: Path) -> None:
     run = lost_run(tmp_path)
     assert main(["explain", str(run.folder), "--scan", "9"]) == 0
-    picture = tmp_path / "run" / "scan_cart_9.000.png"
+    picture = tmp_path / "run" / "scan_cart_109.png"
     assert picture.read_bytes()[:4] == b"\x89PNG"
     assert main(["explain", str(run.folder), "--scan", "77"]) == 2

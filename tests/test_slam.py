@@ -101,7 +101,7 @@ def test_a_bad_event_is_refused_with_one_line_and_changes_nothing(name: str) -> 
             "reparametrize is 'off', expected a number of at least 0, or No",
         ),
         (lambda: km.Slam(rover()).covariance(), "covariance of nothing was asked for, expected names of robots"),
-        (lambda: km.Slam(rover()).covariance(["rover"]), "['rover'] is not in the map, expected a robot or a landmark"),
+        (lambda: km.Slam(rover()).covariance(["rover"]), "['rover'] is not in the map, expected 'rover' or one of"),
         (lambda: km.Slam(rover()).remove(["rover"]), "['rover'] is not in the map"),
         (lambda: km.Slam(rover()).add_landmark(1, (0, 0), landmark="point"), "landmark 1 is 'point', expected a landm"),
         (lambda: km.Mount(km.sensors.Range(), association="auto"), "Mount: association is 'auto', expected an object"),

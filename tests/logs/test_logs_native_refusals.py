@@ -236,3 +236,15 @@ def test_a_byte_that_is_not_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scans.csv").write_bytes(HEAD.encode() + b"\n\xff\xfe")
     with pytest.raises(LogError, match="not text"):
         open_log(tmp_path)
+
+
+def test_a_file_whose_name_is_nearly_one_of_a_log_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "log"
+    folder.mkdir()
+    (folder / "controls.csv").write_text("t_s,robot,v_mps,w_radps\n0,rover,1,0\n")
+    (folder / "scan.csv").write_text(f"{HEAD}\n{GOOD}\n")
+    (folder / "notes.csv").write_text("anything\n")
+    with pytest.raises(LogError, match=r"scan\.csv: a file of this name is not read, expected scans\.csv"):
+        open_log(folder)
+    (folder / "scan.csv").rename(folder / "scans.csv")
+    assert len(open_log(folder).events) == 2

@@ -19,6 +19,7 @@ from kalmark.config.schema import Config
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.logs.log import Log
 from kalmark.results.progress import track
+from kalmark.results.warnings import NO_ID
 from kalmark.slam.events import Control, Event, Fix, Id, Scan
 from kalmark.slam.report import Report
 from kalmark.slam.slam import Slam
@@ -74,7 +75,9 @@ def recorded(config: Config, log: Log, progress: bool = True) -> Recorded:
         raise KalmarkError(f"{log.name}: got points with and without a signature, expected one kind to replay")
     events = _recognised(reports, landmarks, (*slam.robots,) if sizes == {2} else ())
     if not any(isinstance(event, Look) for event in events):
-        raise KalmarkError(f"{log.name}: no observation is of a landmark of the map, expected some to replay")
+        nameless = any(o.reason == NO_ID for report in reports for o in report.observations)
+        hint = "; without ids try --set association.type=auto" if nameless else ""
+        raise KalmarkError(f"{log.name}: no observation is of a landmark of the map, expected some to replay{hint}")
     slam = build_slam(_on_known_map(config), log)
     for name, mean in landmarks.items():
         slam.add_landmark(name, mean)

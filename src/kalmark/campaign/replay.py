@@ -89,7 +89,7 @@ def refuse_other(config: Config, name: str, robot: Robot) -> None:
         raise config.error((*path, "motion"), what)
     for key, mount in robot.sensors.items():
         if mount.detector is not None:
-            what = "got a detector, expected scans of landmarks to replay: the log holds what they are found in"
+            what = "got a detector, expected scans of landmarks, not raw ones (victoria_park_known has such)"
             raise config.error((*path, "sensors", key, "detector"), what)
 
 

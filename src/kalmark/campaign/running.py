@@ -81,6 +81,8 @@ def run_campaign(
             raise KalmarkError(f"campaign: {name} is {value!r}, expected a whole number of at least {least}")
     refuse_unknown(estimators)
     world = world if isinstance(world, World | Replay) else open_scene(world, progress=progress)
+    if skip >= len(world.times()):
+        raise KalmarkError(f"campaign: skip is {skip}, expected less than the {len(world.times())} steps")
     configs = configs_of(world, estimators)
     plan = Plan(world, configs, seed, map_every)
     results = list(track(results_of(plan, runs, jobs, backend), f"campaign {world.name}", runs, show=progress))
@@ -107,7 +109,8 @@ def open_scene(
     """
     shipped, path = shipped_worlds(), Path(path_or_name)
     named = str(path_or_name) in shipped or (path.stem in shipped and path.suffix in (".yaml", ".yml"))
-    if "world" in read_tree(path).values if path.is_file() else named and log is None:
+    both = path.stem in shipped_configs()
+    if "world" in read_tree(path).values if path.is_file() else named and not (both and log is not None):
         if log is not None:
             raise ConfigError(f"--log {log}: {path} is a world, expected a configuration to use it in")
         return load_world(path_or_name, overrides)

@@ -25,6 +25,6 @@ def explain(
     told = explanation_of(loaded, scan, robot)
     for line in told.lines():
         typer.echo(line)
-    path = run / f"scan_{file_name(told.robot)}_{told.t_s:.3f}.png"
+    path = run / f"scan_{file_name(told.robot)}_{told.in_log}.png"
     replace_file(path, lambda temporary: save_scan(loaded, told, temporary))
     typer.echo(str(path))

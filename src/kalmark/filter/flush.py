@@ -138,11 +138,13 @@ class Flush:
         return self.panel * PANEL >= self.n
 
     def advance(self, work: float) -> None:
-        """Do so much work, in multiplications: of some work at least one step."""
+        """Do so much work, in multiplications, at least one step; to know a panel is left for later if it is more."""
         if work <= 0:
             return
-        until = self.spent + work
+        begun, until = self.spent, self.spent + work
         while self.spent < until and not self.done:
+            if self.column == 0 and self.spent > begun and self.spent + self.aside > until:
+                return
             self.spent += self._step(int((until - self.spent) // (self.cost * PANEL)))
 
     def _step(self, tiles: int) -> int:

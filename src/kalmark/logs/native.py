@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,11 @@ def read(path: Path, request: Request) -> Log:
     """Return the native log in a folder.  Raises LogError with file and line."""
     if not any((path / name).is_file() for name in FILES[:3]):
         raise LogError(f"{path}: no controls.csv, scans.csv or fixes.csv, expected at least one of them")
+    others = [file.name for file in path.glob("*.csv") if file.name not in FILES]
+    for name in FILES:
+        near = [] if (path / name).is_file() else get_close_matches(name, others, n=1, cutoff=0.85)
+        if near:
+            raise LogError(f"{path / near[0]}: a file of this name is not read, expected {name}")
     events: list[Event] = []
     control_columns: dict[str, tuple[str, ...]] = {}
     sensor_columns: dict[tuple[str, str], tuple[str, ...]] = {}

@@ -69,12 +69,17 @@ class Explanation:
     changes: tuple[Change, ...]
     asked: str = ""
 
+    @property
+    def in_log(self) -> str:
+        """The time of the log in s, by which the scan is found again."""
+        return _short(self.log_t_s)
+
     def lines(self) -> Iterator[str]:
         """Tell it."""
         d = 3 if len(self.pose) == 7 else 2
         sigma = math.sqrt(max(np.trace(self.covariance[:d, :d]) / d, 0.0))
         at = ", ".join(f"{x:.2f}" for x in self.pose[:d])
-        when = f"t = {self.t_s:.3f} s ({_short(self.log_t_s)} s in the log)"
+        when = f"t = {self.t_s:.3f} s ({self.in_log} s in the log)"
         yield f"{self.robot} · {self.sensor or 'no sensor'} · {when}{'; ' if self.asked else ''}{self.asked}"
         yield f"then at ({at}) m, sigma {sigma:.3g} m; {count(len(self.fates), 'observation')}"
         if self.gates is not None:

@@ -63,6 +63,7 @@ def _scan(told: Explanation) -> dict[str, Any]:
     pose = gaussians(told.pose[None, :2], told.covariance[None, :2, :2])
     return {
         "t": round(told.t_s, 3),
+        "in_log": told.in_log,
         "robot": told.robot,
         "sensor": told.sensor,
         "pose": pose,

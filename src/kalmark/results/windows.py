@@ -133,19 +133,23 @@ def _windows(history: History, step: Ints, value: Array, weight: Ints, least: in
 
 def window_warnings(history: History) -> Iterator[str]:
     """Return a line for each sign that the map is wrong."""
-    yield from _of(nis_windows(history), _high_nis)
-    yield from _of(left_out_windows(history), _left_out)
-    yield from _of(autocorrelations(history), _correlated)
+    begin_s = float(history.t_ns[0]) * 1e-9 if len(history.t_ns) else 0.0
+    yield from _of(nis_windows(history), _high_nis, begin_s)
+    yield from _of(left_out_windows(history), _left_out, begin_s)
+    yield from _of(autocorrelations(history), _correlated, begin_s)
 
 
-def _of(windows: list[Window], told: Any) -> Iterator[str]:
+def _of(windows: list[Window], told: Any, begin_s: float) -> Iterator[str]:
     if len(windows) < 3:
         return
     median = float(np.median([w.value for w in windows]))
     worst = max(windows, key=lambda w: w.value)
     line = told(worst, median, len(windows))
     if line:
-        yield f"{line} from t={figure(worst.start_s)} to {figure(worst.end_s)} s: the map may be wrong from there on"
+        when = f"from t={worst.start_s:.1f} to {worst.end_s:.1f} s"
+        if begin_s:
+            when += f" ({begin_s + worst.start_s:.1f} to {begin_s + worst.end_s:.1f} s in the log)"
+        yield f"{line} {when}: the map may be wrong from there on"
 
 
 def _high_nis(worst: Window, median: float, count: int) -> str:

@@ -63,7 +63,8 @@ class Members:
         """Return the slot of a block.  Raises MapError if there is none of that name."""
         slot = self.slots.get(name) if isinstance(name, Hashable) else None
         if slot is None:
-            raise MapError(f"{name!r} is not in the map, expected a robot or a landmark: it has {len(self.kinds)}")
+            robots, count = ", ".join(map(repr, self.robots)), len(self.kinds)
+            raise MapError(f"{name!r} is not in the map, expected {robots} or one of its {count} landmarks")
         return slot
 
     def slots_of(self, names: Sequence[Any]) -> npt.NDArray[np.int64]:

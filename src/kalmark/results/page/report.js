@@ -184,9 +184,8 @@ function bounds(t, low, high) {
 
 function drawNis() {
   const nis = DATA.nis;
-  el("nis-note").textContent = nis.window > 1
-    ? `mean over windows of ${nis.window} scans; the band holds 95 % of the windows of a filter with the right noise`
-    : "each scan; the band holds 95 % of the scans of a filter with the right noise";
+  const band = "the band would hold 95 % of them if observations were independent; those of a scan share the error of the pose, so more are outside";
+  el("nis-note").textContent = `${nis.window > 1 ? `mean over windows of ${nis.window} scans` : "each scan"}; ${band}`;
   Plotly.react("nis", [...bounds(nis.t, nis.low, nis.high),
     {x: nis.t, y: nis.value, mode: "lines", line: {color: "#1f5fa8", width: 1.1},
      hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
@@ -260,7 +259,7 @@ if (judged.length) {
 if (DATA.nis.t.length) drawNis(); else el("nis-section").remove();
 if (Object.keys(DATA.outcomes.counts).length) drawOutcomes(); else el("association").remove();
 if (DATA.association.scans.length && el("which")) {
-  DATA.association.scans.forEach((scan, i) => el("which").add(new Option(`t = ${scan.t} s, ${scan.robot}`, i)));
+  DATA.association.scans.forEach((scan, i) => el("which").add(new Option(`t = ${scan.t} s, ${scan.robot} (--scan ${scan.in_log})`, i)));
   el("which").addEventListener("change", () => drawScan(DATA.association.scans[+el("which").value]));
   drawScan(DATA.association.scans[0]);
 } else if (el("ambiguous")) el("ambiguous").remove();
