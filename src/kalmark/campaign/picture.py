@@ -13,6 +13,7 @@ from kalmark.results.picture import COLOURS
 if TYPE_CHECKING:
     from kalmark.campaign.campaign import Campaign
 
+POINTS = 400  # of a curve, at most
 COARSE, FINE = (1.0, 2.0, 5.0), (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # ticks in a decade
 
 
@@ -29,17 +30,34 @@ def draw(campaign: Campaign, path: Path) -> None:
     for axis, name in zip(axes, rows, strict=True):
         _draw_row(axis, campaign, name)
     axes[-1].set_xlabel("time (s)")
-    figure.suptitle(f"{campaign.world}: average NEES of {campaign.runs} runs, seed {campaign.seed}")
+    each = _each(len(campaign.t_s))
+    means = f"; curves: means over {each} steps" if each > 1 else ""
+    figure.suptitle(f"{campaign.world}: average NEES of {campaign.runs} runs, seed {campaign.seed}{means}")
     figure.savefig(path, dpi=110)
+
+
+def _each(steps: int) -> int:
+    """Return how many steps to draw as one."""
+    return -(-steps // POINTS)
+
+
+def _thinned(values: Any) -> Any:
+    """Return the means of so many values (N,), masked ones left out, that a curve of them can be read."""
+    values, each = np.ma.masked_invalid(values), _each(len(values))
+    means = np.ma.array(np.zeros(-(-len(values) // each)), mask=True)
+    for i in range(len(means)):
+        means[i] = values[i * each : (i + 1) * each].mean()
+    return means
 
 
 def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    t_s = np.array(campaign.t_s) - (campaign.t_s[0] if campaign.kind == "config" else 0.0)  # logs have clocks
+    t_s = _thinned(np.array(campaign.t_s) - (campaign.t_s[0] if campaign.kind == "config" else 0.0))  # logs have clocks
     for i, (estimator, scores) in enumerate(campaign.scores.items()):
         anees = Anees(name, scores, campaign.skip)
-        value, low, high = (np.nanmean(np.ma.masked_invalid(a), axis=0) for a in (anees.mean, anees.low, anees.high))
+        rows = (np.nanmean(np.ma.masked_invalid(a), axis=0) for a in (anees.mean, anees.low, anees.high))
+        value, low, high = map(_thinned, rows)
         some = ~np.ma.getmaskarray(value)
         label = f"{estimator} ({anees.average:.3g}; {100 * anees.inside:.0f} % inside)"
         if i == 0:
