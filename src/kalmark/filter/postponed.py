@@ -114,10 +114,6 @@ class PostponedMap(Layout):
             out[rest] = places(self, slots[rest], d)
         return out
 
-    def places(self, slots: Index, d: int) -> Array:
-        """Return the first d numbers (K, d), a place, of blocks at rest."""
-        return places(self, slots, d)
-
     def awake(self, d: int) -> tuple[Index, Array]:
         """Return the slots (N,) of the active blocks, and their first d numbers (N, d)."""
         slots = np.array([s for s in self._owners if self.blocks[s, X_SIZE] >= d], dtype=np.int64)

@@ -92,7 +92,7 @@ class Nearby:
             resting = resting[[s in names and sorts[names[s]] in kinds for s in resting.tolist()]]
             if len(resting):
                 slots = np.concatenate([slots, resting])
-                places = np.concatenate([places, map_.places(resting, p.shape[1])])
+                places = np.concatenate([places, map_.means(resting, p.shape[1])])
         rows, columns = closest(distances(p, places), nearest, farther)
         return rows, [names[s] for s in slots[columns].tolist()], places[columns]
 
