@@ -15,7 +15,7 @@ import numpy.typing as npt
 from kalmark.compiled import compiled
 from kalmark.filter.fresh import Fresh
 from kalmark.filter.leap import Way
-from kalmark.filter.map import ATOM_AT, ATOMS, P_AT, P_SIZE, X_AT, X_SIZE, Layout
+from kalmark.filter.map import P_AT, P_SIZE, X_SIZE, Layout, laid_out
 from kalmark.filter.storage import PANEL, Stored, Triangle, subtract
 
 Array = npt.NDArray[np.float64]
@@ -175,42 +175,37 @@ class Flush:
             corrected(C, rows, columns, done, self.where, self.R, self.V, self.phase.P_AA, self.q)
         return C
 
-    def know(self, slot: int) -> None:
-        """Bring a block's mean up to date and make its elements readable."""
-        rows = self.map.rows(slot)
-        if rows[0] < self.n and not self.known[rows[0]]:
-            self._know(slot, slot + 1)
+    def know(self, slots: Index) -> None:
+        """Bring the means of blocks (K,) up to date and make their elements readable."""
+        rows = self.map.blocks[slots, P_AT]
+        here = rows < self.n
+        unknown = slots[here][~self.known[rows[here]]]
+        if len(unknown):
+            self._know(unknown)
 
     def _know_more(self, first: int, last: int) -> bool:
         """Know the blocks at rest among the rows first..last; return whether any were unknown."""
         unknown = np.flatnonzero(self.resting[first:last] & ~self.known[first:last])
         if len(unknown):
-            self._know(*np.searchsorted(self.map.blocks[:, P_AT], [first + unknown[0], last]))
+            self._know(np.arange(*np.searchsorted(self.map.blocks[:, P_AT], [first + unknown[0], last])))
         return len(unknown) > 0
 
-    def _know(self, slot: int, end: int) -> None:
-        """Work out the means of the blocks slot..end, their rows of R = [W, w, a], and their covariances V' with A."""
-        p, blocks = self.phase, self.map.blocks[slot:end]
-        if len(blocks) == 0:
-            return
-        atoms = self.map.atoms[blocks[0, ATOM_AT] : blocks[-1, ATOM_AT] + blocks[-1, ATOMS]]
-        first, last = self.map.rows(slot)[0], self.map.rows(end - 1)[-1] + 1
-        where = slice(blocks[0, X_AT], blocks[-1, X_AT] + blocks[-1, X_SIZE])
-        atoms = atoms - np.array([0, where.start, first])
-        rows = np.arange(first, last)
+    def _know(self, slots: Index) -> None:
+        """Work out the means of some blocks, their rows of R = [W, w, a], and their covariances V' with A."""
+        p = self.phase
+        blocks, atoms, numbers, rows = laid_out(self.map.blocks[slots], self.map.atoms)
         G = self.storage.get(rows, p.A0)
-        x, _, a = p.way.carried(atoms, self.x_before[where], G)
-        V = p.Phi @ G.T + p.P_TA.T @ a.T
+        x, _, a = p.way.carried(atoms, self.x_before[numbers], G)
+        V = G @ p.Phi.T + a @ p.P_TA
         w = G @ p.Phi_T.T + a @ (0.5 * p.P_TT)
-        new, panel = ~self.known[rows], first // PANEL
-        some = slice(None) if new.all() else new
-        self.R[first:last][some] = np.hstack([G @ self.L, w, a])[some]
-        self.V[panel, :, first - panel * PANEL : last - panel * PANEL][:, some] = V[:, some]
+        R = np.concatenate([G @ self.L, w, a], axis=1)
+        new = ~self.known[rows]
+        here = rows[new]
+        self.R[here] = R[new]
+        self.V[here // PANEL, :, here % PANEL] = V[new]
         self.known[rows] = True
-        for block in blocks:
-            if self.where[block[P_AT]] < 0:
-                here = slice(block[X_AT], block[X_AT] + block[X_SIZE])
-                self.map.x[here] = x[here.start - where.start : here.stop - where.start]
+        asleep = np.repeat(self.where[self.map.blocks[slots, P_AT]] < 0, blocks[:, X_SIZE])
+        self.map.x[numbers[asleep]] = x[asleep]
 
 
 def _in_use(map_: Layout, n: int) -> npt.NDArray[np.bool_]:

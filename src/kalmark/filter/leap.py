@@ -131,7 +131,7 @@ class Leaps:
     ) -> None:  # fmt: skip
         """Add a leap of a robot: S (A0, R) and U (T, R) are all that was displaced before, ds and du what it did."""
         self.S, self.U = (
-            np.hstack([_padded(old, len(now), old.shape[1]), now - _padded(done, *now.shape), d[:, None]])
+            np.column_stack([_since(old, now, done), d])
             for old, now, done, d in ((self.S, S, self.S_done, ds), (self.U, U, self.U_done, du))
         )
         self.S_done, self.U_done = S.copy(), U.copy()
@@ -144,9 +144,7 @@ class Leaps:
     def way(self, S: Array, U: Array, axes: int, origins: Array) -> Way:
         """Return the way by these leaps to where S (A0, R) and U (T, R) have displaced all, robots at `origins`."""
         if len(self):
-            before = self.S.shape[1]
-            S = np.hstack([_padded(self.S, len(S), before), S - _padded(self.S_done, *S.shape)])
-            U = np.hstack([_padded(self.U, len(U), before), U - _padded(self.U_done, *U.shape)])
+            S, U = _since(self.S, S, self.S_done), _since(self.U, U, self.U_done)
             origins = np.concatenate([self.origins, origins])
         return Way(S, U, self.robots, self.turn, self.turns, origins, axes)
 
@@ -180,9 +178,14 @@ class Way(NamedTuple):
         return Carried(*_carried(atoms, x, G @ self.shadows, *self[1:]))
 
 
-def _padded(A: Array, rows: int, columns: int) -> Array:
-    out = np.zeros((rows, columns))
-    out[: A.shape[0], : A.shape[1]] = A
+@compiled
+def _since(before: Array, now: Array, done: Array) -> Array:
+    """Return [before, now - done]; rows and columns that were not there yet are zero."""
+    first = before.shape[1]
+    out = np.zeros((len(now), first + now.shape[1]))
+    out[: len(before), :first] = before
+    out[:, first:] = now
+    out[: len(done), first : first + done.shape[1]] -= done
     return out
 
 

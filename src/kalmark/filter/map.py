@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.compiled import compiled
 from kalmark.errors import MapError
 from kalmark.filter import kernels
 from kalmark.filter.fresh import Fresh
@@ -129,7 +130,8 @@ class StochasticMap(Layout):
     @classmethod
     def of(cls, x: Array, P: Array, blocks: Table, atoms: Table, axes: int) -> StochasticMap:
         """Return a map to be read only, of these arrays."""
-        m = cls(0)
+        m = cls.__new__(cls)
+        m._rows, m._numbers = {}, {}
         m.x, m.P, m.blocks, m.atoms, m.axes, m.n, m.x_n = x, P, blocks, atoms, axes, len(P), len(x)
         return m
 
@@ -236,3 +238,23 @@ def _appended(table: Table, rows: Table) -> Table:
         buffer[:count] = table
     buffer[count : count + len(rows)] = rows
     return buffer[: count + len(rows)]
+
+
+@compiled
+def laid_out(blocks: Table, atoms: Table) -> tuple[Table, Table, Index, Index]:
+    """Return the tables of these blocks, one after the other, and the numbers and rows they had before."""
+    own, table = np.empty_like(blocks), np.empty((blocks[:, 5].sum(), 3), np.int64)
+    numbers, rows = np.empty(blocks[:, 1].sum(), np.int64), np.empty(blocks[:, 3].sum(), np.int64)
+    x_to = p_to = atom_to = 0
+    for k in range(len(blocks)):
+        x_at, x_size, p_at, p_size, atom_at, count = blocks[k]
+        own[k, 0], own[k, 1], own[k, 2], own[k, 3], own[k, 4], own[k, 5] = x_to, x_size, p_to, p_size, atom_to, count
+        for i in range(x_size):
+            numbers[x_to + i] = x_at + i
+        for i in range(p_size):
+            rows[p_to + i] = p_at + i
+        for i in range(count):
+            kind, x, p = atoms[atom_at + i]
+            table[atom_to + i, 0], table[atom_to + i, 1], table[atom_to + i, 2] = kind, x - x_at + x_to, p - p_at + p_to
+        x_to, p_to, atom_to = x_to + x_size, p_to + p_size, atom_to + count
+    return own, table, numbers, rows

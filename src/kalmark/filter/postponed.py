@@ -24,7 +24,7 @@ from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Phase, Room
 from kalmark.filter.map import P_AT, X_SIZE, Layout, StochasticMap
 from kalmark.filter.pace import SLICE, USING, Pace
-from kalmark.filter.reading import excerpt, joint, places
+from kalmark.filter.reading import excerpt, joint, places, resting
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import RHO, Rn, Space
 
@@ -95,7 +95,7 @@ class PostponedMap(Layout):
     def mean(self, slot: int) -> Array:
         """Return a copy of a block's mean."""
         at = self._owners.get(slot)
-        return self.active.mean(at) if at is not None else self._preview(slot)[0].x
+        return self.active.mean(at) if at is not None else resting(self, np.array([slot])).x
 
     def first(self, slot: int) -> Array:
         """Return a copy of a block's first estimate, of a robot its last predicted one."""
@@ -146,16 +146,6 @@ class PostponedMap(Layout):
 
     def _read(self, rows: Index, columns: Index) -> Array:
         return self.storage.get(rows, columns) if self._job is None else self._job.read(rows, columns)
-
-    def _preview(self, slot: int) -> tuple[leap.Carried, Array, Array]:
-        """Return a block at rest as it is now, its Jacobian G in `_resting_rows`, and the covariance it has besides."""
-        space, rows = self.spaces[slot], self.rows(slot)
-        assert space is not None
-        if self._job is not None:
-            self._job.know(slot)
-        G = self._read(rows, self._A0)
-        now = self._way().carried(space.atoms, self.x[self.numbers(slot)], G)
-        return now, np.hstack([G, now.a]), self._read(rows, rows)
 
     def _displacements(self) -> tuple[Array, Array]:
         """Return the parts (A0, R) and (T, R) that each robot's corrections have in the shadows and the kept turns."""
@@ -289,11 +279,11 @@ class PostponedMap(Layout):
             return
         space = self.spaces[slot]
         assert space is not None
-        now, G, Q = self._preview(slot)
+        now = resting(self, np.array([slot]))
         if len(self._A0):
-            at = self.active.augment(space, now.x, self._resting_rows(), G, Q)
+            at = self.active.augment(space, now.x, self._resting_rows(), now.G, now.Q)
         else:
-            at = self.active.add(space, now.x, Q)
+            at = self.active.add(space, now.x, now.Q)
         self.active.x_first[self.active.numbers(at)] = self.x_first[self.numbers(slot)]
         self._activate(slot, at)
         rows = self.active.rows(at)

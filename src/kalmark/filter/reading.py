@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
-from kalmark.filter.map import P_SIZE, StochasticMap
+from kalmark.filter.map import StochasticMap, laid_out
 from kalmark.geometry.spaces import Table
 
 if TYPE_CHECKING:
@@ -22,44 +22,27 @@ Index = npt.NDArray[np.int64]
 
 class Resting(NamedTuple):
     """Blocks at rest, laid out one after the other: their tables and means x there, their Jacobian G in
-    `_resting_rows`, and their rows of the storage.
+    `_resting_rows`, the covariance Q that they have besides, and where the last leap left them.
     """
 
     blocks: Table
     atoms: Table
     x: Array
     G: Array
-    rows: Index
-
-
-@compiled
-def laid_out(blocks: Table, atoms: Table) -> tuple[Table, Table, Index, Index]:
-    """Return the tables of these blocks, one after the other, and the numbers and rows they had before."""
-    own, table = np.empty_like(blocks), np.empty((blocks[:, 5].sum(), 3), np.int64)
-    numbers, rows = np.empty(blocks[:, 1].sum(), np.int64), np.empty(blocks[:, 3].sum(), np.int64)
-    x_to = p_to = atom_to = 0
-    for k in range(len(blocks)):
-        x_at, x_size, p_at, p_size, atom_at, count = blocks[k]
-        own[k, 0], own[k, 1], own[k, 2], own[k, 3], own[k, 4], own[k, 5] = x_to, x_size, p_to, p_size, atom_to, count
-        for i in range(x_size):
-            numbers[x_to + i] = x_at + i
-        for i in range(p_size):
-            rows[p_to + i] = p_at + i
-        for i in range(count):
-            kind, x, p = atoms[atom_at + i]
-            table[atom_to + i, 0], table[atom_to + i, 1], table[atom_to + i, 2] = kind, x - x_at + x_to, p - p_at + p_to
-        x_to, p_to, atom_to = x_to + x_size, p_to + p_size, atom_to + count
-    return own, table, numbers, rows
+    Q: Array
+    x_left: Array
 
 
 def resting(map_: PostponedMap, slots: Index) -> Resting:
     """Return blocks at rest as they are now, all carried along at once."""
-    for slot in slots.tolist() if map_._job is not None else ():
-        map_._job.know(slot)  # type: ignore[union-attr]
+    if map_._job is not None:
+        map_._job.know(slots)
     blocks, atoms, numbers, rows = laid_out(map_.blocks[slots], map_.atoms)
-    G = map_._read(rows, map_._A0)
-    now = map_._way().carried(atoms, map_.x[numbers], G)
-    return Resting(blocks, atoms, now.x, np.hstack([G, now.a]), rows)
+    count = len(map_._A0)
+    C = map_._read(rows, np.concatenate([map_._A0, rows]))
+    now = map_._way().carried(atoms, map_.x[numbers], C[:, :count])
+    G, Q = np.concatenate([C[:, :count], now.a], axis=1), C[:, count:].copy()
+    return Resting(blocks, atoms, now.x, G, Q, now.x_left)
 
 
 def places(map_: PostponedMap, slots: Index, d: int) -> Array:
@@ -70,50 +53,61 @@ def places(map_: PostponedMap, slots: Index, d: int) -> Array:
 
 def joint(map_: PostponedMap, slots: Sequence[int]) -> Array:
     """Return the joint covariance of blocks, in the order given."""
-    rests = {slot: slot not in map_._owners for slot in slots}
-    if not any(rests.values()):
-        return kernels.submatrix(map_.active.P, _active_rows(map_, slots))
-    order = sorted(rests, key=lambda slot: rests[slot])  # those at rest last
-    asleep = np.array([slot for slot in order if rests[slot]], dtype=np.int64)
-    P = _joint(map_, _active_rows(map_, [slot for slot in order if not rests[slot]]), resting(map_, asleep))
-    ends = np.cumsum([map_.blocks[slot, P_SIZE] for slot in order])
-    rows = {slot: np.arange(end - map_.blocks[slot, P_SIZE], end) for slot, end in zip(order, ends, strict=True)}
-    return kernels.submatrix(P, np.concatenate([rows[slot] for slot in slots]))
-
-
-def _active_rows(map_: PostponedMap, slots: Sequence[int]) -> Index:
-    rows = [map_.active.rows(map_._owners[slot]) for slot in slots]
-    return np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
-
-
-def _joint(map_: PostponedMap, own: Index, rest: Resting) -> Array:
-    """Return the joint covariance of the active rows `own` and of blocks at rest: P_BA = G P, P_BB = G P G' + Q."""
-    extra = map_._resting_rows()
-    e, n = len(extra), len(own)
-    S = kernels.submatrix(map_.active.P, np.concatenate([extra, own]))
-    B = rest.G @ S[:e]
-    C = B[:, :e] @ rest.G.T + map_._read(rest.rows, rest.rows)
-    P = np.empty((n + len(C), n + len(C)))
-    P[:n, :n], P[n:, :n], P[:n, n:], P[n:, n:] = S[e:, e:], B[:, e:], B[:, e:].T, 0.5 * (C + C.T)
-    return P
+    m, first, _, here = excerpt(map_, slots[0], -1, np.array(slots[1:], dtype=np.int64))
+    return m.covariance([first, *here.tolist()])
 
 
 def excerpt(map_: PostponedMap, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
     """Return a dense map to read these blocks from, and their slots there: the active one if all are there."""
-    at, head = map_._at[slots], [robot] if mount < 0 else [robot, mount]
-    if (not len(at) or at.min() >= 0) and all(slot in map_._owners for slot in head):
-        return map_.active, map_._owners[robot], map_._owners.get(mount, -1), at
-    copied = np.array(list(dict.fromkeys([*head, *slots.tolist()])), dtype=np.int64)
-    is_at_rest = map_.is_at_rest(copied)
-    awake, rest = copied[~is_at_rest], resting(map_, copied[is_at_rest])
-    blocks, atoms, numbers, rows = laid_out(map_.active.blocks[map_._at[awake]], map_.active.atoms)
+    own, rest, here = told_apart(map_._at, np.concatenate([[robot, mount], slots]))
+    if not len(rest):
+        return map_.active, int(map_._at[robot]), map_._owners.get(mount, -1), map_._at[slots]
+    m, asleep = map_.active, resting(map_, rest)
+    blocks, atoms, numbers, rows = laid_out(m.blocks[own], m.atoms)
     moved = np.array([len(numbers), 0, len(rows), 0, len(atoms), 0])
-    m = StochasticMap.of(
-        np.concatenate([map_.active.x[numbers], rest.x]),
-        _joint(map_, rows, rest),
-        np.concatenate([blocks, rest.blocks + moved]),
-        np.concatenate([atoms, rest.atoms + np.array([0, len(numbers), len(rows)])]),
-        map_.axes,
-    )
-    here = dict(zip([*awake.tolist(), *copied[is_at_rest].tolist()], range(len(copied)), strict=True))
-    return m, here[robot], here.get(mount, -1), np.array([here[slot] for slot in slots.tolist()], dtype=np.int64)
+    x, P = np.concatenate([m.x[numbers], asleep.x]), joined(m.P, rows, map_._resting_rows(), asleep.G, asleep.Q)
+    blocks = np.concatenate([blocks, asleep.blocks + moved])
+    atoms = np.concatenate([atoms, asleep.atoms + np.array([0, len(numbers), len(rows)])])
+    return StochasticMap.of(x, P, blocks, atoms, map_.axes), int(here[0]), int(here[1]), here[2:]
+
+
+@compiled
+def told_apart(at: Index, slots: Index) -> tuple[Index, Index, Index]:
+    """Return of blocks those that are active, as what they are in the active map, and those at rest, each once.
+
+    And the place (K,) of each where those that are active come first; a slot of -1 is none.
+    """
+    own, rest, here = np.empty(len(slots), np.int64), np.empty(len(slots), np.int64), np.full(len(slots), -1)
+    n = m = 0
+    for k in range(len(slots)):
+        if slots[k] < 0:
+            continue
+        active = at[slots[k]] >= 0
+        some, number, count = (own, at[slots[k]], n) if active else (rest, slots[k], m)
+        i = 0
+        while i < count and some[i] != number:
+            i += 1
+        if i == count:
+            some[i] = number
+            n, m = (n + 1, m) if active else (n, m + 1)
+        here[k] = i if active else -2 - i
+    for k in range(len(slots)):
+        if here[k] < -1:
+            here[k] = n - 2 - here[k]
+    return own[:n].copy(), rest[:m].copy(), here
+
+
+@compiled
+def joined(P: Array, rows: Index, extra: Index, G: Array, Q: Array) -> Array:
+    """Return the covariance of these rows of P and of blocks B at rest: P_BA = G P, P_BB = G P G' + Q.
+
+    G is in the rows `extra` of P.
+    """
+    e, n = len(extra), len(rows)
+    S = kernels.submatrix(P, np.concatenate((extra, rows)))
+    B = G @ S[:e]
+    out = np.empty((n + len(G), n + len(G)))
+    out[:n, :n], out[n:, :n], out[:n, n:] = S[e:, e:], B[:, e:], B[:, e:].T
+    C = np.ascontiguousarray(B[:, :e]) @ G.T + Q
+    out[n:, n:] = 0.5 * (C + C.T)
+    return out
