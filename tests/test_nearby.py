@@ -7,7 +7,7 @@ import pytest
 
 import kalmark as km
 from kalmark.filter.postponed import PostponedMap
-from kalmark.slam.nearby import closest, distances
+from kalmark.slam.nearby import distances, limits, within
 
 
 def field(map_: str) -> tuple[km.Slam, np.ndarray]:
@@ -30,31 +30,33 @@ def field(map_: str) -> tuple[km.Slam, np.ndarray]:
 def test_the_nearest_are_found_active_or_at_rest(map_: str) -> None:
     slam, _ = field(map_)
     p = np.array([[3.0, 4.0], [20.0, 20.0], [np.nan, 0.0], [39.0, 1.0]])
-    rows, names, places = slam.nearby.pairs(slam, frozenset({"point"}), p, 4, 3.0)
+    found = slam.nearby.pairs(slam, frozenset({"point"}), (slam.slot("r"), -1), p, 4, 3.0)
+    names, places = [slam.members.names[slot] for slot in found.slots.tolist()], found.places
     means = np.array([slam.mean(i) for i in range(400)])
     for k in range(len(p)):
         gaps = np.linalg.norm(means - p[k], axis=1)
         near = [i for i in np.argsort(gaps)[:4].tolist() if gaps[i] <= 3.0 * gaps.min()]
-        assert {names[m] for m in np.flatnonzero(rows == k)} == set(near)
+        assert {names[m] for m in np.flatnonzero(found.rows == k)} == set(near)
     np.testing.assert_allclose(places, means[names], atol=1e-12)
     gaps = np.linalg.norm(means - p[1], axis=1)
     assert slam.nearby.around(slam, "point", p[1], 30) == np.argsort(gaps)[:30].tolist()
 
 
-@pytest.mark.parametrize("nearest", [1, 3, 50])
+@pytest.mark.parametrize("nearest", [1, 3, 30, 50])
 def test_the_least_of_each_row_are_told(nearest: int) -> None:
     rng = np.random.default_rng(1)
     p, places = rng.uniform(0, 9, (5, 3)), rng.uniform(0, 9, (40, 3))
     gaps = distances(p, places)
     np.testing.assert_allclose(gaps, np.linalg.norm(p[:, None] - places, axis=2))
-    rows, columns = closest(gaps, nearest, 2.0)
+    rows, columns = within(gaps, nearest, limits(gaps, nearest, 2.0))
     for k in range(5):
         wanted = [i for i in np.argsort(gaps[k])[:nearest].tolist() if gaps[k, i] <= 2.0 * gaps[k].min()]
         assert sorted(columns[rows == k].tolist()) == sorted(wanted)
 
 
 def test_without_landmarks_none_is_near() -> None:
-    rows, columns = closest(np.zeros((3, 0)), 4, 10.0)
+    gaps = np.zeros((3, 0))
+    rows, columns = within(gaps, 4, limits(gaps, 4, 10.0))
     assert len(rows) == len(columns) == 0
 
 

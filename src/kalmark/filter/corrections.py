@@ -175,6 +175,17 @@ def invariant(
     return e, z, Z, d2, near, True
 
 
+def compared(view: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
+    """Return each observation's innovation covariance Z (K, p, p) and d2 (K,); nothing is corrected.  [S] (83)."""
+    x, P, _n, blocks, atoms, _axes = map_
+    robot, mount, slots, d, y, R, _gate = scan
+    index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    head = head_sizes(blocks, atoms, robot, mount)[1]
+    _e, z, E_h, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
+    Z, d2, _healthy = innovation(P, index, E_h, E_l, R, z)
+    return Z, d2
+
+
 def fit(view: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
     """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if it is sick."""
     x, P, _n, blocks, atoms, axes = map_
@@ -288,6 +299,7 @@ def first_estimates(
 
 
 compiled_invariant = compiled(invariant)
+compiled_compared = compiled(compared)
 compiled_fit = compiled(fit)
 compiled_averaged = compiled(averaged)
 compiled_textbook = compiled(textbook)

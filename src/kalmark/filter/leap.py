@@ -175,7 +175,7 @@ class Way(NamedTuple):
 
     def carried(self, atoms: Table, x: Array, G: Array) -> Carried:
         """Carry blocks of the mean x and the covariance G (n, A0) with the shadows along."""
-        return Carried(*_carried(atoms, x, G @ self.shadows, *self[1:]))
+        return Carried(*carried(atoms, x, G, *self))
 
 
 @compiled
@@ -190,51 +190,43 @@ def _since(before: Array, now: Array, done: Array) -> Array:
 
 
 @compiled
-def _carried(
-    atoms: Table, x: Array, D: Array, U: Array, robots: Index, turn: Array, turns: Array, origins: Array, axes: int
-) -> tuple[Array, Array, Array]:
-    """Return `Carried` of displacements D (n, C) + a U, U (T, C), column by column; all else is one leap's after the
+def carried(
+    atoms: Table, x: Array, G: Array, S: Array, U: Array, robots: Index, turn: Array, turns: Array, origins: Array,
+    axes: int,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return `Carried` of displacements G S + a U, column by column; all else of a `Way` is one leap's after the
     other's.
     """
-    a = np.zeros((len(D), len(U) + axes * (D.shape[1] - robots[:, 0].sum() - len(robots))))
+    D = G @ S
+    n = len(D)
+    a = np.zeros((n, len(U) + axes * (D.shape[1] - robots[:, 0].sum() - len(robots))))
     column = kept = turned_by = stood = 0
     x, x_left = x.copy(), x
+    turned = generator(atoms, x, n, axes, origins[0]) if axes > 0 else np.zeros((n, 0))
     for k in range(len(robots) + 1):
         leaps = k < len(robots)
         count = robots[k, 0] if leaps else D.shape[1] - column
-        for c in range(count):
-            d = _displacement(D, U, a, column + c, kept)
-            _turn(atoms, x, d, NO_TURN, a, kept + c * axes, axes, origins[stood + c])
+        width = count * axes
+        for c in range(count + leaps):
+            d = D[:, column + c].copy()
+            for i in range(n):
+                for j in range(kept):
+                    d[i] += a[i, j] * U[j, column + c]
+            robot, by = c, NO_TURN
+            if c == count:
+                robot, by = robots[k, 1], turn[k * axes : (k + 1) * axes]
+                for i in range(n):
+                    for j in range(width):
+                        d[i] += a[i, kept + j] * turns[turned_by + j]
+            own = kept + robot * axes
+            if axes == 6:
+                turned = generator(atoms, x, n, axes, origins[stood + robot])
+            a[:, own : own + axes] -= turned
+            retract(atoms, x, d, by)
+            if axes > 0:
+                turned = generator(atoms, x, n, axes, origins[stood + robot])
+                a[:, own : own + axes] += turned
         if leaps:
-            robot, width = robots[k, 1], count * axes
-            d = _displacement(D, U, a, column + count, kept)
-            for i in range(len(d)):
-                for j in range(width):
-                    d[i] += a[i, kept + j] * turns[turned_by + j]
-            by = turn[k * axes : (k + 1) * axes]
-            _turn(atoms, x, d, by, a, kept + robot * axes, axes, origins[stood + robot])
             column, kept, turned_by, stood = column + count + 1, kept + width, turned_by + width, stood + count
             x_left = x.copy()
     return x, x_left, a
-
-
-@compiled
-def _displacement(D: Array, U: Array, a: Array, column: int, kept: int) -> Array:
-    """Return D + a U (n,), of one column and of the turns kept so far."""
-    d = D[:, column].copy()
-    for i in range(len(d)):
-        for j in range(kept):
-            d[i] += a[i, j] * U[j, column]
-    return d
-
-
-@compiled
-def _turn(
-    atoms: Table, x: Array, d: Array, turn: Array, a: Array, column: int, axes: int, origin: Array
-) -> None:  # fmt: skip
-    """Move the mean x by a correction d that turns the world by `turn`, and add to `a` how the coordinates turned."""
-    if axes > 0:
-        a[:, column : column + axes] -= generator(atoms, x, len(d), axes, origin)
-    retract(atoms, x, d, turn)
-    if axes > 0:
-        a[:, column : column + axes] += generator(atoms, x, len(d), axes, origin)

@@ -149,7 +149,8 @@ class PostponedMap(Layout):
 
     def _displacements(self) -> tuple[Array, Array]:
         """Return the parts (A0, R) and (T, R) that each robot's corrections have in the shadows and the kept turns."""
-        D = np.column_stack([*self._moved.values()]) if self._moved else self.active.x[self._s_x][:, None]
+        moved = list(self._moved.values()) or [self.active.x[self._s_x]]
+        D = moved[0][:, None] if len(moved) == 1 else np.column_stack(moved)
         return D[: len(self._A0)], D[len(self._A0) :]
 
     def _way(self) -> leap.Way:
@@ -158,7 +159,8 @@ class PostponedMap(Layout):
 
     def _stand(self) -> Array:
         """Return where the robots stand (R, 3)."""
-        return np.array([self.active.mean(self._owners[robot])[:3] for robot in self._moved] or np.zeros((1, 3)))
+        m, robots = self.active, [self._owners[robot] for robot in self._moved]
+        return np.concatenate([m.x[m.numbers(at)][:3] for at in robots] or [np.zeros(3)]).reshape(-1, 3)
 
     # ------------------------------------------------------------------ growing and shrinking
     def add(self, space: Space, mean: Any, cov: Any = None) -> int:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
+from kalmark.filter.leap import carried
 from kalmark.filter.map import StochasticMap, laid_out
 from kalmark.geometry.spaces import Table
 
@@ -38,11 +39,20 @@ def resting(map_: PostponedMap, slots: Index) -> Resting:
     if map_._job is not None:
         map_._job.know(slots)
     blocks, atoms, numbers, rows = laid_out(map_.blocks[slots], map_.atoms)
-    count = len(map_._A0)
     C = map_._read(rows, np.concatenate([map_._A0, rows]))
-    now = map_._way().carried(atoms, map_.x[numbers], C[:, :count])
-    G, Q = np.concatenate([C[:, :count], now.a], axis=1), C[:, count:].copy()
-    return Resting(blocks, atoms, now.x, G, Q, now.x_left)
+    return Resting(blocks, atoms, *carried_along(atoms, map_.x[numbers], C, *map_._way()))
+
+
+@compiled
+def carried_along(
+    atoms: Table, x: Array, C: Array, S: Array, U: Array, robots: Index, turn: Array, turns: Array, origins: Array,
+    axes: int,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Return x, G, Q and x_left of `Resting`, C being the covariance with the shadows and, behind that, their own."""
+    count = C.shape[1] - len(C)
+    G = C[:, :count].copy()
+    x, x_left, a = carried(atoms, x, G, S, U, robots, turn, turns, origins, axes)
+    return x, np.concatenate((G, a), axis=1), C[:, count:].copy(), x_left
 
 
 def places(map_: PostponedMap, slots: Index, d: int) -> Array:
@@ -62,12 +72,10 @@ def excerpt(map_: PostponedMap, robot: int, mount: int, slots: Index) -> tuple[S
     own, rest, here = told_apart(map_._at, np.concatenate([[robot, mount], slots]))
     if not len(rest):
         return map_.active, int(map_._at[robot]), map_._owners.get(mount, -1), map_._at[slots]
-    m, asleep = map_.active, resting(map_, rest)
-    blocks, atoms, numbers, rows = laid_out(m.blocks[own], m.atoms)
-    moved = np.array([len(numbers), 0, len(rows), 0, len(atoms), 0])
-    x, P = np.concatenate([m.x[numbers], asleep.x]), joined(m.P, rows, map_._resting_rows(), asleep.G, asleep.Q)
-    blocks = np.concatenate([blocks, asleep.blocks + moved])
-    atoms = np.concatenate([atoms, asleep.atoms + np.array([0, len(numbers), len(rows)])])
+    m, now = map_.active, resting(map_, rest)
+    x, P, blocks, atoms = joined(
+        m.x, m.P, m.blocks[own], m.atoms, map_._resting_rows(), now.x, now.blocks, now.atoms, now.G, now.Q
+    )
     return StochasticMap.of(x, P, blocks, atoms, map_.axes), int(here[0]), int(here[1]), here[2:]
 
 
@@ -98,16 +106,27 @@ def told_apart(at: Index, slots: Index) -> tuple[Index, Index, Index]:
 
 
 @compiled
-def joined(P: Array, rows: Index, extra: Index, G: Array, Q: Array) -> Array:
-    """Return the covariance of these rows of P and of blocks B at rest: P_BA = G P, P_BB = G P G' + Q.
+def joined(
+    x: Array, P: Array, blocks: Table, atoms: Table, extra: Index,
+    x_B: Array, blocks_B: Table, atoms_B: Table, G: Array, Q: Array,
+) -> tuple[Array, Array, Table, Table]:  # fmt: skip
+    """Return mean, covariance and tables of active blocks followed by blocks B at rest, whose G is in the rows `extra`.
 
-    G is in the rows `extra` of P.
+    P_BA = G P, P_BB = G P G' + Q.
     """
+    own, table, numbers, rows = laid_out(blocks, atoms)
     e, n = len(extra), len(rows)
     S = kernels.submatrix(P, np.concatenate((extra, rows)))
     B = G @ S[:e]
-    out = np.empty((n + len(G), n + len(G)))
-    out[:n, :n], out[n:, :n], out[:n, n:] = S[e:, e:], B[:, e:], B[:, e:].T
+    joint = np.empty((n + len(G), n + len(G)))
+    joint[:n, :n], joint[n:, :n], joint[:n, n:] = S[e:, e:], B[:, e:], B[:, e:].T
     C = np.ascontiguousarray(B[:, :e]) @ G.T + Q
-    out[n:, n:] = 0.5 * (C + C.T)
-    return out
+    joint[n:, n:] = 0.5 * (C + C.T)
+    count = len(own)
+    own, table = np.concatenate((own, blocks_B)), np.concatenate((table, atoms_B))
+    own[count:, 0] += len(numbers)
+    own[count:, 2] += n
+    own[count:, 4] += len(table) - len(atoms_B)
+    table[len(table) - len(atoms_B) :, 1] += len(numbers)
+    table[len(table) - len(atoms_B) :, 2] += n
+    return np.concatenate((x[numbers], x_B)), joint, own, table

@@ -65,7 +65,7 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
     """
     p, q = exponential_v(turn[0]) if len(turn) == 1 else (1.0, 0.0)
     whole = turn[len(turn) - 3 :] if len(turn) >= 3 else np.zeros(3)
-    V = left_jacobian(whole)
+    V = left_jacobian(whole) if len(turn) >= 3 else np.eye(3)
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
         if kind == VECTOR:

@@ -68,7 +68,8 @@ def _around(slam: Slam, view: View, robot: int) -> list[tuple[Look, list[Id]]]:
     d = 2 if len(view.at) == 3 else 3
     if view.tells_places:
         at = view.pose(slam.map, robot)[None, :d]
-        names = slam.nearby.pairs(slam, kinds, at, AROUND, math.inf)[1]
+        found = slam.nearby.pairs(slam, kinds, (robot, view.mount), at, AROUND, math.inf).slots
+        names = [members.names[slot] for slot in found.tolist()]
     else:
         names = [name for name in members.in_reach(view) if members.kinds[name].kind in kinds]
     return [(look, [names[i] for i in rows]) for look, rows in members.by_look(view, names)]

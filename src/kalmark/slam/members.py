@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from kalmark.slam.scene import EUCLIDEAN, ROBOT, Look, View
 from kalmark.slam.tentative import Tentative
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
 
 FADES = 0.9  # of what was learnt, from one scan to the next
 
@@ -43,6 +44,8 @@ class Members:
         self.slots: dict[Id, int] = {}
         self.names: dict[int, Id] = {}
         self.kinds: dict[Id, Landmark] = {}
+        self._sort_at: Index = np.full(64, -1)  # by slot: of the landmark there, a number in `_sorts`, -1 for none
+        self._sorts: dict[str, int] = {}
         self.sorts: dict[Id, str] = {}
         self.seen: dict[Id, int] = {}
         self.searched: dict[Id, list[int]] = {}
@@ -67,15 +70,36 @@ class Members:
             raise MapError(f"{name!r} is not in the map, expected {robots} or one of its {count} landmarks")
         return slot
 
-    def slots_of(self, names: Sequence[Any]) -> npt.NDArray[np.int64]:
+    def slots_of(self, names: Sequence[Any]) -> Index:
         """Return the slots (K,) of blocks that are in the map."""
         return np.fromiter(map(self.slots.__getitem__, names), np.int64, len(names))
 
     def place(self, name: Id, slot: int, kind: Landmark) -> None:
         """Enter a landmark, or give one another slot and kind."""
-        self.names.pop(self.slots.get(name, -1), None)
-        self.slots[name], self.kinds[name], self.names[slot] = slot, kind, name
-        self.sorts[name] = kind.kind
+        self._leave(name)
+        self.slots[name], self.kinds[name] = slot, kind
+        self._take(name, slot)
+
+    def _take(self, name: Id, slot: int) -> None:
+        kind = self.kinds[name].kind
+        self.names[slot], self.sorts[name] = name, kind
+        self._reach(slot)
+        self._sort_at[slot] = self._sorts.setdefault(kind, len(self._sorts))
+
+    def _leave(self, name: Id) -> None:
+        slot = self.slots.get(name)
+        if slot is not None and self.names.pop(slot, None) is not None:
+            self._sort_at[slot] = -1
+
+    def _reach(self, slot: int) -> None:
+        while slot >= len(self._sort_at):
+            self._sort_at = np.concatenate([self._sort_at, np.full(len(self._sort_at), -1)])
+
+    def are_of(self, kinds: Collection[str], slots: Index) -> npt.NDArray[np.bool_]:
+        """Return which slots (K,) are those of landmarks of some kinds."""
+        self._reach(slots.max(initial=-1))
+        wanted = np.array([kind in kinds for kind in self._sorts] + [False])  # the last one for no landmark
+        return wanted[self._sort_at[slots]]
 
     def start(self, name: Id, slot: int, kind: Landmark) -> None:
         """Enter a landmark that a sensor has just seen for the first time."""
@@ -91,8 +115,11 @@ class Members:
     def enter(self, slots: dict[Id, int], kinds: dict[Id, Landmark]) -> None:
         """Enter all blocks and all landmarks of a map at once."""
         self.slots, self.kinds = slots, kinds
-        self.names = {slots[name]: name for name in kinds if name in slots}
-        self.sorts = {name: kind.kind for name, kind in kinds.items()} | dict.fromkeys(self.robots, ROBOT)
+        self.names, self.sorts = {}, {}
+        for name in kinds:
+            if name in slots:
+                self._take(name, slots[name])
+        self.sorts |= dict.fromkeys(self.robots, ROBOT)
 
     def count(self, names: Iterable[Any]) -> None:
         """Count an observation that was used of each of some landmarks or robots."""
@@ -107,7 +134,7 @@ class Members:
 
     def forget(self, name: Id) -> None:
         """Strike out a landmark."""
-        self.names.pop(self.slots[name], None)
+        self._leave(name)
         for other in self.together.get(name, ()):
             if other != name:
                 self.together[other].discard(name)

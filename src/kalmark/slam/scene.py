@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -11,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import ModelError
-from kalmark.filter import kernels
+from kalmark.filter import corrections, kernels
 from kalmark.filter.estimators import Map
-from kalmark.filter.observed import add_blocks, innovation, observed_block
+from kalmark.filter.map import StochasticMap
+from kalmark.filter.observed import add_blocks, observed_block
 from kalmark.models import landmarks as kinds
 from kalmark.models.landmarks import InverseDepth2D
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
@@ -25,7 +27,7 @@ from kalmark.slam.delayed import Delayed
 from kalmark.slam.events import Id, Scan
 from kalmark.slam.initialization import initialization_of
 from kalmark.slam.natural import natural
-from kalmark.slam.nearby import has_place
+from kalmark.slam.nearby import Pairs, has_place
 from kalmark.slam.report import Compared, Report
 from kalmark.slam.robot import Mount
 from kalmark.slam.together import Landmarks
@@ -68,6 +70,14 @@ class Look:
     def d(self) -> int:
         """How many of the landmark's numbers are seen."""
         return self.landmark.space.size
+
+    def predict(
+        self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
+        run = corrections.compiled_compared if isinstance(self.view, tuple) else corrections.compared
+        scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), math.inf
+        return run(self.view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the view, whose addresses mean nothing to another process."""
@@ -201,16 +211,11 @@ class View:
 
     def predict(self, map_: Map, robot: int, look: Look, slots: Index, y: Array, R: Array) -> tuple[Array, Array]:
         """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
-        if len(slots) > AT_ONCE:  # an excerpt is dense
+        if len(slots) > AT_ONCE and len(set(slots.tolist())) > AT_ONCE:  # an excerpt is dense
             cuts = [slice(i, i + AT_ONCE) for i in range(0, len(slots), AT_ONCE)]
             parts = [self.predict(map_, robot, look, slots[cut], y[cut], R[cut]) for cut in cuts]
             return np.concatenate([Z for Z, _ in parts]), np.concatenate([d2 for _, d2 in parts])
-        m, robot, mount, slots = map_.excerpt(robot, self.mount, slots)
-        index, _, mean = observed_block(m.x, m.blocks, m.atoms, robot, mount, slots, look.d)
-        head = len(mean) - look.d * len(slots)
-        _, z, E_h, E_l = linearize(look.view, mean[:head], mean[head:].reshape(len(slots), look.d), y)
-        Z, d2, _ = innovation(m.P, index, E_h, E_l, R, z)
-        return Z, d2
+        return look.predict(*map_.excerpt(robot, self.mount, slots), y, R)
 
     def information(
         self, map_: Map, robot: int, look: Look, slots: Index, event: Scan, rows: list[int], R: Array
@@ -265,7 +270,8 @@ class Scene:
     def __init__(self, slam: Slam, view: View, event: Scan, ids: tuple[Id | None, ...], R: Array) -> None:
         self.ids, self.y, self.robot = ids, event.y, event.robot
         self._slam, self._view, self._event, self._R = slam, view, event, R
-        self._pairs: tuple[Index, list[Id], Array] | None = None
+        self._pairs: Pairs | None = None  # that were near each other when candidates were asked for,
+        self._names: list[Id] = []  # and the landmarks of these
         self.seen_at: Array | None = None  # where the observations seem to come from, once that was asked for
         self.compared: Compared | None = None  # by the last question for `distances`
 
@@ -293,31 +299,56 @@ class Scene:
         That is the `nearest` ones to each place, but none so many times `farther` than the nearest.  A sensor that does
         not tell where its measurements come from could have seen any.
         """
-        places = self._view.places(self._slam.map, self._slam.members.slots[self._event.robot], self._event.y)
+        view, members = self._view, self._slam.members
+        robot = members.slots[self._event.robot]
+        places = view.places(self._slam.map, robot, self._event.y)
         if places is None:
-            return self._slam.members.in_reach(self._view)
-        self.seen_at = places
-        self._pairs = self._slam.nearby.pairs(self._slam, frozenset(self._view.looks), places, nearest, farther)
-        return list(dict.fromkeys(self._pairs[1]))
+            return members.in_reach(view)
+        found = self._slam.nearby.pairs(
+            self._slam, frozenset(view.looks), (robot, view.mount), places, nearest, farther
+        )  # fmt: skip
+        self.seen_at, self._pairs = places, found
+        self._names = [members.names[slot] for slot in found.slots.tolist()]
+        return list(dict.fromkeys(self._names))
 
     def distances(self, candidates: list[Id]) -> Array:
         """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83).
 
         inf where a candidate is not near an observation.
         """
-        map_, members, view, event = self._slam.map, self._slam.members, self._view, self._event
-        robot = members.slots[event.robot]
-        d2 = np.full((len(event.y), len(candidates)), np.inf)
-        rows, columns, places = self._near(candidates)
-        names = [candidates[c] for c in columns.tolist()]
-        slots = members.slots_of(names)
-        for look, which in members.by_look(view, names):
-            k, c, l = (rows, columns, slots) if len(which) == len(rows) else (rows[which], columns[which], slots[which])
-            R = view.noise(map_, robot, look, l, self._R[k], event)
-            d2[k, c] = view.predict(map_, robot, look, l, event.y[k], R)[1]
-        if places is not None:
-            self.compared = Compared(rows, names, d2[rows, columns], places)
+        d2 = np.full((len(self.y), len(candidates)), np.inf)
+        if self._pairs is None:
+            k, l = (a.ravel() for a in np.indices(d2.shape))
+            slots = self._slam.members.slots_of(candidates)[l]
+            pairs = Pairs(k, slots, np.zeros((len(k), 0)), np.full(len(k), -1), None)
+            d2[k, l] = self._squared(pairs, [candidates[i] for i in l.tolist()])
+            return d2
+        found, names = self._pairs, self._names
+        number = {name: i for i, name in enumerate(candidates)}
+        columns = np.array([number.get(name, -1) for name in names], dtype=np.int64)
+        if (columns < 0).any():
+            asked = np.flatnonzero(columns >= 0)
+            found, names, columns = found.some(asked), [names[i] for i in asked.tolist()], columns[asked]
+        d2[found.rows, columns] = squared = self._squared(found, names)
+        self.compared = Compared(found.rows, names, squared, found.places)
         return d2
+
+    def _squared(self, pairs: Pairs, names: list[Id]) -> Array:
+        """Return the squared distances (M,) of pairs of an observation and a landmark."""
+        view, event, out = self._view, self._event, np.empty(len(names))
+        map_, robot = self._slam.map, self._slam.members.slots[event.robot]
+        for look, which in self._slam.members.by_look(view, names):
+            some = pairs if len(which) == len(names) else pairs.some(which)
+            y, R = event.y[some.rows], view.noise(map_, robot, look, some.slots, self._R[some.rows], event)
+            resting = some.at >= 0
+            if some.excerpt is None or not resting.any():
+                out[which] = view.predict(map_, robot, look, some.slots, y, R)[1]
+                continue
+            d2, active = np.empty(len(which)), ~resting
+            d2[active] = view.predict(map_, robot, look, some.slots[active], y[active], R[active])[1]
+            d2[resting] = look.predict(*some.excerpt, some.at[resting], y[resting], R[resting])[1]
+            out[which] = d2
+        return out
 
     def report(self) -> Report:
         """Return a report of what was compared, before anything is fused."""
@@ -360,14 +391,3 @@ class Scene:
         if not self._view.tells_places or len(sorts) > 1:
             return None
         return Landmarks(self._slam, self._view, self._event, names, self._R)
-
-    def _near(self, candidates: list[Id]) -> tuple[Index, Index, Array | None]:
-        """Return the observations and the numbers of candidates that are near each other, and where these are."""
-        if self._pairs is None:
-            rows, columns = np.indices((len(self._event.y), len(candidates)))
-            return rows.ravel(), columns.ravel(), None
-        number = {name: i for i, name in enumerate(candidates)}
-        rows, names, places = self._pairs
-        columns = np.array([number.get(name, -1) for name in names], dtype=np.int64)
-        asked = columns >= 0
-        return rows[asked], columns[asked], places[asked]
