@@ -7,7 +7,7 @@ import pytest
 
 import kalmark as km
 from kalmark.filter.postponed import PostponedMap
-from kalmark.slam.nearby import distances, limits, within
+from kalmark.slam.nearby import distances, paired
 
 
 def field(map_: str) -> tuple[km.Slam, np.ndarray]:
@@ -31,13 +31,19 @@ def test_the_nearest_are_found_active_or_at_rest(map_: str) -> None:
     slam, _ = field(map_)
     p = np.array([[3.0, 4.0], [20.0, 20.0], [np.nan, 0.0], [39.0, 1.0]])
     found = slam.nearby.pairs(slam, frozenset({"point"}), (slam.slot("r"), -1), p, 4, 3.0)
-    names, places = [slam.members.names[slot] for slot in found.slots.tolist()], found.places
+    names = [slam.members.names[slot] for slot in found.slots[found.numbers].tolist()]
     means = np.array([slam.mean(i) for i in range(400)])
     for k in range(len(p)):
         gaps = np.linalg.norm(means - p[k], axis=1)
         near = [i for i in np.argsort(gaps)[:4].tolist() if gaps[i] <= 3.0 * gaps.min()]
         assert {names[m] for m in np.flatnonzero(found.rows == k)} == set(near)
-    np.testing.assert_allclose(places, means[names], atol=1e-12)
+    np.testing.assert_allclose(found.places[found.numbers], means[names], atol=1e-12)
+    m, robot, mount, here = found.excerpt or (None, 0, 0, np.zeros(0))
+    assert m is not None and mount == -1
+    np.testing.assert_allclose(m.means(here, 2), found.places, atol=1e-12)
+    for slot, at in zip(found.slots.tolist(), here.tolist(), strict=True):
+        wanted = slam.map.covariance([slam.slot("r"), slot])
+        np.testing.assert_allclose(m.covariance([robot, at]), wanted, atol=1e-12)
     gaps = np.linalg.norm(means - p[1], axis=1)
     assert slam.nearby.around(slam, "point", p[1], 30) == np.argsort(gaps)[:30].tolist()
 
@@ -46,18 +52,17 @@ def test_the_nearest_are_found_active_or_at_rest(map_: str) -> None:
 def test_the_least_of_each_row_are_told(nearest: int) -> None:
     rng = np.random.default_rng(1)
     p, places = rng.uniform(0, 9, (5, 3)), rng.uniform(0, 9, (40, 3))
-    gaps = distances(p, places)
-    np.testing.assert_allclose(gaps, np.linalg.norm(p[:, None] - places, axis=2))
-    rows, columns = within(gaps, nearest, limits(gaps, nearest, 2.0))
+    gaps = np.linalg.norm(p[:, None] - places, axis=2)
+    np.testing.assert_allclose(distances(p, places), gaps)
+    rows, numbers, used = paired(p, places, nearest, 2.0)
+    columns = used[numbers]
     for k in range(5):
         wanted = [i for i in np.argsort(gaps[k])[:nearest].tolist() if gaps[k, i] <= 2.0 * gaps[k].min()]
         assert sorted(columns[rows == k].tolist()) == sorted(wanted)
 
 
 def test_without_landmarks_none_is_near() -> None:
-    gaps = np.zeros((3, 0))
-    rows, columns = within(gaps, 4, limits(gaps, 4, 10.0))
-    assert len(rows) == len(columns) == 0
+    assert not any(len(found) for found in paired(np.zeros((3, 2)), np.zeros((0, 2)), 4, 10.0))
 
 
 @pytest.mark.parametrize("slots", [[5, 0], [0, 399, 5, 200], [300, 301], [7, 7, 250]])
@@ -65,3 +70,15 @@ def test_covariances_of_blocks_active_and_at_rest_are_the_dense_ones(slots: list
     (dense, _), (postponed, _) = field("dense"), field("postponed")
     pairs = [(slam.map.covariance([slam.slot(i) for i in slots])) for slam in (dense, postponed)]
     np.testing.assert_allclose(pairs[1], pairs[0], rtol=1e-9, atol=1e-12)
+
+
+def test_slots_are_told_by_the_kind_of_their_landmark() -> None:
+    slam = km.Slam([km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.RangeBearing())})])
+    for i in range(200):
+        slam.add_landmark(i, (float(i), 0.0), 0.01 * np.eye(2))
+        slots = np.array([slam.slot("r"), -1, slam.slot(i), slam.slot(i) + 1, slam.slot(0)])
+        sort_at, wanted = slam.members.sorts_of(frozenset({"point"}), len(slam.map.blocks) + 1)
+        assert wanted[sort_at[slots]].tolist() == [False, False, True, False, True]
+    slam.remove(7)
+    sort_at, wanted = slam.members.sorts_of(frozenset({"point"}), 0)
+    assert not wanted[sort_at[8]]

@@ -156,10 +156,9 @@ class StochasticMap(Layout):
         """Return the first d numbers (K, d) of blocks."""
         return self.x[self.blocks[slots, X_AT][:, None] + np.arange(d)]
 
-    def awake(self, d: int) -> tuple[Index, Array]:
-        """Return the slots (N,) of the blocks whose means are kept up to date, and their first d numbers (N, d)."""
-        slots = np.flatnonzero(self.blocks[:, X_SIZE] >= d)
-        return slots, self.means(slots, d)
+    def awake(self) -> tuple[Array, Table, Index]:
+        """Return the means that are kept up to date, the blocks they belong to and the slots of these, -1 for none."""
+        return self.x, self.blocks, np.arange(len(self.blocks))
 
     def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
         """Return a dense map to read these blocks from, and their slots there."""

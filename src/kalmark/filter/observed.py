@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Index, submatrix
+from kalmark.filter import kernels
+from kalmark.filter.kernels import Index
 from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table
 
 Array = npt.NDArray[np.float64]
@@ -64,12 +65,30 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
     """
     k, p, d = E_l.shape
     head = E_r.shape[2]
-    Z = np.empty((k, p, p))
-    rows = np.empty(head + d, np.int64)
-    rows[:head] = index[:head]
+    n = head + d
+    Z, H, HP = np.empty((k, p, p)), np.empty((p, n)), np.empty((p, n))
+    S = np.empty((n, n))
+    kernels.copy_submatrix(P, index[:head], S)
     for i in range(k):
-        rows[head:] = index[head + i * d : head + (i + 1) * d]
-        Z[i] = linearized(z[i : i + 1], E_r[i : i + 1], E_l[i : i + 1], submatrix(P, rows), R[i : i + 1])[3]
+        H[:, :head], H[:, head:] = E_r[i], E_l[i]
+        own = index[head + i * d]
+        for a in range(head, n):
+            row = own + a - head
+            for b in range(a + 1):
+                column = index[b] if b < head else own + b - head
+                S[a, b] = S[b, a] = P[max(row, column), min(row, column)]
+        for a in range(p):
+            for c in range(n):
+                s = 0.0
+                for j in range(n):
+                    s += H[a, j] * S[j, c]
+                HP[a, c] = s
+        for a in range(p):
+            for b in range(p):
+                s = 0.0
+                for c in range(n):
+                    s += H[a, c] * HP[b, c]
+                Z[i, a, b] = s + R[i, a, b]
     d2, healthy = squared_distances(Z, z)
     return Z, d2, healthy
 

@@ -22,11 +22,11 @@ import numpy.typing as npt
 from kalmark.filter import kernels, leap
 from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Phase, Room
-from kalmark.filter.map import P_AT, X_SIZE, Layout, StochasticMap
+from kalmark.filter.map import P_AT, Layout, StochasticMap
 from kalmark.filter.pace import SLICE, USING, Pace
-from kalmark.filter.reading import excerpt, joint, places, resting
+from kalmark.filter.reading import Resting, excerpt, joint, places, resting
 from kalmark.filter.storage import PANEL, Triangle
-from kalmark.geometry.spaces import RHO, Rn, Space
+from kalmark.geometry.spaces import RHO, Rn, Space, Table
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -49,6 +49,7 @@ class PostponedMap(Layout):
         self.most = most
         self.phase = 0  # number of flushes
         self._at: Index = np.full(64, -1)  # slot in the active map, -1 at rest
+        self._slot_of: Index = np.full(64, -1)  # by slots in the active map, -1 for shadows
         self._job: Flush | None = None
         self._room = Room(self.storage.fresh)
         self._anchored: set[int] = set()  # blocks with inverse distances
@@ -59,7 +60,7 @@ class PostponedMap(Layout):
         """Begin a phase: nothing is active."""
         self.phase += 1
         self.active.reset()
-        self._at[:] = -1
+        self._at[:] = self._slot_of[:] = -1
         self._owners: dict[int, int] = {}  # slots in the active map by slot
         self._A0: Index = NO_ROWS  # rows of the storage that have shadows,
         self._s: Index = NO_ROWS  # their shadows' rows in the active map,
@@ -114,18 +115,19 @@ class PostponedMap(Layout):
             out[rest] = places(self, slots[rest], d)
         return out
 
-    def awake(self, d: int) -> tuple[Index, Array]:
-        """Return the slots (N,) of the active blocks, and their first d numbers (N, d)."""
-        slots = np.array([s for s in self._owners if self.blocks[s, X_SIZE] >= d], dtype=np.int64)
-        return slots, self.active.means(self._at[slots], d)
+    def awake(self) -> tuple[Array, Table, Index]:
+        """Return the means of the active blocks, these, and their slots, -1 for shadows."""
+        return self.active.x, self.active.blocks, self._slot_of[: len(self.active.blocks)]
 
     def is_at_rest(self, slots: Index) -> npt.NDArray[np.bool_]:
         """Tell which blocks (K,) are not active."""
         return self._at[slots] < 0
 
-    def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
+    def excerpt(
+        self, robot: int, mount: int, slots: Index, read: Resting | None = None
+    ) -> tuple[StochasticMap, int, int, Index]:
         """Return a dense map to read these blocks from, and their slots there; blocks at rest stay there."""
-        return excerpt(self, robot, mount, slots)
+        return excerpt(self, robot, mount, slots, read)
 
     def _resting_rows(self) -> Index:
         """Return the rows of the active map that blocks at rest depend on: the shadows and all turns."""
@@ -186,8 +188,9 @@ class PostponedMap(Layout):
     def remove(self, slot: int) -> None:
         """Marginalise a block out; its slot is free for another of its shape, once no shadow of it is left."""
         if slot in self._owners:
-            self.active.remove(self._owners.pop(slot))
-            self._at[slot] = -1
+            at = self._owners.pop(slot)
+            self.active.remove(at)
+            self._at[slot] = self._slot_of[at] = -1
             self._drift.forget(slot)
             self._points.look_again()
         space = self.spaces[slot]
@@ -209,6 +212,8 @@ class PostponedMap(Layout):
 
     def _activate(self, slot: int, at: int) -> None:
         self._owners[slot] = self._at[slot] = at
+        self._slot_of = _reaching(self._slot_of, at)
+        self._slot_of[at] = slot
         self.active.axes = self.axes
         self._points.look_again()
 
@@ -220,8 +225,7 @@ class PostponedMap(Layout):
 
     def _reserve(self, size: int) -> None:
         super()._reserve(size)
-        if len(self.blocks) >= len(self._at):
-            self._at = np.concatenate([self._at, np.full(len(self._at), -1)])
+        self._at = _reaching(self._at, len(self.blocks))
 
     # ------------------------------------------------------------------ moving
     def predict(self, index: Index, F: Array, Q: Array) -> None:
@@ -388,3 +392,8 @@ class PostponedMap(Layout):
         for slot, space in self._gone:
             self._free.setdefault(space.kinds, []).append(slot)
         self._begin()
+
+
+def _reaching(slots: Index, slot: int) -> Index:
+    """Return slots by slots that reach to a slot: twice as many, -1, if need be."""
+    return slots if slot < len(slots) else np.concatenate([slots, np.full(max(slot, len(slots)), -1)])

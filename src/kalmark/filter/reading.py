@@ -21,17 +21,26 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+NONE = np.zeros(0, dtype=np.int64)
+AT_ONCE = 32  # blocks at rest to be read jointly, where that is not asked for
+
+
 class Resting(NamedTuple):
     """Blocks at rest, laid out one after the other: their tables and means x there, their Jacobian G in
     `_resting_rows`, the covariance Q that they have besides, and where the last leap left them.
     """
 
+    slots: Index
     blocks: Table
     atoms: Table
     x: Array
     G: Array
     Q: Array
     x_left: Array
+
+    def places(self, d: int) -> Array:
+        """Return the first d numbers (K, d) of each."""
+        return self.x[self.blocks[:, :1] + np.arange(d)]
 
 
 def resting(map_: PostponedMap, slots: Index) -> Resting:
@@ -40,7 +49,7 @@ def resting(map_: PostponedMap, slots: Index) -> Resting:
         map_._job.know(slots)
     blocks, atoms, numbers, rows = laid_out(map_.blocks[slots], map_.atoms)
     C = map_._read(rows, np.concatenate([map_._A0, rows]))
-    return Resting(blocks, atoms, *carried_along(atoms, map_.x[numbers], C, *map_._way()))
+    return Resting(slots, blocks, atoms, *carried_along(atoms, map_.x[numbers], C, *map_._way()))
 
 
 @compiled
@@ -57,8 +66,8 @@ def carried_along(
 
 def places(map_: PostponedMap, slots: Index, d: int) -> Array:
     """Return the first d numbers (K, d) of blocks at rest."""
-    now = resting(map_, slots)
-    return now.x[now.blocks[:, :1] + np.arange(d)]
+    parts = [slots[i : i + AT_ONCE] for i in range(0, len(slots), AT_ONCE)]
+    return np.concatenate([resting(map_, part).places(d) for part in parts])
 
 
 def joint(map_: PostponedMap, slots: Sequence[int]) -> Array:
@@ -67,16 +76,22 @@ def joint(map_: PostponedMap, slots: Sequence[int]) -> Array:
     return m.covariance([first, *here.tolist()])
 
 
-def excerpt(map_: PostponedMap, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
-    """Return a dense map to read these blocks from, and their slots there: the active one if all are there."""
-    own, rest, here = told_apart(map_._at, np.concatenate([[robot, mount], slots]))
+def excerpt(
+    map_: PostponedMap, robot: int, mount: int, slots: Index, read: Resting | None = None
+) -> tuple[StochasticMap, int, int, Index]:
+    """Return a dense map to read these blocks from, and their slots there: the active one if all are there.
+
+    `read` are those at rest among them if they have been read since anything changed, and others.
+    """
+    first = NONE if read is None else read.slots
+    own, rest, here = told_apart(map_._at, np.concatenate([[robot, mount], first, slots]))
     if not len(rest):
         return map_.active, int(map_._at[robot]), map_._owners.get(mount, -1), map_._at[slots]
-    m, now = map_.active, resting(map_, rest)
+    m, now = map_.active, read if read is not None and len(first) == len(rest) else resting(map_, rest)
     x, P, blocks, atoms = joined(
         m.x, m.P, m.blocks[own], m.atoms, map_._resting_rows(), now.x, now.blocks, now.atoms, now.G, now.Q
     )
-    return StochasticMap.of(x, P, blocks, atoms, map_.axes), int(here[0]), int(here[1]), here[2:]
+    return StochasticMap.of(x, P, blocks, atoms, map_.axes), int(here[0]), int(here[1]), here[2 + len(first) :]
 
 
 @compiled

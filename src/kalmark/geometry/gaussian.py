@@ -6,6 +6,7 @@ for the rest.  How landmarks are started from them is in `kalmark.slam.delayed`.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,7 @@ def bhattacharyya(a: Any, A: Any, b: Any, B: Any) -> float:
     return float(apart + (both - (np.linalg.slogdet(A)[1] + np.linalg.slogdet(B)[1]) / 2) / 2)
 
 
+@lru_cache(maxsize=256)
 def gate(probability: float, dof: int) -> float:
     """Return the squared Mahalanobis distance within which a Gaussian of `dof` dimensions lies so often."""
     from scipy.special import gammaincinv

@@ -173,7 +173,9 @@ class _Ranging(Planar):
 
     def points(self, y: Array) -> tuple[Array, Array]:
         """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
-        p, P_y = inv_scan_many(np.column_stack([self.distances(y), y[:, 1]]))
+        seen = y[:, :2].copy()
+        seen[:, 0] = self.distances(y)
+        p, P_y = inv_scan_many(seen)
         P_y[:, :, 0] /= self.scale
         return p, P_y
 

@@ -119,6 +119,11 @@ class _Gated:
             query.learn(0.0, float(len(open_)))
             return answers
         pairs, reasons, mixed, known = self.match(query, open_, names, d2, gate)
+        if known is None and pairs.min() >= 0:
+            for row, (k, pair) in enumerate(zip(open_.tolist(), pairs.tolist(), strict=True)):
+                answers[k] = names[pair], reasons.get(row, "")
+            query.learn(float(len(open_)), 0.0)
+            return answers
         mixture = None if mixed is None else Mixture(open_, names, mixed)
         nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
         for row, (k, pair, d) in enumerate(zip(open_.tolist(), pairs.tolist(), least.tolist(), strict=True)):
@@ -150,8 +155,8 @@ class _Gated:
     def _near(self, query: Query, open_: Index, nearest: int) -> tuple[list[Id], Array]:
         named = set(query.ids)
         names = [c for c in query.candidates(nearest, self.farther) if c not in named]
-        d2 = query.distances(names)[open_] if names else np.zeros((len(open_), 0))
-        return names, np.where(np.isnan(d2), np.inf, d2)
+        d2 = query.distances(names) if names else np.zeros((len(query.ids), 0))
+        return names, np.fmin(d2 if len(open_) == len(d2) else d2[open_], np.inf)  # NaN is as far as can be
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Return the number of the name paired with each row of d2 (K, L), -1 for none or its like, and why."""
@@ -164,9 +169,11 @@ class NearestNeighbour(_Gated):
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair greedily; an observation whose nearest landmark is taken gets none."""
-        pairs, reasons, taken = np.full(len(d2), -1), {}, set()
         nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
         fits = (least <= gate).tolist()
+        if all(fits) and len(set(nearest)) == len(nearest):
+            return Matched(np.array(nearest), {})
+        pairs, reasons, taken = np.full(len(d2), -1), {}, set()
         for row in np.argsort(least, kind="stable").tolist():
             column = nearest[row]
             if column in taken:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from kalmark.slam.tentative import Tentative
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 FADES = 0.9  # of what was learnt, from one scan to the next
 
@@ -32,10 +33,11 @@ class Members:
 
     `sorts` has the words by which a `View` finds its `looks`: a landmark's kind, or ROBOT.
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
-    found, `together` is what was seen in one scan with it; `lately` are those seen last, and `alone` says how
-    often one far from all that it may be has to be seen before that is looked at again.  `ends` are the abscissas (2,)
-    of the segments seen of lines, `doubts` and `tentative` what waits to become a landmark: without a block, and with
-    one; `unlocated` what is known of those whose ranges do not tell yet where they are, `here` the last place kept.
+    found, `together` is what was seen in one scan with it; `lately` are those seen last, `last_seen` those of the last
+    scan, and `alone` says how often one far from all that it may be has to be seen before that is looked at again.
+    `ends` are the abscissas (2,) of the segments seen of lines, `doubts` and `tentative` what waits to become a
+    landmark: without a block, and with one; `unlocated` what is known of those whose ranges do not tell yet where they
+    are, `here` the last place kept.
     `theirs` are ids of the log or of a survey that look like the names made up for what has none: u1, u2, ...
     """
 
@@ -46,6 +48,7 @@ class Members:
         self.kinds: dict[Id, Landmark] = {}
         self._sort_at: Index = np.full(64, -1)  # by slot: of the landmark there, a number in `_sorts`, -1 for none
         self._sorts: dict[str, int] = {}
+        self._wanted: dict[frozenset[str], Flags] = {}
         self.sorts: dict[Id, str] = {}
         self.seen: dict[Id, int] = {}
         self.searched: dict[Id, list[int]] = {}
@@ -54,6 +57,7 @@ class Members:
         self.tentative: dict[Id, Tentative] = {}
         self.together: dict[Id, set[Id]] = {}
         self.lately: list[Id] = []
+        self.last_seen: list[Id] = []
         self.alone: dict[Id, int] = {}
         self.existence: dict[Id, tuple[float, int]] = {}
         self.unlocated: dict[Id, Unlocated] = {}
@@ -92,14 +96,19 @@ class Members:
             self._sort_at[slot] = -1
 
     def _reach(self, slot: int) -> None:
-        while slot >= len(self._sort_at):
+        while slot + 1 >= len(self._sort_at):
             self._sort_at = np.concatenate([self._sort_at, np.full(len(self._sort_at), -1)])
 
-    def are_of(self, kinds: Collection[str], slots: Index) -> npt.NDArray[np.bool_]:
-        """Return which slots (K,) are those of landmarks of some kinds."""
-        self._reach(slots.max(initial=-1))
-        wanted = np.array([kind in kinds for kind in self._sorts] + [False])  # the last one for no landmark
-        return wanted[self._sort_at[slots]]
+    def sorts_of(self, kinds: frozenset[str], count: int) -> tuple[Index, Flags]:
+        """Return the sort of the landmark on each of `count` slots, or more, and which sorts are of some kinds.
+
+        The last of both are of no landmark, so that a slot or a sort of -1 is none.
+        """
+        self._reach(count)
+        wanted = self._wanted.get(kinds)
+        if wanted is None or len(wanted) <= len(self._sorts):
+            wanted = self._wanted[kinds] = np.array([*(sort in kinds for sort in self._sorts), False])
+        return self._sort_at, wanted
 
     def start(self, name: Id, slot: int, kind: Landmark) -> None:
         """Enter a landmark that a sensor has just seen for the first time."""
@@ -135,6 +144,7 @@ class Members:
     def forget(self, name: Id) -> None:
         """Strike out a landmark."""
         self._leave(name)
+        self.last_seen = []
         for other in self.together.get(name, ()):
             if other != name:
                 self.together[other].discard(name)

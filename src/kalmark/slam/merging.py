@@ -63,9 +63,11 @@ def note(slam: Slam, outcomes: Sequence[Observation]) -> list[Id]:
     members = slam.members
     seen: list[Any] = [o.landmark for o in outcomes if o.outcome in ("associated", "new")]
     names = [name for name in seen if name in members.kinds]
-    for name in names:
-        members.together.setdefault(name, set()).update(names)
-    members.lately = [name for name in members.lately if name not in names][-COMPANY:] + names
+    if names != members.last_seen:
+        for name in names:
+            members.together.setdefault(name, set()).update(names)
+        members.lately = [name for name in members.lately if name not in names][-COMPANY:] + names
+        members.last_seen = names
     unnamed: list[Any] = [o.landmark for o in outcomes if o.id is None]
     return [name for name in unnamed if name in names]
 

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from kalmark.compiled import compiled
 from kalmark.filter.map import X_AT, StochasticMap
 from kalmark.filter.postponed import PostponedMap
-from kalmark.geometry.spaces import HEADING, RHO, VECTOR, VECTOR3, Space
+from kalmark.filter.reading import AT_ONCE, resting
+from kalmark.geometry.spaces import HEADING, RHO, VECTOR, VECTOR3, Space, Table
 from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
+NONE = np.zeros(0, dtype=np.int64)
 TINY_M, FAR_M = 1e-9, 1e100
 AT_REST = 8  # to be asked for their own means, of each place: they have moved on by what is pending
 REGION = 512  # landmarks round a scan, to compare with this one and the next
@@ -40,73 +43,137 @@ def has_place(space: Space) -> bool:
 
 
 @compiled
+def distance(p: Array, place: Array) -> float:
+    """Return how far two places (d,) are apart."""
+    square = 0.0
+    for j in range(len(p)):
+        square += (p[j] - place[j]) ** 2
+    return math.sqrt(square)
+
+
+@compiled
 def distances(p: Array, places: Array) -> Array:
     """Return how far places (N, d) are from p (K, d): (K, N)."""
     gaps = np.empty((len(p), len(places)))
     for k in range(len(p)):
         for i in range(len(places)):
-            square = 0.0
-            for j in range(p.shape[1]):
-                square += (p[k, j] - places[i, j]) ** 2
-            gaps[k, i] = math.sqrt(square)
+            gaps[k, i] = distance(p[k], places[i])
     return gaps
 
 
 @compiled
-def least(gaps: Array, count: int) -> Array:
-    """Return the `count`-th least (K,) of each row, inf where there are fewer."""
-    out, kept = np.full(len(gaps), np.inf), np.empty(count)
+def least(gaps: Array, count: int) -> float:
+    """Return the `count`-th least of some gaps (N,), inf where there are fewer."""
+    if not 0 < count <= len(gaps):
+        return np.inf
+    if count > FEW:
+        return float(np.partition(gaps, count - 1)[count - 1])
+    kept = np.full(count, np.inf)
+    for gap in gaps:
+        j = count - 1
+        if gap < kept[j]:
+            while j > 0 and kept[j - 1] > gap:
+                kept[j] = kept[j - 1]
+                j -= 1
+            kept[j] = gap
+    return kept[count - 1]
+
+
+@compiled
+def limits(gaps: Array, nearest: int, farther: float) -> Array:
+    """Return how far (K,) the nearest of each row of gaps (K, N) are, none so many times farther than the nearest."""
+    out = np.empty(len(gaps))
     for k in range(len(gaps)):
-        if count > FEW and count <= gaps.shape[1]:
-            out[k] = np.partition(gaps[k], count - 1)[count - 1]
-        elif count <= gaps.shape[1]:
-            kept[:] = np.inf
-            for i in range(gaps.shape[1]):
-                j = count - 1
-                if gaps[k, i] < kept[j]:
-                    while j > 0 and kept[j - 1] > gaps[k, i]:
-                        kept[j] = kept[j - 1]
-                        j -= 1
-                    kept[j] = gaps[k, i]
-            out[k] = kept[count - 1]
+        out[k] = min(farther * max(least(gaps[k], 1), TINY_M), least(gaps[k], nearest))
     return out
 
 
 @compiled
-def within(gaps: Array, nearest: int, limit: Array) -> tuple[Index, Index]:
-    """Return rows and columns (M,) of what is within the limit (K,) of its row, of each row at most so many."""
-    count, n = gaps.shape
-    rows, columns = np.empty(count * min(n, nearest), np.int64), np.empty(count * min(n, nearest), np.int64)
-    found = 0
+def paired(p: Array, places: Array, nearest: int, farther: float) -> tuple[Index, Index, Index]:
+    """Return rows of p (K, d) and numbers of places (N, d), both (M,): of each p the nearest, as `limits` has it.
+
+    The places are numbered as they come up: `used` (L,) has which they are.
+    """
+    gaps = distances(p, places)
+    limit, count, n = limits(gaps, nearest, farther), len(p), len(places)
+    rows, numbers = np.empty(count * min(n, nearest), np.int64), np.empty(count * min(n, nearest), np.int64)
+    used, number = np.empty(n, np.int64), np.full(n, -1)
+    found = L = 0
     for k in range(count):
         first = found
         for i in range(n):
             if gaps[k, i] <= limit[k] and found < first + nearest:
-                rows[found], columns[found] = k, i
+                if number[i] < 0:
+                    number[i], used[L] = L, i
+                    L += 1
+                rows[found], numbers[found] = k, number[i]
                 found += 1
-    return rows[:found].copy(), columns[:found].copy()
+    return rows[:found].copy(), numbers[:found].copy(), used[:L].copy()
 
 
-def limits(gaps: Array, nearest: int, farther: float) -> Array:
-    """Return how far (K,) the nearest of each row of gaps (K, N) are, none so many times farther than the nearest."""
-    return np.minimum(farther * np.maximum(least(gaps, 1), TINY_M), least(gaps, nearest))
+@compiled
+def awake(
+    p: Array, x: Array, blocks: Table, slots: Index, sorts: tuple[Index, Flags], nearest: int, farther: float
+) -> tuple[Index, Array, Array]:
+    """Return the slots (N,) of active landmarks, where they are (N, d), and the `limits` (K,) to the nearest of them.
+
+    `slots` are those of the active blocks, `sorts` say what is there and wanted.
+    """
+    found, places = np.empty(len(slots), np.int64), np.empty((len(slots), p.shape[1]))
+    count = 0
+    for i in range(len(slots)):
+        if sorts[1][sorts[0][slots[i]]]:
+            found[count] = slots[i]
+            for j in range(p.shape[1]):
+                places[count, j] = x[blocks[i, X_AT] + j]
+            count += 1
+    return found[:count].copy(), places[:count].copy(), limits(distances(p, places[:count]), nearest, farther)
+
+
+@compiled
+def asleep(
+    p: Array, limit: Array, most: int, centre: Array, radius: float, slots: Index, places: Array, at: Index,
+    sorts: tuple[Index, Flags],
+) -> tuple[Index, bool]:  # fmt: skip
+    """Return which `slots` of a region, at rest and wanted, are among the `most` nearest to p within a limit (K,).
+
+    And whether these are all in the region.  `at` tells what is active, `sorts` what is there and wanted.
+    """
+    here = np.empty(len(slots), np.int64)
+    n, inside = 0, True
+    for i in range(len(slots)):
+        if at[slots[i]] < 0 and sorts[1][sorts[0][slots[i]]]:
+            here[n] = i
+            n += 1
+    found, near, gaps = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(n)
+    for k in range(len(p)):
+        count, far = 0, limit[k]
+        for i in range(n):
+            if abs(p[k, 0] - places[here[i], 0]) <= far:
+                gap = distance(p[k], places[here[i]])
+                if gap <= far:
+                    near[count], gaps[count] = i, gap
+                    count += 1
+        if count >= most:
+            far = least(gaps[:count], most)
+        for i in range(count):
+            found[near[i]] = found[near[i]] or gaps[i] <= far
+        inside = inside and distance(p[k], centre) + far <= radius
+    return slots[here[:n][found]], inside
 
 
 class Pairs(NamedTuple):
-    """Observations (M,) and the slots of landmarks that may belong together, and where these are (M, 2 or 3).
+    """Observations (M,) and the `numbers` (M,) of landmarks that may belong together.
 
-    Those at rest have been read: `at` are their slots in the `excerpt` (map, robot, mount), -1 of all others.
+    Of the landmarks: their slots (L,), where they are (L, 2 or 3) and, if not too many are at rest, what was read of
+    them: a map with the slots in it of the robot, its mount and the landmarks (L,).
     """
 
     rows: Index
+    numbers: Index
     slots: Index
     places: Array
-    at: Index
-    excerpt: tuple[StochasticMap, int, int] | None
-
-    def some(self, which: Index | list[int]) -> Pairs:
-        """Return some of them."""
-        return Pairs(self.rows[which], self.slots[which], self.places[which], self.at[which], self.excerpt)
+    excerpt: tuple[StochasticMap, int, int, Index] | None
 
 
 class Region(NamedTuple):
@@ -135,52 +202,52 @@ class Nearby:
         That is, of each place the nearest ones, none so many times farther than the nearest.  `head` are the slots of
         the robot and, if it is in the map, its mount: those at rest are read with them.
         """
-        map_, members, d = slam.map, slam.members, p.shape[1]
-        slots, places = map_.awake(d)
-        use = members.are_of(kinds, slots)
-        slots, places, excerpt = slots[use], places[use], None
-        gaps, at = distances(p, places), np.full(len(slots), -1)
-        if isinstance(map_, PostponedMap):
-            resting = self._at_rest(map_, members, kinds, p, limits(gaps, nearest, farther), max(AT_REST, nearest))
-            if len(resting):
-                m, robot, mount, here = map_.excerpt(*head, resting)
-                more, excerpt = m.means(here, d), (m, robot, mount)
-                slots, at = np.concatenate([slots, resting]), np.concatenate([at, here])
-                places, gaps = np.concatenate([places, more]), np.concatenate([gaps, distances(p, more)], axis=1)
-        rows, columns = within(gaps, nearest, limits(gaps, nearest, farther))
-        return Pairs(rows, slots[columns], places[columns], at[columns], excerpt)
+        map_, d, read = slam.map, p.shape[1], None
+        x, blocks, own = map_.awake()
+        sorts = slam.members.sorts_of(kinds, len(map_.blocks))
+        slots, places, limit = awake(p, x, blocks, own, sorts, nearest, farther)
+        if not isinstance(map_, PostponedMap):
+            rows, numbers, used = paired(p, places, nearest, farther)
+            return Pairs(rows, numbers, slots[used], places[used], map_.excerpt(*head, slots[used]))
+        still = self._at_rest(map_, slam.members, sorts, p, limit, max(AT_REST, nearest))
+        if len(still):
+            read = resting(map_, still) if len(still) <= AT_ONCE else None
+            slots = np.concatenate([slots, still])
+            places = np.concatenate([places, map_.means(still, d) if read is None else read.places(d)])
+        rows, numbers, used = paired(p, places, nearest, farther)
+        excerpt = map_.excerpt(*head, slots[used], read) if len(still) <= AT_ONCE else None
+        return Pairs(rows, numbers, slots[used], places[used], excerpt)
 
     def around(self, slam: Slam, kind: str, p: Array, count: int) -> list[Id]:
         """Return the landmarks of a kind nearest to p (2 or 3,), nearest first: at rest as the last flush left them."""
         map_, members = slam.map, slam.members
-        slots, places = map_.awake(len(p))
-        gaps = distances(p[None], places)[0]
+        x, blocks, own = map_.awake()
+        sorts = members.sorts_of(frozenset({kind}), len(map_.blocks))
+        slots, places, _ = awake(p[None], x, blocks, own, sorts, 1, 1.0)
         if isinstance(map_, PostponedMap) and self._known(map_, members, len(p)):
             found = self._nearest(p, count)
-            here = map_.is_at_rest(found.slots)
-            slots = np.concatenate([slots, found.slots[here]])
-            gaps = np.concatenate([gaps, distances(p[None], found.places[here])[0]])
-        use = members.are_of(frozenset({kind}), slots)
-        slots, gaps = slots[use], gaps[use]
+            here = map_.is_at_rest(found.slots) & sorts[1][sorts[0][found.slots]]
+            slots, places = np.concatenate([slots, found.slots[here]]), np.concatenate([places, found.places[here]])
+        gaps = distances(p[None], places)[0]
         return [members.names[s] for s in slots[np.argsort(gaps, kind="stable")[:count]].tolist()]
 
     def _at_rest(
-        self, map_: PostponedMap, members: Members, kinds: frozenset[str], p: Array, limit: Array, count: int
+        self, map_: PostponedMap, members: Members, sorts: tuple[Index, Flags], p: Array, limit: Array, count: int
     ) -> Index:
         """Return the slots of the blocks at rest nearest to p, within a limit (K,), when they came to rest."""
-        near = (np.abs(p) < FAR_M).all(axis=1)
-        if not self._known(map_, members, p.shape[1]) or not near.any():
-            return np.zeros(0, dtype=np.int64)
-        p, limit, region, size, wider = p[near], limit[near], self._region, REGION, 1.0
+        if not self._known(map_, members, p.shape[1]):
+            return NONE
+        if not (np.abs(p) < FAR_M).all():
+            near = (np.abs(p) < FAR_M).all(axis=1)
+            return self._at_rest(map_, members, sorts, p[near], limit[near], count) if near.any() else NONE
+        region, size, wider = self._region, REGION, 1.0
         while True:
             if region is not None:
-                slots, places = region.slots, region.places
-                use = map_.is_at_rest(slots) & members.are_of(kinds, slots)
-                slots, gaps = slots[use], distances(p, places[use])
-                limit_here = np.minimum(limit, least(gaps, count))
-                if wider * (np.linalg.norm(p - region.centre, axis=1) + limit_here).max() <= region.radius:
+                centre, radius, slots, places = region
+                found, inside = asleep(p, limit, count, centre, radius / wider, slots, places, map_._at, sorts)
+                if inside:
                     self._region = region
-                    return np.unique(slots[within(gaps, count, limit_here)[1]])
+                    return found
             region, size, wider = self._nearest(p.mean(axis=0), size), 2 * size, WIDER
 
     def _known(self, map_: PostponedMap, members: Members, d: int) -> bool:

@@ -49,9 +49,13 @@ class Candidate(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """What was compared: observations (M,) with landmarks, their squared distances (M,) and places (M, 2 or 3)."""
+    """What was compared: observations (M,) with the `numbers` (M,) of landmarks (L,), and their squared distances (M,).
+
+    `places` (L, 2 or 3) are those of the landmarks.
+    """
 
     rows: npt.NDArray[np.int64]
+    numbers: npt.NDArray[np.int64]
     landmarks: list[Id]
     d2: Array
     places: Array
@@ -120,10 +124,11 @@ class Report:
         """The landmarks that observations without an id were compared with."""
         if self.compared is None:
             return []
-        pairs = zip(self.compared.rows.tolist(), self.compared.landmarks, self.compared.d2.tolist(), strict=True)
+        rows, numbers, landmarks, d2, places = self.compared
         ids = getattr(self.event, "ids", None)
-        open_ = [(*p, at) for p, at in zip(pairs, self.compared.places, strict=True) if not ids or ids[p[0]] is None]
-        return [Candidate(*pair) for pair in open_ if math.isfinite(pair[2])]
+        pairs = zip(rows.tolist(), numbers.tolist(), d2.tolist(), strict=True)
+        open_ = [(k, l, d) for k, l, d in pairs if (not ids or ids[k] is None) and math.isfinite(d)]
+        return [Candidate(k, landmarks[l], d, places[l]) for k, l, d in open_]
 
     def blank(self, p: int) -> None:
         """Enter that nothing was predicted of any observation, whose innovations have p numbers."""

@@ -16,6 +16,7 @@ from kalmark.filter import corrections, kernels
 from kalmark.filter.estimators import Map
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.observed import add_blocks, observed_block
+from kalmark.filter.reading import AT_ONCE
 from kalmark.models import landmarks as kinds
 from kalmark.models.landmarks import InverseDepth2D
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-
-AT_ONCE = 32  # landmarks whose joint covariance is looked at
 
 ROBOT = "robot"
 ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one view applies to
@@ -102,6 +101,7 @@ class View:
         self.starts = _starts(self.association, self.upkeep)
         mounts = [mount for robot in slam.robots.values() for mount in robot.sensors.values()]
         self.looks = self._looks(any((m.landmark or landmarks or natural(m)).kind == "polar" for m in mounts))
+        self.kinds = frozenset(self.looks)
         self._refuse_misfit()
         self.dof = self._dof()
         self.gate = self.association.threshold(self.dof, slam.estimator.default_gate)
@@ -304,12 +304,10 @@ class Scene:
         places = view.places(self._slam.map, robot, self._event.y)
         if places is None:
             return members.in_reach(view)
-        found = self._slam.nearby.pairs(
-            self._slam, frozenset(view.looks), (robot, view.mount), places, nearest, farther
-        )  # fmt: skip
-        self.seen_at, self._pairs = places, found
-        self._names = [members.names[slot] for slot in found.slots.tolist()]
-        return list(dict.fromkeys(self._names))
+        self.seen_at, head = places, (robot, view.mount)
+        self._pairs = self._slam.nearby.pairs(self._slam, view.kinds, head, places, nearest, farther)
+        self._names = [members.names[slot] for slot in self._pairs.slots.tolist()]
+        return self._names.copy()
 
     def distances(self, candidates: list[Id]) -> Array:
         """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83).
@@ -318,36 +316,33 @@ class Scene:
         """
         d2 = np.full((len(self.y), len(candidates)), np.inf)
         if self._pairs is None:
-            k, l = (a.ravel() for a in np.indices(d2.shape))
-            slots = self._slam.members.slots_of(candidates)[l]
-            pairs = Pairs(k, slots, np.zeros((len(k), 0)), np.full(len(k), -1), None)
-            d2[k, l] = self._squared(pairs, [candidates[i] for i in l.tolist()])
+            slots = self._slam.members.slots_of(candidates)
+            rows, numbers = (a.ravel() for a in np.indices(d2.shape))
+            d2[rows, numbers] = self._squared(Pairs(rows, numbers, slots, np.zeros((len(slots), 0)), None), candidates)
             return d2
-        found, names = self._pairs, self._names
-        number = {name: i for i, name in enumerate(candidates)}
-        columns = np.array([number.get(name, -1) for name in names], dtype=np.int64)
-        if (columns < 0).any():
-            asked = np.flatnonzero(columns >= 0)
-            found, names, columns = found.some(asked), [names[i] for i in asked.tolist()], columns[asked]
-        d2[found.rows, columns] = squared = self._squared(found, names)
-        self.compared = Compared(found.rows, names, squared, found.places)
+        pairs, columns = self._pairs, self._pairs.numbers
+        if candidates != self._names:
+            at = {name: i for i, name in enumerate(candidates)}
+            columns = np.array([at.get(name, -1) for name in self._names], dtype=np.int64)[columns]
+            asked = columns >= 0
+            columns, pairs = columns[asked], pairs._replace(rows=pairs.rows[asked], numbers=pairs.numbers[asked])
+        d2[pairs.rows, columns] = squared = self._squared(pairs, self._names)
+        self.compared = Compared(pairs.rows, pairs.numbers, self._names, squared, pairs.places)
         return d2
 
     def _squared(self, pairs: Pairs, names: list[Id]) -> Array:
         """Return the squared distances (M,) of pairs of an observation and a landmark."""
-        view, event, out = self._view, self._event, np.empty(len(names))
+        view, event, out = self._view, self._event, np.empty(len(pairs.rows))
         map_, robot = self._slam.map, self._slam.members.slots[event.robot]
         for look, which in self._slam.members.by_look(view, names):
-            some = pairs if len(which) == len(names) else pairs.some(which)
-            y, R = event.y[some.rows], view.noise(map_, robot, look, some.slots, self._R[some.rows], event)
-            resting = some.at >= 0
-            if some.excerpt is None or not resting.any():
-                out[which] = view.predict(map_, robot, look, some.slots, y, R)[1]
-                continue
-            d2, active = np.empty(len(which)), ~resting
-            d2[active] = view.predict(map_, robot, look, some.slots[active], y[active], R[active])[1]
-            d2[resting] = look.predict(*some.excerpt, some.at[resting], y[resting], R[resting])[1]
-            out[which] = d2
+            some = slice(None) if len(which) == len(names) else np.isin(pairs.numbers, which)
+            k, l = pairs.rows[some], pairs.numbers[some]
+            y, R = event.y[k], view.noise(map_, robot, look, pairs.slots[l], self._R[k], event)
+            if pairs.excerpt is None:
+                out[some] = view.predict(map_, robot, look, pairs.slots[l], y, R)[1]
+            else:
+                m, robot_here, mount, here = pairs.excerpt
+                out[some] = look.predict(m, robot_here, mount, here[l], y, R)[1]
         return out
 
     def report(self) -> Report:
