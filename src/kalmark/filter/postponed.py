@@ -24,7 +24,7 @@ from kalmark.filter.drift import Drift
 from kalmark.filter.flush import Flush, Phase, Room
 from kalmark.filter.map import P_AT, Layout, StochasticMap
 from kalmark.filter.pace import SLICE, USING, Pace
-from kalmark.filter.reading import Resting, excerpt, joint, places, resting
+from kalmark.filter.reading import excerpt, joint, places, resting
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import RHO, Rn, Space, Table
 
@@ -123,11 +123,9 @@ class PostponedMap(Layout):
         """Tell which blocks (K,) are not active."""
         return self._at[slots] < 0
 
-    def excerpt(
-        self, robot: int, mount: int, slots: Index, read: Resting | None = None
-    ) -> tuple[StochasticMap, int, int, Index]:
+    def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
         """Return a dense map to read these blocks from, and their slots there; blocks at rest stay there."""
-        return excerpt(self, robot, mount, slots, read)
+        return excerpt(self, robot, mount, slots)
 
     def _resting_rows(self) -> Index:
         """Return the rows of the active map that blocks at rest depend on: the shadows and all turns."""

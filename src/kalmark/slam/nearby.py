@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.filter.estimators import Map
 from kalmark.filter.map import X_AT, StochasticMap
 from kalmark.filter.postponed import PostponedMap
-from kalmark.filter.reading import AT_ONCE, resting
+from kalmark.filter.reading import AT_ONCE
 from kalmark.geometry.spaces import HEADING, RHO, VECTOR, VECTOR3, Space, Table
 from kalmark.slam.events import Id
 
@@ -32,7 +33,7 @@ Flags = npt.NDArray[np.bool_]
 NONE = np.zeros(0, dtype=np.int64)
 TINY_M, FAR_M = 1e-9, 1e100
 AT_REST = 8  # to be asked for their own means, of each place: they have moved on by what is pending
-REGION = 512  # landmarks round a scan, to compare with this one and the next
+REGION = 256  # landmarks round a scan, to compare with this one and the next
 WIDER = 1.5  # times as far as this one needs
 FEW = 16  # numbers to be kept in order
 
@@ -114,20 +115,27 @@ def paired(p: Array, places: Array, nearest: int, farther: float) -> tuple[Index
 @compiled
 def awake(
     p: Array, x: Array, blocks: Table, slots: Index, sorts: tuple[Index, Flags], nearest: int, farther: float
-) -> tuple[Index, Array, Array]:
-    """Return the slots (N,) of active landmarks, where they are (N, d), and the `limits` (K,) to the nearest of them.
+) -> tuple[Index, Array]:
+    """Return the slots (N,) of active landmarks within the `limits` (K,) of p (K, d), and these.
 
     `slots` are those of the active blocks, `sorts` say what is there and wanted.
     """
-    found, places = np.empty(len(slots), np.int64), np.empty((len(slots), p.shape[1]))
-    count = 0
+    here = np.empty(len(slots), np.int64)
+    n, d = 0, p.shape[1]
     for i in range(len(slots)):
         if sorts[1][sorts[0][slots[i]]]:
-            found[count] = slots[i]
-            for j in range(p.shape[1]):
-                places[count, j] = x[blocks[i, X_AT] + j]
-            count += 1
-    return found[:count].copy(), places[:count].copy(), limits(distances(p, places[:count]), nearest, farther)
+            here[n] = i
+            n += 1
+    places = np.empty((n, d))
+    for i in range(n):
+        for j in range(d):
+            places[i, j] = x[blocks[here[i], X_AT] + j]
+    gaps = distances(p, places)
+    limit, found = limits(gaps, nearest, farther), np.zeros(n, np.bool_)
+    for k in range(len(p)):
+        for i in range(n):
+            found[i] = found[i] or gaps[k, i] <= limit[k]
+    return slots[here[:n][found]], limit
 
 
 @compiled
@@ -202,28 +210,28 @@ class Nearby:
         That is, of each place the nearest ones, none so many times farther than the nearest.  `head` are the slots of
         the robot and, if it is in the map, its mount: those at rest are read with them.
         """
-        map_, d, read = slam.map, p.shape[1], None
+        map_, excerpt = slam.map, None
         x, blocks, own = map_.awake()
         sorts = slam.members.sorts_of(kinds, len(map_.blocks))
-        slots, places, limit = awake(p, x, blocks, own, sorts, nearest, farther)
-        if not isinstance(map_, PostponedMap):
-            rows, numbers, used = paired(p, places, nearest, farther)
-            return Pairs(rows, numbers, slots[used], places[used], map_.excerpt(*head, slots[used]))
+        slots, limit = awake(p, x, blocks, own, sorts, nearest, farther)
         still = self._at_rest(map_, slam.members, sorts, p, limit, max(AT_REST, nearest))
-        if len(still):
-            read = resting(map_, still) if len(still) <= AT_ONCE else None
-            slots = np.concatenate([slots, still])
-            places = np.concatenate([places, map_.means(still, d) if read is None else read.places(d)])
-        rows, numbers, used = paired(p, places, nearest, farther)
-        excerpt = map_.excerpt(*head, slots[used], read) if len(still) <= AT_ONCE else None
+        slots = np.concatenate([slots, still]) if len(still) else slots
+        if len(still) <= AT_ONCE:
+            m, robot, mount, here = map_.excerpt(*head, slots)
+            places = m.means(here, p.shape[1])
+            rows, numbers, used = paired(p, places, nearest, farther)
+            excerpt = m, robot, mount, here[used]
+        else:
+            places = map_.means(slots, p.shape[1])
+            rows, numbers, used = paired(p, places, nearest, farther)
         return Pairs(rows, numbers, slots[used], places[used], excerpt)
 
     def around(self, slam: Slam, kind: str, p: Array, count: int) -> list[Id]:
         """Return the landmarks of a kind nearest to p (2 or 3,), nearest first: at rest as the last flush left them."""
         map_, members = slam.map, slam.members
-        x, blocks, own = map_.awake()
-        sorts = members.sorts_of(frozenset({kind}), len(map_.blocks))
-        slots, places, _ = awake(p[None], x, blocks, own, sorts, 1, 1.0)
+        sorts, slots = members.sorts_of(frozenset({kind}), len(map_.blocks)), map_.awake()[2]
+        slots = slots[sorts[1][sorts[0][slots]]]
+        places = map_.means(slots, len(p))
         if isinstance(map_, PostponedMap) and self._known(map_, members, len(p)):
             found = self._nearest(p, count)
             here = map_.is_at_rest(found.slots) & sorts[1][sorts[0][found.slots]]
@@ -232,10 +240,10 @@ class Nearby:
         return [members.names[s] for s in slots[np.argsort(gaps, kind="stable")[:count]].tolist()]
 
     def _at_rest(
-        self, map_: PostponedMap, members: Members, sorts: tuple[Index, Flags], p: Array, limit: Array, count: int
+        self, map_: Map, members: Members, sorts: tuple[Index, Flags], p: Array, limit: Array, count: int
     ) -> Index:
         """Return the slots of the blocks at rest nearest to p, within a limit (K,), when they came to rest."""
-        if not self._known(map_, members, p.shape[1]):
+        if not isinstance(map_, PostponedMap) or not self._known(map_, members, p.shape[1]):
             return NONE
         if not (np.abs(p) < FAR_M).all():
             near = (np.abs(p) < FAR_M).all(axis=1)
