@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from kalmark.errors import MapError
 from kalmark.filter import kernels
-from kalmark.filter.map import P_AT, P_SIZE
+from kalmark.filter.map import P_AT, P_SIZE, StochasticMap
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3, Space
 from kalmark.slam.ambiguity import density, gains
@@ -33,7 +33,8 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 EVERY = 5  # sightings of a landmark, after each of which it is looked at; one that is alone after twice as many
-NEAREST = 128  # landmarks near it, among which are those that it may be
+NEAREST = 128  # landmarks near it, among which are those that it may be,
+NEAR = 32  # and so many at first
 COMPANY = 12  # landmarks seen lately, which must find their own as well
 TRIES = 8  # of what it may be
 WIDE = 1.5  # times the gate of the nearest it may be, within which all are that it may be
@@ -137,13 +138,12 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     """Return what a landmark and others seen lately may be: lists of pairs, its own first."""
     members, together = slam.members, slam.members.together
     at = slam.mean(name)[:d]
-    kind = members.kinds[name].kind
-    others = [n for n in slam.nearby.around(slam, kind, at, NEAREST) if n in together and n != name]
-    by_id = not members.made_up(name)  # two ids are two landmarks
-    possible = [l for l, o in enumerate(others) if o not in together[name] and (not by_id or members.made_up(o))]
-    if not possible or _is_out_of_reach(slam, name, [others[l] for l in possible[:TRIES]], d):
-        members.alone[name] = 2 * members.seen.get(name, 0)
-        return
+    for count in (NEAR, NEAREST):  # most can be none of those nearby, and so of none
+        others, possible = _others(slam, name, at, count)
+        told = count == NEAREST or len(possible) >= TRIES
+        if told and (not possible or _is_out_of_reach(slam, name, [others[l] for l in possible[:TRIES]], d)):
+            members.alone[name] = 2 * members.seen.get(name, 0)
+            return
     places = _places(slam, others, d)
     far = np.linalg.norm(places - at, axis=1)
     possible.sort(key=lambda l: far[l])
@@ -176,6 +176,16 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
             yield pairs
 
 
+def _others(slam: Slam, name: Id, at: Array, count: int) -> tuple[list[Id], list[int]]:
+    """Return the landmarks nearest to one that is `at` (2 or 3,), and the numbers of those that it may be."""
+    members, together = slam.members, slam.members.together
+    near = slam.nearby.around(slam, members.kinds[name].kind, at, count)
+    others = [n for n in near if n in together and n != name]
+    by_id = not members.made_up(name)  # two ids are two landmarks
+    different = together[name]
+    return others, [l for l, o in enumerate(others) if o not in different and (not by_id or members.made_up(o))]
+
+
 def _company(slam: Slam, name: Id, d: int) -> list[Id]:
     """Return what must find its own if a landmark does: what was seen lately, or, if it was not, once, with it."""
     members, kinds = slam.members, slam.members.kinds
@@ -200,23 +210,32 @@ def _reach(Z: Array) -> float:
 
 def _is_out_of_reach(slam: Slam, name: Id, others: Sequence[Id], d: int) -> bool:
     """Return whether a landmark can be none of some others."""
-    z, Z = _differences(slam, [(name, other) for other in others])
-    far, n = np.linalg.norm(z[:, :d], axis=1), z.shape[1]
+    m, here = _read(slam, [name, *others])
+    l = m.means(here, d)
+    far = np.linalg.norm(l[1:] - l[0], axis=1)
     i = int(np.argmin(far))
-    return bool(far[i] > _reach(Z[i * n : (i + 1) * n, i * n : (i + 1) * n]))
+    P = m.covariance([here[0], here[1 + i]])
+    n = len(P) // 2
+    return bool(far[i] > _reach(P[:n, :n] + P[n:, n:] - P[:n, n:] - P[n:, :n] + EQUAL_M**2 * np.eye(n)))
+
+
+def _read(slam: Slam, names: Sequence[Id]) -> tuple[StochasticMap, Index]:
+    """Return a map to read landmarks from, and their slots (K,) there."""
+    m, _, _, here = slam.map.excerpt(slam.members.slots[next(iter(slam.robots))], -1, slam.members.slots_of(names))
+    return m, here
 
 
 def _differences(slam: Slam, pairs: Sequence[tuple[Id, Id]]) -> tuple[Array, Array]:
     """Return the differences z (M, n) of pairs of landmarks and their joint covariance (M n, M n)."""
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
-    m, _, _, here = slam.map.excerpt(slam.members.slots[next(iter(slam.robots))], -1, slam.members.slots_of(names))
+    m, here = _read(slam, names)
     n = int(m.blocks[here[0], P_SIZE])
     P = kernels.submatrix(m.P, (m.blocks[here, P_AT][:, None] + np.arange(n)).ravel())
     at, rows = {name: i for i, name in enumerate(names)}, np.arange(len(pairs))
     of = np.zeros((len(pairs), len(names)))
     of[rows, [at[b] for _, b in pairs]] = 1.0
     of[rows, [at[a] for a, _ in pairs]] = -1.0
-    J = np.kron(of, np.eye(n))
+    J = (of[:, None, :, None] * np.eye(n)[:, None]).reshape(len(pairs) * n, -1)
     return of @ m.means(here, n), J @ P @ J.T + EQUAL_M**2 * np.eye(len(J))
 
 

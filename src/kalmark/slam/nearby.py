@@ -229,14 +229,12 @@ class Nearby:
     def around(self, slam: Slam, kind: str, p: Array, count: int) -> list[Id]:
         """Return the landmarks of a kind nearest to p (2 or 3,), nearest first: at rest as the last flush left them."""
         map_, members = slam.map, slam.members
-        sorts, slots = members.sorts_of(frozenset({kind}), len(map_.blocks)), map_.awake()[2]
-        slots = slots[sorts[1][sorts[0][slots]]]
-        places = map_.means(slots, len(p))
-        if isinstance(map_, PostponedMap) and self._known(map_, members, len(p)):
-            found = self._nearest(p, count)
-            here = map_.is_at_rest(found.slots) & sorts[1][sorts[0][found.slots]]
-            slots, places = np.concatenate([slots, found.slots[here]]), np.concatenate([places, found.places[here]])
-        gaps = distances(p[None], places)[0]
+        sorts = members.sorts_of(frozenset({kind}), len(map_.blocks))
+        slots, limit = awake(p[None], *map_.awake(), sorts, count, math.inf)
+        still = self._at_rest(map_, members, sorts, p[None], limit, count)
+        left = map_.x[map_.blocks[still, X_AT][:, None] + np.arange(len(p))]
+        gaps = distances(p[None], np.concatenate([map_.means(slots, len(p)), left]))[0]
+        slots = np.concatenate([slots, still])
         return [members.names[s] for s in slots[np.argsort(gaps, kind="stable")[:count]].tolist()]
 
     def _at_rest(

@@ -176,8 +176,7 @@ def _distances(
     map_, robot = slam.map, slam.members.slots[event.robot]
     tentative = [slam.members.tentative[name] for name in names]
     near = np.ones((len(rows), len(names)), dtype=np.bool_)
-    places = view.places(map_, robot, event.y[list(rows)])
-    if places is not None and len(names) > NEAREST:
+    if len(names) > NEAREST and (places := view.places(map_, robot, event.y[list(rows)])) is not None:
         here = map_.means(np.array([t.slot for t in tentative]), places.shape[1])
         gaps = np.linalg.norm(places[:, None] - here, axis=2)
         near = gaps <= np.partition(gaps, NEAREST - 1, axis=1)[:, NEAREST - 1 : NEAREST]
