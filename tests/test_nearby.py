@@ -82,3 +82,33 @@ def test_slots_are_told_by_the_kind_of_their_landmark() -> None:
     slam.remove(7)
     sort_at, wanted = slam.members.sorts_of(frozenset({"point"}), 0)
     assert not wanted[sort_at[8]]
+
+
+@pytest.mark.parametrize("association", [km.association.NearestNeighbour(), km.association.Automatic()])
+def test_what_is_seen_without_ids_is_told_alike_in_both_maps(association: km.association.Association) -> None:
+    runs = []
+    for map_ in ("dense", "postponed"):
+        rng = np.random.default_rng(2)
+        points = 2.0 * np.stack(np.meshgrid(np.arange(9), np.arange(9)), -1).reshape(-1, 2) + rng.uniform(
+            0, 0.8, (81, 2)
+        )
+        sensor, motion = km.sensors.RangeBearing(0.05, 0.01), km.motion.Odometry2D(0.01, 0.0, 0.01)
+        robot = km.Robot("r", motion, sensors={"s": km.Mount(sensor)})
+        slam, pose, run = km.Slam([robot], association, km.estimators.Ekf(), map=map_), np.zeros(3), []
+        if isinstance(slam.map, PostponedMap):
+            slam.map.most = 40
+        for t in range(200):
+            u = np.array([0.4, 0.0, (-1) ** (t // 50) * np.pi / 8 if t % 50 in range(36, 44) else 0.0])
+            pose = km.geometry.compose(pose, u)[0]
+            near = points[np.linalg.norm(points - pose[:2], axis=1) < 3.5]
+            y = km.geometry.observe(pose, near)[0] + rng.normal(size=near.shape) * (0.05, 0.01)
+            slam.process(km.Control(t, "r", u + rng.normal(size=3) * (0.01, 0.0, 0.01)))
+            run.append(slam.process(km.Scan(t, "r", "s", y)))
+        runs.append(run)
+        assert not isinstance(slam.map, PostponedMap) or slam.map.phase > 10
+    for dense, postponed in zip(*runs, strict=True):
+        assert [(o.outcome, o.landmark) for o in dense.observations] == [
+            (o.outcome, o.landmark) for o in postponed.observations
+        ]
+        told = [{(c.index, c.landmark): c.d2 for c in report.candidates} for report in (dense, postponed)]
+        assert told[0] == pytest.approx(told[1], rel=1e-6)

@@ -18,9 +18,9 @@ from scipy.optimize import linear_sum_assignment
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import Landmark
 from kalmark.slam import kept
-from kalmark.slam.association import FORBIDDEN
 from kalmark.slam.decisions import ANEW, Decision
 from kalmark.slam.events import Id, Scan
+from kalmark.slam.gated import FORBIDDEN
 from kalmark.slam.posterior import JUST_SEEN, room
 from kalmark.slam.report import Late, Observation, Report
 
