@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from kalmark.cli.tables import print_summary
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
 from kalmark.results.picture import Picture, ellipses, headline, stretches_of
@@ -21,7 +23,7 @@ from kalmark.results.report import report_html, show
 from kalmark.results.run import Run
 from kalmark.results.series import reasons, series
 from kalmark.results.thinned import POINTS
-from kalmark.results.words import count, figure
+from kalmark.results.words import BATCH, ROBOT, TOTALS, count, figure, header
 from kalmark.slam.events import Control, Fix, Scan
 from results_world import circle, slam_for
 
@@ -122,6 +124,28 @@ def test_the_report_is_one_file_that_asks_nothing_of_the_network(run: Run) -> No
     assert "http" not in markup
     assert not re.search(r"<(link|img|iframe)\b|\bsrc=", markup)
     assert len(page) < 8e6
+
+
+def test_the_page_names_figures_in_the_words_of_the_command_line(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    summary = run.evaluate() | {"toolbox": {"ate_raw_m": 0.25}, "batch": {"sigma_ratio": 0.9, "rms_px": 0.5}, "own": 7}
+    table = report_html(replace(run, summary=summary)).partition("<h2>Figures</h2>")[2].partition("</section>")[0]
+    print_summary("", summary)
+    printed = capsys.readouterr().out
+    assert "landmark sigma, the filter's over the batch's" in printed
+    shown = [label.strip() for key, label, _ in (*TOTALS, *BATCH) if key in summary | summary["batch"]]
+    assert len(shown) > 12
+    for label in shown:
+        assert escape(label) in table
+    for key, label, unit in ROBOT:
+        assert key in summary["robots"]["rover"]
+        assert f"<th>{header(label, unit)}</th>" in table and header(label, unit) in printed
+    assert "<td>toolbox: position RMSE</td><td>0.25</td><td>m</td>" in table
+    words = re.findall(r"<tr title=\"[^\"]*\"><td[^>]*>([^<]*)</td>", table)
+    assert [label for label in words if "_" in label or label == "own"] == ["own"], "only what is unknown has its key"
+
+
+def test_a_share_is_shown_in_per_cent() -> None:
+    assert (show(0.125, "%"), show(0.125), show([0.5, 0.25], "s")) == ("12.5", "0.125", "0.5, 0.25")
 
 
 def test_text_from_a_log_cannot_break_out_of_the_page() -> None:

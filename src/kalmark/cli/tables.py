@@ -7,38 +7,8 @@ from typing import Any
 
 import typer
 
-TOTALS: tuple[tuple[str, str, str], ...] = (
-    ("observations", "observations", ""),
-    ("associated", "  associated", ""),
-    ("new", "  new landmarks", ""),
-    ("rejected", "  rejected by the gate", ""),
-    ("ignored", "  ignored", ""),
-    ("deferred", "  deferred", ""),
-    ("tentative", "  tentative", ""),
-    ("landmarks", "landmarks in the map", ""),
-    ("judged", "fused, where the log hides an id", ""),
-    ("wrong", "  with another's landmark", ""),
-    ("duplicates", "  landmarks beyond one for each id", ""),
-    ("nis_per_dof", "NIS per degree of freedom (1)", ""),
-    ("fixes", "fixes given to the filter", ""),
-    ("fixes_rejected", "  rejected by the gate", ""),
-    ("fix_nis_per_dof", "  NIS per degree of freedom (1)", ""),
-    ("landmarks_matched", "landmarks matched to true ones", ""),
-    ("landmark_rmse_m", "landmark RMSE, aligned", "m"),
-    ("landmark_rmse_raw_m", "landmark RMSE, raw", "m"),
-    ("corner_rms_px", "reprojection of corners, RMS", "px"),
-    ("fix_median_m", "distance to position fixes, median", "m"),
-    ("fix_rms_10m", "distance to position fixes, RMS within 10 m", "m"),
-    ("fix_within_10m", "position fixes within 10 m", "%"),
-    ("step_us_median", "time a step, median", "us"),
-    ("step_us_p99", "time a step, 99 %", "us"),
-)
-ROBOT: tuple[tuple[str, str, str], ...] = (
-    ("ate_raw_m", "position RMSE", "m"),
-    ("ate_m", "aligned", "m"),
-    ("heading_rmse_deg", "heading RMSE", "deg"),
-    ("pose_nees", "pose NEES", ""),
-)
+from kalmark.results.words import BATCH, ROBOT, TOTALS, header, in_words
+
 _SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
@@ -53,7 +23,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     ]
     print_table(title, ("", "", ""), rows, align="<><")
     robots: Mapping[str, Any] = summary.get("robots", {})
-    shown = [(key, f"{label} ({unit})" if unit else label, unit) for key, label, unit in ROBOT]
+    shown = [(key, header(label, unit), unit) for key, label, unit in ROBOT]
     shown = [row for row in shown if any(figures.get(row[0]) is not None for figures in robots.values())]
     if shown:
         columns = ("robot", *(label for _, label, _ in shown))
@@ -68,7 +38,8 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
-        print_table("against the batch solution", ("", ""), [(k, number(v)) for k, v in batch.items()], align="<>")
+        table = [(label, number(value), unit) for _, label, value, unit in in_words(batch, BATCH)]
+        print_table("against the batch solution", ("", "", ""), table, align="<><")
     for line in summary.get("warnings", ()):
         typer.echo(f"warning: {line}")
     for line in summary.get("advice", ()):

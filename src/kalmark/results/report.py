@@ -12,23 +12,19 @@ from kalmark.results.files import config_yaml
 from kalmark.results.picture import headline
 from kalmark.results.series import reasons, series
 from kalmark.results.series_association import change_rows
+from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
 
-_ROBOT_COLUMNS = {
-    "scans": "scans",
-    "path_m": "path (m)",
-    "ate_raw_m": "position RMSE (m)",
-    "ate_m": "aligned (m)",
-    "heading_rmse_deg": "heading RMSE (deg)",
-    "pose_nees": "pose NEES",
-    "pose_nees_world": "in world coordinates",
-    "fix_median_m": "fixes: median (m)",
-    "fix_rms_10m": "RMS within 10 m (m)",
-    "fix_within_10m": "share within 10 m",
-    "diverged": "diverged",
-}
+_ROBOT = (
+    ("scans", "scans", ""),
+    ("path_m", "path", "m"),
+    *ROBOT,
+    ("pose_nees_world", "in world coordinates", ""),
+    *(row for row in TOTALS if row[0] in ("fix_median_m", "fix_rms_10m", "fix_within_10m")),
+    ("diverged", "diverged", ""),
+)
 
 
 _HINTS = {
@@ -45,7 +41,7 @@ def report_html(run: Run) -> str:
         style=_resource("report.css"),
         figures="".join(f"<span>{html.escape(figure)}</span>" for figure in figures),
         robots=robot_table(run.summary),
-        summary=_table([(key, show(value)) for key, value in _flat(run.summary)]),
+        summary=summary_table(run.summary),
         warnings="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("warnings", ())),
         advice="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("advice", ())),
         mounts=_mounts(run.summary),
@@ -64,21 +60,36 @@ def report_html(run: Run) -> str:
 def robot_table(summary: dict[str, Any]) -> str:
     """Return the table of the figures of each robot."""
     robots = summary["robots"]
-    columns = [key for key in _ROBOT_COLUMNS if any(key in figures for figures in robots.values())]
-    rows = [(name, *(show(figures.get(key)) for key in columns)) for name, figures in robots.items()]
-    return _table(rows, ("robot", *(_ROBOT_COLUMNS[key] for key in columns)))
+    columns = [row for row in _ROBOT if any(row[0] in figures for figures in robots.values())]
+    rows = [(name, *(show(f.get(key), unit) for key, _, unit in columns)) for name, f in robots.items()]
+    return _table(rows, ("robot", *(header(label, unit) for _, label, unit in columns)))
 
 
-def show(value: Any) -> str:
-    """Return a figure as it is printed: four significant digits, a dash for what is not there."""
+def summary_table(summary: dict[str, Any]) -> str:
+    """Return the table of all other figures in words; under the mouse, each tells its key in ``summary.json``."""
+    figures = dict(_flat(summary))
+    words = [*TOTALS, *MORE, *((f"batch.{key}", f"batch solution: {label}", unit) for key, label, unit in BATCH)]
+    others = [name for name, value in summary.items() if isinstance(value, dict) and "ate_raw_m" in value]
+    words += [(f"{name}.{key}", f"{name}: {label}", unit) for name in others for key, label, unit in ROBOT]
+    rows = "".join(
+        f'<tr title="{html.escape(key)}"><td{" class=part" if label.startswith(" ") else ""}>'
+        f"{html.escape(label.strip())}</td><td>{html.escape(show(value, unit))}</td><td>{unit}</td></tr>"
+        for key, label, value, unit in in_words(figures, tuple(words))
+    )
+    return f"<table>{rows}</table>"
+
+
+def show(value: Any, unit: str = "") -> str:
+    """Return a figure as it is printed: four significant digits, a dash for what is not there; a share in per cent."""
     if value is None:
         return "–"  # noqa: RUF001 - a dash
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
+        value = 100.0 * value if unit == "%" else value
         return f"{value:,.4g}" if 1e-3 <= abs(value) < 1e5 or value == 0 else f"{value:.3e}"
     if isinstance(value, list):
-        return ", ".join(show(item) for item in value)
+        return ", ".join(show(item, unit) for item in value)
     return str(value)
 
 
