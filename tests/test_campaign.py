@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from kalmark.campaign import Campaign, run_campaign
+from kalmark.campaign.picture import curves
 from kalmark.campaign.running import Plan, configs_of, joblib_backend
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.simulate import load_world
@@ -125,6 +126,16 @@ def test_a_saved_campaign_has_figures_a_row_a_step_and_a_picture(small: Campaign
     assert (last["estimator"], last["robot"], last["step"], last["runs"]) == ("invariant", "robot", "40", "3")
     assert float(last["pose_low"]) < 3 < float(last["pose_high"])
     assert (folder / "anees.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_no_curve_is_drawn_across_a_gap_in_time_but_across_steps_without_a_value() -> None:
+    t_s, value = np.arange(20.0) + 100.0 * (np.arange(20) >= 10), np.arange(20.0)
+    value[[3, 15]] = np.nan
+    t, mean, double = curves(t_s, value, 2 * value)
+    assert np.flatnonzero(np.isnan(t)).tolist() == np.flatnonzero(np.isnan(mean)).tolist() == [9]
+    assert mean[[2, 3, 8, 10]].tolist() == [2.0, 4.0, 9.0, 10.0]
+    np.testing.assert_array_equal(double, 2 * mean)
+    assert [len(row) for row in curves(t_s, np.full(20, np.nan))] == [0, 0]
 
 
 def test_an_estimator_may_be_given_with_a_key_of_its_own() -> None:

@@ -16,7 +16,7 @@ from matplotlib.image import imread
 from kalmark.cli.tables import print_summary
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
-from kalmark.results.picture import Picture, ellipses, headline, stretches_of
+from kalmark.results.picture import Picture, ellipses, grouped, headline, stretches_of
 from kalmark.results.plot import draw_map, save_map
 from kalmark.results.record import record
 from kalmark.results.report import report_html, show
@@ -220,6 +220,12 @@ def test_no_line_is_drawn_across_a_gap_in_time() -> None:
     (robot,) = page_data(report_html(run))["robots"]
     assert robot["gaps"] == [before]
     assert robot["truth"]["x"][before] is None
+    nis = page_data(report_html(run))["nis"]
+    (gap,) = nis["gaps"]
+    assert nis["t"][gap - 1] < 4.05
+    assert nis["t"][gap] >= 8.8, "since the first scan"
+    groups, gaps = grouped(np.array([0, 1, 3, 4, 5, 9]), 10**9 * np.array([0, 1, 2, 30, 31, 32]), 4)
+    assert (groups.tolist(), gaps.tolist()) == ([0, 0, 0, 1, 1, 2], [1])
     assert stretches_of(10**9 * np.array([0, 5, 10, 15, 70])).tolist() == [0, 0, 0, 0, 1]
 
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.campaign.statistics import Anees, kinds
-from kalmark.results.picture import COLOURS
+from kalmark.results.history import Array
+from kalmark.results.picture import COLOURS, grouped
 
 if TYPE_CHECKING:
     from kalmark.campaign.campaign import Campaign
@@ -41,28 +42,29 @@ def _each(steps: int) -> int:
     return -(-steps // POINTS)
 
 
-def _thinned(values: Any) -> Any:
-    """Return the means of so many values (N,), masked ones left out, that a curve of them can be read."""
-    values, each = np.ma.masked_invalid(values), _each(len(values))
-    means = np.ma.array(np.zeros(-(-len(values) // each)), mask=True)
-    for i in range(len(means)):
-        means[i] = values[i * each : (i + 1) * each].mean()
-    return means
+def curves(t_s: Array, value: Array, *others: Array) -> Array:
+    """Return curves (K, M), the first over time (N,), that can be read: means over steps that have a value (N,).
+
+    NaN stands where a gap in time is, so that no line is drawn across it.
+    """
+    steps = np.flatnonzero(np.isfinite(value))
+    groups, gaps = grouped(steps, (t_s[steps] * 1e9).astype(np.int64), _each(len(t_s)))
+    size = np.bincount(groups)
+    return np.insert([np.bincount(groups, row[steps]) / size for row in (t_s, value, *others)], gaps, np.nan, axis=1)
 
 
 def _draw_row(axis: Any, campaign: Campaign, name: str) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    t_s = _thinned(np.array(campaign.t_s) - (campaign.t_s[0] if campaign.kind == "config" else 0.0))  # logs have clocks
+    t_s = np.array(campaign.t_s) - (campaign.t_s[0] if campaign.kind == "config" else 0.0)  # logs have clocks
     for i, (estimator, scores) in enumerate(campaign.scores.items()):
         anees = Anees(name, scores, campaign.skip)
-        rows = (np.nanmean(np.ma.masked_invalid(a), axis=0) for a in (anees.mean, anees.low, anees.high))
-        value, low, high = map(_thinned, rows)
-        some = ~np.ma.getmaskarray(value)
+        rows = (np.ma.masked_invalid(a).mean(axis=0).filled(np.nan) for a in (anees.mean, anees.low, anees.high))
+        t, value, low, high = curves(t_s, *rows)
         label = f"{estimator} ({anees.average:.3g}; {100 * anees.inside:.0f} % inside)"
         if i == 0:
-            axis.fill_between(t_s[some], low[some], high[some], color="0.85", linewidth=0, label="95 % band")
-        axis.plot(t_s[some], value[some], color=COLOURS[i % len(COLOURS)], linewidth=0.9, label=label)
+            axis.fill_between(t, low, high, color="0.85", linewidth=0, label="95 % band")
+        axis.plot(t, value, color=COLOURS[i % len(COLOURS)], linewidth=0.9, label=label)
     axis.axhline(campaign.ideal(name), color="0.4", linewidth=0.6)
     axis.set_yscale("log")
     bottom, top = axis.get_ylim()

@@ -81,6 +81,16 @@ def broken(points: Array, stretches: Ints) -> Array:
     return np.insert(points, at, np.nan, axis=0)
 
 
+def grouped(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
+    """Return the group (N,) of each of these steps, and before which groups a gap in time is.
+
+    A group is drawn as one: what is of so many consecutive steps, and on one side of a gap.
+    """
+    stretches = stretches_of(t_ns)
+    new = (np.diff(steps // each, prepend=-1) != 0) | (np.diff(stretches, prepend=0) != 0)
+    return np.cumsum(new) - 1, np.flatnonzero(np.diff(stretches[new])) + 1
+
+
 def _used_fixes(run: Run) -> dict[str, Array]:
     """Return the fixes (N, 2) of each robot that the filter used; they are in the frame of the map."""
     used = [fix for fix in run.history.inputs.fixes if fix.used]

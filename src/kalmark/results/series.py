@@ -10,7 +10,7 @@ import numpy as np
 
 from kalmark.results.consistency import anees_interval, nees, nis, pose_error
 from kalmark.results.history import Array, Ints, MapSnapshot
-from kalmark.results.picture import Picture, broken
+from kalmark.results.picture import Picture, broken, grouped
 from kalmark.results.series_association import association_series
 from kalmark.results.series_space import space_series
 from kalmark.results.thinned import POINTS, gaussians, significant, thin, xy
@@ -89,22 +89,22 @@ def _errors(run: Run, rows: Ints) -> dict[str, Any]:
 
 
 def _nis(run: Run, t: Array) -> dict[str, Any]:
-    """Return NIS per degree of freedom over windows of equally many steps, and the 95 % bounds of each window."""
+    """Return NIS per degree of freedom over windows of steps, the 95 % bounds of each, and where gaps in time are."""
     history = run.history
     used = history.outcome == "associated"
     value, dof = nis(history.z[used], history.Z[used])
+    steps, at = np.unique(history.step[used][dof > 0], return_inverse=True)
     window = max(1, -(-len(t) // (POINTS // 4)))
-    count = -(-len(t) // window)
-    at = history.step[used] // window
-    total = np.bincount(at, np.nan_to_num(value), count)
-    degrees = np.bincount(at, dof, count).astype(int)
-    keep = degrees > 0
-    bounds = {n: anees_interval(n) for n in np.unique(degrees[keep]).tolist()}
+    groups, gaps = grouped(steps, history.t_ns[steps], window)
+    total = np.bincount(groups[at], value[dof > 0])
+    degrees = np.bincount(groups[at], dof[dof > 0]).astype(int)
+    bounds = {n: anees_interval(n) for n in np.unique(degrees).tolist()}
     return {
-        "t": significant(t[np.minimum(np.arange(count) * window + window // 2, len(t) - 1)][keep], 7),
-        "value": significant(total[keep] / degrees[keep]),
-        "low": significant(np.array([bounds[n][0] / n for n in degrees[keep].tolist()])),
-        "high": significant(np.array([bounds[n][1] / n for n in degrees[keep].tolist()])),
+        "t": significant(np.bincount(groups, t[steps]) / np.bincount(groups), 7),
+        "value": significant(total / degrees),
+        "low": significant(np.array([bounds[n][0] / n for n in degrees.tolist()])),
+        "high": significant(np.array([bounds[n][1] / n for n in degrees.tolist()])),
+        "gaps": gaps.tolist(),
         "window": window,
     }
 

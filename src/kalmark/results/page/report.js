@@ -6,6 +6,8 @@ const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["
 const el = id => document.getElementById(id);
 const axis = title => ({title: {text: title, standoff: 8}, gridcolor: "#e6e8ec", zeroline: false, linecolor: "#c4c8cf",
                         automargin: true});
+const END = Math.max(0, ...DATA.robots.flatMap(r => r.t.slice(-1))) || 1;
+const timeAxis = () => ({...axis("time (s)"), range: [0, END]});
 const layout = extra => ({margin: {l: 64, r: 16, t: 10, b: 44}, font: {family: "system-ui, sans-serif", size: 13, color: INK},
                           paper_bgcolor: "white", plot_bgcolor: "white", hovermode: "closest",
                           legend: {orientation: "h", y: -0.12, x: 0}, ...extra});
@@ -67,10 +69,40 @@ function upTo(t, now) {
   return low;
 }
 
-/* The first n steps of a robot's path, broken before each step that follows a gap in time. */
+/* Values, broken before each that follows a gap in time. */
+function broken(values, gaps) {
+  const at = new Set(gaps);
+  return values.flatMap((v, i) => at.has(i) ? [null, v] : [v]);
+}
+
+/* The first n steps of a robot's path, broken at gaps. */
 function pathOf(r, n, axes) {
-  const gaps = new Set(r.gaps);
-  return Object.fromEntries(axes.map(k => [k, r[k].slice(0, n).flatMap((v, i) => gaps.has(i) ? [null, v] : [v])]));
+  return Object.fromEntries(axes.map(k => [k, broken(r[k].slice(0, n), r.gaps)]));
+}
+
+/* A curve over time, broken at gaps; what is alone between two of them is a dot. */
+function curve(t, values, gaps, style) {
+  const x = broken(t, gaps), y = broken(values, gaps), none = v => v === null || v === undefined;
+  const alone = y.map((v, i) => !none(v) && none(y[i - 1]) && none(y[i + 1]));
+  return {x, y, mode: alone.includes(true) ? "lines+markers" : "lines", marker: {size: alone.map(a => a ? 3 : 0)}, ...style};
+}
+
+/* The band between two curves over time, an outline for each stretch between gaps. */
+function band(t, low, high, gaps) {
+  const x = [], y = [], at = new Set(gaps);
+  let stretch = [];
+  const close = () => {
+    const back = [...stretch].reverse();
+    x.push(...stretch.map(i => t[i]), ...back.map(i => t[i]), null);
+    y.push(...stretch.map(i => low[i]), ...back.map(i => high[i]), null);
+    stretch = [];
+  };
+  t.forEach((_, i) => {
+    if (at.has(i) || low[i] === null) close();
+    if (low[i] !== null) stretch.push(i);
+  });
+  close();
+  return {x, y, mode: "lines", line: {width: 0}, fill: "toself", fillcolor: BAND, hoverinfo: "skip"};
 }
 
 function still() {
@@ -157,40 +189,34 @@ function drawErrors(robot) {
   const traces = [], page = layout({height: 560, showlegend: false}), two = names.length > 3;
   names.forEach((name, i) => {
     const n = i + 1, row = i % 3, right = i > 2, at = {xaxis: right ? "x2" : "x", yaxis: "y" + (i ? n : "")};
-    const band = robot.sigma[i].map(s => s === null ? null : 3 * s);
-    traces.push({x: robot.t, y: band.map(b => b === null ? null : -b), mode: "lines", line: {width: 0}, hoverinfo: "skip", ...at});
-    traces.push({x: robot.t, y: band, mode: "lines", line: {width: 0}, fill: "tonexty", fillcolor: BAND, hoverinfo: "skip", ...at});
-    traces.push({x: robot.t, y: robot.error[i], mode: "lines", line: {color: robot.colour, width: 1.1},
-                 hovertemplate: `%{x:.1f} s: %{y:.4g}<extra>${name}</extra>`, ...at});
+    const [low, high] = [-3, 3].map(n => robot.sigma[i].map(s => s === null ? null : n * s));
+    traces.push({...band(robot.t, low, high, robot.gaps), ...at});
+    traces.push(curve(robot.t, robot.error[i], robot.gaps, {line: {color: robot.colour, width: 1.1},
+                      hovertemplate: `%{x:.1f} s: %{y:.4g}<extra>${name}</extra>`, ...at}));
     page["yaxis" + (i ? n : "")] = {...axis(name), domain: [1 - (row + 1) / 3 + 0.025, 1 - row / 3 - 0.01], zeroline: true,
                                     zerolinecolor: "#c4c8cf", anchor: right ? "x2" : "x"};
   });
-  page.xaxis = {...axis("time (s)"), anchor: "y3", domain: [0, two ? 0.46 : 1]};
-  if (two) page.xaxis2 = {...axis("time (s)"), anchor: "y6", domain: [0.54, 1], matches: "x"};
+  page.xaxis = {...timeAxis(), anchor: "y3", domain: [0, two ? 0.46 : 1]};
+  if (two) page.xaxis2 = {...timeAxis(), anchor: "y6", domain: [0.54, 1], matches: "x"};
   Plotly.react("errors", traces, page, CONFIG);
   const [low, high] = DATA.neesBounds, ends = [robot.t[0], robot.t[robot.t.length - 1]];
   el("nees-note").textContent = `${DATA.dof} degrees of freedom; the band holds 95 % of a consistent filter's values; errors last, so a run may be outside for long`;
-  Plotly.react("nees", [...bounds(ends, [low, low], [high, high]),
-    {x: robot.t, y: robot.nees, mode: "lines", line: {color: robot.colour, width: 1.1},
-     hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
+  Plotly.react("nees", [band(ends, [low, low], [high, high], []),
+    curve(robot.t, robot.nees, robot.gaps, {line: {color: robot.colour, width: 1.1},
+          hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"}),
     {x: ends, y: [DATA.dof, DATA.dof], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
-    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: logAxis("NEES", [...robot.nees, low, high])}), CONFIG);
-}
-
-function bounds(t, low, high) {
-  return [{x: t, y: low, mode: "lines", line: {width: 0}, hoverinfo: "skip"},
-          {x: t, y: high, mode: "lines", line: {width: 0}, fill: "tonexty", fillcolor: BAND, hoverinfo: "skip"}];
+    layout({height: 280, showlegend: false, xaxis: timeAxis(), yaxis: logAxis("NEES", [...robot.nees, low, high])}), CONFIG);
 }
 
 function drawNis() {
   const nis = DATA.nis;
-  const band = "the band would hold 95 % of them if observations were independent; those of a scan share the error of the pose, so more are outside";
-  el("nis-note").textContent = `${nis.window > 1 ? `mean over windows of ${nis.window} scans` : "each scan"}; ${band}`;
-  Plotly.react("nis", [...bounds(nis.t, nis.low, nis.high),
-    {x: nis.t, y: nis.value, mode: "lines", line: {color: "#1f5fa8", width: 1.1},
-     hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"},
+  const meaning = "the band would hold 95 % of them if observations were independent; those of a scan share the error of the pose, so more are outside";
+  el("nis-note").textContent = `${nis.window > 1 ? `mean over windows of ${nis.window} scans` : "each scan"}; ${meaning}`;
+  Plotly.react("nis", [band(nis.t, nis.low, nis.high, nis.gaps),
+    curve(nis.t, nis.value, nis.gaps, {line: {color: "#1f5fa8", width: 1.1},
+          hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"}),
     {x: [nis.t[0], nis.t[nis.t.length - 1]], y: [1, 1], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
-    layout({height: 280, showlegend: false, xaxis: axis("time (s)"), yaxis: logAxis("NIS / dof", [...nis.value, ...nis.low, ...nis.high])}), CONFIG);
+    layout({height: 280, showlegend: false, xaxis: timeAxis(), yaxis: logAxis("NIS / dof", [...nis.value, ...nis.low, ...nis.high])}), CONFIG);
 }
 
 const CHANGE = {merged: ["#1f5fa8", "triangle-down"], removed: ["#c8553d", "x-thin"]};
@@ -244,7 +270,7 @@ function drawOutcomes() {
   const traces = Object.entries(DATA.outcomes.counts).map(([name, y]) =>
     ({x: DATA.outcomes.t, y, type: "bar", name, marker: {color: OUTCOME[name]},
       hovertemplate: `%{x:.1f} s: %{y} ${name}<extra></extra>`}));
-  Plotly.react("outcomes", [...traces, ...marks], layout({height: 280, barmode: "stack", bargap: 0, xaxis: axis("time (s)"), showlegend: true,
+  Plotly.react("outcomes", [...traces, ...marks], layout({height: 280, barmode: "stack", bargap: 0, xaxis: timeAxis(), showlegend: true,
     yaxis: axis("observations"), legend: {orientation: "h", y: 1.02, yanchor: "bottom"}}), CONFIG);
 }
 
