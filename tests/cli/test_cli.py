@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from command_line import Kalmark, refused, write_log_of_space
 
+from kalmark.results.consistency import anees_interval
+
 
 def test_run_writes_the_run_folder_and_prints_its_figures(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
     done = kalmark("run", "native", "--log", log)
@@ -102,6 +104,13 @@ def test_a_campaign_prints_estimators_side_by_side(kalmark: Kalmark, tmp_path: P
     assert "joint state" in done.out
     summary = json.loads((tmp_path / "mc" / "summary.json").read_text())
     assert list(summary["estimators"]) == ["invariant", "ekf"]
+    low, high = anees_interval(3, 2)
+    assert summary["band"]["pose"] == pytest.approx([low, high])
+    (pose,) = (line for line in done.out.splitlines() if line.strip().startswith("pose (3)"))
+    assert f"{low:.2f} to {high:.2f}" in pose
+    for label, key in (("aligned", "landmark_rmse_m"), ("raw", "landmark_rmse_raw_m")):
+        (line,) = (line for line in done.out.splitlines() if f"landmark RMSE, {label}, m" in line)
+        assert line.split()[-2] == f"{summary['estimators']['invariant'][key]:.3f}"
 
 
 def test_data_list_names_every_dataset(kalmark: Kalmark) -> None:

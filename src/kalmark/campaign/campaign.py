@@ -46,12 +46,22 @@ class Campaign:
         words = "orientation" if name == "heading" and self.ideal(name) == 3 else _WORDS.get(name, name)
         return f"{words} ({self.ideal(name):.3g})"
 
+    def band(self, name: str) -> tuple[float, float] | None:
+        """Return the 95 % chi-square band of an ANEES at one step, the median over steps; None if it has no value.
+
+        The average over steps scatters less, by how much the correlation of the steps decides.
+        """
+        anees = Anees(name, next(iter(self.scores.values())), self.skip)
+        low, high = (a[:, self.skip :][np.isfinite(a[:, self.skip :])] for a in (anees.low, anees.high))
+        return (float(np.median(low)), float(np.median(high))) if len(low) else None
+
     def summary(self) -> dict[str, Any]:
         """Return the figures of ``summary.json``: a section for each estimator."""
         estimators = {name: figures(scores, self.skip) for name, scores in self.scores.items()}
         head = {self.kind: self.world, "seed": self.seed, "runs": self.runs, "steps": len(self.t_s)}
         dof = {name: self.ideal(name) for name in self._names()}
-        tail = {"map_every": self.map_every, "skip": self.skip, "dof": dof, "estimators": estimators}
+        band = {name: self.band(name) for name in self._names()}
+        tail = {"map_every": self.map_every, "skip": self.skip, "dof": dof, "band": band, "estimators": estimators}
         return none_for_nan({**head, **tail})
 
     def save(self, folder: str | Path) -> Path:

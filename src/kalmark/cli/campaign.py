@@ -21,7 +21,8 @@ FIGURES = (
     ("pose_inside", "pose in its band, %"),
     ("position_rmse_m", "position RMSE, m"),
     ("heading_rmse_deg", "heading RMSE, deg"),
-    ("landmark_rmse_m", "landmark RMSE, m"),
+    ("landmark_rmse_m", "landmark RMSE, aligned, m"),
+    ("landmark_rmse_raw_m", "landmark RMSE, raw, m"),
     ("mount_m", "mount at the end, m"),
     ("mount_deg", "mount at the end, deg"),
     ("mount_sure", "mounts within 3 sigma at the end"),
@@ -72,13 +73,18 @@ def campaign(
 def print_campaign(campaign: Campaign) -> None:
     """Print one row a figure, one column an estimator."""
     estimators: dict[str, dict[str, Any]] = campaign.summary()["estimators"]
-    rows = [
-        (
-            campaign.label(label) if label in NEES else label,
-            *(number(figures.get(key), "%" if key.endswith("_inside") else "") for figures in estimators.values()),
-        )
-        for key, label in FIGURES
-        if any(figures.get(key) is not None for figures in estimators.values())
-    ]
+    rows = []
+    for key, label in FIGURES:
+        if any(figures.get(key) is not None for figures in estimators.values()):
+            name = key.removesuffix("_anees")
+            words = (campaign.label(name), band(campaign, name)) if name in NEES else (label, "")
+            unit = "%" if key.endswith("_inside") else ""
+            rows.append((*words, *(number(figures.get(key), unit) for figures in estimators.values())))
     title = f"{campaign.world}: {campaign.runs} runs, seed {campaign.seed}; ANEES (in brackets: of a consistent filter)"
-    print_table(title, ("", *estimators), rows, align="<" + ">" * len(estimators))
+    print_table(title, ("", "95 % band, one step", *estimators), rows, align="<>" + ">" * len(estimators))
+
+
+def band(campaign: Campaign, name: str) -> str:
+    """Return the band of an ANEES of so many runs at one step as text, "" if there is none."""
+    ends = campaign.band(name)
+    return f"{ends[0]:.2f} to {ends[1]:.2f}" if ends else ""
