@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import kalmark as km
 from kalmark.cli import main
@@ -144,6 +145,31 @@ def test_what_has_an_id_is_drawn_with_its_landmark_and_d2_as_what_has_none(tmp_p
     assert lone.get_xlim()[1] < 100.0
     (tmp_path / "run" / "map.kmk").unlink()
     assert not np.isfinite([fate.seen_at for fate in explain(Run.load(tmp_path / "run"), 2.0).fates]).any()
+
+
+def test_a_drawn_scan_has_no_far_landmarks_and_no_text_over_another(tmp_path: Path) -> None:
+    held = explain(lost_run(tmp_path), 7.0)
+    places = [np.array(p) for p in ([4.0, 1.0], [4.3, 1.2], [4.4, 0.8], [4.6, 1.1])]
+    near = tuple(
+        Compared(f"u{k}", d2, p) for k, (d2, p) in enumerate(zip([1.23, 4.56, 7.89, 120.0], places, strict=True))
+    )
+    fates = tuple(
+        replace(held.fates[0], index=k, landmark="", seen_at=np.array([3.0, y]), compared=compared)
+        for k, (y, compared) in enumerate([(1.0, near), (1.1, near), (0.5, near[3:])])
+    )
+    told = replace(held, fates=fates)
+    run = Run.load(tmp_path / "run")
+    figure = draw_scan(run, told)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    texts = figure.axes[0].texts
+    said = [text.get_text() for text in texts]
+    assert sorted(said) == sorted(["0", "1", "2", "u0", "u1", "u2", *2 * ["1.23", "4.56", "7.89"]])
+    boxes = [text.get_window_extent() for text in texts]
+    pairs = [(a, b) for i, a in enumerate(said) for j, b in enumerate(said[:i]) if boxes[i].overlaps(boxes[j])]
+    assert pairs == []
+    assert sum("u3 (d2 120)" in line for line in told.lines()) == 3
+    assert [fate.near for fate in fates] == [[*near[:3]], [*near[:3]], []]
 
 
 def pointed_at(T: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 
 AROUND_S = 1.0  # before the first and after the last scan, a time still means them
+FAR = 30.0  # d2 of a landmark that an observation cannot be of, by whatever gate: it is not drawn, but for the nearest
+FARTHEST = 100.0  # d2 of the nearest that is not drawn either
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,12 @@ class Fate:
     reason: str
     seen_at: Array
     compared: tuple[Compared, ...]
+
+    @property
+    def near(self) -> list[Compared]:
+        """What to draw of what it was compared with: what it may be of, the landmark decided on, and the nearest."""
+        least = min((other.d2 for other in self.compared if other.d2 <= FARTHEST), default=0.0)
+        return [c for c in self.compared if c.d2 <= max(FAR, least) or c.landmark == self.landmark]
 
 
 @dataclass(frozen=True, eq=False)

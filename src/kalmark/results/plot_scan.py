@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from kalmark.results.explain import Compared, Explanation, Fate
+from kalmark.results.explain import Explanation, Fate
 from kalmark.results.history import Array
 from kalmark.results.picture import INK, ellipses
 from kalmark.results.words import figure as figure_of
@@ -26,10 +26,9 @@ OUTCOME = {
 FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
 PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
-FAR = 30.0  # d2 of a landmark that an observation cannot be of, by whatever gate: it is not drawn, but for the nearest
-FARTHEST = 300.0  # d2 of the nearest that is not drawn either
-SHORT = 0.12  # of the picture's width: a line on which no number fits
-ON_LINE: dict[str, Any] = {"ha": "center", "va": "center", "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
+PAPER = 490.0  # width of the axes in points, about
+MARK = 6.0  # half a cross or a square, in points
+ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
 def save_scan(run: Run, told: Explanation, path: str | Path) -> None:
@@ -52,21 +51,7 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
     _robot(axes, run, told)
     low, high = _extent(told)
     _landmarks(axes, run, told, low, high)
-    for fate in told.fates:
-        colour = OUTCOME.get(fate.outcome, INK)
-        if not np.isfinite(fate.seen_at[:2]).all():
-            continue
-        at = float(fate.seen_at[0]), float(fate.seen_at[1])
-        axes.plot(*at, "x", color=colour, ms=9, mew=2, zorder=5)
-        _beside(axes, at, (5, 5), _label(fate), color=colour, fontsize=9, zorder=6)
-        for other in _near(fate):
-            chosen, there = other.landmark == fate.landmark, (float(other.place[0]), float(other.place[1]))
-            axes.plot(*zip(at, there, strict=True), "-" if chosen else ":", color=colour, lw=2 if chosen else 1)
-            axes.plot(*there, "s", color=INK, mfc="none", ms=8, zorder=4)
-            _beside(axes, there, (7, -12), other.landmark, fontsize=8, color=INK)
-            if not chosen:
-                off = _off(at, there) if np.hypot(*np.subtract(there, at)) < SHORT * (high[0] - low[0]) else (0.0, 0.0)
-                _beside(axes, _between(at, there), off, figure_of(other.d2), fontsize=8, color=colour, **ON_LINE)
+    _observations(axes, told, low, high)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -80,32 +65,80 @@ def draw_scan(run: Run, told: Explanation) -> Figure:
     return figure
 
 
-def _near(fate: Fate) -> list[Compared]:
-    """Return what an observation was compared with and may be of, the landmark decided on, and the nearest."""
-    least = min((other.d2 for other in fate.compared if other.d2 <= FARTHEST), default=0.0)
-    return [c for c in fate.compared if c.d2 <= max(FAR, least) or c.landmark == fate.landmark]
+def _observations(axes: Axes, told: Explanation, low: Array, high: Array) -> None:
+    """Draw the marks of observations and landmarks, and the lines between; then their texts, each where it has room."""
+    fates = [fate for fate in told.fates if np.isfinite(fate.seen_at[:2]).all()]
+    squares = {other.landmark: other.place[:2] for fate in fates for other in fate.near}
+    labels = _Labels(axes, low, high, [*squares.values(), *(fate.seen_at[:2] for fate in fates)])
+    for place in squares.values():
+        axes.plot(*place, "s", color=INK, mfc="none", ms=8, zorder=4)
+    for fate in fates:
+        colour, at = OUTCOME.get(fate.outcome, INK), fate.seen_at[:2]
+        axes.plot(*at, "x", color=colour, ms=9, mew=2, zorder=5)
+        labels.beside(at, _label(fate), fontsize=9, color=colour)
+        for other in fate.near:
+            chosen = other.landmark == fate.landmark
+            style: dict[str, Any] = {"ls": "-", "lw": 2} if chosen else {"ls": ":", "lw": 1}
+            axes.plot(*zip(at, other.place[:2], strict=True), color=colour, **style)
+    for name, place in squares.items():
+        labels.beside(place, name, fontsize=8, color=INK)
+    for fate in fates:
+        for other in fate.near:
+            if other.landmark != fate.landmark:
+                style = {"fontsize": 8, "color": OUTCOME.get(fate.outcome, INK), **ON_LINE}
+                labels.along(fate.seen_at[:2], other.place[:2], figure_of(other.d2), **style)
+
+
+class _Labels:
+    """Texts in the axes from `low` to `high` (2,), each at that of several places where it covers the least.
+
+    Boxes are in points of the paper, left, bottom, right, top; those of the marks (2,) are taken from the start.
+    """
+
+    def __init__(self, axes: Axes, low: Array, high: Array, marks: list[Array]) -> None:
+        self.axes, self.low, self.scale = axes, low, PAPER / float(high[0] - low[0])
+        centres = np.array([self.paper(mark) for mark in marks]).reshape(-1, 2)
+        self.taken = np.hstack([centres - MARK, centres + MARK])
+
+    def paper(self, at: Array) -> Array:
+        """Return where a place (2,) of the map is on paper."""
+        out: Array = (at - self.low) * self.scale
+        return out
+
+    def beside(self, at: Array, text: str, **style: Any) -> None:
+        """Put a text at a side of a mark, or at a corner."""
+        sides = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float64)
+        off = np.where(sides.all(axis=1, keepdims=True), [3.0, MARK], MARK + 2.0) + _half(text, style["fontsize"])
+        self._put(self.paper(at) + sides * off, text, style)
+
+    def along(self, one: Array, other: Array, text: str, **style: Any) -> None:
+        """Put a text on the line from one place to another, nearer to the first, or beside the line."""
+        begin, way = self.paper(one), self.paper(other) - self.paper(one)
+        across = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-9)
+        off = float(np.abs(across) @ _half(text, style["fontsize"])) + 2.0
+        parts = np.array([0.35, 0.5, 0.25, 0.65, 0.8])[:, None]
+        places = [begin + parts * way + side * off * across for side in (0.0, 1.0, -1.0)]
+        self._put(np.concatenate(places), text, style)
+
+    def _put(self, centres: Array, text: str, style: dict[str, Any]) -> None:
+        half = _half(text, style["fontsize"])
+        boxes = np.hstack([centres - half, centres + half])[:, None]
+        sides = np.minimum(boxes[..., 2:], self.taken[:, 2:]) - np.maximum(boxes[..., :2], self.taken[:, :2])
+        best = int(np.argmin(np.prod(np.maximum(sides, 0.0), axis=2).sum(axis=1)))
+        self.taken = np.vstack([self.taken, boxes[best]])
+        at = self.low + centres[best] / self.scale
+        self.axes.text(at[0], at[1], text, ha="center", va="center", clip_on=True, zorder=6, **style)
+
+
+def _half(text: str, size: float) -> Array:
+    """Return half the width and height (2,) of a text, in points, about."""
+    return np.array([0.31 * size * len(text), 0.55 * size])
 
 
 def _label(fate: Fate) -> str:
     """Return an observation's number, and the d2 of the landmark decided on."""
     d2 = next((c.d2 for c in fate.compared if c.landmark == fate.landmark), None)
     return str(fate.index) if d2 is None else f"{fate.index}: {figure_of(d2, 2)}"
-
-
-def _beside(axes: Axes, at: tuple[float, float], off: tuple[float, float], text: str, **style: Any) -> None:
-    axes.annotate(text, at, off, textcoords="offset points", clip_on=True, **style)
-
-
-def _off(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return how far a number is put off a short line, in points, across it."""
-    x, y = other[0] - one[0], other[1] - one[1]
-    size = float(np.hypot(x, y)) or 1.0
-    return -14.0 * abs(y) / size, -11.0 * abs(x) / size
-
-
-def _between(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return a place on the line from an observation to a landmark, nearer to the observation."""
-    return one[0] + 0.35 * (other[0] - one[0]), one[1] + 0.35 * (other[1] - one[1])
 
 
 def _robot(axes: Axes, run: Run, told: Explanation) -> None:
@@ -131,7 +164,7 @@ def _landmarks(axes: Axes, run: Run, told: Explanation, low: Array, high: Array)
 def _extent(told: Explanation) -> tuple[Array, Array]:
     """Return the corners (2,) of what is drawn."""
     points = [told.pose[:2], *(f.seen_at[:2] for f in told.fates)]
-    points += [c.place[:2] for f in told.fates for c in _near(f)]
+    points += [c.place[:2] for f in told.fates for c in f.near]
     shown = np.array([p for p in points if np.isfinite(p).all()])
     low, high = shown.min(axis=0), shown.max(axis=0)
     middle, half = (low + high) / 2, 0.62 * max(float((high - low).max()), LEAST_M)

@@ -75,7 +75,7 @@ def _fate(fate: Fate) -> dict[str, Any]:
     x, y = rounded(fate.seen_at[:2], 4)
     near = [
         {"name": c.landmark, "d2": float(f"{c.d2:.3g}")} | dict(zip("xy", rounded(c.place[:2], 4), strict=True))
-        for c in fate.compared
+        for c in fate.near
     ]
     text = f"{fate.outcome}{' ' + fate.landmark if fate.landmark else ''}{': ' if fate.reason else ''}{fate.reason}"
     return {
