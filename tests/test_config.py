@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from kalmark.config import documentation, load_config, resolve_config, shipped_configs
 from kalmark.config.schema import LogConfig
+from kalmark.config.tree import name_of, name_on
 from kalmark.errors import ConfigError
 from kalmark.logs import FORMATS
 
@@ -299,3 +300,11 @@ def test_a_start_of_space_may_have_a_sigma_for_each_axis(tmp_path: Path) -> None
 def test_every_option_of_a_log_format_is_a_key() -> None:
     options = {option for entry in FORMATS.values() for option in entry.options}
     assert options <= set(LogConfig.model_fields)
+
+
+def test_a_file_is_called_by_its_name_or_by_its_folder_if_all_such_files_have_that_name() -> None:
+    assert name_of(Path("runs/woods/config.yaml"), "config") == "woods"
+    assert name_of(Path("runs/woods/fast.yaml"), "config") == "fast"
+    assert name_of(Path("worlds/config.yaml"), "world") == "config"
+    assert (name_of(Path("/config.yaml"), "config"), name_of(None, "world")) == ("config", "world")
+    assert (name_on("woods", "log"), name_on("log", "log")) == ("woods on log", "log")

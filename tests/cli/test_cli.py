@@ -49,7 +49,9 @@ def test_the_saved_configuration_runs_again_to_the_same_map(kalmark: Kalmark, lo
     overrides = ["--set", "robots.each.motion.sigma_v_mps=0.3", "--set", "estimator.type=ekf"]
     assert kalmark("run", "native", "--log", log, *overrides, "--out", "first").status == 0
     assert "sigma_v_mps: 0.3" in (tmp_path / "first" / "config.yaml").read_text()
-    assert kalmark("run", "first/config.yaml", "--out", "second").status == 0
+    again = kalmark("run", "first/config.yaml", "--out", "second")
+    assert again.status == 0
+    assert again.out.startswith("first on log"), "it is called by its folder, not config like all of them"
     first, second = ((tmp_path / name / "landmarks.csv").read_bytes() for name in ("first", "second"))
     assert first == second
 

@@ -21,6 +21,7 @@ from kalmark.config.building import build_robot, config_dict
 from kalmark.config.mounting import StartConfig
 from kalmark.config.opening import described
 from kalmark.config.schema import Config
+from kalmark.config.tree import name_on
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
@@ -78,7 +79,7 @@ def replay_of(config: Config, log: Log, progress: bool = True) -> Replay:
         sections[name] = section.model_copy(update={"start": start})
     settings = config.model_copy(update={"robots": sections})
     written = config_yaml(config_dict(config))
-    return Replay(f"{config.name} on {log.name}", settings, log.robots, recorded(settings, log, progress), written)
+    return Replay(name_on(config.name, log.name), settings, log.robots, recorded(settings, log, progress), written)
 
 
 def refuse_other(config: Config, name: str, robot: Robot) -> None:

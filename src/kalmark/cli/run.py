@@ -57,6 +57,8 @@ def run(
     ] = None,
 ) -> None:
     """Run one log through one filter and write a run folder."""
+    from kalmark.config.tree import name_of, name_on
+
     out = writable(out or Path("out") / Path(config).stem)
     with computing():
         result = run_log(config, log, overrides=overrides or (), on_error=on_error.value if on_error else None)
@@ -64,7 +66,7 @@ def run(
         if batch or (batch is None and summary.get("corner_rms_px") is not None):
             summary = against_batch(result, summary, needed=bool(batch))
         result.save(out)
-    finish(result, out, f"{Path(config).stem} on {result.log.name}")
+    finish(result, out, name_on(name_of(Path(config), "config"), result.log.name))
     if summary.get("stopped"):
         raise typer.Exit(2)
 

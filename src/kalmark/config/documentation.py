@@ -42,7 +42,8 @@ A configuration is a YAML 1.2 file.  `kalmark run CONFIG` takes a path or one of
 that is left out has the default given here; an unknown key or a bad value is refused with file, line, column, the
 value, what was expected and the nearest key.  `--set a.b=value` overrides one key from the command line, `--log PATH`
 the log; another `type` replaces its whole section, but for a mount; what no robot of the log takes is refused.
-The `config.yaml` that a run leaves in its folder holds everything that was in force, and can be run again.
+The `config.yaml` that a run leaves in its folder holds everything that was in force, and can be run again;
+its title is then the folder's name.
 `kalmark config native > mine.yaml` prints a shipped one to start from.
 
 ```yaml

@@ -11,7 +11,7 @@ from kalmark.config.landmarks import Association, IdentityAssociation, Landmark
 from kalmark.config.models import Motion, PlaneSensor, SpaceSensor, UnicycleMotion, world_of
 from kalmark.config.mounting import VELOCITY, SpaceStartConfig, StartConfig, UpkeepConfig
 from kalmark.config.sections import Linearity, NotNegative, Number, Positive, RobotName, Section, expected, type_or
-from kalmark.config.tree import OVERRIDE
+from kalmark.config.tree import OVERRIDE, name_of
 from kalmark.errors import ConfigError
 
 
@@ -183,8 +183,8 @@ class Config(Section):
 
     @property
     def name(self) -> str:
-        """The file's name without its ending, or "config"."""
-        return self._file.stem if self._file else "config"
+        """The file's name without its ending, its folder's name for a ``config.yaml``, or "config"."""
+        return name_of(self._file, "config")
 
     def overridden(self, *path: str) -> bool:
         """Return whether an override gave the value at `path`."""

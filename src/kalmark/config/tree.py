@@ -20,6 +20,18 @@ OVERRIDE = "--set "  # how the place begins of what was set on the command line
 _DEEPEST = 12  # a configuration is 5 levels deep; an alias to its own parent has no end
 
 
+def name_of(file: Path | None, general: str) -> str:
+    """Return a file's name without its ending; of one with the `general` name that all have, that of its folder."""
+    if file is None or file.stem != general:
+        return file.stem if file else general
+    return file.resolve().parent.name or general
+
+
+def name_on(name: str, log: str) -> str:
+    """Return what a configuration over a log is called: by both names, by one if a log has its own beside it."""
+    return name if name == log else f"{name} on {log}"
+
+
 @dataclass
 class Tree:
     """Plain values, with the place of every key and every value by path."""

@@ -20,7 +20,7 @@ from kalmark.config.mounting import SpaceStartConfig, StartConfig
 from kalmark.config.reading import resolve_name, validate
 from kalmark.config.schema import Config, RobotConfig, SpaceRobotConfig
 from kalmark.config.sections import Positive, Section, expected
-from kalmark.config.tree import Tree, read_tree
+from kalmark.config.tree import Tree, name_of, read_tree
 from kalmark.simulate.layouts3d import Layout
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import Sensing
@@ -127,8 +127,8 @@ class World(Section):
 
     @property
     def name(self) -> str:
-        """The file's name without its ending, or "world"."""
-        return self._file.stem if self._file else "world"
+        """The file's name without its ending, its folder's name for a ``world.yaml``, or "world"."""
+        return name_of(self._file, "world")
 
     @property
     def has_signatures(self) -> bool:
