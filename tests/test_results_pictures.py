@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -24,7 +25,7 @@ from kalmark.results.run import Run
 from kalmark.results.series import reasons, series
 from kalmark.results.thinned import POINTS
 from kalmark.results.words import BATCH, ROBOT, TOTALS, count, figure, header
-from kalmark.slam.events import Control, Fix, Scan
+from kalmark.slam.events import Control, Event, Fix, Scan
 from results_world import circle, slam_for
 
 
@@ -251,6 +252,25 @@ def test_figures_in_words_are_without_powers_of_ten_and_in_the_right_number() ->
     title, parts = headline(recorded(circle(steps=1)))
     assert title == "circle · invariant"
     assert "1 scan" in parts
+
+
+def test_steps_in_which_something_is_compiled_have_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = circle(steps=8)
+    slam, scans = slam_for(log), 0
+    process = slam.process
+
+    def compiling(event: Event) -> Any:
+        nonlocal scans
+        scans += isinstance(event, Scan)
+        if isinstance(event, Control) and scans == 4:
+            numba.njit(lambda a: a + 1)(1.0)
+        return process(event)
+
+    recorded(log)
+    monkeypatch.setattr(slam, "process", compiling)
+    run = record(slam, log, progress=False)
+    assert np.flatnonzero(np.isnan(run.history.step_us)).tolist() == [4]
+    assert run.evaluate()["step_us_p99"] > 0
 
 
 def test_the_first_step_does_not_count_for_the_time_a_step_takes(run: Run) -> None:

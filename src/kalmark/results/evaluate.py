@@ -35,6 +35,7 @@ def evaluate(run: Run) -> dict[str, Any]:
     """Return the figures of ``summary.json``; a figure that needs what is not there is absent or None."""
     history = run.history
     robots = {name: robot_figures(run, name) for name in history.robots}
+    step_us = history.step_us[1:][np.isfinite(history.step_us[1:])]
     summary: dict[str, Any] = {
         "log": run.log.as_dict(),
         "estimator": run.estimator,
@@ -50,8 +51,8 @@ def evaluate(run: Run) -> dict[str, Any]:
         "landmarks": len(run.landmarks),
         "skipped": sum(map(records_of, run.skipped)),
         "wall_s": run.wall_s,
-        "step_us_median": _quantile(history.step_us[1:], 0.5),
-        "step_us_p99": _quantile(history.step_us[1:], 0.99),
+        "step_us_median": _quantile(step_us, 0.5),
+        "step_us_p99": _quantile(step_us, 0.99),
         "nis_per_dof": nis_per_dof(history),
         "pose_dof": 6 if history.in_space else 3,
         "diverged": bool(run.stopped) or any(figures.get("diverged", False) for figures in robots.values()),

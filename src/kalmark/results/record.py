@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from numba.core import event as numba_event
 
 from kalmark.errors import DivergedError, EventError
 from kalmark.logs.start import begins_at
@@ -62,16 +64,17 @@ def record(
     recorder.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in events)
     recorder.starts = _starts(slam, events)
     begin = time.perf_counter()
-    for event in track(events, getattr(log, "name", "log"), len(events), show=progress):
-        try:
-            recorder.process(event)
-        except EventError as error:
-            if on_error == "raise":
-                raise
-            recorder.skipped.append(str(error))
-        except DivergedError as error:
-            recorder.stopped = str(error)
-            break
+    with numba_event.install_listener("numba:compiler_lock", recorder.compiler):
+        for event in track(events, getattr(log, "name", "log"), len(events), show=progress):
+            try:
+                recorder.process(event)
+            except EventError as error:
+                if on_error == "raise":
+                    raise
+                recorder.skipped.append(str(error))
+            except DivergedError as error:
+                recorder.stopped = str(error)
+                break
     wall_s = time.perf_counter() - begin
     return recorder.run(log, config, wall_s)
 
@@ -83,6 +86,18 @@ def _starts(slam: Slam, events: list[Event]) -> tuple[Start, ...]:
         for name, t_ns in begins.items()
         if t_ns is not None
     )
+
+
+class _Compiler(numba_event.Listener):  # type: ignore[misc, unused-ignore]
+    """Notes when an inner loop is being compiled or read from the disk, once in a process."""
+
+    was_busy = False
+
+    def on_start(self, event: Any) -> None:
+        self.was_busy = True
+
+    def on_end(self, event: Any) -> None:
+        pass
 
 
 @dataclass
@@ -101,10 +116,11 @@ class _Recorder:
     scans: list[Scan] = field(default_factory=list)
     means: list[Array] = field(default_factory=list)
     covariances: list[Array] = field(default_factory=list)
-    step_ns: list[int] = field(default_factory=list)
+    step_ns: list[float] = field(default_factory=list)
     kinds: list[str] = field(default_factory=list)
     left: list[Array] = field(default_factory=list)
     maps: list[MapSnapshot] = field(default_factory=list)
+    compiler: _Compiler = field(default_factory=_Compiler)
     _spent_ns: int = 0
 
     def process(self, event: Event) -> None:
@@ -122,8 +138,8 @@ class _Recorder:
                 used = all(o.outcome == "associated" for o in report.observations)
                 self.fixes.append(UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0]))
             return
-        self.step_ns.append(self._spent_ns)
-        self._spent_ns = 0
+        self.step_ns.append(math.nan if self.compiler.was_busy else self._spent_ns)
+        self._spent_ns, self.compiler.was_busy = 0, False
         self.scans.append(event)
         self.reports.append(report)
         self.means.append(self.slam.mean(event.robot))
