@@ -25,6 +25,7 @@ from kalmark.results.run import Run
 from kalmark.results.series import reasons, series
 from kalmark.results.thinned import POINTS
 from kalmark.results.words import BATCH, ROBOT, TOTALS, count, figure, header
+from kalmark.slam.association import ByIdentity
 from kalmark.slam.events import Control, Event, Fix, Scan
 from results_world import circle, slam_for
 
@@ -244,6 +245,28 @@ def test_fixes_that_the_filter_used_are_drawn_where_they_were_measured() -> None
     assert Picture.of(run).used["rover"].tolist() == [[1.0, 0.1]]
     assert page_data(report_html(run))["usedFixes"] == {"rover": {"x": [1.0], "y": [0.1]}}
     assert "fixes used" in [text.get_text() for text in draw_map(run).legends[0].get_texts()]
+
+
+def test_how_far_fixes_are_from_the_estimate_is_a_curve_of_the_page_with_a_gap_where_there_were_none() -> None:
+    log, true = circle(steps=200), circle(steps=200).truth["rover"]
+    at = [k for k in range(5, 200, 5) if not 60 < k < 140]
+    t_ns, xy = true.t_ns[at].tolist(), true.poses[at, :2]
+    xy[3, 1] += 50.0
+    fixes = [Fix(t_ns=t, robot="rover", y=y, cov=0.01 * np.eye(2)) for t, y in zip(t_ns, xy, strict=True)]
+    slam = slam_for(log)
+    slam.association = ByIdentity(gate=0.9973)
+    run = record(slam, sorted([*log.events, *fixes], key=lambda e: e.t_ns), progress=False)
+    data = page_data(report_html(run))
+    (rover,) = data["innovations"]
+    assert (rover["name"], rover["colour"]) == ("rover", data["robots"][0]["colour"])
+    assert rover["gaps"] == [at.index(140)]
+    assert np.array(rover["t"]) == pytest.approx(np.array(at) * 0.1 - 0.1)
+    assert rover["z"][1][3] == pytest.approx(50.0, abs=1.0)
+    assert (np.abs(np.delete(rover["z"], 3, axis=1)) < 3 * np.delete(rover["sigma"], 3, axis=1)).mean() > 0.9
+    assert np.min(rover["sigma"]) >= 0.1
+    assert rover["rejected"]["t"] == [rover["t"][3]]
+    assert [column[0] for column in rover["rejected"]["z"]] == [column[3] for column in rover["z"]]
+    assert page_data(report_html(recorded(log)))["innovations"] == []
 
 
 def test_figures_in_words_are_without_powers_of_ten_and_in_the_right_number() -> None:

@@ -160,6 +160,8 @@ _TEMPLATE = """<!DOCTYPE html>
 <div id="errors"></div>
 <h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
 <section id="nis-section"><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>
+<section id="fixes-section"><h2>Position fixes <select id="fixed"></select> <small>fix less estimate just before it, and
+3-sigma bands; crosses: rejected</small></h2><div id="fixes"></div></section>
 <section id="association"><h2>Association</h2><div id="outcomes"></div>{reasons}
 <div id="ambiguous"><h2>Ambiguous scans <select id="which"></select>
 <small>crosses: observations; squares: landmarks compared with, and d2; a full line goes to the chosen one</small></h2>

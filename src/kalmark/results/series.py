@@ -12,6 +12,7 @@ from kalmark.results.consistency import anees_interval, nees, nis, pose_error
 from kalmark.results.history import Array, Ints, MapSnapshot
 from kalmark.results.picture import Picture, broken, grouped
 from kalmark.results.series_association import association_series
+from kalmark.results.series_fixes import fix_series
 from kalmark.results.series_space import space_series
 from kalmark.results.thinned import POINTS, gaussians, significant, thin, xy
 from kalmark.slam.report import OUTCOMES
@@ -38,6 +39,7 @@ def series(run: Run) -> dict[str, Any]:
         }
     return shown | {
         "robots": [_robot(run, picture, robot, t) for robot in picture.paths],
+        "innovations": fix_series(run, picture),
         "nis": _nis(run, t),
         "dof": dof,
         "neesBounds": anees_interval(dof),

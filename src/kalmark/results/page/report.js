@@ -219,6 +219,33 @@ function drawNis() {
     layout({height: 280, showlegend: false, xaxis: timeAxis(), yaxis: logAxis("NIS / dof", [...nis.value, ...nis.low, ...nis.high])}), CONFIG);
 }
 
+/* How far the fixes of a robot were from the estimate. */
+function drawFixes(robot) {
+  const traces = [], count = robot.z.length, page = layout({height: 80 + 140 * count, showlegend: false});
+  robot.z.forEach((z, i) => {
+    const at = {yaxis: "y" + (i ? i + 1 : "")}, [low, high] = [-3, 3].map(n => robot.sigma[i].map(s => n * s));
+    const hovertemplate = `%{x:.1f} s: %{y:.4g} m<extra>${"xyz"[i]}</extra>`;
+    traces.push({...band(robot.t, low, high, robot.gaps), ...at},
+      curve(robot.t, z, robot.gaps, {line: {color: robot.colour, width: 1.1}, hovertemplate, ...at}),
+      {x: robot.rejected.t, y: robot.rejected.z[i], mode: "markers", hovertemplate, ...at,
+       marker: {symbol: "x-thin", size: 7, line: {color: OUTCOME.rejected, width: 1.5}}});
+    page["yaxis" + (i ? i + 1 : "")] = {...axis("xyz"[i] + " (m)"), domain: [1 - (i + 1) / count + 0.025, 1 - i / count - 0.01],
+                                        zeroline: true, zerolinecolor: "#c4c8cf"};
+  });
+  const range = [Math.min(0, robot.t[0]), Math.max(END, robot.t[robot.t.length - 1])];
+  page.xaxis = {...axis("time (s)"), range, anchor: "y" + (count > 1 ? count : "")};
+  Plotly.react("fixes", traces, page, CONFIG);
+}
+
+/* Draw what is of one robot, with a choice if there are several; without any, remove the section. */
+function ofEach(robots, choice, section, draw) {
+  if (!robots.length) { el(section).remove(); return; }
+  robots.forEach((r, i) => el(choice).add(new Option(r.name, i)));
+  el(choice).hidden = robots.length < 2;
+  el(choice).addEventListener("change", () => draw(robots[+el(choice).value]));
+  draw(robots[0]);
+}
+
 const CHANGE = {merged: ["#1f5fa8", "triangle-down"], removed: ["#c8553d", "x-thin"]};
 
 /* One ambiguous scan: observations, the landmarks each was compared with, and the decision. */
@@ -275,13 +302,8 @@ function drawOutcomes() {
 }
 
 drawMap();
-const judged = DATA.robots.filter(r => r.error);
-if (judged.length) {
-  judged.forEach((r, i) => el("robot").add(new Option(r.name, i)));
-  el("robot").hidden = judged.length < 2;
-  el("robot").addEventListener("change", () => drawErrors(judged[+el("robot").value]));
-  drawErrors(judged[0]);
-} else el("against-truth").remove();
+ofEach(DATA.robots.filter(r => r.error), "robot", "against-truth", drawErrors);
+ofEach(DATA.innovations, "fixed", "fixes-section", drawFixes);
 if (DATA.nis.t.length) drawNis(); else el("nis-section").remove();
 if (Object.keys(DATA.outcomes.counts).length) drawOutcomes(); else el("association").remove();
 if (DATA.association.scans.length && el("which")) {
