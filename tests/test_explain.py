@@ -228,6 +228,7 @@ def test_the_page_draws_the_ambiguous_scans_and_lists_what_was_merged(tmp_path: 
     page = report_html(run)
     assert "Landmarks merged and removed" in page
     assert "Ambiguous scans" in page
+    assert "whose d2 is at the cross" in page and "`${seen.k}: ${chosen.d2}`" in page
 
 
 def test_a_scan_can_be_drawn_from_the_folder_alone(tmp_path: Path) -> None:

@@ -164,7 +164,8 @@ _TEMPLATE = """<!DOCTYPE html>
 3-sigma bands; crosses: rejected</small></h2><div id="fixes"></div></section>
 <section id="association"><h2>Association</h2><div id="outcomes"></div>{reasons}
 <div id="ambiguous"><h2>Ambiguous scans <select id="which"></select>
-<small>crosses: observations; squares: landmarks compared with, and d2; a full line goes to the chosen one</small></h2>
+<small>crosses: observations; squares: landmarks compared with, and d2; a full line goes to the chosen
+one, whose d2 is at the cross</small></h2>
 <div id="scan"></div><ul id="told"></ul></div>{changes}</section>
 <section><h2>Figures</h2>{robots}{summary}{mounts}{skipped}</section>
 <section><h2>Configuration</h2><pre>{config}</pre></section>

@@ -266,10 +266,13 @@ function drawScan(scan) {
     traces.push({x: seen.near.map(n => n.x), y: seen.near.map(n => n.y), mode: "markers+text", showlegend: false,
       text: seen.near.map(n => n.name), textposition: "bottom right", textfont: {size: 11, color: INK},
       marker: {symbol: "square-open", size: 10, color: INK}, hovertemplate: `observation ${seen.k}, %{text}<extra></extra>`});
-    const along = axis => seen.near.map(n => seen[axis] + 0.35 * (n[axis] - seen[axis]));
-    traces.push({x: along("x"), y: along("y"), mode: "text", text: seen.near.map(n => `${n.d2}`), showlegend: false,
+    const others = seen.near.filter(n => n.name !== seen.landmark), chosen = seen.near.find(n => n.name === seen.landmark);
+    const along = axis => others.map(n => seen[axis] + 0.35 * (n[axis] - seen[axis]));
+    traces.push({x: along("x"), y: along("y"), mode: "text", text: others.map(n => `${n.d2}`), showlegend: false,
       textfont: {size: 11, color: colour}, hoverinfo: "skip"});
-    traces.push({x: [seen.x], y: [seen.y], mode: "markers+text", text: [seen.k], textposition: "top center",
+    const above = others.reduce((sum, n) => sum + n.y - seen.y, 0) > 0;  /* where the lines go */
+    traces.push({x: [seen.x], y: [seen.y], mode: "markers+text", text: [chosen ? `${seen.k}: ${chosen.d2}` : seen.k],
+      textposition: above ? "bottom center" : "top center",
       textfont: {size: 12, color: colour}, marker: {symbol: "x-thin", size: 11, line: {color: colour, width: 3}},
       name: seen.outcome, legendgroup: seen.outcome, showlegend: first, hovertemplate: `${seen.k}: ${escaped(seen.text)}<extra></extra>`});
   }
