@@ -46,14 +46,14 @@ class Campaign:
         words = "orientation" if name == "heading" and self.ideal(name) == 3 else _WORDS.get(name, name)
         return f"{words} ({self.ideal(name):.3g})"
 
-    def band(self, name: str) -> tuple[float, float] | None:
-        """Return the 95 % chi-square band of an ANEES at one step, the median over steps; None if it has no value.
+    def band(self, name: str) -> list[float] | None:
+        """Return the 95 % band [low, high] of an ANEES at one step, the median over steps; None if it has none.
 
         The average over steps scatters less, by how much the correlation of the steps decides.
         """
         anees = Anees(name, next(iter(self.scores.values())), self.skip)
         low, high = (a[:, self.skip :][np.isfinite(a[:, self.skip :])] for a in (anees.low, anees.high))
-        return (float(np.median(low)), float(np.median(high))) if len(low) else None
+        return [float(np.median(low)), float(np.median(high))] if len(low) else None
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of ``summary.json``: a section for each estimator."""
