@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
+Excerpt = tuple[StochasticMap, int, int, Index]  # a map, and the slots in it of a robot, its mount and landmarks
 
 NONE = np.zeros(0, dtype=np.int64)
 TINY_M, FAR_M = 1e-9, 1e100
@@ -173,15 +174,14 @@ def asleep(
 class Pairs(NamedTuple):
     """Observations (M,) and the `numbers` (M,) of landmarks that may belong together.
 
-    Of the landmarks: their slots (L,), where they are (L, 2 or 3) and, if not too many are at rest, what was read of
-    them: a map with the slots in it of the robot, its mount and the landmarks (L,).
+    Of the landmarks: their slots (L,), where they are (L, 2 or 3) and, if not too many are at rest, what was read.
     """
 
     rows: Index
     numbers: Index
     slots: Index
     places: Array
-    excerpt: tuple[StochasticMap, int, int, Index] | None
+    excerpt: Excerpt | None
 
 
 class Region(NamedTuple):

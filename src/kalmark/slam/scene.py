@@ -385,4 +385,8 @@ class Scene:
         sorts = {self._slam.members.sorts[name] for name in names}
         if not self._view.tells_places or len(sorts) > 1:
             return None
-        return Landmarks(self._slam, self._view, self._event, names, self._R)
+        read = None if self._pairs is None else self._pairs.excerpt
+        if read is not None and names != self._names:
+            at = {name: i for i, name in enumerate(self._names)}
+            read = (*read[:3], read[3][[at[name] for name in names]]) if at.keys() >= set(names) else None
+        return Landmarks(self._slam, self._view, self._event, names, self._R, read)

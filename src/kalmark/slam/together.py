@@ -11,6 +11,7 @@ from kalmark.filter import corrections, kernels
 from kalmark.filter.map import P_AT
 from kalmark.slam.events import Id
 from kalmark.slam.matchings import Places
+from kalmark.slam.nearby import Excerpt
 from kalmark.slam.posterior import room
 
 if TYPE_CHECKING:
@@ -24,14 +25,14 @@ LIMITS = 30, 1e-2  # linearisations of a matching, and the sigmas by which the l
 
 
 class Landmarks:
-    """Landmarks of one kind, whose places a sensor tells."""
+    """Landmarks of one kind, whose places a sensor tells; `read` is an excerpt of the map that has them."""
 
-    def __init__(self, slam: Slam, view: View, event: Any, names: list[Id], R: Array) -> None:
+    def __init__(self, slam: Slam, view: View, event: Any, names: list[Id], R: Array, read: Excerpt | None) -> None:
         self._slam, self._view, self._event, self._R = slam, view, event, R
         self._look = view.looks[slam.members.sorts[names[0]]]
         self._slots = slam.members.slots_of(names)
         self._robot = slam.members.slots[event.robot]
-        self._here = slam.map.excerpt(self._robot, view.mount, self._slots)
+        self._here = slam.map.excerpt(self._robot, view.mount, self._slots) if read is None else read
 
     def places(self) -> Places:
         """Return where all observations seem to be from the sensor (K, n), where the landmarks are, and covariances."""
@@ -56,7 +57,7 @@ class Landmarks:
         """Return log |Z| / |R| of each pair: how much less is known of where it is seen than a sensor tells."""
         if not len(rows):
             return np.zeros(0)
-        view, map_, slots = self._view, self._slam.map, self._slots[columns]
-        R = view.noise(map_, self._robot, self._look, slots, self._R[rows], self._event)
-        Z, _ = view.predict(map_, self._robot, self._look, slots, self._event.y[rows], R)
+        (m, robot, mount, here), y = self._here, self._event.y[rows]
+        R = self._view.noise(self._slam.map, self._robot, self._look, self._slots[columns], self._R[rows], self._event)
+        Z, _ = self._look.predict(m, robot, mount, here[columns], y, R)
         return room(Z, R)
