@@ -34,7 +34,8 @@ class Members:
     `sorts` has the words by which a `View` finds its `looks`: a landmark's kind, or ROBOT.
     Of a landmark, `seen` counts the observations that were used, `searched` the scans in which it was looked for and
     found, `together` is what was seen in one scan with it; `lately` are those seen last, `last_seen` those of the last
-    scan, and `alone` says how often one far from all that it may be has to be seen before that is looked at again.
+    scan, and `looked` says how often one had been seen when it was last asked which others it
+    may be, and after how many `changes`: landmarks that have come or gone.
     `ends` are the abscissas (2,) of the segments seen of lines, `doubts` and `tentative` what waits to become a
     landmark: without a block, and with one; `unlocated` what is known of those whose ranges do not tell yet where they
     are, `here` the last place kept.
@@ -58,7 +59,8 @@ class Members:
         self.together: dict[Id, set[Id]] = {}
         self.lately: list[Id] = []
         self.last_seen: list[Id] = []
-        self.alone: dict[Id, int] = {}
+        self.looked: dict[Id, tuple[int, int]] = {}
+        self.changes = 0
         self.existence: dict[Id, tuple[float, int]] = {}
         self.unlocated: dict[Id, Unlocated] = {}
         self.here: tuple[str, str, int, int] | None = None  # robot, sensor, time: the block of where it was
@@ -88,6 +90,7 @@ class Members:
         kind = self.kinds[name].kind
         self.names[slot], self.sorts[name] = name, kind
         self._reach(slot)
+        self.changes += 1
         self._sort_at[slot] = self._sorts.setdefault(kind, len(self._sorts))
 
     def _leave(self, name: Id) -> None:
@@ -144,6 +147,7 @@ class Members:
     def forget(self, name: Id) -> None:
         """Strike out a landmark."""
         self._leave(name)
+        self.changes += 1
         self.last_seen = []
         for other in self.together.get(name, ()):
             if other != name:
@@ -156,7 +160,7 @@ class Members:
             self.searched,
             self.ends,
             self.together,
-            self.alone,
+            self.looked,
             self.existence,
         ):
             table.pop(name, None)

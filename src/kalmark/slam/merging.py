@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-EVERY = 5  # sightings of a landmark, after each of which it is looked at; one that is alone after twice as many
+EVERY = 5  # sightings of a landmark, after which it is looked at again
 NEAREST = 128  # landmarks near it, among which are those that it may be,
 NEAR = 32  # and so many at first
 COMPANY = 12  # landmarks seen lately, which must find their own as well
@@ -81,14 +81,19 @@ def merge(slam: Slam, view: View, robot: str, outcomes: Sequence[Observation]) -
         return
     again, kept = False, list[Id]()
     for name in mine:
-        seen = members.seen.get(name, 0)
-        due = again or (seen % EVERY == 0 and seen >= members.alone.get(name, 0))
-        if due and name in members.kinds and _fits(members.kinds[name].space):
+        if name in members.kinds and (again or _is_due(slam, name)) and _fits(members.kinds[name].space):
+            members.looked[name] = members.seen.get(name, 0), members.changes
             for merged in _merge_with(slam, view, robot, name):
                 again = True  # now the others are known better to each other
                 kept.append(merged[1])
                 yield merged
     yield from _follow(slam, view, robot, kept)
+
+
+def _is_due(slam: Slam, name: Id) -> bool:
+    """Return whether to look at a landmark: not again where nothing is new in the map, before it is seen as often."""
+    seen, (before, changes) = slam.members.seen.get(name, 0), slam.members.looked.get(name, (0, -1))
+    return seen % EVERY == 0 and (changes != slam.members.changes or seen >= 2 * before)
 
 
 def _follow(slam: Slam, view: View, robot: str, merged: list[Id]) -> Iterator[tuple[Id, Id, str]]:
@@ -142,7 +147,6 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
         others, possible = _others(slam, name, at, count)
         told = count == NEAREST or len(possible) >= TRIES
         if told and (not possible or _is_out_of_reach(slam, name, [others[l] for l in possible[:TRIES]], d)):
-            members.alone[name] = 2 * members.seen.get(name, 0)
             return
     places = _places(slam, others, d)
     far = np.linalg.norm(places - at, axis=1)

@@ -75,7 +75,8 @@ def _state(slam: Slam) -> State:
         "reparametrize": slam.reparametrize,
         "existence": [[_id(name), *told] for name, told in slam.members.existence.items()],
         "lately": [_id(name) for name in slam.members.lately],
-        "alone": [[_id(name), count] for name, count in slam.members.alone.items()],
+        "looked": [[_id(name), *told] for name, told in slam.members.looked.items()],
+        "changes": slam.members.changes,
         "together": [[_id(name), [_id(other) for other in others]] for name, others in slam.members.together.items()],
         "searched": [[_id(name), counts] for name, counts in slam.members.searched.items()],
         "ends": [[_id(name), t.tolist()] for name, t in slam.members.ends.items()],
@@ -200,7 +201,8 @@ def _fill(slam: Slam, state: State, members: dict[str, bytes], given: Landmark |
     slam.members.doubts.open = {i: _doubt(i, *rest) for i, *rest in state["doubts"]}
     slam.members.existence = {i: (float(odds), int(missed)) for i, odds, missed in state.get("existence", ())}
     slam.members.lately = list(state.get("lately", ()))
-    slam.members.alone = {name: count for name, count in state.get("alone", ())}
+    slam.members.looked = {name: (seen, changes) for name, seen, changes in state.get("looked", ())}
+    slam.members.changes = _count(state.get("changes", 0), "changes")
     slam.members.together = {i: set(others) for i, others in state.get("together", ())}
     slam.members.unlocated = ranges_restored(state.get("unlocated", []))
     slam.members.here = None if state.get("here") is None else tuple(state["here"])
