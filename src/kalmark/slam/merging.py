@@ -34,7 +34,8 @@ Index = npt.NDArray[np.int64]
 
 EVERY = 5  # sightings of a landmark, after which it is looked at again
 NEAREST = 128  # landmarks near it, among which are those that it may be,
-NEAR = 32  # and so many at first
+NEAR = 32  # and so many at first:
+FEW = 3  # of these, by where they came to rest, tell how near the nearest is
 COMPANY = 12  # landmarks seen lately, which must find their own as well
 TRIES = 8  # of what it may be
 WIDE = 1.5  # times the gate of the nearest it may be, within which all are that it may be
@@ -145,8 +146,8 @@ def _hypotheses(slam: Slam, name: Id, d: int) -> Iterator[list[tuple[Id, Id]]]:
     at = slam.mean(name)[:d]
     for count in (NEAR, NEAREST):  # most can be none of those nearby, and so of none
         others, possible = _others(slam, name, at, count)
-        told = count == NEAREST or len(possible) >= TRIES
-        if told and (not possible or _is_out_of_reach(slam, name, [others[l] for l in possible[:TRIES]], d)):
+        told = count == NEAREST or len(possible) >= FEW
+        if told and (not possible or _is_out_of_reach(slam, name, [others[l] for l in possible[:FEW]], d)):
             return
     places = _places(slam, others, d)
     far = np.linalg.norm(places - at, axis=1)
