@@ -92,7 +92,7 @@ def merge(slam: Slam, view: View, robot: str, outcomes: Sequence[Observation]) -
 
 
 def _is_due(slam: Slam, name: Id) -> bool:
-    """Return whether to look at a landmark: not again where nothing is new in the map, before it is seen as often."""
+    """Return whether to look at a landmark: where nothing has come or gone, only when seen twice as often."""
     seen, (before, changes) = slam.members.seen.get(name, 0), slam.members.looked.get(name, (0, -1))
     return seen % EVERY == 0 and (changes != slam.members.changes or seen >= 2 * before)
 
