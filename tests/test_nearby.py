@@ -112,3 +112,12 @@ def test_what_is_seen_without_ids_is_told_alike_in_both_maps(association: km.ass
         ]
         told = [{(c.index, c.landmark): c.d2 for c in report.candidates} for report in (dense, postponed)]
         assert told[0] == pytest.approx(told[1], rel=1e-6)
+
+
+def test_many_at_rest_are_found_but_not_read_jointly() -> None:
+    slam, points = field("postponed")
+    p = np.array([[20.0, 20.0]])
+    found = slam.nearby.pairs(slam, frozenset({"point"}), (slam.slot("r"), -1), p, 60, np.inf)
+    wanted = np.argsort(np.linalg.norm(points - p, axis=1))[:60]
+    assert {slam.members.names[slot] for slot in found.slots.tolist()} == set(wanted.tolist())
+    assert found.excerpt is None

@@ -290,13 +290,6 @@ def test_a_map_of_a_users_sensor_wants_the_robots_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.mean(1), slam.mean(1))
 
 
-@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut off"])
-def test_a_file_that_is_no_map_is_refused(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "map.kmk").write_bytes(content)
-    with pytest.raises(MapError, match=r"map\.kmk: .*expected a map written by save"):
-        km.Slam.load(tmp_path / "map.kmk")
-
-
 def test_a_users_own_sensor_gives_the_map_of_the_built_in_one() -> None:
     mine = km.pointwise(
         lambda v: np.array([np.hypot(*v), np.arctan2(v[1], v[0])]),

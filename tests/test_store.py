@@ -385,3 +385,10 @@ def test_in_a_map_saved_before_that_was_kept_the_names_made_up_are_those_with_a_
 def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"none\.kmk: No such file or directory, expected a map"):
         load(tmp_path / "none.kmk")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut off"])
+def test_a_file_that_is_no_map_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "map.kmk").write_bytes(content)
+    with pytest.raises(MapError, match=r"map\.kmk: .*expected a map written by save"):
+        km.Slam.load(tmp_path / "map.kmk")

@@ -210,21 +210,15 @@ class Nearby:
         That is, of each place the nearest ones, none so many times farther than the nearest.  `head` are the slots of
         the robot and, if it is in the map, its mount: those at rest are read with them.
         """
-        map_, excerpt = slam.map, None
-        x, blocks, own = map_.awake()
+        map_, d = slam.map, p.shape[1]
         sorts = slam.members.sorts_of(kinds, len(map_.blocks))
-        slots, limit = awake(p, x, blocks, own, sorts, nearest, farther)
+        slots, limit = awake(p, *map_.awake(), sorts, nearest, farther)
         still = self._at_rest(map_, slam.members, sorts, p, limit, max(AT_REST, nearest))
         slots = np.concatenate([slots, still]) if len(still) else slots
-        if len(still) <= AT_ONCE:
-            m, robot, mount, here = map_.excerpt(*head, slots)
-            places = m.means(here, p.shape[1])
-            rows, numbers, used = paired(p, places, nearest, farther)
-            excerpt = m, robot, mount, here[used]
-        else:
-            places = map_.means(slots, p.shape[1])
-            rows, numbers, used = paired(p, places, nearest, farther)
-        return Pairs(rows, numbers, slots[used], places[used], excerpt)
+        read = map_.excerpt(*head, slots) if len(still) <= AT_ONCE else None
+        places = map_.means(slots, d) if read is None else read[0].means(read[3], d)
+        rows, numbers, used = paired(p, places, nearest, farther)
+        return Pairs(rows, numbers, slots[used], places[used], None if read is None else (*read[:3], read[3][used]))
 
     def around(self, slam: Slam, kind: str, p: Array, count: int) -> list[Id]:
         """Return the landmarks of a kind nearest to p (2 or 3,), nearest first: at rest as the last flush left them."""
