@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 import kalmark as km
-from kalmark.slam.association import Association
+from kalmark.association import Association
 
 POSES = ((0.2, 3.0), (0.4, 5.0), (1.0, 15.0))  # sigma of the position on each axis, m, and of the heading, deg
 SIGHTINGS, UNMAPPED, REACH = 8, 0.15, 7.0

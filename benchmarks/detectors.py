@@ -12,7 +12,7 @@ import numpy as np
 
 from kalmark.config import load_config, open_config_log
 from kalmark.detect import Corners, Trunks, Walls
-from kalmark.slam.events import Scan
+from kalmark.events import Scan
 
 
 def main() -> None:

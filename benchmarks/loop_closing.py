@@ -24,8 +24,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import kalmark as km
+from kalmark.association import Association
 from kalmark.geometry.gaussian import gate
-from kalmark.slam.association import Association
 
 SPACING, REACH, MOST = 2.0, 7.0, 12
 SIGHT, ODOMETRY = np.array([0.05, np.radians(0.5)]), np.array([0.02, 0.02, np.radians(0.3)])

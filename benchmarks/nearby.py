@@ -19,8 +19,8 @@ import numpy as np
 from field import Field, Step, new_slam
 
 import kalmark as km
+from kalmark.events import Id
 from kalmark.filter.kernels import one_thread
-from kalmark.slam.events import Id
 
 CIRCLE, MEASURED = 3000, 1000
 

@@ -14,10 +14,10 @@ import numpy as np
 
 import kalmark as km
 from kalmark.config import build_slam, load_config, open_config_log
+from kalmark.events import Control, Scan
 from kalmark.geometry import compose, inverse, wrap
 from kalmark.results.batch import solve_batch
 from kalmark.results.record import record
-from kalmark.slam.events import Control, Scan
 
 SECOND = 1_000_000_000
 WHEELBASE_M = 2.83

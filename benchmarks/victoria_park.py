@@ -24,10 +24,10 @@ from scipy.spatial import cKDTree
 
 from kalmark.cli.run import run_log
 from kalmark.config import load_config, open_config_log
+from kalmark.events import Scan
 from kalmark.filter.kernels import one_thread
 from kalmark.results.align import rigid
 from kalmark.results.run import Run
-from kalmark.slam.events import Scan
 
 NEAR_M, SIGHTINGS = 0.5, 3
 PLACE_M = 2.0

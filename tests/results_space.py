@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 import kalmark as km
+from kalmark.events import Control, Event, Scan
 from kalmark.geometry.frames3d import compose, move, to_frame
 from kalmark.geometry.rotations import exp, from_euler
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.cameras import project_pinhole
-from kalmark.slam.events import Control, Event, Scan
 
 STEP_NS = 100_000_000
 U = np.array([0.1, 0.0, 0.004, 0.0, 0.0, 0.02])

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.events import Control, Event, Scan
 from kalmark.filter.estimators import Invariant
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.models.motion import Unicycle
 from kalmark.models.sensors import RangeBearing
-from kalmark.slam.events import Control, Event, Scan
-from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
+from kalmark.tracks.robot import Mount, Robot
 
 STEP_NS = 100_000_000
 

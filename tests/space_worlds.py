@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.events import Scan
 from kalmark.logs.log import Log
 from kalmark.simulate import World
-from kalmark.slam.events import Scan
 
 
 def world(**keys: Any) -> World:

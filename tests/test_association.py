@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.association.joint import best_matching
+from kalmark.association.matchings import Places, matchings
 from kalmark.errors import EventError
 from kalmark.filter.postponed import PostponedMap
 from kalmark.geometry.gaussian import gate
-from kalmark.slam.joint import best_matching
-from kalmark.slam.matchings import Places, matchings
-from kalmark.slam.scene import Scene
+from kalmark.tracks.scene import Scene
 
 METHODS = (
     km.association.NearestNeighbour(),

@@ -14,6 +14,7 @@ import kalmark as km
 from batch_dense import Link, Sight, link, optimum
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
+from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import V, wrap
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import POINT2
@@ -26,7 +27,6 @@ from kalmark.results.batch_rows import plus
 from kalmark.results.record import record
 from kalmark.results.run import Run, load_run
 from kalmark.simulate import load_world, simulate
-from kalmark.slam.events import Control, Event, Fix, Scan
 from results_world import circle, slam_for
 
 Array = np.ndarray

@@ -12,6 +12,7 @@ from scipy.optimize import least_squares
 import kalmark as km
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
+from kalmark.events import Control, Event, Scan
 from kalmark.geometry import frames3d, rotations
 from kalmark.geometry.spaces import SE3
 from kalmark.results.batch import solve_batch
@@ -19,7 +20,6 @@ from kalmark.results.batch_factors import State
 from kalmark.results.batch_input import batch_input
 from kalmark.results.record import record
 from kalmark.results.run import Run
-from kalmark.slam.events import Control, Event, Scan
 
 Array = np.ndarray
 FORWARD = np.concatenate([[0.1, 0.05, 0.2], rotations.from_euler(np.radians([-90.0, 0.0, -90.0]))[0]])

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 import kalmark as km
 from kalmark.errors import EventError, KalmarkError, MapError, ModelError
+from kalmark.events import checked_id, seconds
 from kalmark.geometry.spaces import Rn
-from kalmark.slam.checks import covariance, measurements
-from kalmark.slam.events import checked_id, seconds
+from kalmark.tracks.checks import covariance, measurements
 
 NAN, INF = float("nan"), float("inf")
 LIDAR = km.sensors.RangeBearing()

@@ -9,11 +9,11 @@ import pytest
 
 import kalmark as km
 from kalmark.config.building import build_slam
+from kalmark.events import Event
 from kalmark.geometry.rotations import exp, matrix
 from kalmark.geometry.spaces import SE3
 from kalmark.simulate.robots import simulate
 from kalmark.simulate.worlds import load_world
-from kalmark.slam.events import Event
 
 ANGLES = ("inverse_depth", "inverse_depth_line")  # azimuth and elevation: turns with the world to first order only
 TURN = np.array([0.7, -1.1, 0.4])

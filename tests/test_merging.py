@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.association.ambiguity import doubtful, gains
 from kalmark.errors import MapError
-from kalmark.slam import merging
-from kalmark.slam.ambiguity import doubtful, gains
+from kalmark.management import merging
 
 ESTIMATORS = [km.estimators.Ekf(), km.estimators.Invariant()]  # for `Fej` the first estimates must be good
 GARDEN = np.array([[4.0, 1.0], [6.0, -2.0], [5.0, 4.0], [8.0, 1.0], [9.0, -3.0], [3.0, -4.0]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.association.index import distances, paired
 from kalmark.filter.postponed import PostponedMap
-from kalmark.slam.nearby import distances, paired
 
 
 def field(map_: str) -> tuple[km.Slam, np.ndarray]:

@@ -12,7 +12,7 @@ import pytest
 import kalmark as km
 from kalmark.errors import MapError, ModelError
 from kalmark.geometry import V_inverse
-from kalmark.slam.hypotheses import to_point
+from kalmark.management.hypotheses import to_point
 
 AT = np.array([0.2, 0.1, 0.3])
 NOISE = np.array([0.01, 0.003, 0.005])

@@ -10,6 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.config import build_slam
+from kalmark.events import Control, Event, Scan
 from kalmark.geometry.frames3d import compose, move, plus, to_frame
 from kalmark.results.calibration import Direction, directions, mount_rows
 from kalmark.results.cameras import mounts
@@ -17,7 +18,6 @@ from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run, load_run
 from kalmark.simulate import load_world, simulate
-from kalmark.slam.events import Control, Event, Scan
 from results_space import FORWARD, MOUNT, NOISE, STEP_NS
 
 ON_THE_FLOOR = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.05])

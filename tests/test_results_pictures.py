@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from kalmark.association import ByIdentity
 from kalmark.cli.tables import print_summary
+from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
 from kalmark.results.picture import Picture, ellipses, grouped, headline, stretches_of
@@ -25,8 +27,6 @@ from kalmark.results.run import Run
 from kalmark.results.series import reasons, series
 from kalmark.results.thinned import POINTS
 from kalmark.results.words import BATCH, ROBOT, TOTALS, count, figure, header
-from kalmark.slam.association import ByIdentity
-from kalmark.slam.events import Control, Event, Fix, Scan
 from results_world import circle, slam_for
 
 

@@ -12,12 +12,12 @@ import pytest
 
 from kalmark.config import load_config
 from kalmark.errors import DivergedError, EventError, LogError, RunError
+from kalmark.events import Control, Fix, Scan
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
 from kalmark.logs import open_log, write_native
 from kalmark.results.record import record
 from kalmark.results.run import Run, load_run, replace_file
-from kalmark.slam.events import Control, Fix, Scan
 from results_world import STEP_NS, circle, slam_for
 
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")

@@ -12,15 +12,15 @@ import pytest
 
 import results_space
 from kalmark.errors import DivergedError
+from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.logs.log import Log
 from kalmark.models.motion import Unicycle
 from kalmark.models.sensors import Bearing, RangeBearing
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import load_run
-from kalmark.slam.events import Control, Event, Fix, Scan, order
-from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
+from kalmark.tracks.robot import Mount, Robot
 from results_space import spiral
 from results_world import STEP_NS, circle, slam_for, start_of
 

@@ -18,7 +18,7 @@ from kalmark.geometry.rotations import exp, from_euler, matrix, multiply
 from kalmark.geometry.spaces import MOUNTS
 from kalmark.models import landmarks
 from kalmark.models.observe import expectation, inverse_expectation, linearize, linearize_built_in, view_of
-from kalmark.slam.scene import Look
+from kalmark.tracks.scene import Look
 
 IN_SPACE = [kind for kind in landmarks.BUILT_IN if kind().space.world == "space"]
 BY_KIND: dict[str, Any] = {kind.kind: kind for kind in landmarks.BUILT_IN}

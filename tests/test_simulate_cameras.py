@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.events import Scan
 from kalmark.geometry import SE3
 from kalmark.geometry.rotations import from_euler
 from kalmark.logs.log import Log
 from kalmark.simulate import World, simulate
-from kalmark.slam.events import Scan
 from space_worlds import assert_sigma, scans, world
 
 AHEAD = {"roll_deg": -90.0, "yaw_deg": -90.0}

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from kalmark.events import Control, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, scan_many, to_frame_many
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
 from kalmark.simulate.sights import gaussian
-from kalmark.slam.events import Control, Scan
 
 
 def controls(log: Log, robot: str) -> np.ndarray:

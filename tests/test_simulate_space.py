@@ -11,6 +11,7 @@ import pytest
 
 import kalmark as km
 from kalmark.errors import ConfigError
+from kalmark.events import Control
 from kalmark.geometry import SE3
 from kalmark.geometry.rotations import from_euler, matrix
 from kalmark.logs import write_native
@@ -20,7 +21,6 @@ from kalmark.simulate import load_world, simulate
 from kalmark.simulate.layouts3d import RandomBox, TagRoom
 from kalmark.simulate.robots import simulation
 from kalmark.simulate.routes import control_in_space
-from kalmark.slam.events import Control
 from space_worlds import assert_sigma, faulty, scans, world
 
 

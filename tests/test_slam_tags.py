@@ -14,8 +14,8 @@ from kalmark.errors import DivergedError, KalmarkError
 from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import from_euler, multiply
+from kalmark.management.doubts import AGAIN, Doubts
 from kalmark.models.sensors_camera import TELLING
-from kalmark.slam.doubts import AGAIN, Doubts
 
 FORWARD = from_euler(np.radians([-90.0, 0.0, -90.0]))[0]  # a camera that looks along the robot's x
 AT = np.concatenate([[0.0, 0.0, 0.6], FORWARD])

@@ -16,21 +16,21 @@ from typing import TYPE_CHECKING, Any
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
-    from kalmark import detect, geometry
+    from kalmark import association, detect, geometry
+    from kalmark.events import Control, Fix, Scan
     from kalmark.filter import estimators
     from kalmark.logs import Log, open_log
+    from kalmark.management import initialization
+    from kalmark.management.attention import Attention
+    from kalmark.management.delayed import Delayed
+    from kalmark.management.upkeep import Upkeep
     from kalmark.models import landmarks, motion, sensors
     from kalmark.models.pointwise import pointwise
+    from kalmark.report import Observation, Report
     from kalmark.results.record import record
     from kalmark.results.run import Run
-    from kalmark.slam import association, initialization
-    from kalmark.slam.attention import Attention
-    from kalmark.slam.delayed import Delayed
-    from kalmark.slam.events import Control, Fix, Scan
-    from kalmark.slam.report import Observation, Report
-    from kalmark.slam.robot import Mount, Robot
     from kalmark.slam.slam import Slam
-    from kalmark.slam.upkeep import Upkeep
+    from kalmark.tracks.robot import Mount, Robot
 
 __version__ = "0.1.0"
 
@@ -41,30 +41,30 @@ __all__ = [
 ]  # fmt: skip
 
 _MODULES = {
-    "association": "kalmark.slam.association",
+    "association": "kalmark.association",
     "detect": "kalmark.detect",
     "estimators": "kalmark.filter.estimators",
     "geometry": "kalmark.geometry",
-    "initialization": "kalmark.slam.initialization",
+    "initialization": "kalmark.management.initialization",
     "landmarks": "kalmark.models.landmarks",
     "motion": "kalmark.models.motion",
     "presets": "kalmark.presets",
     "sensors": "kalmark.models.sensors",
 }
 _NAMES = {
-    "Attention": "kalmark.slam.attention",
-    "Control": "kalmark.slam.events",
-    "Delayed": "kalmark.slam.delayed",
-    "Fix": "kalmark.slam.events",
+    "Attention": "kalmark.management.attention",
+    "Control": "kalmark.events",
+    "Delayed": "kalmark.management.delayed",
+    "Fix": "kalmark.events",
     "Log": "kalmark.logs",
-    "Mount": "kalmark.slam.robot",
-    "Observation": "kalmark.slam.report",
-    "Report": "kalmark.slam.report",
-    "Robot": "kalmark.slam.robot",
+    "Mount": "kalmark.tracks.robot",
+    "Observation": "kalmark.report",
+    "Report": "kalmark.report",
+    "Robot": "kalmark.tracks.robot",
     "Run": "kalmark.results.run",
-    "Scan": "kalmark.slam.events",
+    "Scan": "kalmark.events",
     "Slam": "kalmark.slam.slam",
-    "Upkeep": "kalmark.slam.upkeep",
+    "Upkeep": "kalmark.management.upkeep",
     "open_log": "kalmark.logs",
     "pointwise": "kalmark.models.pointwise",
     "record": "kalmark.results.record",

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from kalmark.events import Control, Scan
 from kalmark.logs import Log, open_log
-from kalmark.slam.events import Control, Scan
 
 Data = Callable[[str], Path]
 

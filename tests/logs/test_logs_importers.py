@@ -9,8 +9,8 @@ import pytest
 import scipy.io
 
 from kalmark.errors import LogError
+from kalmark.events import Scan
 from kalmark.logs import open_log
-from kalmark.slam.events import Scan
 
 MRCLAM = {
     "Barcodes.dat": "# subject barcode\n 1 \t 5\n 2 \t 14\n 6 \t 72\n",

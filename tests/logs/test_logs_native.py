@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from native_logs import GOOD, HEAD, native
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
 from kalmark.logs.text import nanoseconds, seconds
-from kalmark.slam.events import Control, Event, Fix, Scan, order
 
 
 def same(a: np.ndarray | None, b: np.ndarray | None, shape: tuple[int, ...]) -> bool:

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalmark.errors import LogError
+from kalmark.events import Scan
 from kalmark.logs import Trajectory, open_log
 from kalmark.logs.source import records_of
-from kalmark.slam.events import Scan
 
 CONTROLS = "t_s,robot,v_mps,w_radps\n" + "".join(f"{t},{r},1,0\n" for t in range(5, 10) for r in ("a", "b"))
 SCANS = "t_s,robot,sensor,id,range_m,bearing_rad\n6,a,s,1,4,0\n6,a,s,b,5,0\n7,a,s,b,5,0\n7,b,s,1,5,0\n"

@@ -11,8 +11,8 @@ import pytest
 
 from kalmark.config import build_slam, load_config
 from kalmark.errors import LogError
+from kalmark.events import Control, Scan
 from kalmark.logs import open_log
-from kalmark.slam.events import Control, Scan
 
 Data = Callable[[str], Path]
 

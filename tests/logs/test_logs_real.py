@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Scan, order
 from kalmark.logs import Log, open_log, write_native
-from kalmark.slam.events import Control, Scan, order
 
 Data = Callable[[str], Path]
 

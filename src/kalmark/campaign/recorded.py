@@ -17,11 +17,11 @@ from kalmark.config.landmarks import IdentityAssociation
 from kalmark.config.mounting import UpkeepConfig
 from kalmark.config.schema import Config
 from kalmark.errors import DivergedError, EventError, KalmarkError
+from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.logs.log import Log
+from kalmark.report import Report
 from kalmark.results.progress import track
 from kalmark.results.warnings import NO_ID
-from kalmark.slam.events import Control, Event, Fix, Id, Scan
-from kalmark.slam.report import Report
 from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]

@@ -22,15 +22,15 @@ from kalmark.config.mounting import StartConfig
 from kalmark.config.opening import described
 from kalmark.config.schema import Config
 from kalmark.config.tree import name_on
+from kalmark.events import Control, Event, Fix, Id
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
 from kalmark.results.files import config_yaml
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
-from kalmark.slam.drive import Drive, Part
-from kalmark.slam.events import Control, Event, Fix, Id
-from kalmark.slam.robot import Robot
+from kalmark.slam.motion import Drive, Part
+from kalmark.tracks.robot import Robot
 
 Array = npt.NDArray[np.float64]
 

@@ -15,11 +15,11 @@ import numpy.typing as npt
 from kalmark.campaign import errors
 from kalmark.campaign.errors import Judged
 from kalmark.errors import DivergedError
+from kalmark.events import Id, Scan
+from kalmark.report import Report
 from kalmark.results.align import rigid, rmse
 from kalmark.results.consistency import SINGULAR, diverged, nees, pose_error
 from kalmark.simulate.robots import Simulation
-from kalmark.slam.events import Id, Scan
-from kalmark.slam.report import Report
 from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]

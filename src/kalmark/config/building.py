@@ -17,11 +17,11 @@ from kalmark.config.sections import Section
 from kalmark.errors import ModelError
 from kalmark.logs.log import Log
 from kalmark.logs.start import true_start
+from kalmark.management.attention import Attention
+from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Motion as MotionModel
-from kalmark.slam.attention import Attention
-from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
-from kalmark.slam.upkeep import Upkeep
+from kalmark.tracks.robot import Mount, Robot
 
 
 def build_slam(config: Config, log: Log | None = None) -> Slam:

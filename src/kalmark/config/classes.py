@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kalmark import association
 from kalmark.config.mounting import PlanePose, SpacePose, SpaceStartConfig
 from kalmark.config.sections import Section
 from kalmark.detect import corners, reflectors, trunks
 from kalmark.filter import estimators
 from kalmark.geometry.rotations import from_euler
+from kalmark.management import initialization
+from kalmark.management.delayed import Delayed
 from kalmark.models import landmarks, motion, sensors
-from kalmark.slam import association, initialization
-from kalmark.slam.delayed import Delayed
 
 Array = npt.NDArray[np.float64]
 

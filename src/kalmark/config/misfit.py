@@ -14,9 +14,9 @@ from kalmark.config.sections import types
 from kalmark.config.tree import OVERRIDE, Tree
 from kalmark.detect.scan import RAW
 from kalmark.errors import ConfigError, LogError
+from kalmark.events import Scan
 from kalmark.logs.log import Log
-from kalmark.slam.events import Scan
-from kalmark.slam.robot import Mount
+from kalmark.tracks.robot import Mount
 
 
 def refuse_idle(tree: Tree, log: Log) -> None:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from kalmark.detect.circles import segments
 from kalmark.errors import EventError, ModelError
-from kalmark.slam.events import Scan, shown, when
+from kalmark.events import Scan, shown, when
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

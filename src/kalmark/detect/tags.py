@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import EventError, ModelError
-from kalmark.slam.events import Scan, when
+from kalmark.events import Scan, when
 
 Array = npt.NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """Gaussians: ellipses, distances, gates, and uncertain transforms compounded, intersected and merged.
 
 [S] App. B for ellipses, Mahalanobis distance and gates; Smith and Cheeseman's approximate transformations, as in [T] 2,
-for the rest.  How landmarks are started from them is in `kalmark.slam.delayed`.
+for the rest.  How landmarks are started from them is in `kalmark.management.delayed`.
 """
 
 from __future__ import annotations

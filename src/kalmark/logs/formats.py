@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Event, Scan
 from kalmark.logs.dlr import DLR
 from kalmark.logs.download import find_data
 from kalmark.logs.freiburg import FREIBURG
@@ -27,7 +28,6 @@ from kalmark.logs.starry_night import STARRY_NIGHT
 from kalmark.logs.tagslam import TAGSLAM
 from kalmark.logs.text import raising
 from kalmark.logs.victoria_park import VICTORIA_PARK
-from kalmark.slam.events import Event, Scan
 
 FORMATS: dict[str, Format] = {
     entry.name: entry

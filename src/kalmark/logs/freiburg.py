@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Id
 from kalmark.logs.log import Array, Log
 from kalmark.logs.source import Format, Request
 from kalmark.logs.steps import Steps
 from kalmark.logs.text import landmark_id, number, rows
-from kalmark.slam.events import Id
 
 ROBOT, SENSOR, FILE = "robot", "sensor", "sensor_data.dat"
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from kalmark.events import Event, Scan
 from kalmark.logs.log import Log
-from kalmark.slam.events import Event, Scan
 
 
 def hide_ids(log: Log) -> Log:

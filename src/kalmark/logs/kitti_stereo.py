@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Scan, order
 from kalmark.logs.log import Array, Log
 from kalmark.logs.rig import frame, placed
 from kalmark.logs.source import Format, Request, choice, quantity
-from kalmark.slam.events import Control, Event, Scan, order
 
 ROBOT, SENSOR = "car", "stereo"
 NAMES = ("features", "time_stamps", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")

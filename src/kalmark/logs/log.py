@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import LogError
+from kalmark.events import Event, Id, Scan
 from kalmark.geometry.angles import wrap
-from kalmark.slam.events import Event, Id, Scan
 
 Array = npt.NDArray[np.float64]
 Times = npt.NDArray[np.int64]
@@ -108,7 +108,7 @@ class PositionTrack:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Hold one log: `events` sorted by `kalmark.slam.events.order`, and what is known to score them against.
+    """Hold one log: `events` sorted by `kalmark.events.order`, and what is known to score them against.
 
     `truth` and `gps` are by robot, `landmarks` are by id: true positions (2,) or (3,) m, both ends of a line (6,) or
     the pose of a tag (7,) (all {} where unknown).  `skipped` has one line for each thing left out; `control_columns`

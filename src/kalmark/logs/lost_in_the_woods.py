@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Scan, order
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.matlab import arrays, column, variables
 from kalmark.logs.source import Format, Request, quantity
-from kalmark.slam.events import Control, Event, Scan, order
 
 ROBOT, SENSOR, FILE = "robot", "laser", "dataset2.mat"
 COLUMNS = {"range_bearing": ("range_m", "bearing_rad"), "bearing": ("bearing_rad",)}

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.logs.log import Array, Log, Trajectory
 from kalmark.logs.source import Format, Request, nearest, quantity
 from kalmark.logs.text import rows, timed_rows
-from kalmark.slam.events import Control, Event, Id, Scan, order
 
 SENSOR = "camera"
 LAST_ROBOT = 5

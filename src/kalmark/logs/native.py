@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Fix, Id, Scan, order
 from kalmark.logs.log import Array, Log, PositionTrack, Trajectory
 from kalmark.logs.rig import mapping
 from kalmark.logs.source import Format, Request, folder_of, nearest
 from kalmark.logs.stray import Places, refuse_misspelt
 from kalmark.logs.table import CONTROL, OBSERVATION, Row, Table, read_table
 from kalmark.logs.text import landmark_id, seconds
-from kalmark.slam.events import Control, Event, Fix, Id, Scan, order
 
 RIG = "rig.yaml"
 FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv")

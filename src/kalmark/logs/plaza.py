@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.logs.log import Array, Log, Trajectory
 from kalmark.logs.matlab import arrays
 from kalmark.logs.source import Format, Request
 from kalmark.logs.text import Refuse, nanoseconds, number, rows, timed_rows
-from kalmark.slam.events import Control, Event, Id, Scan, order
 
 ROBOT, SENSOR = "robot", "radio"
 ODOMETRY, RANGES, TRUTH = "_DR.txt", "_TD.txt", "_.mat"

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.logs.log import Array, Log, Trajectory
 from kalmark.logs.slamtb_rig import WXYZ_TO_XYZW, Part, described, is_lines, parts
 from kalmark.logs.source import Format, Request
-from kalmark.slam.events import Control, Event, Id, Scan, order
 
 NAME = "slamtb"
 CONTROLS = {

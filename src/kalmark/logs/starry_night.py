@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Scan, order
 from kalmark.logs.log import Array, Log, Trajectory
 from kalmark.logs.matlab import arrays, column, variables
 from kalmark.logs.rig import frame, named, placed
 from kalmark.logs.source import Format, Request
-from kalmark.slam.events import Control, Event, Scan, order
 
 ROBOT, SENSOR, FILE = "robot", "stereo", "vincentive_dataset3.mat"
 NAMES = (

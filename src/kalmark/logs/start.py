@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from kalmark.events import Control, Event
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Array, Log, Trajectory
-from kalmark.slam.events import Control, Event
 
 
 def begins_at(events: Iterable[Event], robot: str, held: bool) -> int | None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from kalmark.events import Control, Event, Id, Scan
 from kalmark.logs.log import Array
 from kalmark.logs.source import STEP_NS
 from kalmark.logs.text import Refuse
-from kalmark.slam.events import Control, Event, Id, Scan
 
 
 @dataclass

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Event, Scan, order
 from kalmark.logs.log import Array, Log
 from kalmark.logs.rig import placed
 from kalmark.logs.ros import find_bag, messages, stamp
@@ -21,7 +22,6 @@ from kalmark.logs.source import Format, Request, choice, quantity
 from kalmark.logs.tagslam_odometry import Odometry, read_odometry
 from kalmark.logs.tagslam_reference import Reference, read_reference
 from kalmark.logs.tagslam_rig import Scene, described_camera, read_cameras, read_scene
-from kalmark.slam.events import Event, Scan, order
 
 ROBOT = "rig"
 FILES = ("tagslam.yaml", "cameras.yaml", "camera_poses.yaml", "tag_detections.bag", "tag_detections.bag.bz2")

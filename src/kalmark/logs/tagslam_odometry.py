@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from kalmark.events import Control, Scan
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.log import Array, Times, Trajectory
 from kalmark.logs.ros import components, stamp
 from kalmark.logs.tagslam_reference import between, unit
 from kalmark.logs.tagslam_rig import Scene, frame_of
-from kalmark.slam.events import Control, Scan
 
 SIGMA_M, SIGMA_RAD = 0.005, 0.005
 """Per square root of a second, where tagslam.yaml gives none: the visual-inertial odometry of test 21 has 0.003."""

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from kalmark.events import Id
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.log import Array, Trajectory
 from kalmark.logs.ros import components, find_bag, messages, stamp
 from kalmark.logs.tagslam_rig import Scene
-from kalmark.slam.events import Id
 
 HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
 

@@ -9,7 +9,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 from kalmark.errors import LogError
-from kalmark.slam.events import Id
+from kalmark.events import Id
 
 Refuse = Callable[[str], None]
 """Takes one line about a bad row: raises it as a LogError, or notes it and lets reading go on (`on_error`)."""

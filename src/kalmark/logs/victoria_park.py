@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Event, Scan, order
 from kalmark.logs.log import Array, Log, PositionTrack, Times
 from kalmark.logs.matlab import arrays, column
 from kalmark.logs.source import Format, Request, choice, folder_of
 from kalmark.logs.text import nanoseconds, read_text, timed_rows
-from kalmark.slam.events import Control, Event, Scan, order
 
 ROBOT, SENSOR = "car", "laser"
 ASCII_ZIP, ASCII_DR, MAT_DR, GPS = "victoria_park_ascii.zip", "DRS.txt", "aa3_dr.mat", "aa3_gpsx.mat"

@@ -11,11 +11,11 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from kalmark.errors import LogError
+from kalmark.events import Control, Fix, Id, Scan
 from kalmark.logs.log import Array, Log
 from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
 from kalmark.logs.table import CANONICAL, cov_columns
 from kalmark.logs.text import landmark_id, seconds
-from kalmark.slam.events import Control, Fix, Id, Scan
 
 Table = tuple[list[str], list[list[str]]]
 

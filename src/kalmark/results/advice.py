@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.events import Scan
 from kalmark.models import sensors
 from kalmark.results.consistency import nis
 from kalmark.results.describe import TYPES
 from kalmark.results.history import Array, History
 from kalmark.results.warnings import POSE_NEES
 from kalmark.results.words import figure
-from kalmark.slam.events import Scan
 
 if TYPE_CHECKING:
+    from kalmark.report import Report
     from kalmark.results.run import Run
-    from kalmark.slam.report import Report
     from kalmark.slam.slam import Slam
 
 LOW = 0.5  # squares over those of the stated noise: it is 1.4 times too large

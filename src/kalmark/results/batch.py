@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import KalmarkError
+from kalmark.events import Event, Id
 from kalmark.results.align import rmse
 from kalmark.results.batch_factors import State
 from kalmark.results.batch_input import Input, Known, batch_input
 from kalmark.results.batch_solve import Solution, minimise
 from kalmark.results.batch_tags_input import adjust_run
-from kalmark.slam.events import Event, Id
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log

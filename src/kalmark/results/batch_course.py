@@ -10,10 +10,10 @@ import numpy.typing as npt
 from kalmark.errors import KalmarkError
 from kalmark.models.observe import composed
 from kalmark.results.batch_rows import ORIGIN
-from kalmark.slam.drive import Drive, Part
+from kalmark.slam.motion import Drive, Part
 
 if TYPE_CHECKING:
-    from kalmark.slam.robot import Robot
+    from kalmark.tracks.robot import Robot
 
 Array = npt.NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Turn a run and the log it was made from into the least-squares problem of the same data.
 
-The log is replayed through the same clock as in the filter (`kalmark.slam.drive`), and of the observations exactly
+The log is replayed through the same clock as in the filter (`kalmark.slam.motion`), and of the observations exactly
 those are taken that the filter used: the associated ones, and those that started a landmark.
 """
 
@@ -15,6 +15,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from kalmark.errors import KalmarkError
+from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.observe import composed, inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor, NonAdditiveSensor, Sensor
@@ -23,13 +24,12 @@ from kalmark.results.batch_factors import Factor, Positions, Sightings, State, b
 from kalmark.results.batch_problem import Problem
 from kalmark.results.batch_rows import ORIGIN, SPACES
 from kalmark.results.history import History, as_id
-from kalmark.slam.checks import measurements
-from kalmark.slam.events import Control, Event, Fix, Id, Scan
 from kalmark.slam.prediction import bias_block
+from kalmark.tracks.checks import measurements
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
-    from kalmark.slam.robot import Mount
+    from kalmark.tracks.robot import Mount
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -12,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import KalmarkError
+from kalmark.events import Id
 from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.align import rigid, rmse
 from kalmark.results.batch_tags import Sightings, Tags, adjust, look, parts, together
 from kalmark.results.corners import USED
-from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run

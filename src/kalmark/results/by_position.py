@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.events import Id
 from kalmark.results.history import Array
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.shapes import EUCLIDEAN, LINE
-from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run

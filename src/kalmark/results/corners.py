@@ -13,8 +13,8 @@ from kalmark.results.cameras import mount_now
 from kalmark.results.history import Array
 
 if TYPE_CHECKING:
-    from kalmark.slam.events import Scan
-    from kalmark.slam.report import Report
+    from kalmark.events import Scan
+    from kalmark.report import Report
     from kalmark.slam.slam import Slam
 
 USED = ("associated", "new")

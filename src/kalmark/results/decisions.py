@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from kalmark.slam.report import Report
+    from kalmark.report import Report
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.logs.source import records_of
+from kalmark.report import OUTCOMES
 from kalmark.results.advice import advice
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
 from kalmark.results.by_position import by_position, no_ids
@@ -21,7 +22,6 @@ from kalmark.results.shapes import EUCLIDEAN, LINE
 from kalmark.results.truth import Fixes, Truth, fitted
 from kalmark.results.warnings import fix_nis_per_dof, warnings
 from kalmark.results.windows import window_figures
-from kalmark.slam.report import OUTCOMES
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run

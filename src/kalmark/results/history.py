@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.events import Id
 from kalmark.results.decisions import Decisions
 from kalmark.results.inputs import Inputs
-from kalmark.slam.events import Id
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import RunError
+from kalmark.events import Id
 from kalmark.results.history import as_id, padded_rows, padded_squares
 from kalmark.results.shapes import LINE, POINT, TAG, place
-from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.events import Id
 from kalmark.results.align import Rigid, rigid, rigid_robust
 from kalmark.results.evaluate import FIX_GAP_S, antenna_path
 from kalmark.results.history import Array, Ints
 from kalmark.results.truth import moved
 from kalmark.results.warnings import POSE_NEES
 from kalmark.results.words import count, figure
-from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from numba.core import event as numba_event
 
 from kalmark.errors import DivergedError, EventError
+from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.logs.start import begins_at
 from kalmark.results.advice import stated_noise
 from kalmark.results.cameras import biases, cameras, mounts
@@ -26,11 +27,10 @@ from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
 from kalmark.results.run import LogReference, Run
 from kalmark.results.truth import Truth
-from kalmark.slam.events import Control, Event, Fix, Id, Scan
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
-    from kalmark.slam.report import Observation, Report
+    from kalmark.report import Observation, Report
     from kalmark.slam.slam import Slam
 
 SNAPSHOTS = 60

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.events import Id
 from kalmark.results.history import History, as_id
-from kalmark.slam.events import Id
 
 
 def known_as(history: History) -> dict[str, str]:

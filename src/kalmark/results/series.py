@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.report import OUTCOMES
 from kalmark.results.consistency import anees_interval, nees, nis, pose_error
 from kalmark.results.history import Array, Ints, MapSnapshot
 from kalmark.results.picture import Picture, broken, grouped
@@ -15,7 +16,6 @@ from kalmark.results.series_association import association_series
 from kalmark.results.series_fixes import fix_series
 from kalmark.results.series_space import space_series
 from kalmark.results.thinned import POINTS, gaussians, significant, thin, xy
-from kalmark.slam.report import OUTCOMES
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run

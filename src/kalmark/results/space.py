@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
 from kalmark.results.history import Array, Camera
 from kalmark.results.picture import Picture, broken
 from kalmark.results.shapes import EUCLIDEANS, LINE, Shapes, shapes
-from kalmark.slam.events import Id
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run

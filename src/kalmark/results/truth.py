@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.results.align import Rigid
 from kalmark.results.consistency import pose_error
 from kalmark.results.history import Array, History, Start, as_id, padded_rows, texts
 from kalmark.results.shapes import LINE, TAG
-from kalmark.slam.events import Id
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 SAME_FRAME_M, SAME_FRAME_RAD, SAME_FRAME_SIGMAS = 0.05, 0.02, 4.0

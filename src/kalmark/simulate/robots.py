@@ -18,6 +18,7 @@ import numpy.typing as npt
 from numpy.random import Generator, SeedSequence
 
 from kalmark.config.building import build_robot
+from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
@@ -41,8 +42,7 @@ from kalmark.simulate.sights import (
     things_of,
 )
 from kalmark.simulate.worlds import World
-from kalmark.slam.events import Control, Event, Id, Scan, order
-from kalmark.slam.robot import Mount, Robot
+from kalmark.tracks.robot import Mount, Robot
 
 Array = npt.NDArray[np.float64]
 Key = tuple[int, str, str]

@@ -18,13 +18,13 @@ from scipy.spatial import cKDTree
 
 from kalmark import presets
 from kalmark.config.sections import Section
+from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE3
 from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.tags import corners, tag_seen_from
 from kalmark.simulate.layouts import Scenery
-from kalmark.slam.events import Id
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]

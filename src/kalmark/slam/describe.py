@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from kalmark import detect
+from kalmark import association, detect
 from kalmark.errors import MapError
 from kalmark.filter import estimators
+from kalmark.management import attention, initialization, upkeep
 from kalmark.models import landmarks, motion, sensors
 from kalmark.models.protocols import Landmark
-from kalmark.slam import association, attention, initialization, upkeep
-from kalmark.slam.robot import Mount, Robot
+from kalmark.tracks.robot import Mount, Robot
 
 State = dict[str, Any]
 

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import EventError, MapError
+from kalmark.events import seconds
 from kalmark.filter.kernels import moved_noise
 from kalmark.geometry.spaces import Rn, Space
-from kalmark.slam.drive import Part, body_axes
-from kalmark.slam.events import seconds
+from kalmark.slam.motion import Part, body_axes
 
 if TYPE_CHECKING:
     from kalmark.models.protocols import Motion

@@ -17,16 +17,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.association import ByIdentity, ambiguity
+from kalmark.association.averaging import average, refuse_postponed
+from kalmark.association.index import Nearby
+from kalmark.association.protocol import ANEW, DEFERRED, NEW, Association, Decision
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
+from kalmark.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
 from kalmark.filter.estimators import Estimator, Invariant, Map
+from kalmark.management import budget, delayed, lifecycle, tentative
+from kalmark.management.approach import approach
+from kalmark.management.doubts import MIRRORED
+from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark
-from kalmark.slam import ambiguity, budget, delayed, lifecycle, tentative
-from kalmark.slam.approach import approach
-from kalmark.slam.association import ByIdentity
-from kalmark.slam.averaging import average, refuse_postponed
-from kalmark.slam.checks import (
+from kalmark.report import LandmarkTable, Observation, Report, judged
+from kalmark.slam.motion import Drive
+from kalmark.slam.prediction import forget_error, place_bias, predict
+from kalmark.tracks.checks import (
     covariance,
     instance,
     measurements,
@@ -35,17 +43,9 @@ from kalmark.slam.checks import (
     refuse_bad_fix,
     refuse_odd_parts,
 )
-from kalmark.slam.decisions import ANEW, DEFERRED, NEW, Association, Decision
-from kalmark.slam.doubts import MIRRORED
-from kalmark.slam.drive import Drive
-from kalmark.slam.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
-from kalmark.slam.members import Members
-from kalmark.slam.nearby import Nearby
-from kalmark.slam.prediction import forget_error, place_bias, predict
-from kalmark.slam.report import LandmarkTable, Observation, Report, judged
-from kalmark.slam.robot import Robot, mount_name, robots_given
-from kalmark.slam.scene import Scene, View
-from kalmark.slam.upkeep import CAREFUL, Upkeep
+from kalmark.tracks.members import Members
+from kalmark.tracks.robot import Robot, mount_name, robots_given
+from kalmark.tracks.scene import Scene, View
 
 Array = npt.NDArray[np.float64]
 

@@ -17,22 +17,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.association.protocol import Association
 from kalmark.errors import KalmarkError, MapError
+from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
+from kalmark.management.doubts import Doubt
+from kalmark.management.tentative import Tentative
+from kalmark.management.upkeep import CAREFUL
 from kalmark.models.protocols import Landmark
-from kalmark.slam.decisions import Association
 from kalmark.slam.describe import State, described, landmark_type, restored, robot_described, robots_restored, same
-from kalmark.slam.doubts import Doubt
-from kalmark.slam.events import Id
 from kalmark.slam.prediction import bias_block, bias_name
-from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.slam import Slam
 from kalmark.slam.store_map import map_arrays, map_described, map_restored
 from kalmark.slam.store_ranges import ranges_described, ranges_owners, ranges_restored
 from kalmark.slam.store_waiting import check_kept, kept_described, kept_restored, waiting_described, waiting_restored
-from kalmark.slam.tentative import Tentative
-from kalmark.slam.upkeep import CAREFUL
+from kalmark.tracks.robot import Robot, mount_name
 
 Array = npt.NDArray[np.float64]
 

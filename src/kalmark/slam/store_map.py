@@ -17,8 +17,8 @@ from kalmark.filter.map import Layout, StochasticMap
 from kalmark.filter.postponed import PostponedMap
 from kalmark.filter.storage import PANEL, Triangle
 from kalmark.geometry.spaces import Space
+from kalmark.management.lifecycle import NUMBERS
 from kalmark.slam.describe import State
-from kalmark.slam.lifecycle import NUMBERS
 
 Array = npt.NDArray[np.float64]
 Read = Callable[[str, tuple[int, ...]], Array]  # a name and the shape expected

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import MapError
+from kalmark.events import Id
 from kalmark.geometry.spaces import POINT2, Space
-from kalmark.slam.events import Id
-from kalmark.slam.hypotheses import POLAR, Ring
-from kalmark.slam.initialization import Unlocated
-from kalmark.slam.trilateration import Kept, Ranges
+from kalmark.management.hypotheses import POLAR, Ring
+from kalmark.management.initialization import Unlocated
+from kalmark.management.trilateration import Kept, Ranges
 
 
 def ranges_described(unlocated: Mapping[Id, Unlocated]) -> list[list[Any]]:

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.slam.candidates import Candidate, Sight, Waiting
+from kalmark.events import Id, Scan
+from kalmark.management.candidates import Candidate, Sight, Waiting
+from kalmark.management.kept import Kept
 from kalmark.slam.describe import State
-from kalmark.slam.events import Id, Scan
-from kalmark.slam.kept import Kept
 
 if TYPE_CHECKING:
+    from kalmark.management.tentative import Tentative
     from kalmark.slam.slam import Slam
-    from kalmark.slam.tentative import Tentative
 
 
 def waiting_described(slam: Slam) -> list[Any]:

@@ -1,0 +1,184 @@
+"""Associations that pair what fits one by one: individual gates, then each for itself, as an assignment, or jointly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from kalmark.association.joint import best_matching
+from kalmark.association.protocol import (
+    ANEW,
+    DEFERRED,
+    FRESH,
+    HELD_BACK,
+    MIXED,
+    NEW,
+    STRANGE,
+    Decision,
+    Matched,
+    Mixture,
+    Query,
+)
+from kalmark.errors import ModelError
+from kalmark.events import Id
+from kalmark.geometry.gaussian import gate as chi2_gate
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+FORBIDDEN = 1e6  # times the gate: a pair outside
+
+
+@dataclass(frozen=True)
+class Gated:
+    """Pairs of observations and landmarks inside an individual gate; ids are used where given.
+
+    Beyond `new_gate` from every landmark an observation is a new one; what is nearer than that and stays without a pair
+    is left alone.
+    """
+
+    gate: float = 0.99
+    new_gate: float = 0.99999
+
+    nearest: ClassVar[int] = 4  # candidates for an observation,
+    farther: ClassVar[float] = 10.0  # none so many times as far as the nearest
+
+    def __post_init__(self) -> None:
+        for name in ("gate", "new_gate"):
+            value = getattr(self, name)
+            if not 0 < value < 1:
+                raise ModelError(f"{type(self).__name__}: {name} is {value!r}, expected a probability between 0 and 1")
+
+    def threshold(self, m: int, default: float) -> float:
+        """Return the gate as a squared Mahalanobis distance."""
+        return chi2_gate(self.gate, m)
+
+    def associate(self, query: Query) -> list[Decision]:
+        """Answer with the ids where there are, with the pairs of `match` elsewhere."""
+        answers: list[Decision] = [(i, "") if i is not None else (NEW, "no landmark near") for i in query.ids]
+        open_ = np.array([k for k, i in enumerate(query.ids) if i is None], dtype=np.int64)
+        gate, far = chi2_gate(self.gate, query.dof()), chi2_gate(self.new_gate, query.dof())
+        names, d2 = self.near(query, open_, gate) if len(open_) else ([], np.zeros((0, 0)))
+        if not names:
+            query.learn(0.0, float(len(open_)))
+            return answers
+        pairs, reasons, mixed, known = self.match(query, open_, names, d2, gate)
+        if known is None and pairs.min() >= 0:
+            for row, (k, pair) in enumerate(zip(open_.tolist(), pairs.tolist(), strict=True)):
+                answers[k] = names[pair], reasons.get(row, "")
+            query.learn(float(len(open_)), 0.0)
+            return answers
+        mixture = None if mixed is None else Mixture(open_, names, mixed)
+        nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
+        for row, (k, pair, d) in enumerate(zip(open_.tolist(), pairs.tolist(), least.tolist(), strict=True)):
+            if pair >= 0:
+                answers[k] = (names[pair], reasons.get(row, ""))
+            elif pair == HELD_BACK:
+                answers[k] = (DEFERRED, reasons[row])
+            elif pair == MIXED and mixture is not None:
+                answers[k] = (mixture, reasons[row])
+            elif pair == FRESH:
+                answers[k] = (NEW, reasons[row])
+            elif pair == STRANGE:
+                answers[k] = (ANEW, reasons[row])
+            elif d <= gate:
+                why = f"its nearest landmark {names[nearest[row]]!r} is another observation's"
+                answers[k] = (None, reasons.get(row, why))
+            elif d <= far:
+                answers[k] = (None, f"between {names[nearest[row]]!r} and a new landmark: d2 {d:.1f}")
+        if known is None:
+            known = np.where(pairs >= 0, 1.0, np.where(least > far, 0.0, np.nan))
+        told = known[~np.isnan(known)]
+        query.learn(float(told.sum()), float((1.0 - told).sum()))
+        return answers
+
+    def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
+        """Return the candidates and their squared distances d2 (K, L) from the observations `open_`."""
+        return self._near(query, open_, self.nearest)
+
+    def _near(self, query: Query, open_: Index, nearest: int) -> tuple[list[Id], Array]:
+        named = set(query.ids)
+        names = [c for c in query.candidates(nearest, self.farther) if c not in named]
+        d2 = query.distances(names) if names else np.zeros((len(query.ids), 0))
+        return names, np.fmin(d2 if len(open_) == len(d2) else d2[open_], np.inf)  # NaN is as far as can be
+
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
+        """Return the number of the name paired with each row of d2 (K, L), -1 for none or its like, and why."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class NearestNeighbour(Gated):
+    """Take the nearest landmark inside an individual gate, each at most once in a scan, the closest pair first."""
+
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
+        """Pair greedily; an observation whose nearest landmark is taken gets none."""
+        nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
+        fits = (least <= gate).tolist()
+        if all(fits) and len(set(nearest)) == len(nearest):
+            return Matched(np.array(nearest), {})
+        pairs, reasons, taken = np.full(len(d2), -1), {}, set()
+        for row in np.argsort(least, kind="stable").tolist():
+            column = nearest[row]
+            if column in taken:
+                reasons[row] = f"its nearest landmark {names[column]!r} is taken by a nearer observation"
+            elif fits[row]:
+                taken.add(column)
+                pairs[row] = column
+        return Matched(pairs, reasons)
+
+
+@dataclass(frozen=True)
+class GlobalAssignment(Gated):
+    """Take the pairs whose squared distances add up to the least, one without a pair counting as the gate.
+
+    Bipartite matching: an observation gives way to another if that makes the whole better.
+    """
+
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
+        """Pair by the linear assignment of the whole scan."""
+        count = len(names)
+        cost = np.full((len(d2), count + len(d2)), gate)
+        cost[:, :count] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
+        columns = linear_sum_assignment(cost)[1]
+        return Matched(np.where(columns < count, columns, -1), {})
+
+
+@dataclass(frozen=True)
+class JointCompatibility(Gated):
+    """Take the largest set of pairs that fit together: JCBB.  Neira and Tardos 2001.
+
+    The error of the pose is common to all observations of a scan, and only a joint test knows.  At most `most_nodes` of
+    the search are looked at; what is best by then is taken.
+    """
+
+    most_nodes: int = 20_000
+
+    nearest: ClassVar[int] = 16
+    farther: ClassVar[float] = math.inf
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.most_nodes < 1:
+            raise ModelError(f"JointCompatibility: most_nodes is {self.most_nodes}, expected at least 1")
+
+    def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
+        """Pair by branch and bound, the observations with the fewest candidates first."""
+        order = np.argsort((d2 <= gate).sum(axis=1), kind="stable")
+        fitting = [np.flatnonzero(d2[row] <= gate) for row in order]
+        fitting = [columns[np.argsort(d2[row, columns])] for row, columns in zip(order, fitting, strict=True)]
+        first, columns = np.cumsum([0, *(len(c) for c in fitting)]), np.concatenate(fitting)
+        pairs = np.full(len(d2), -1)
+        if not len(columns):
+            return Matched(pairs, {})
+        z, Z = query.jointly(np.repeat(open_[order], np.diff(first)), [names[c] for c in columns.tolist()])
+        gates = np.array([0.0, *(chi2_gate(self.gate, z.shape[1] * (n + 1)) for n in range(len(d2)))])
+        chosen, finished = best_matching(first, columns, z, Z, gates, self.most_nodes)
+        pairs[order] = np.where(chosen >= 0, columns[chosen], -1)
+        why = "it does not fit with the others" + ("" if finished else f", as far as {self.most_nodes} nodes tell")
+        return Matched(pairs, dict.fromkeys(range(len(d2)), why))

@@ -1,0 +1,188 @@
+"""What `Slam.process` answers: what became of each observation and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.events import Event, Id, seconds
+from kalmark.filter.estimators import Correction
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
+
+Array = npt.NDArray[np.float64]
+
+Late = tuple[int, str, str, int]
+OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
+NOTHING = np.zeros((0, 0))
+NOTHING.flags.writeable = False
+
+
+class Observation(NamedTuple):
+    """One observation's fate: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance.
+
+    `shares` are the landmarks over which a soft association averaged, each with its weight, the likeliest first.
+    """
+
+    index: int  # type: ignore[assignment]  # of the observation in its scan; hides tuple.index
+    id: Id | None
+    outcome: str
+    landmark: Id | None
+    d2: float | None
+    reason: str
+    shares: tuple[tuple[Id, float], ...] = ()
+
+
+class Candidate(NamedTuple):
+    """A landmark that observation `index` was compared with: its squared distance and its place in the map."""
+
+    index: int  # type: ignore[assignment]
+    landmark: Id
+    d2: float
+    place: Array
+
+
+class Compared(NamedTuple):
+    """What was compared: observations (M,) with the `numbers` (M,) of landmarks (L,), and their squared distances (M,).
+
+    `places` (L, 2 or 3) are those of the landmarks.
+    """
+
+    rows: npt.NDArray[np.int64]
+    numbers: npt.NDArray[np.int64]
+    landmarks: list[Id]
+    d2: Array
+    places: Array
+
+
+def judged(
+    rows: Sequence[int], ids: Sequence[Id | None], names: Sequence[Any], done: Correction, gate: float
+) -> list[Observation]:
+    """Return what became of the observations `rows` that were compared with those landmarks; NaN if they could not be.
+
+    `ids` are those of the whole scan.
+    """
+    d2, fused = done.d2.tolist(), done.fused.tolist()
+    outcomes = [Observation(k, ids[k], "associated", name, d, "") for k, name, d in zip(rows, names, d2, strict=True)]
+    if all(fused):
+        return outcomes
+    return [seen if used else _rejected(seen, gate) for seen, used in zip(outcomes, fused, strict=True)]
+
+
+def _rejected(seen: Observation, gate: float) -> Observation:
+    if seen.d2 is None or math.isnan(seen.d2):
+        return seen._replace(outcome="rejected", d2=None, reason="nothing can be expected of it from here")
+    far = "so far from what is expected that d2 is no number" if gate == math.inf else f"outside the gate of {gate:.2f}"
+    return seen._replace(outcome="rejected", reason=far)
+
+
+class Report:
+    """The answer to one event.
+
+    `y` and the expectation `e` are (K, m), the innovation `z` (K, p) and its covariance `Z` (K, p, p), with p = m but
+    for sensors that measure more than can be innovated; rows of observations that were not compared with a landmark
+    are NaN.  `removed` are landmarks given up and tentative ones dropped, each with the reason, and
+    `merged` are those that are gone, the ones they turned out to be, and why.  `late` are earlier
+    observations, tentative then, that this scan has let be fused: time, robot, sensor and number in its scan of each.
+    `compared` are the landmarks that observations were compared with, `seen_at` (K, 2 or 3) is where these seemed to
+    come from.
+    """
+
+    __slots__ = ("Z", "compared", "e", "event", "late", "merged", "observations", "removed", "seen_at", "y", "z")
+
+    def __init__(self, event: Event, y: Array = NOTHING) -> None:
+        self.event = event
+        self.observations: tuple[Observation, ...] = ()
+        self.removed: tuple[tuple[Id, str], ...] = ()
+        self.merged: tuple[tuple[Id, Id, str], ...] = ()
+        self.late: tuple[Late, ...] = ()
+        self.compared: Compared | None = None
+        self.seen_at: Array = NOTHING
+        self.y = y
+        self.e: Array = NOTHING
+        self.z: Array = NOTHING
+        self.Z: Array = NOTHING
+
+    @property
+    def t_ns(self) -> int:
+        """The event's time in nanoseconds."""
+        return self.event.t_ns
+
+    @property
+    def robot(self) -> str:
+        """The event's robot."""
+        return self.event.robot
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        """The landmarks that observations without an id were compared with."""
+        if self.compared is None:
+            return []
+        rows, numbers, landmarks, d2, places = self.compared
+        ids = getattr(self.event, "ids", None)
+        pairs = zip(rows.tolist(), numbers.tolist(), d2.tolist(), strict=True)
+        open_ = [(k, l, d) for k, l, d in pairs if (not ids or ids[k] is None) and math.isfinite(d)]
+        return [Candidate(k, landmarks[l], d, places[l]) for k, l, d in open_]
+
+    def blank(self, p: int) -> None:
+        """Enter that nothing was predicted of any observation, whose innovations have p numbers."""
+        count = len(self.y)
+        self.e, self.z, self.Z = (
+            np.full(self.y.shape, np.nan),
+            np.full((count, p), np.nan),
+            np.full((count, p, p), np.nan),
+        )
+
+    def fill(self, rows: Sequence[int], done: Correction) -> None:
+        """Enter what was predicted of the observations `rows`; the others stay as they are."""
+        if len(rows) == len(self.y):
+            self.e, self.z, self.Z = done.e, done.z, done.Z
+        else:
+            self.e[rows], self.z[rows], self.Z[rows] = done.e, done.z, done.Z
+
+    def __repr__(self) -> str:
+        counts = {o: sum(obs.outcome == o for obs in self.observations) for o in OUTCOMES}
+        said = ", ".join(f"{n} {o}" for o, n in counts.items() if n) or "no observations"
+        return f"<Report of {type(self.event).__name__} at t={seconds(self.event.t_ns)} s: {said}>"
+
+
+class LandmarkEstimate(NamedTuple):
+    """One landmark of the map."""
+
+    id: Id
+    kind: str
+    mean: Array
+    covariance: Array
+    observations: int
+
+
+@dataclass(frozen=True)
+class LandmarkTable:
+    """All landmarks of a map, column by column; iterate for `LandmarkEstimate` rows."""
+
+    ids: list[Id]
+    kinds: list[str]
+    means: list[Array]
+    covariances: list[Array]
+    observations: list[int]
+
+    @classmethod
+    def of(cls, slam: Slam) -> LandmarkTable:
+        """Return the landmarks of a map."""
+        kinds, seen = slam.members.kinds, slam.members.seen
+        ids = list(kinds)
+        columns = ([kinds[i].kind for i in ids], [slam.mean(i) for i in ids], [slam.covariance(i) for i in ids])
+        return cls(ids, *columns, [seen.get(i, 0) for i in ids])
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __iter__(self) -> Iterator[LandmarkEstimate]:
+        columns: Any = (self.ids, self.kinds, self.means, self.covariances, self.observations)
+        return (LandmarkEstimate(*row) for row in zip(*columns, strict=True))
