@@ -7,11 +7,11 @@ sees in a lane it knows from the last one.  Every event goes through `Slam.proce
 processor time of the thread, so that other work on the machine counts less; the ratios are the result.
 
 ordinary    median step in a place that is known, 10 landmarks in view, after 2,000 steps there: as it comes, with what
-            is still active of the way there, and after a flush, with the neighbourhood alone active
+            is still active of the way there, and after a full update, with the neighbourhood alone active
 amortised   mean step of the whole mission, its compiled code loaded by a small one before
 worst       the slowest steps of it
 dense       steps of the dense map with as many landmarks, 10 in view; a mission from steps at half and all of the map
-adverse     10 m a step over a map that is known, so that all in view is always old and at rest
+adverse     10 m a step over a map that is known, so that all in view is always old and inactive
 memory      of the covariance, each landmark pair, measured at 4,000 and 12,000 landmarks and extrapolated
 """
 
@@ -38,7 +38,7 @@ from field import ODOMETRY, SIGHT, Field, Step
 
 import kalmark as km
 from kalmark.filter import kernels
-from kalmark.filter.postponed import PostponedMap
+from kalmark.filter.compressed.map import CompressedMap
 
 GIB = 2.0**30
 
@@ -55,7 +55,7 @@ def take(slam: km.Slam, steps: Iterable[Step]) -> np.ndarray:
     return np.array(spent)
 
 
-def postponed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
+def compressed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
     """Return the figures of a mission with the map that Slam chooses, and where it ended."""
     field = Field(side, side)
     slam, steps = field.slam(), field.mission()
@@ -77,10 +77,10 @@ def postponed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
     }
     row["ordinary_us"] = float(np.median(take(slam, field.circle(3000))[-1000:])) * 1e3
     row["settled_us"] = row["ordinary_us"]
-    if isinstance(slam.map, PostponedMap):
+    if isinstance(slam.map, CompressedMap):
         row["storage_GiB"] = slam.map.storage.nbytes / GIB
         row["active"] = slam.map.active.n
-        slam.map.flush()
+        slam.map.full_update()
         slam.map.finish()
         row["settled_us"] = float(np.median(take(slam, field.circle(3000))[-1000:])) * 1e3
     return row, field, slam
@@ -109,8 +109,8 @@ def memory(count: int, numbers: str) -> dict[str, float]:
     before = resident()
     for i in range(count):
         slam.add_landmark(i, np.array([i % 100, i // 100], dtype=float), 0.01 * np.eye(2))
-    assert isinstance(slam.map, PostponedMap)
-    slam.map.flush()
+    assert isinstance(slam.map, CompressedMap)
+    slam.map.full_update()
     slam.map.finish()
     return {"resident": resident() - before, "storage": slam.map.storage.nbytes}
 
@@ -127,18 +127,18 @@ def memory_table() -> dict[str, Any]:
         each = {count: one["resident"] / pairs[count] for count, one in measured.items()}
         slope = (measured[12_000]["resident"] - measured[4_000]["resident"]) / (pairs[12_000] - pairs[4_000])
         total = measured[12_000]["resident"] + slope * (pairs[goal] - pairs[12_000])
-        flush = 16_000 * 2.0 * goal  # bytes a row that a flush may take: filter/storage.py
-        rows[numbers] = {"bytes_per_pair": each, "landmarks": goal, "GiB": total / GIB, "flush_GiB": flush / GIB}
+        update = 16_000 * 2.0 * goal  # bytes a row that a full update may take: filter/compressed/storage.py
+        rows[numbers] = {"bytes_per_pair": each, "landmarks": goal, "GiB": total / GIB, "update_GiB": update / GIB}
         said = ", ".join(f"{value:.2f} at {count:,}" for count, value in each.items())
         print(f"  {numbers}: bytes a pair {said}; {goal:,} landmarks take {total / GIB:.1f} GiB,", end=" ")
-        print(f"a flush at most {flush / GIB:.1f} more")
+        print(f"a full update at most {update / GIB:.1f} more")
     return rows
 
 
 def report(rows: list[dict[str, Any]], adverse: dict[str, float] | None) -> None:
     """Print the table."""
     print(
-        "\n| landmarks | steps | mission | amortised | ordinary, flushed | worst three | dense step | dense mission |"
+        "\n| landmarks | steps | mission | amortised | ordinary, updated | worst three | dense step | dense mission |"
     )
     print("|---|---|---|---|---|---|---|---|")
     for r in rows:
@@ -148,7 +148,7 @@ def report(rows: list[dict[str, Any]], adverse: dict[str, float] | None) -> None
         print(f"| {r['dense_mission_s']:.1f} s = {r['dense_mission_s'] / r['mission_s']:.1f} x |")
     most, least = rows[-1], rows[0]
     print(f"\nordinary, largest over smallest map: {most['ordinary_us'] / least['ordinary_us']:.2f},", end=" ")
-    print(f"after a flush {most['settled_us'] / least['settled_us']:.2f}")
+    print(f"after a full update {most['settled_us'] / least['settled_us']:.2f}")
     if adverse:
         print(f"adverse: {adverse['mean_ms']:.1f} ms a step, worst {adverse['worst_ms']:.0f} ms;", end=" ")
         print(f"{adverse['mean_ms'] / rows[-1]['dense_ms']:.2f} times a dense step")
@@ -160,9 +160,9 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
     curves = {
         "dense": [r["dense_ms"] for r in rows],
-        "postponed, worst of a mission": [r["worst_ms"][0] for r in rows],
-        "postponed, amortised over a mission": [r["amortised_ms"] for r in rows],
-        "postponed, ordinary": [r["ordinary_us"] * 1e-3 for r in rows],
+        "compressed, worst of a mission": [r["worst_ms"][0] for r in rows],
+        "compressed, amortised over a mission": [r["amortised_ms"] for r in rows],
+        "compressed, ordinary": [r["ordinary_us"] * 1e-3 for r in rows],
     }
     for name, values in curves.items():
         axes.loglog(n, values, marker="o", label=name)
@@ -191,10 +191,10 @@ def main() -> None:
     adverse = None
     mpl.use("Agg")
     with kernels.one_thread():
-        postponed(10)  # loads the compiled code
+        compressed(10)  # loads the compiled code
         for side in options.sides:
-            row, field, slam = postponed(side)
-            if side == max(options.sides) and isinstance(slam.map, PostponedMap):
+            row, field, slam = compressed(side)
+            if side == max(options.sides) and isinstance(slam.map, CompressedMap):
                 spent = take(slam, field.rush(60))
                 adverse = {"mean_ms": spent[10:].mean(), "worst_ms": spent.max()}
             del slam

@@ -89,10 +89,10 @@ def plaza(*sets: str, seed: int | None = None) -> tuple[float, float, float, boo
         if isinstance(event, km.Scan):
             t_ns.append(event.t_ns)
             path.append(slam.mean("robot")[:2])
-    names = [name for name in log.landmarks if name in slam.members.slots]
+    names = [name for name in log.landmarks if name in slam.tracks.slots]
     truth = log.truth["robot"].at(np.array(t_ns))[:, :2]
     there, found = (np.array([f(name) for name in names]) for f in (log.landmarks.__getitem__, slam.mean))
-    gain = slam.mean("robot.radio")[3] if "robot.radio" in slam.members.slots else 1 / 1.069
+    gain = slam.mean("robot.radio")[3] if "robot.radio" in slam.tracks.slots else 1 / 1.069
     return rmse(np.array(path), truth), rmse(found, there), float(1 / gain), len(names) == len(log.landmarks)
 
 

@@ -25,8 +25,8 @@ from ways import Isam2, Known, Process, Textbook, Way, conditions, in_turns, pin
 
 import kalmark as km
 from kalmark.filter import corrections, kernels
+from kalmark.filter.compressed.map import CompressedMap
 from kalmark.filter.estimators import Invariant
-from kalmark.filter.postponed import PostponedMap
 from kalmark.models.motion2d import increment
 
 SIGHTINGS, WARM_UP = 6, 101
@@ -58,7 +58,7 @@ class Kernels(Way):
         self.first = first
         for event in first:
             self.slam.process(event)
-        self.map, self.look = self.slam.map, self.slam._views["r", "lidar"].looks["point"].view
+        self.map, self.model = self.slam.map, self.slam._channels["r", "lidar"].models["point"].model
         self.index, self.N = self.map.index(0), np.diag(ODOMETRY**2)
         self.noise = np.tile(np.diag(SIGHT**2), (SIGHTINGS, 1, 1))
 
@@ -70,7 +70,7 @@ class Kernels(Way):
         kernels.predict(m.P, m.n, self.index, F, G @ self.N @ G.T)
         slots = np.array([self.slam.slot(i) for i in scan.ids or ()])
         seen = (0, -1, slots, 2, scan.y, self.noise, np.inf)
-        corrections.compiled_invariant(self.look, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), seen, (6, 1e-3))
+        corrections.compiled_invariant(self.model, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), seen, (6, 1e-3))
 
 
 class Isam2Pose(Isam2):
@@ -118,8 +118,8 @@ def known_field(map_: str) -> tuple[Field, km.Slam]:
     slam = field.slam(map_)
     for i, landmark in enumerate(field.landmarks):
         slam.add_landmark(i, landmark, 0.01 * np.eye(2))
-    if isinstance(slam.map, PostponedMap):
-        slam.map.flush()
+    if isinstance(slam.map, CompressedMap):
+        slam.map.full_update()
         slam.map.finish()
     return field, slam
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-FAR_M = 81.91  # what the laser says when nothing comes back
+FAR_M = 81.91  # the reading of a beam without return
+ANGLES = np.radians(np.arange(361) / 2 - 90)
+SIGMA_M = 0.03
 
 
 @dataclass

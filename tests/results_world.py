@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,8 @@ from kalmark.filter.estimators import Invariant
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.models.motion import Unicycle
 from kalmark.models.sensors import RangeBearing
+from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
-from kalmark.tracks.robot import Mount, Robot
 
 STEP_NS = 100_000_000
 
@@ -88,8 +87,3 @@ def slam_for(log: Log, start: Any = None, estimator: Any = None) -> Slam:
         ],
         estimator=estimator or Invariant(),
     )
-
-
-def nothing() -> SimpleNamespace:
-    """Return a log without events."""
-    return SimpleNamespace(name="empty", __iter__=lambda: iter(()))

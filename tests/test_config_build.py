@@ -4,22 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import create_model
 
 import kalmark as km
 from kalmark.config import Config, build_slam, config_dict, load_config, open_config_log, slam_from_config
-from kalmark.config.classes import CLASSES, MOUNTED
-from kalmark.config.landmarks import Association, Landmark
-from kalmark.config.models import Motion, Sensor
-from kalmark.config.mounting import AttentionConfig
-from kalmark.config.reading import validate
-from kalmark.config.schema import Estimator
-from kalmark.config.sections import types
-from kalmark.config.tree import Tree
+from kalmark.config.choices import section_of
+from kalmark.declare import classes, parameters
 from kalmark.errors import ConfigError
 from kalmark.logs import Log, Trajectory
 from kalmark.results.files import config_yaml
@@ -42,21 +34,22 @@ def log_of(*robots: str) -> Log:
     return Log("test", robots, events, truth=truth, control_columns=columns)
 
 
-@pytest.mark.parametrize("choice", [Motion, Sensor, Landmark, Association, Estimator])
-def test_keys_and_defaults_are_those_of_the_models(choice: Any) -> None:
-    holder = create_model("Holder", section=(choice, ...))
-    for name in types(choice):
-        section = validate(Tree(values={"section": {"type": name}}), holder).section  # type: ignore[attr-defined]
-        parameters = {f.name: f.default for f in dataclasses.fields(CLASSES[name]) if f.init}  # type: ignore[arg-type]
-        keys = section.model_dump(exclude={"type", *MOUNTED})
-        assert keys.keys() == parameters.keys(), name
-        left_open = {key for key, value in keys.items() if value is None}  # differs in plane and space
-        assert keys == parameters | dict.fromkeys(left_open), name
-        assert not left_open or name == "inverse_depth"
+@pytest.mark.parametrize("role", ["motion", "sensor", "landmark", "association", "estimator", "detector"])
+def test_keys_and_defaults_are_those_of_the_models(role: str) -> None:
+    for name, models in classes(role).items():
+        section = section_of(role, name)()
+        own = {parameter.name: parameter for parameter in parameters(models[0])}
+        keys = {key: value for key, value in section.model_dump().items() if key in own}
+        assert keys.keys() == own.keys(), name
+        for key, value in keys.items():
+            left_open = len({next(p.default for p in parameters(m) if p.name == key) for m in models}) > 1
+            assert value == (None if left_open else own[key].default), (name, key)
 
 
-def test_an_attention_has_the_keys_and_defaults_of_its_model() -> None:
-    assert AttentionConfig().model_dump() == dataclasses.asdict(km.Attention())
+def test_every_parameter_is_documented() -> None:
+    for role in ("motion", "sensor", "landmark", "association", "estimator", "detector", "attention", "upkeep"):
+        for models in classes(role).values():
+            assert all(parameter.text.endswith(".") for model in models for parameter in parameters(model)), models
 
 
 def test_a_robot_without_a_start_starts_at_the_truth_exactly(tmp_path: Path) -> None:

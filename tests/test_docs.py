@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import figures
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -48,3 +50,23 @@ def test_every_page_the_documentation_points_to_exists() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name} points to {target}"
+
+
+def test_the_page_of_figures_is_made_of_the_saved_ones() -> None:
+    assert figures.PAGE.read_text() == figures.page(), "python benchmarks/figures.py --table writes it anew"
+    names = [f"{one.section}: {one.name}" for one in figures.figures()]
+    assert len(set(names)) == len(names)
+    assert set(json.loads(figures.SAVED.read_text())) <= set(names), "a saved figure that no command measures"
+
+
+@pytest.mark.parametrize("command", sorted({one.command for one in figures.figures()}))
+def test_the_program_of_a_figure_exists(command: str) -> None:
+    words = command.split()
+    if words[:3] == ["python", "-m", "pytest"]:
+        tests = [(file.name, file.read_text()) for file in (ROOT / "tests").rglob("test_*.py")]
+        assert any(words[-1] in name or re.search(rf"def test_\w*{words[-1]}", text) for name, text in tests), words[-1]
+    elif words[0] == "python":
+        assert (ROOT / words[1]).is_file()
+    else:
+        shipped = {path.stem for path in (ROOT / "src" / "kalmark" / "configs").rglob("*.yaml")}
+        assert words[0] == "kalmark" and words[1] in ("campaign", "run") and words[2] in shipped

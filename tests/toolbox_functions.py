@@ -290,12 +290,12 @@ def ellipse(i: Case, o: Case) -> list[Pair]:
 
 def cloister_walk(i: Case, o: Case) -> list[Pair]:
     *limits, n = i["args"]
-    return [(cloister(*limits, int(n)).T, o["world"])]
+    return [(cloister(*[*limits, int(n)]).T, o["world"])]
 
 
 def two_storeys(i: Case, o: Case) -> list[Pair]:
     *limits, n = i["args"]
-    return [(thick_cloister(*limits, int(n)).T, o["world"])]
+    return [(thick_cloister(*[*limits, int(n)]).T, o["world"])]
 
 
 def house_of_segments(i: Case, o: Case) -> list[Pair]:

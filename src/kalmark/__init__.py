@@ -17,6 +17,7 @@ from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
     from kalmark import association, detect, geometry
+    from kalmark.declare import register
     from kalmark.events import Control, Fix, Scan
     from kalmark.filter import estimators
     from kalmark.logs import Log, open_log
@@ -29,15 +30,15 @@ if TYPE_CHECKING:
     from kalmark.report import Observation, Report
     from kalmark.results.record import record
     from kalmark.results.run import Run
+    from kalmark.slam.robot import Mount, Robot
     from kalmark.slam.slam import Slam
-    from kalmark.tracks.robot import Mount, Robot
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Attention", "Control", "Delayed", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run",
     "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "initialization", "landmarks",
-    "motion", "open_log", "pointwise", "presets", "record", "sensors",
+    "motion", "open_log", "pointwise", "presets", "record", "register", "sensors",
 ]  # fmt: skip
 
 _MODULES = {
@@ -57,10 +58,10 @@ _NAMES = {
     "Delayed": "kalmark.management.delayed",
     "Fix": "kalmark.events",
     "Log": "kalmark.logs",
-    "Mount": "kalmark.tracks.robot",
+    "Mount": "kalmark.slam.robot",
     "Observation": "kalmark.report",
     "Report": "kalmark.report",
-    "Robot": "kalmark.tracks.robot",
+    "Robot": "kalmark.slam.robot",
     "Run": "kalmark.results.run",
     "Scan": "kalmark.events",
     "Slam": "kalmark.slam.slam",
@@ -68,6 +69,7 @@ _NAMES = {
     "open_log": "kalmark.logs",
     "pointwise": "kalmark.models.pointwise",
     "record": "kalmark.results.record",
+    "register": "kalmark.declare",
 }
 
 

@@ -39,7 +39,7 @@ _FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
 
 SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` calls them
     "models": ("compiled.py", "geometry/*.py", "models/*.py"),
-    "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/*.py"),
+    "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py"),
 }
 
 

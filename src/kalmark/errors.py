@@ -12,7 +12,13 @@ class EventError(KalmarkError):
 
 
 class ModelError(KalmarkError):
-    """A motion, sensor or landmark model that is wrong in itself or does not fit the others."""
+    """A motion, sensor or landmark model that is wrong in itself or does not fit the others.
+
+    `key` is the parameter that is wrong, if it is one, and `wanted` what it is to be.
+    """
+
+    key = ""
+    wanted = ""
 
 
 class MapError(KalmarkError):

@@ -75,7 +75,7 @@ HUGE = 1e15  # a control: no robot's
 
 
 def finite(value: Any, what: str, error: type[KalmarkError] = EventError) -> Array:
-    """Return a copy of `value` as a float array, or raise `error` if anything in it is not a finite number."""
+    """Return a copy of `value` as a float array (..., n), or raise `error` if a number in it is not finite."""
     try:
         array = np.array(value, order="C")
     except (TypeError, ValueError):

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.events import Event, Id, seconds
+from kalmark.events import Event, Id, Scan, seconds
 from kalmark.filter.estimators import Correction
-
-if TYPE_CHECKING:
-    from kalmark.slam.slam import Slam
 
 Array = npt.NDArray[np.float64]
 
@@ -125,7 +122,7 @@ class Report:
         if self.compared is None:
             return []
         rows, numbers, landmarks, d2, places = self.compared
-        ids = getattr(self.event, "ids", None)
+        ids = self.event.ids if isinstance(self.event, Scan) else None
         pairs = zip(rows.tolist(), numbers.tolist(), d2.tolist(), strict=True)
         open_ = [(k, l, d) for k, l, d in pairs if (not ids or ids[k] is None) and math.isfinite(d)]
         return [Candidate(k, landmarks[l], d, places[l]) for k, l, d in open_]
@@ -171,14 +168,6 @@ class LandmarkTable:
     means: list[Array]
     covariances: list[Array]
     observations: list[int]
-
-    @classmethod
-    def of(cls, slam: Slam) -> LandmarkTable:
-        """Return the landmarks of a map."""
-        kinds, seen = slam.members.kinds, slam.members.seen
-        ids = list(kinds)
-        columns = ([kinds[i].kind for i in ids], [slam.mean(i) for i in ids], [slam.covariance(i) for i in ids])
-        return cls(ids, *columns, [seen.get(i, 0) for i in ids])
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from command_line import Done, Kalmark, write_log
 
+from command_line import Done, Kalmark, write_log
 from kalmark.cli import main
 
 

@@ -6,8 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import Kalmark, refused, write_log_of_space
 
+import kalmark.models.landmarks
+import kalmark.models.motion
+import kalmark.models.sensors  # noqa: F401 - these register their models
+from command_line import Kalmark, refused, write_log_of_space
+from kalmark.declare import built_in
 from kalmark.results.consistency import anees_interval
 
 
@@ -152,14 +156,10 @@ def test_check_passes_a_right_model_and_names_a_wrong_jacobian(kalmark: Kalmark,
         assert what in refused(kalmark("check", name))
 
 
-BUILT_IN = [
-    *(f"motion:{name}" for name in ("Odometry2D", "Unicycle", "Ackermann")),
-    *(f"sensors:{name}" for name in ("RangeBearing", "Bearing", "Range", "Position2D", "RangeBearingSignature")),
-    *(f"landmarks:{name}" for name in ("Point2D", "PointSignature2D")),
-]
+BUILT_IN = [f"{own.__module__}:{own.__name__}" for role in ("motion", "sensor", "landmark") for own in built_in(role)]
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_check_passes_what_kalmark_brings(kalmark: Kalmark, name: str) -> None:
-    done = kalmark("check", f"kalmark.models.{name}")
+    done = kalmark("check", name)
     assert (done.status, done.err) == (0, "")

@@ -6,8 +6,8 @@ import subprocess
 import sys
 
 import pytest
-from command_line import Kalmark
 
+from command_line import Kalmark
 from kalmark.cli import main
 
 
@@ -44,10 +44,10 @@ def test_a_bug_exits_with_1_and_its_traceback() -> None:
 
 
 def test_an_interrupt_is_one_line(kalmark: Kalmark, monkeypatch: pytest.MonkeyPatch) -> None:
-    import kalmark.cli.run
+    from kalmark.cli import run as module
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(kalmark.cli.run, "run_log", interrupt)
+    monkeypatch.setattr(module, "run_log", interrupt)
     assert main(["run", "native"]) == 130

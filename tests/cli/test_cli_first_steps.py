@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numba
 import pytest
-from command_line import Kalmark, write_log
 
+from command_line import Kalmark, write_log
 from kalmark.compiled import COMPILING, say_compiling
 from kalmark.config import load_config, shipped_configs
 from kalmark.logs import list_data

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
 from command_line import Kalmark
 
 SHORT = {"kitti": 2}  # of the real logs, what takes long

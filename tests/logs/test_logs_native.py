@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from native_logs import GOOD, HEAD, native
 
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
 from kalmark.logs.text import nanoseconds, seconds
+from native_logs import GOOD, HEAD, native
 
 
 def same(a: np.ndarray | None, b: np.ndarray | None, shape: tuple[int, ...]) -> bool:

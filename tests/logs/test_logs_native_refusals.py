@@ -6,12 +6,12 @@ import re
 from pathlib import Path
 
 import pytest
-from native_logs import GOOD, HEAD, SCANS, native
 
 from kalmark.errors import LogError
 from kalmark.events import Scan
 from kalmark.logs import open_log
 from kalmark.logs.source import records_of
+from native_logs import GOOD, HEAD, SCANS, native
 
 BAD_ROWS = {
     "a value that is NaN": (f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,nan,0.3\n", 3, "range_m is 'nan'", "finite"),

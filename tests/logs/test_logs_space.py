@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import scipy.io
 from scipy.spatial.transform import Rotation
-from space_logs import Data, controls, in_sensor, opened, pose_of, scans
 
 from kalmark.errors import LogError
 from kalmark.events import Control
 from kalmark.logs import Log, open_log, write_native
 from kalmark.models.cameras import project_omni, project_pinhole
+from space_logs import Data, controls, in_sensor, opened, pose_of, scans
 
 
 def stereo(p: np.ndarray, s: dict[str, Any]) -> np.ndarray:

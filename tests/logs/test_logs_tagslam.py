@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from space_logs import Data, controls, in_sensor, opened, pose_of, scans
 
 from kalmark.errors import LogError
 from kalmark.logs import Log, open_log
+from space_logs import Data, controls, in_sensor, opened, pose_of, scans
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")
 

@@ -3,28 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from kalmark.association.joint import best_matching
-from kalmark.association.protocol import (
-    ANEW,
-    DEFERRED,
-    FRESH,
-    HELD_BACK,
-    MIXED,
-    NEW,
-    STRANGE,
-    Decision,
-    Matched,
-    Mixture,
-    Query,
-)
-from kalmark.errors import ModelError
+from kalmark.association.protocol import NEW, Answer, Decision, Matched, Mixture, Query
+from kalmark.declare import Count, Probability, declared, register
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
 
@@ -34,7 +21,7 @@ Index = npt.NDArray[np.int64]
 FORBIDDEN = 1e6  # times the gate: a pair outside
 
 
-@dataclass(frozen=True)
+@declared
 class Gated:
     """Pairs of observations and landmarks inside an individual gate; ids are used where given.
 
@@ -42,17 +29,13 @@ class Gated:
     is left alone.
     """
 
-    gate: float = 0.99
-    new_gate: float = 0.99999
+    gate: Annotated[Probability, "Pair an observation with a landmark inside this probability."] = 0.99
+    new_gate: Annotated[
+        Probability, "Beyond this probability from every landmark it is a new one; in between it is left alone."
+    ] = 0.99999
 
     nearest: ClassVar[int] = 4  # candidates for an observation,
-    farther: ClassVar[float] = 10.0  # none so many times as far as the nearest
-
-    def __post_init__(self) -> None:
-        for name in ("gate", "new_gate"):
-            value = getattr(self, name)
-            if not 0 < value < 1:
-                raise ModelError(f"{type(self).__name__}: {name} is {value!r}, expected a probability between 0 and 1")
+    farther: ClassVar[float] = 10.0  # within so many times the nearest distance
 
     def threshold(self, m: int, default: float) -> float:
         """Return the gate as a squared Mahalanobis distance."""
@@ -78,14 +61,10 @@ class Gated:
         for row, (k, pair, d) in enumerate(zip(open_.tolist(), pairs.tolist(), least.tolist(), strict=True)):
             if pair >= 0:
                 answers[k] = (names[pair], reasons.get(row, ""))
-            elif pair == HELD_BACK:
-                answers[k] = (DEFERRED, reasons[row])
-            elif pair == MIXED and mixture is not None:
+            elif pair == Answer.MIXTURE.value and mixture is not None:
                 answers[k] = (mixture, reasons[row])
-            elif pair == FRESH:
-                answers[k] = (NEW, reasons[row])
-            elif pair == STRANGE:
-                answers[k] = (ANEW, reasons[row])
+            elif pair < Answer.NONE.value:
+                answers[k] = (Answer(pair), reasons[row])
             elif d <= gate:
                 why = f"its nearest landmark {names[nearest[row]]!r} is another observation's"
                 answers[k] = (None, reasons.get(row, why))
@@ -112,12 +91,15 @@ class Gated:
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
+@register("association", "nearest")
 class NearestNeighbour(Gated):
-    """Take the nearest landmark inside an individual gate, each at most once in a scan, the closest pair first."""
+    """The nearest landmark by Mahalanobis distance, inside its gate.
+
+    Each is taken at most once in a scan, the closest pair first.
+    """
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
-        """Pair greedily; an observation whose nearest landmark is taken gets none."""
+        """Pair greedily by d2 (K, L); an observation whose nearest landmark is taken gets none."""
         nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
         fits = (least <= gate).tolist()
         if all(fits) and len(set(nearest)) == len(nearest):
@@ -133,15 +115,16 @@ class NearestNeighbour(Gated):
         return Matched(pairs, reasons)
 
 
-@dataclass(frozen=True)
+@register("association", "global")
 class GlobalAssignment(Gated):
-    """Take the pairs whose squared distances add up to the least, one without a pair counting as the gate.
+    """The pairs of the whole scan whose squared Mahalanobis distances add up to the least.
 
-    Bipartite matching: an observation gives way to another if that makes the whole better.
+    An observation without a pair counts as the gate.  Bipartite matching: an observation gives way to another if that
+    makes the whole better.
     """
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
-        """Pair by the linear assignment of the whole scan."""
+        """Pair by the linear assignment of the whole scan, of d2 (K, L)."""
         count = len(names)
         cost = np.full((len(d2), count + len(d2)), gate)
         cost[:, :count] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
@@ -149,26 +132,21 @@ class GlobalAssignment(Gated):
         return Matched(np.where(columns < count, columns, -1), {})
 
 
-@dataclass(frozen=True)
+@register("association", "jcbb")
 class JointCompatibility(Gated):
-    """Take the largest set of pairs that fit together: JCBB.  Neira and Tardos 2001.
+    """The largest set of pairs that fit together (JCBB): for a pose known worse than landmarks are apart.
 
-    The error of the pose is common to all observations of a scan, and only a joint test knows.  At most `most_nodes` of
-    the search are looked at; what is best by then is taken.
+    Neira and Tardos 2001.  The error of the pose is common to all observations of a scan, and only a joint test knows.
+    At most `most_nodes` of the search are looked at; what is best by then is taken.
     """
 
-    most_nodes: int = 20_000
+    most_nodes: Annotated[Count, "Nodes of the search after which the best so far is taken."] = 20_000
 
     nearest: ClassVar[int] = 16
     farther: ClassVar[float] = math.inf
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.most_nodes < 1:
-            raise ModelError(f"JointCompatibility: most_nodes is {self.most_nodes}, expected at least 1")
-
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
-        """Pair by branch and bound, the observations with the fewest candidates first."""
+        """Pair by branch and bound on d2 (K, L), the observations with the fewest candidates first."""
         order = np.argsort((d2 <= gate).sum(axis=1), kind="stable")
         fitting = [np.flatnonzero(d2[row] <= gate) for row in order]
         fitting = [columns[np.argsort(d2[row, columns])] for row, columns in zip(order, fitting, strict=True)]

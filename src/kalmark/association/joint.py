@@ -15,9 +15,9 @@ Index = npt.NDArray[np.int64]
 
 @compiled
 def extend(L: Array, w: Array, z: Array, Z: Array, chosen: Index, count: int, m: int, p: int) -> float:
-    """Append pair m to the factor L of the `count` pairs chosen, and to w = L^-1 z; return what it adds to d2.
+    """Append pair m to the factor L (n, n) of the `count` pairs chosen, and to w (n,) = L^-1 z; return the added d2.
 
-    inf if the covariance is not positive definite with it.
+    z (M p,) and Z (M p, M p) are those of all pairs.  inf if the covariance is not positive definite with it.
     """
     n, added = count * p, 0.0
     for a in range(p):
@@ -46,7 +46,9 @@ def extend(L: Array, w: Array, z: Array, Z: Array, chosen: Index, count: int, m:
 
 
 @compiled
-def best_matching(first: Index, landmark: Index, z: Array, Z: Array, gates: Array, most: int) -> tuple[Index, bool]:
+def best_matching(  # noqa: C901 - one compiled loop: a recursion without calls
+    first: Index, landmark: Index, z: Array, Z: Array, gates: Array, most: int
+) -> tuple[Index, bool]:
     """Return the pair chosen for each of K observations (-1: none), and whether the search was finished.
 
     The pairs of observation i are first[i] to first[i + 1] - 1, best first; pair m is with landmark[m], has the

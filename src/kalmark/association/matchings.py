@@ -41,7 +41,7 @@ def agree(i: int, a: int, j: int, b: int, places: Places, gate: float) -> bool:
 
 @compiled
 def narrow(alive: Flags, m: int, of: Index, landmark: Index, places: Places, gate: float, left: Flags) -> int:
-    """Write into `left` which of the pairs alive agree with pair m; return how many were asked."""
+    """Write into `left` (M,) which of the pairs `alive` (M,) agree with pair m; return the number of tests."""
     asked = 0
     for c in range(len(alive)):
         left[c] = False
@@ -53,7 +53,7 @@ def narrow(alive: Flags, m: int, of: Index, landmark: Index, places: Places, gat
 
 @compiled
 def possible(alive: Flags, first: Index, i: int) -> int:
-    """Return how many observations from i on have a pair alive."""
+    """Return how many observations from i on have a pair in `alive` (M,)."""
     count = 0
     for j in range(i, len(first) - 1):
         count += int(alive[first[j] : first[j + 1]].any())
@@ -61,7 +61,7 @@ def possible(alive: Flags, first: Index, i: int) -> int:
 
 
 @compiled
-def matchings(
+def matchings(  # noqa: C901 - one compiled loop: a recursion without calls
     first: Index, landmark: Index, places: Places, gate: float, slack: int, most: int, keep: int
 ) -> tuple[Index, bool]:
     """Return the matchings (N, K) of pairs that agree, -1 for an observation without one, and whether all were found.

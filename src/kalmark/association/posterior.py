@@ -23,7 +23,7 @@ Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Experience = tuple[float, float]
 
-JUST_SEEN = math.log(16.0)  # |Z| / |R| up to which the robot knows the place of a landmark
+WELL_KNOWN = math.log(16.0)  # |Z| / |R| up to which the robot knows where a landmark is
 SLACK = 1  # pairs that a matching may have less than the largest
 KEEP = 200  # matchings to look at
 
@@ -35,10 +35,10 @@ class Together(Protocol):
         """Return where all observations and all landmarks are, with covariances."""
 
     def fit(self, rows: Index, columns: Index) -> tuple[float, float]:
-        """Return d2 and log |Z| of pairs of an observation and a landmark, all at once."""
+        """Return the joint d2 and log |Z| of pairs of an observation `rows` (M,) and a landmark `columns` (M,)."""
 
-    def room(self, rows: Index, columns: Index) -> Array:
-        """Return log |Z| / |R| of each pair: how much less is known of where it is seen than a sensor tells."""
+    def log_volume_ratio(self, rows: Index, columns: Index) -> Array:
+        """Return log |Z| / |R| (M,) of each pair: twice the information gain of the measurement."""
 
 
 class Posterior(NamedTuple):
@@ -69,12 +69,12 @@ class Posterior(NamedTuple):
         return f"ambiguous: {said}" + ("" if self.finished else ", and the search was not finished")
 
 
-def room(Z: Array, R: Array) -> Array:
-    """Return log |Z| / |R| (M,): how much less is known of where a landmark is seen than the sensor tells."""
+def log_volume_ratio(Z: Array, R: Array) -> Array:
+    """Return log |Z| / |R| (M,): twice the information that a measurement gives."""
     return np.asarray(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(R)[1])
 
 
-def crowd(d2: Array, gate: float, p: int) -> Array:
+def expected_in_gate(d2: Array, gate: float, p: int) -> Array:
     """Return how many landmarks there are to each observation in a volume as large as its gate.  d2 is (K, L)."""
     known = np.isfinite(d2)
     reach = np.maximum(np.where(known, d2, 0.0).max(axis=1, initial=0.0), gate)

@@ -1,12 +1,13 @@
 """What an association may ask about a scan and what it may answer.
 
-It answers for each observation with a landmark's id, `NEW`, `ANEW`, `DEFERRED`, a `Mixture` of landmarks, or None
+It answers for each observation with a landmark's id, `NEW`, `REMAP`, `DEFERRED`, a `Mixture` of landmarks, or None
 (leave it alone), and why.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from enum import Enum
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -17,18 +18,23 @@ from kalmark.events import Id
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-HELD_BACK, FRESH, MIXED, STRANGE = -2, -3, -4, -5  # in the place of a pair: DEFERRED, NEW, a Mixture, ANEW
 
+class Answer(Enum):
+    """What an association may answer instead of a landmark; the values stand in the place of a pair's number.
 
-class New:
-    """The answer for an observation of something that is not in the map yet: `NEW`.
-
-    `ANEW` is that of a robot that is lost, for what it has not just seen: in the map or not, it may be mapped anew.
+    NONE: leave the observation alone.  DEFERRED: it cannot be decided yet.  NEW: it is not in the map.  MIXTURE: it is
+    averaged over several landmarks.  REMAP: the robot is lost; what it observes may be mapped again until it
+    relocalises.
     """
 
+    NONE = -1
+    DEFERRED = -2
+    NEW = -3
+    MIXTURE = -4
+    REMAP = -5
 
-class Deferred:
-    """The answer for an observation that cannot be told yet."""
+
+NEW, REMAP, DEFERRED = Answer.NEW, Answer.REMAP, Answer.DEFERRED
 
 
 class Mixture:
@@ -41,8 +47,7 @@ class Mixture:
         self.rows, self.names, self.pairs, self.weights = rows, names, found.pairs, found.weights
 
 
-NEW, ANEW, DEFERRED = New(), New(), Deferred()
-Decision = tuple[Id | New | Deferred | Mixture | None, str]
+Decision = tuple[Id | Answer | Mixture | None, str]
 
 
 class Query(Protocol):
@@ -76,10 +81,10 @@ class Query(Protocol):
 
 
 class Matched(NamedTuple):
-    """The number of the landmark paired with each observation (K,), or -1 for none and its like; some with reasons.
+    """The number of the landmark paired with each observation (K,), or the value of an `Answer`; some with reasons.
 
-    `mixed` are the matchings to average over for those that are MIXED, `known` (K,) how likely each observation is of a
-    landmark of the map, nan where that cannot be said; None where only pairs tell.
+    `mixed` are the matchings to average over, `known` (K,) the probability that each observation is of a landmark of
+    the map, nan where it is unknown; None: only the pairs are known.
     """
 
     pairs: Index
@@ -88,6 +93,7 @@ class Matched(NamedTuple):
     known: Array | None = None
 
 
+@runtime_checkable
 class Association(Protocol):
     """Decides which landmark each observation of a scan belongs to."""
 
@@ -95,4 +101,46 @@ class Association(Protocol):
         """Return the squared Mahalanobis distance up to which a pair is fused."""
 
     def associate(self, query: Query) -> list[Decision]:
-        """Return a landmark's id, NEW or None for each observation, and the reason."""
+        """Return a landmark's id, an `Answer`, a `Mixture` or None for each observation, and the reason."""
+
+
+@runtime_checkable
+class WeighsMatchings(Protocol):
+    """An association that may weigh matchings of the whole scan, and so says itself what is ambiguous."""
+
+    @property
+    def weighs(self) -> bool:
+        """Whether it does."""
+
+
+@runtime_checkable
+class AveragesMatchings(Protocol):
+    """An association that may answer with a `Mixture`; the estimator then has to be able to average."""
+
+    @property
+    def averages(self) -> bool:
+        """Whether it does."""
+
+
+@runtime_checkable
+class GatesNew(Protocol):
+    """An association with the probability with which an observation of a known landmark is not taken for a new one."""
+
+    @property
+    def new_gate(self) -> float:
+        """The probability."""
+
+
+def weighs(association: Association) -> bool:
+    """Return whether an association weighs matchings; one that does not say so does not."""
+    return isinstance(association, WeighsMatchings) and association.weighs
+
+
+def averages(association: Association) -> bool:
+    """Return whether an association averages over matchings; one that does not say so does not."""
+    return isinstance(association, AveragesMatchings) and association.averages
+
+
+def new_gate(association: Association) -> float:
+    """Return the probability of the gate beyond which an observation is of a new landmark, by default 0.99999."""
+    return association.new_gate if isinstance(association, GatesNew) else 0.99999

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
 from kalmark.association.gated import FORBIDDEN, Gated, GlobalAssignment, JointCompatibility
-from kalmark.association.posterior import JUST_SEEN, Posterior, added, agreeing, crowd, posterior
-from kalmark.association.protocol import FRESH, HELD_BACK, MIXED, STRANGE, Matched, Query
-from kalmark.errors import ModelError
+from kalmark.association.posterior import WELL_KNOWN, Posterior, added, agreeing, expected_in_gate, posterior
+from kalmark.association.protocol import Answer, Matched, Query
+from kalmark.declare import Count, Within, declared, register
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
 
@@ -21,13 +20,15 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
+NEW, DEFERRED, MIXTURE, REMAP = (each.value for each in (Answer.NEW, Answer.DEFERRED, Answer.MIXTURE, Answer.REMAP))
+
 CLEAR = 0.05  # landmarks in a gate by chance, up to which each observation can be told by itself
 NONE = 0.99  # how likely an observation must be of nothing in the map to be of something new
 BY_CHANCE = 1e-3  # matchings as good to be expected by chance where there is more than one landmark in a gate
 WIDEST = 256  # candidates for an observation
 
 
-@dataclass(frozen=True)
+@declared
 class Weighing(Gated):
     """Matchings as wholes, of landmarks however many are inside a gate.
 
@@ -35,23 +36,18 @@ class Weighing(Gated):
     on average, not counting those just seen, the robot is lost: pairs are then not held against the pose one by one.
     """
 
-    most_nodes: int = 5_000_000
+    most_nodes: Annotated[Count, "Comparisons of pairs after which the search ends."] = 5_000_000
 
     weighs: ClassVar[bool] = True  # it says itself what is ambiguous
     nearest: ClassVar[int] = 8
     farther: ClassVar[float] = math.inf
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.most_nodes < 1:
-            raise ModelError(f"{type(self).__name__}: most_nodes is {self.most_nodes}, expected at least 1")
 
     def threshold(self, m: int, default: float) -> float:
         """Return that any pair of a matching is fused: it was tested as a whole."""
         return math.inf
 
     def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
-        """Return candidates: of each observation's so many that not all of them are inside its gate."""
+        """Return candidates, so many that each observation has one outside its gate, and d2 (K, L)."""
         nearest = self.nearest
         names, d2 = self._near(query, open_, nearest)
         while nearest < WIDEST and ((d2 <= gate).sum(axis=1) >= nearest).any():
@@ -60,14 +56,14 @@ class Weighing(Gated):
         return names, d2
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
-        """Pair one by one where each observation can be told by itself, jointly elsewhere."""
+        """Pair one by one by d2 (K, L) where each observation is certain alone, jointly elsewhere."""
         together = query.together(names)
         if together is None:
             return JointCompatibility(self.gate, self.new_gate).match(query, open_, names, d2, gate)
         rows, columns = np.nonzero(np.isfinite(d2))
         just = np.zeros(d2.shape, dtype=np.bool_)
-        just[rows, columns] = together.room(open_[rows], columns) <= JUST_SEEN
-        crowded, fit = crowd(np.where(just, np.inf, d2), gate, query.dof()).max(), d2 <= gate
+        just[rows, columns] = together.log_volume_ratio(open_[rows], columns) <= WELL_KNOWN
+        crowded, fit = expected_in_gate(np.where(just, np.inf, d2), gate, query.dof()).max(), d2 <= gate
         if crowded <= CLEAR and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
             return GlobalAssignment.match(self, query, open_, names, d2, gate)  # type: ignore[arg-type]
         lost = crowded > 1
@@ -77,31 +73,31 @@ class Weighing(Gated):
         told = np.asarray(near.any(axis=1))
         pairs, reasons, mixed, _ = self.choose(query, names, found, told, lost)
         none = np.where(told, found.none() if found.finished else np.nan, np.where(d2.min(axis=1) > far, 1.0, np.nan))
-        if lost and (pairs == STRANGE).all():  # it has not recognised anything
-            return self.anew(np.where(just, d2, np.inf), gate, far, reasons)
+        if lost and (pairs == REMAP).all():  # it has not recognised anything
+            return self.remapped(np.where(just, d2, np.inf), gate, far, reasons)
         for row in np.flatnonzero(told & (none >= NONE)).tolist() if not lost else ():
-            pairs[row], reasons[row] = FRESH, "no landmark is likely there"
+            pairs[row], reasons[row] = NEW, "no landmark is likely there"
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
             if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
-                pairs[row], reasons[row] = FRESH, "no landmark fits there, from where the others are seen"
+                pairs[row], reasons[row] = NEW, "no landmark fits there, from where the others are seen"
         return Matched(pairs, reasons, mixed, 1.0 - none)
 
-    def anew(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:
+    def remapped(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:
         """Pair what a lost robot sees with what it has just seen, at these d2 (K, L); the rest is strange to it."""
         cost = np.full((len(d2), d2.shape[1] + len(d2)), gate)
         cost[:, : d2.shape[1]] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
         columns = linear_sum_assignment(cost)[1]
-        pairs = np.where(columns < d2.shape[1], columns, np.where(d2.min(axis=1) > far, STRANGE, HELD_BACK))
+        pairs = np.where(columns < d2.shape[1], columns, np.where(d2.min(axis=1) > far, REMAP, DEFERRED))
         return Matched(pairs, reasons, None, np.full(len(d2), np.nan))
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
-        """Choose from the matchings; `near` tells which observations any landmark could be."""
+        """Choose from the matchings; `near` (K,) marks the observations with a candidate inside the gate."""
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
+@register("association", "auto")
 class Automatic(Weighing):
-    """Pair one by one where the pose is clear, jointly where it is not, and hold back what remains ambiguous.
+    """One by one where the pose is clear, the likeliest matching where it is not; what is ambiguous is deferred.
 
     Where gates are small against the gaps between landmarks, that is the global assignment.  Elsewhere the likeliest of
     the matchings whose pairs agree with each other is taken (`posterior`), and of it each pair that is at least as
@@ -109,47 +105,48 @@ class Automatic(Weighing):
     robot is lost, and a matching is only taken if it holds most of the scan and none as good is expected by chance.
     """
 
-    confidence: float = 0.9
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.confidence < 1:
-            raise ModelError(f"Automatic: confidence is {self.confidence!r}, expected a probability below 1")
+    confidence: Annotated[
+        float, Within(ge=0, lt=1), "A pair of the likeliest matching that is less probable is deferred."
+    ] = 0.9
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
-        """Choose the likeliest matching, and hold back pairs that are not sure."""
+        """Choose the most probable matching, defer its uncertain pairs; `near` (K,) as in `choose` above."""
         count = int((found.pairs[0] >= 0).sum())
         if lost and (found.chance > BY_CHANCE or 2 * count <= len(near)):
             why = f"its scan is ambiguous: {count} pairs, {found.chance:.1g} matchings as good are expected by chance"
             why = why if count else "no matching of its scan is likely"
-            return Matched(np.full(len(near), STRANGE), dict.fromkeys(range(len(near)), why))
+            return Matched(np.full(len(near), REMAP), dict.fromkeys(range(len(near)), why))
         pairs, shares = found.pairs[0].copy(), found.shares()
         unsure = ((shares < self.confidence) | (not found.finished)) & near
         reasons = {row: found.why(row, names) for row in np.flatnonzero(unsure).tolist()}
-        pairs[unsure] = HELD_BACK
+        pairs[unsure] = DEFERRED
         return Matched(pairs, reasons)
 
 
-@dataclass(frozen=True)
+@register("association", "sample")
 class Sampled(Weighing):
-    """Draw a matching by how likely each is, instead of the likeliest: [F]'s independent samples from the posterior.
+    """A matching drawn by how likely each is.
+
+    [F]'s independent samples from the posterior.
 
     The same scan draws the same matching for the same `seed`.
     """
 
-    seed: int = 0
+    seed: Annotated[int, Within(ge=0), "Another one draws others."] = 0
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
-        """Draw one."""
+        """Draw one matching; `near` (K,) marks the observations with a candidate."""
         rng = np.random.default_rng([self.seed, *query.key()])
         drawn = int(rng.choice(len(found.weights), p=found.weights))
         why = f"drawn with the probability {found.weights[drawn]:.2f}"
         return Matched(found.pairs[drawn].copy(), dict.fromkeys(range(len(near)), why))
 
 
-@dataclass(frozen=True)
+@register("association", "jpda")
 class Averaged(Weighing):
-    """Average over all matchings, each by how likely it is, as [F] would ideally: JPDA, but jointly for a whole scan.
+    """The mean over all matchings, each by how likely it is; for a dense map.
+
+    As [F] would ideally: JPDA, but jointly for a whole scan.
 
     The map becomes the mean of what it would be after each, and its covariance holds how far these are apart.  Needs a
     dense map.
@@ -158,28 +155,30 @@ class Averaged(Weighing):
     averages: ClassVar[bool] = True
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
-        """Average over what any landmark could be."""
+        """Average over the observations `near` (K,) that have a candidate."""
         unlikely = (found.pairs >= 0).T @ found.weights < 0.5
-        pairs = np.where(near & ~unlikely, MIXED, -1)
+        pairs = np.where(near & ~unlikely, MIXTURE, -1)
         return Matched(pairs, {row: found.why(row, names) for row in np.flatnonzero(near).tolist()}, found)
 
 
-@dataclass(frozen=True)
+@register("association", "clique")
 class Cliques(Gated):
-    """Take the largest set of pairs that agree with each other wherever the robot is, if it fits jointly.  Bailey 2002.
+    """The largest set of pairs that agree with each other wherever the robot is, if it fits jointly.
+
+    Bailey 2002.
 
     Two pairs agree if the landmarks are as far from each other as what was seen is; the pose is not asked before the
     joint test.  Where two sets as large contradict each other, both are deferred.  For the closing of loops.
     """
 
-    most_nodes: int = 5_000_000
+    most_nodes: Annotated[Count, "Comparisons of pairs after which the search ends."] = 5_000_000
 
     weighs: ClassVar[bool] = True
     nearest: ClassVar[int] = WIDEST
     farther: ClassVar[float] = math.inf
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
-        """Pair by the largest clique."""
+        """Pair by the largest clique of the pairs with d2 (K, L) inside the gate."""
         together = query.together(names)
         if together is None:
             return JointCompatibility(self.gate, self.new_gate).match(query, open_, names, d2, gate)
@@ -194,5 +193,5 @@ class Cliques(Gated):
             return Matched(np.full(len(d2), -1), {})
         alike = (found[best] == found[best[0]]).all(axis=0)
         why = "cliques as large contradict each other" + ("" if finished else ", and the search was not finished")
-        pairs = np.where(alike, found[best[0]], HELD_BACK)
+        pairs = np.where(alike, found[best[0]], DEFERRED)
         return Matched(pairs, dict.fromkeys(np.flatnonzero(~alike).tolist(), why))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.campaign.picture import Panel, draw
 from kalmark.campaign.scoring import Scores
 from kalmark.campaign.statistics import Anees, figures, kinds
 from kalmark.results.evaluate import none_for_nan
@@ -66,15 +67,19 @@ class Campaign:
 
     def save(self, folder: str | Path) -> Path:
         """Write ``summary.json``, ``anees.csv`` (a row an estimator, robot and step), ``anees.png``, description."""
-        from kalmark.campaign.picture import draw
-
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
         (folder / f"{self.kind}.yaml").write_text(self.description, encoding="utf-8")
         self._write_steps(folder / "anees.csv")
-        draw(self, folder / "anees.png")
+        title = f"{self.world}: average NEES of {self.runs} runs, seed {self.seed}"
+        t_s = np.array(self.t_s) - (self.t_s[0] if self.kind == "config" else 0.0)  # logs have clocks
+        draw(folder / "anees.png", title, t_s, [self._panel(name) for name in self._names()])
         return folder
+
+    def _panel(self, name: str) -> Panel:
+        anees = {estimator: Anees(name, scores, self.skip) for estimator, scores in self.scores.items()}
+        return Panel(self.label(name), self.ideal(name), anees)
 
     def _names(self) -> list[str]:
         return kinds([score for scores in self.scores.values() for score in scores])

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, exp, log, multiply
 from kalmark.models.landmarks import Polar2D
+from kalmark.models.protocols import Pointed, Segmented, place_of
 from kalmark.results.consistency import point_error, pose_error, rotation_error
 
 Array = npt.NDArray[np.float64]
@@ -66,13 +67,13 @@ def robot_turn(mean: Array, truth: Array) -> Any:
 
 
 def robot(mean: Array, truth: Array, turn: Any, coordinates: str, dof: int) -> Judged:
-    """Judge a robot."""
+    """Compare the mean (size,) of a robot with its truth (size,)."""
     own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
     return Judged(own, world, np.eye(dof), np.empty((0, 0)), np.empty((0, 0)))
 
 
 def mount(mean: Array, truth: Array) -> Judged:
-    """Judge where a sensor sits on its robot: the world's turns leave that as it is."""
+    """Compare the mean (7,) of a mount with its truth (7,): rotations of the world frame do not change it."""
     d = pose_error(mean, truth, "world")
     return Judged(d, d, np.eye(len(d)), np.empty((0, 0)), np.empty((0, 0)))
 
@@ -80,14 +81,14 @@ def mount(mean: Array, truth: Array) -> Judged:
 def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array) -> Judged | None:
     """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
     if len(truth) == 6:
-        return line(model, mean, P, truth, turn, coordinates, eye) if hasattr(model, "endpoints") else None
+        return line(model, mean, P, truth, turn, coordinates, eye) if isinstance(model, Segmented) else None
     if len(truth) == 7:
         if len(mean) != 7:
             return None
         own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
         return Judged(own, world, np.eye(6), mean[None, :3], truth[None, :3])
     point, F = position(model, mean, len(truth))
-    if hasattr(model, "to_point") and len(mean) > len(truth) and not is_known(point, F @ P @ F.T, eye):
+    if isinstance(model, Pointed) and len(mean) > len(truth) and not is_known(point, F @ P @ F.T, eye):
         return None
     own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
     if isinstance(model, Polar2D):  # its Gaussian is on an arc: so is its error
@@ -103,17 +104,17 @@ def unrolled(l: Array, error: Array) -> Array:
 
 
 def is_known(point: Array, P: Array, eye: Array) -> bool:
-    """Tell whether all sigmas of a point are below a third of its distance."""
+    """Return whether all sigmas of a point (d,), covariance P (d, d), are below a third of its distance."""
     return bool(np.isfinite(P).all() and FAR**2 * np.linalg.norm(P, 2) < np.sum((point - eye) ** 2))
 
 
 def position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
     """Return the Euclidean position (d,) of a landmark's state, and its Jacobian (d, dof)."""
-    if hasattr(model, "to_point"):
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            p, P_l = model.to_point(mean[None])
-        return p[0], P_l[0]
-    return mean[:d], np.eye(d, len(mean))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        found = place_of(model, mean[None])
+    if found is None or found[0].shape[1] != d:
+        return mean[:d], np.eye(d, len(mean))
+    return found[0][0], found[1][0]
 
 
 def line(model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array) -> Judged | None:

@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.config.building import build_slam
-from kalmark.config.landmarks import IdentityAssociation
-from kalmark.config.mounting import UpkeepConfig
+from kalmark.config.choices import section_of
 from kalmark.config.schema import Config
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.logs.log import Log
 from kalmark.report import Report
+from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
 from kalmark.results.warnings import NO_ID
 from kalmark.slam.slam import Slam
@@ -52,7 +52,7 @@ class Look(NamedTuple):
         return cov if cov is None else np.broadcast_to(cov, (len(self.event.y), *cov.shape[-2:]))[list(self.rows)]
 
     def scan(self, y: Array, ids: Any, keep: Any = slice(None)) -> Scan:
-        """Return a scan at the same time with other measurements and ids of what is kept of the rows."""
+        """Return a scan at the same time with other measurements y (K, m) and ids of the rows `keep`."""
         e, cov = self.event, self.cov
         return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=y, ids=ids, cov=None if cov is None else cov[keep])
 
@@ -69,7 +69,8 @@ def recorded(config: Config, log: Log, progress: bool = True) -> Recorded:
     slam = build_slam(config, log)
     bar = track(log.events, f"{log.name}, the map", len(log.events), show=progress)
     reports = [report for event in bar if (report := _processed(slam, event, config)) is not None]
-    landmarks = {i: p for i in slam.landmarks().ids if np.isfinite(p := place(slam, i)).all()}
+    found = MapLandmarks.of(slam)
+    landmarks = {i: p for i, p in zip(found.ids, found.means, strict=True) if np.isfinite(p).all()}
     sizes = {len(p) for p in landmarks.values()}
     if len(sizes) > 1:
         raise KalmarkError(f"{log.name}: got points with and without a signature, expected one kind to replay")
@@ -83,16 +84,6 @@ def recorded(config: Config, log: Log, progress: bool = True) -> Recorded:
         slam.add_landmark(name, mean)
     again = track(events, f"{log.name}, the path", len(events), show=progress)
     return Recorded(_followed(slam, again, config), landmarks)
-
-
-def place(slam: Slam, name: Id) -> Array:
-    """Return a landmark's position (2,), with its signature (3,) if it has one; not finite at infinity."""
-    mean, model = slam.mean(name), cast("Any", slam.landmark_model(name))
-    if not hasattr(model, "to_point"):
-        return mean
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        point: Array = model.to_point(mean[None])[0][0]
-    return point
 
 
 def _processed(slam: Slam, event: Event, config: Config) -> Report | None:
@@ -137,7 +128,8 @@ def _on_known_map(config: Config) -> Config:
         )
         for name, robot in config.robots.items()
     }
-    given = {"association": IdentityAssociation(gate="off"), "upkeep": UpkeepConfig()}
+    trusted = section_of("association", "identity").model_validate({"gate": "off"})
+    given = {"association": trusted, "upkeep": section_of("upkeep", "upkeep")()}
     return config.model_copy(update={"robots": robots, **given})
 
 

@@ -26,11 +26,12 @@ from kalmark.events import Control, Event, Fix, Id
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
+from kalmark.models.protocols import bias_covariance
 from kalmark.results.files import config_yaml
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
-from kalmark.slam.motion import Drive, Part
-from kalmark.tracks.robot import Robot
+from kalmark.slam.motion import HeldInput, Part
+from kalmark.slam.robot import Robot
 
 Array = npt.NDArray[np.float64]
 
@@ -102,7 +103,7 @@ class _Driven:
     state: Array
     bias: Array | float
     sensors: dict[str, tuple[Any, Array]]
-    drive: Drive
+    drive: HeldInput
     told: Array = field(default_factory=lambda: np.zeros(0))
 
     def advance(self, t_ns: int, rng: Generator, last: bool = False) -> None:
@@ -127,10 +128,12 @@ class _Replaying:
         self.origins: dict[Key, tuple[Id | None, ...]] = {}
 
     def _driven(self, robot: Robot) -> _Driven:
-        motion, cov = robot.motion, getattr(robot.motion, "bias_cov", None)
+        motion, cov = robot.motion, bias_covariance(robot.motion)
         start = drawn_start(robot, self.chance.route)
         sensors = {key: drawn_mount(mount, self.chance.mounts) for key, mount in robot.sensors.items()}
-        return _Driven(motion, start, 0.0 if cov is None else gaussian(cov, self.chance.route), sensors, Drive(motion))
+        return _Driven(
+            motion, start, 0.0 if cov is None else gaussian(cov, self.chance.route), sensors, HeldInput(motion)
+        )
 
     def simulation(self) -> Simulation:
         """Return the log of all events, and what it does not tell: states as they are after each scan."""
@@ -184,16 +187,16 @@ class _Replaying:
 
 
 def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
-    """Return the control, near the log's, that leads from r towards where the log's path is at the end of it.
+    """Return the control (m,) between the log's and the one from r (size,) to the path at the end of the interval.
 
-    Least squares: the control departs from the log's by its noise N, bias and diffusion, the end from the path by what
-    the path is uncertain.  Two steps of Gauss-Newton.
+    Least squares: the control differs from the log's by its noise N (m, m), bias and diffusion, the end from the path
+    by the covariance of the path.  Two steps of Gauss-Newton.
     """
     u, dt_s = steer.event.u, steer.dt_s
     if motion.held and not dt_s:
         return u
     end, _, R_u = motion.move(r, u, dt_s)
-    M, D, bias = N, motion.diffusion(u, dt_s), getattr(motion, "bias_cov", None)
+    M, D, bias = N, motion.diffusion(u, dt_s), bias_covariance(motion)
     if bias is not None:
         M = M + bias
     if D is not None:  # as a control; one that hardly moves the robot, like the steering at rest, is left alone
@@ -212,7 +215,7 @@ def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
 
 
 def facing_path(r: Array, end: Array, goal: Array, dt_s: float) -> Array:
-    """Return the pose `goal` turned towards the path by how far beside it `end` is: a car cannot go sideways."""
+    """Return the pose `goal` (3,), rotated towards the path by the lateral distance of `end`: cars do not slip."""
     c, s = np.cos(goal[2]), np.sin(goal[2])
     beside = c * (end[1] - goal[1]) - s * (end[0] - goal[0])
     along = c * (end[0] - r[0]) + s * (end[1] - r[1])

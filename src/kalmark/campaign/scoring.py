@@ -94,7 +94,7 @@ class _Scorer:
             f"{name}.{key}": (name, simulated.mounts[name, key])
             for name, robot in slam.robots.items()
             for key, mount in robot.sensors.items()
-            if getattr(mount, "cov", None) is not None
+            if mount.cov is not None
         }
         self.nis, self.nis_dof = 0.0, 0
 
@@ -129,7 +129,7 @@ class _Scorer:
         slam, coordinates = self.slam, self.slam.estimator.coordinates
         turn = errors.robot_turn(slam.mean(robot), self._state(robot, k))
         judged: dict[Id, Judged] = {}
-        here = [name for name in self.rows if name != robot and not slam._drives[name].lags(slam.t_ns or 0)]
+        here = [name for name in self.rows if name != robot and not slam.lags(name)]
         for name in (robot, *here):
             mean = slam.mean(name)
             dof = slam.robots[name].motion.space.dof

@@ -55,13 +55,13 @@ class Anees:
 
 
 def mean(values: Array) -> float:
-    """Return the mean of what is not NaN, NaN if nothing is."""
+    """Return the mean of the values (N,) that are finite, NaN if none is."""
     values = values[np.isfinite(values)]
     return float(values.mean()) if len(values) else float("nan")
 
 
 def rms(values: Array) -> float:
-    """Return the root of the mean square of what is not NaN."""
+    """Return the root mean square of the values (N,) that are finite."""
     return mean(values**2) ** 0.5
 
 

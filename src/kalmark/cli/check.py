@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from importlib import import_module, util
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +21,7 @@ def check_named(name: str) -> list[Finding]:
     """Return what was found about the model ``module:Class``, ``file.py:Class`` or ``module:object``."""
     import numpy as np
 
+    from kalmark.declare import line_of
     from kalmark.models.check import check_model
 
     model = _model(name)
@@ -29,11 +30,11 @@ def check_named(name: str) -> list[Finding]:
     except ModelError as error:
         raise ModelError(f"{name}: {error}") from None
     except Exception as error:
-        raise ModelError(f"{name}: raised {type(error).__name__}: {error}{_line_of(error)}") from None
+        raise ModelError(f"{name}: raised {type(error).__name__}: {error}{line_of(error)}") from None
 
 
 def check(
-    model: Annotated[str, typer.Argument(metavar="module:Class", help="The model; also file.py:Class, or an object.")],
+    model: Annotated[str, typer.Argument(metavar="module:Class", help="Also file.py:Class, an object or a function.")],
 ) -> None:
     """Check a model of your own: shapes, and Jacobians against differences."""
     findings = check_named(model)
@@ -50,10 +51,9 @@ def _model(name: str) -> Any:
     if not place or not attribute:
         raise KalmarkError(f"{name}: expected module:Class or file.py:Class")
     module = _module(place, name)
-    try:
-        model = getattr(module, attribute)
-    except AttributeError:
-        raise KalmarkError(f"{name}: {place} has no {attribute}, expected a class or an object") from None
+    if attribute not in vars(module):
+        raise KalmarkError(f"{name}: {place} has no {attribute}, expected a class, an object or a function")
+    model = vars(module)[attribute]
     if not isinstance(model, type):
         return model
     try:
@@ -63,27 +63,13 @@ def _model(name: str) -> Any:
 
 
 def _module(place: str, name: str) -> ModuleType:
+    from kalmark.declare import line_of, load_plugin
+
+    if place.endswith(".py"):
+        return load_plugin(Path(place))
     try:
-        if not place.endswith(".py"):
-            sys.path.insert(0, str(Path.cwd()))
-            return import_module(place)
-        spec = util.spec_from_file_location(Path(place).stem, place)
-        if spec is None or spec.loader is None:
-            raise KalmarkError(f"{name}: {place} cannot be imported")
-        module = util.module_from_spec(spec)
-        sys.modules[spec.name] = module
-        spec.loader.exec_module(module)
-        return module
-    except KalmarkError:
-        raise
+        sys.path.insert(0, str(Path.cwd()))
+        return import_module(place)
     except Exception as error:
-        what = f"{type(error).__name__}: {error}{_line_of(error)}"
+        what = f"{type(error).__name__}: {error}{line_of(error)}"
         raise KalmarkError(f"{name}: {place} cannot be imported: {what}") from None
-
-
-def _line_of(error: BaseException) -> str:
-    """Return where in the user's file an error came from."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    return f" ({trace.tb_frame.f_code.co_filename}:{trace.tb_lineno})" if trace is not None else ""

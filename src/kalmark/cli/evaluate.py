@@ -17,7 +17,8 @@ def evaluate_run(folder: Path, truth: Path | None = None, *, batch: bool = False
 
     The comparison with the batch solution is kept in the run's ``summary.json`` (if judged by its own truth).
     """
-    from kalmark.results.run import Run, write
+    from kalmark.results.files import write
+    from kalmark.results.run import Run
 
     run = Run.load(folder)
     if truth is not None:

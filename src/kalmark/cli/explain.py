@@ -18,8 +18,9 @@ def explain(
 ) -> None:
     """Say why one scan's observations became what they did, and draw it: what each was compared with, d2, gates."""
     from kalmark.results.explain import explain as explanation_of
+    from kalmark.results.files import file_name, replace_file
     from kalmark.results.plot_scan import save_scan
-    from kalmark.results.run import Run, file_name, replace_file
+    from kalmark.results.run import Run
 
     loaded = Run.load(run)
     told = explanation_of(loaded, scan, robot)

@@ -8,20 +8,18 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from kalmark.config.classes import covariance_of, model_of, pose_of, velocity_of
+from kalmark.config.choices import ModelSection, model_of
 from kalmark.config.misfit import refuse_controls, refuse_scans
+from kalmark.config.mounting import covariance_of, pose_of, velocity_of
 from kalmark.config.opening import described, open_run
 from kalmark.config.reading import did_you_mean, load_config
 from kalmark.config.schema import Config
-from kalmark.config.sections import Section
 from kalmark.errors import ModelError
 from kalmark.logs.log import Log
 from kalmark.logs.start import true_start
-from kalmark.management.attention import Attention
-from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Motion as MotionModel
+from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
-from kalmark.tracks.robot import Mount, Robot
 
 
 def build_slam(config: Config, log: Log | None = None) -> Slam:
@@ -38,7 +36,7 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
     }
     try:
         m = config.map
-        kept = Upkeep(**config.upkeep.model_dump())
+        kept = model_of(config.upkeep)
         return Slam(robots, **types, map=m.type, numbers=m.numbers, reparametrize=m.linearity, upkeep=kept)
     except ModelError as error:
         raise config.error(("robots",), str(error)) from None
@@ -122,9 +120,9 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
         found = sensor.detector.model_copy(update={"signature": signed if theirs is None else theirs})
         own["detector"] = _build(config, (*path, "detector"), found)
     if sensor.attention is not None:
-        own["attention"] = Attention(**sensor.attention.model_dump())
+        own["attention"] = model_of(sensor.attention)
     if sensor.upkeep is not None:
-        own["upkeep"] = Upkeep(**sensor.upkeep.model_dump())
+        own["upkeep"] = model_of(sensor.upkeep)
     if world == "plane" and sensor.initialization.type != "immediate":
         own["initialization"] = _build(config, (*path, "initialization"), sensor.initialization)
     try:
@@ -133,7 +131,7 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
         raise config.error(path, str(error)) from None
 
 
-def _build(config: Config, path: tuple[str, ...], section: Section | None, world: str = "plane") -> Any:
+def _build(config: Config, path: tuple[str, ...], section: ModelSection | None, world: str = "plane") -> Any:
     """Return the model that a section describes; what the model itself refuses is told with the section's place."""
     if section is None:
         return None

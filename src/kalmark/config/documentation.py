@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
 import math
 import sys
-import textwrap
-from collections.abc import Collection, Iterable
-from itertools import pairwise
 from typing import Any
 
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from kalmark.config import detectors, landmarks, models, mounting, schema
-from kalmark.config.sections import LATER, Section, members
-
-UNITS = {
-    "_mps_per_sqrt_s": "m/s/sqrt(s)",
-    "_radps_per_sqrt_s": "rad/s/sqrt(s)",
-    "_m_per_sqrt_s": "m/sqrt(s)",
-    "_rad_per_sqrt_s": "rad/sqrt(s)",
-    "_per_m": "1/m",
-    "_mps": "m/s",
-    "_radps": "rad/s",
-    "_rad": "rad",
-    "_deg": "deg",
-    "_px": "px",
-    "_m": "m",
-    "_s": "s",
-    "r_max": "m",
-}
+from kalmark.config import mounting, schema
+from kalmark.config.choices import BASES, section_of
+from kalmark.config.sections import LATER, Section
+from kalmark.declare import classes, is_own, unit_of
 
 HEAD = """\
 # Configuration
@@ -42,6 +24,9 @@ A configuration is a YAML 1.2 file.  `kalmark run CONFIG` takes a path or one of
 that is left out has the default given here; an unknown key or a bad value is refused with file, line, column, the
 value, what was expected and the nearest key.  `--set a.b=value` overrides one key from the command line, `--log PATH`
 the log; another `type` replaces its whole section, but for a mount; what no robot of the log takes is refused.
+Models of your own, registered in a Python file by `kalmark.register`, are types like kalmark's own once that file is
+among the `plugins`: a path beside the configuration.  **This runs the code of that file**, each time the configuration
+is read: name only files that you trust.
 The `config.yaml` that a run leaves in its folder holds everything that was in force, and can be run again;
 its title is then the folder's name.
 `kalmark config native > mine.yaml` prints a shipped one to start from.
@@ -79,18 +64,20 @@ def page() -> str:
     parts += [_section("`log`", schema.LogConfig), _section("`robots.NAME`", schema.RobotConfig)]
     parts += [_section("`robots.NAME.start`, in the plane", mounting.StartConfig)]
     parts += [_section("`robots.NAME.start`, in space", mounting.SpaceStartConfig)]
-    parts += [_choice("`robots.NAME.motion`", models.Motion, "motion")]
+    parts += [_choice("`robots.NAME.motion`", "motion")]
     parts += [_section("`robots.NAME.sensors.SENSOR`", mounting.Mounted)]
-    parts += [_choice("`robots.NAME.sensors.SENSOR`, in the plane", models.PlaneSensor, None, mounting.PlaneMounted)]
-    parts += [_choice("`robots.NAME.sensors.SENSOR`, in space", models.SpaceSensor, "sensor", mounting.SpaceMounted)]
-    parts += [_choice("`robots.NAME.sensors.SENSOR.detector`", detectors.Detector, None)]
+    parts += [_section("`robots.NAME.sensors.SENSOR`, in the plane, too", mounting.PlaneMounted, mounting.Mounted)]
+    parts += [_choice("`robots.NAME.sensors.SENSOR`, in the plane", "sensor", "plane")]
+    parts += [_choice("`robots.NAME.sensors.SENSOR`, in space", "sensor", "space")]
+    parts += [_choice("`robots.NAME.sensors.SENSOR.detector`", "detector")]
     parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in the plane", mounting.MountConfig)]
-    parts += [_choice("`robots.NAME.sensors.SENSOR.initialization`, in the plane", mounting.Initialization, None)]
+    parts += [_choice("`robots.NAME.sensors.SENSOR.initialization`, in the plane", "initialization")]
     parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in space", mounting.SpaceMountConfig)]
-    parts += [_choice("`landmarks`, and `landmark` of a sensor", landmarks.Landmark, "landmark")]
-    parts += [_choice("`association`, also of a sensor", landmarks.Association, "association")]
-    parts += [_section("`upkeep`, also of a sensor", mounting.UpkeepConfig)]
-    parts += [_choice("`estimator`", schema.Estimator, "estimator")]
+    parts += [_section("`robots.NAME.sensors.SENSOR.attention`", section_of("attention", "attention"))]
+    parts += [_choice("`landmarks`, and `landmark` of a sensor", "landmark")]
+    parts += [_choice("`association`, also of a sensor", "association")]
+    parts += [_section("`upkeep`, also of a sensor", section_of("upkeep", "upkeep"))]
+    parts += [_choice("`estimator`", "estimator")]
     parts += [_section("`map`", schema.MapConfig) + _later("map")]
     return "\n".join(parts)
 
@@ -101,29 +88,31 @@ def _shipped() -> list[str]:
     return [*shipped_configs()]
 
 
-def _section(title: str, model: type[BaseModel]) -> str:
-    return f"## {title}\n\n{inspect.getdoc(model)}\n\n{_table(model)}\n"
+def _section(title: str, model: type[BaseModel], common: type[BaseModel] = Section) -> str:
+    return f"## {title}\n\n{inspect.getdoc(model)}\n\n{_table(model, common)}\n"
 
 
-def _choice(title: str, choice: Any, kind: str | None, common: type[BaseModel] = Section) -> str:
-    """Return the sections of a choice; keys that all have by inheritance from `common` are left out."""
+def _choice(title: str, role: str, world: str = "") -> str:
+    """Return the sections of a role; keys that all have are left out."""
     parts = [f"## {title}\n"]
-    for name, model in members(choice).items():
-        table = _table(model, without=set(common.model_fields))
-        parts.append(f"**`type: {name}`**  {inspect.getdoc(model)}\n" + (f"\n{table}\n" if table else ""))
-    return "\n".join(parts) + (_later(kind) if kind else "")
+    for name, models in classes(role, world).items():
+        if any(map(is_own, models)):
+            model = section_of(role, name, world)
+            table = _table(model, BASES.get((role, world), Section))
+            parts.append(f"**`type: {name}`**  {inspect.getdoc(model)}\n" + (f"\n{table}\n" if table else ""))
+    return "\n".join(parts) + ("" if world == "plane" else _later(role))
 
 
 def _later(kind: str) -> str:
-    names = ", ".join(f"`{name}`" for name in LATER[kind])
+    names = ", ".join(f"`{name}`" for name in LATER.get(kind, ()))
     return f"\nNot available yet: {names}.\n" if names else ""
 
 
-def _table(model: type[BaseModel], without: Collection[str] = ()) -> str:
+def _table(model: type[BaseModel], common: type[BaseModel] = Section) -> str:
     rows = [
-        f"| `{name}` | {_default(field)} | {_unit(name)} | {text} |"
-        for name, field, text in ((n, f, _texts(model).get(n, "")) for n, f in model.model_fields.items())
-        if text and name not in without
+        f"| `{name}` | {_default(field)} | {unit_of(name)} | {field.description} |"
+        for name, field in model.model_fields.items()
+        if field.description and name not in common.model_fields
     ]
     return "\n".join(["| key | default | unit | meaning |", "|---|---|---|---|", *rows]) if rows else ""
 
@@ -133,7 +122,7 @@ def _default(field: Any) -> str:
     if value is None or value is PydanticUndefined:
         return ""
     if isinstance(value, BaseModel):
-        kind = getattr(value, "type", None)
+        kind = value.model_dump().get("type")
         return f"`{{type: {kind}}}`" if kind else "see below"
     if isinstance(value, dict):
         return "`{" + ", ".join(f"{key}: {{}}" for key in value) + "}`"
@@ -142,27 +131,6 @@ def _default(field: Any) -> str:
     if isinstance(value, float):
         return "`.inf`" if math.isinf(value) else "2 pi" if value == 2 * math.pi else f"`{value:g}`"
     return f"`{value}`"
-
-
-def _unit(name: str) -> str:
-    return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
-
-
-def _texts(model: type[BaseModel]) -> dict[str, str]:
-    """Return the text that stands below each field in the source, inherited ones included."""
-    out: dict[str, str] = {}
-    for cls in reversed([c for c in model.__mro__ if issubclass(c, BaseModel) and c.__module__.startswith("kalmark")]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
-        assert isinstance(body, ast.ClassDef)
-        out |= dict(_pairs(body.body))
-    return out
-
-
-def _pairs(body: list[ast.stmt]) -> Iterable[tuple[str, str]]:
-    for field, text in pairwise(body):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
-            assert isinstance(text.value, ast.Constant)
-            yield field.target.id, str(text.value.value)
 
 
 if __name__ == "__main__":

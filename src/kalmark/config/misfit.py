@@ -5,18 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from kalmark.config.classes import CLASSES
 from kalmark.config.merging import EACH
-from kalmark.config.models import Motion, Sensor
 from kalmark.config.reading import did_you_mean
 from kalmark.config.schema import Config
-from kalmark.config.sections import types
 from kalmark.config.tree import OVERRIDE, Tree
+from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import Scan
 from kalmark.logs.log import Log
-from kalmark.tracks.robot import Mount
+from kalmark.slam.robot import Mount
 
 
 def refuse_idle(tree: Tree, log: Log) -> None:
@@ -40,7 +38,7 @@ def refuse_controls(config: Config, key: str, name: str, columns: tuple[str, ...
     """Refuse controls that the motion of a robot does not take."""
     given = tuple(log.control_columns.get(name, columns))
     if given != columns:
-        fitting = [motion for motion in types(Motion) if CLASSES[motion]().columns == given]
+        fitting = _fitting("motion", given)
         hint = f"; try --set robots.{key}.motion.type={fitting[0]}" if fitting else _meant(given, columns)
         what = f"the controls of {name} have the columns {', '.join(given)}"
         wanted = f"{', '.join(columns)} of its motion {config.robots[key].motion.type}"
@@ -56,7 +54,7 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
         columns = RAW[: max(len(given), 2)] if raw else mounts[sensor].sensor.columns
         if given != columns:
             kind = config.robots[key].sensors[sensor].type
-            fitting = [] if raw else [one for one in types(Sensor) if getattr(CLASSES[one], "columns", ()) == given]
+            fitting = [] if raw else _fitting("sensor", given)
             hint = f"; try --set robots.{key}.sensors.{sensor}.type={fitting[0]}" if fitting else _meant(given, columns)
             wanted = f"{', '.join(columns)} of {'its beams' if raw else f'its type {kind}'}"
             what = f"the scans of {name} by {sensor} have the columns {', '.join(given)}"
@@ -74,6 +72,11 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
             what = f"{name} has scans of the sensor {event.sensor!r}, expected {known}"
             hint = f"if it is another one, add robots.{key}.sensors.{event.sensor}"
             raise LogError(f"{file}{f':{line}' if line else ''}: {what}; {hint}")
+
+
+def _fitting(role: str, columns: tuple[str, ...]) -> list[str | None]:
+    """Return the types of kalmark's own models that take these columns."""
+    return [registered_name(model) for model in built_in(role) if model.columns == columns]
 
 
 def _misnamed(config: Config, key: str, name: str, idle: list[str], sensor: str, log: Log) -> ConfigError:

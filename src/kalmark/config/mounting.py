@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
 
-from kalmark.config.landmarks import Association, HypothesesConfig, Landmark, TrilaterationConfig
-from kalmark.config.sections import (
-    Limit,
-    NotNegative,
-    Number,
-    Positive,
-    Probability,
-    Reserved,
-    Section,
-    Sigmas,
-    expected,
-    type_or,
-)
+from kalmark.config.choices import BASES, Choice, ModelSection, section_of
+from kalmark.config.sections import NotNegative, Number, Reserved, Section, Sigmas, expected
+from kalmark.declare import register
+from kalmark.geometry.rotations import from_euler
 
-Most = Annotated[int, Field(ge=0)] | None
-Count = Annotated[int, Field(ge=1)]
+Array = npt.NDArray[np.float64]
 
+Landmark = Annotated[Any, Choice("landmark", default="point")]
+Association = Annotated[Any, Choice("association", default="identity")]
+Initialization = Annotated[Any, Choice("initialization", default="immediate")]
+Attention = Annotated[Any, Choice("attention", typed=False)]
+Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
+
+Plugins = Annotated[tuple[str, ...], Field(strict=False)]
+
+_UNITS = {"range": "m", "bearing": "rad"}
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
 _PLANE_FOR_SPACE = "a key of the plane for a robot of space"
 VELOCITY = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps", "sigma_v_mps", "sigma_w_radps")
@@ -110,121 +110,52 @@ class SpaceStartConfig(SpacePose):
     """constant_velocity_3d: standard deviation of each rate; or a list of three."""
 
 
-class AttentionConfig(Section):
-    """Which landmarks of a scan are corrected, where new ones are taken, and when one is given up."""
+@register("initialization", "immediate")
+class Immediate:
+    """Start landmarks at first sight; of bearings alone with an unknown depth, `landmark: {type: inverse_depth}`.
 
-    updates: Most = None
-    """At most so many landmarks corrected a scan, those of most expected information first; all if absent."""
-    sequential: bool = False
-    """Correct one landmark after the other, not all of a scan jointly."""
-    starts: Most = None
-    """At most so many new landmarks a scan; all if absent."""
-    first_starts: Most = None
-    """The same while the map is empty; `starts` if absent."""
-    grid: Annotated[tuple[Count, Count], Field(strict=False)] = (1, 1)
-    """New landmarks are spread over so many columns and rows of the image."""
-    margin_px: NotNegative = 0.0
-    """No new landmark nearer to the image's border than this."""
-    searches: Annotated[int, Field(ge=0)] = 10
-    """With `delete`: how often a landmark was expected before it may be given up."""
-    match_ratio: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """With `delete`: give it up if it was found in less than this share of them."""
-    inlier_ratio: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """With `delete`: give it up if less than this share of what was found passed the gate."""
-    delete: bool = False
-    """Give up landmarks that are not found again."""
+    Ranges alone, which cannot, start them by `trilateration`.
+    """
 
 
-class UpkeepConfig(Section):
-    """What makes a landmark of sightings without an id: docs/association.md."""
-
-    confirm: Count = 3
-    """A tentative landmark becomes one when it was seen so often; 1: at its first sighting."""
-    within: Count = 10
-    """It is dropped if that did not happen in so many scans in which it was in view."""
-    keep_poses: Annotated[int, Field(ge=0)] = 0
-    """Its sightings are kept with so many past poses, and fused when it is one; 0: they are not used."""
-    merge: bool = True
-    """Merge landmarks that turn out to be one."""
-    hold_back: bool = False
-    """Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it anew."""
-    odds: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 100.0
-    """So many times likelier than chance is beyond doubt."""
-    p_detect: Probability | None = None
-    """How often one in view is seen; with it, those that are not seen again and again are removed."""
-    p_false: Probability = 0.05
-    """How often something else is taken for a landmark that is gone."""
-
-    @model_validator(mode="after")
-    def _can_be(self) -> UpkeepConfig:
-        if self.within < self.confirm:
-            raise expected(f"at least confirm, {self.confirm}", "within")
-        if self.p_detect is not None and self.p_detect <= self.p_false:
-            raise expected(f"more than p_false, {self.p_false}", "p_detect")
-        return self
-
-
-class Mounted(Section):
+class Mounted(ModelSection):
     """What every sensor has, whatever its type; and a `mount`, see below."""
 
     landmark: Landmark | None = None
     """Landmark type of this sensor; `landmarks` if absent.  A camera whose mount is calibrated wants anchored ones."""
     association: Association | None = None
     """Association of this sensor; the configuration's `association` if absent."""
-    attention: AttentionConfig | None = None
+    attention: Attention | None = None
     """Which landmarks of a scan to take; all if absent."""
-    upkeep: UpkeepConfig | None = None
+    upkeep: Upkeep | None = None
     """What makes a landmark; the configuration's `upkeep` if absent."""
     detector: Reserved = None
-    """How landmarks are found in raw scans: for `range_bearing` and `range_bearing_signature`, else reserved."""
-
-
-class ImmediateInitialization(Section):
-    """Start landmarks at first sight; of bearings alone with an unknown depth, `landmark: {type: inverse_depth}`.
-
-    Ranges alone, which cannot, start them by `trilateration`.
-    """
-
-    type: Literal["immediate"] = "immediate"
-
-
-class DelayedInitialization(Section):
-    """Start landmarks when intersections of past measurements have persisted: docs/bearing_only.md."""
-
-    type: Literal["delayed"] = "delayed"
-    persistence: Count = 4
-    """Intersections that must have been merged into one."""
-    distance: Positive = 3.0
-    """Bhattacharyya distance up to which two Gaussians are of one landmark."""
-    spacing_m: Positive = 0.5
-    """Poses are kept every so many m of the way."""
-    poses: Annotated[int, Field(ge=3)] = 20
-    """So many of them, the last ones."""
-    precision: Positive = 0.1
-    """A landmark starts when its sigma is below this part of its distance."""
-    patience: Count = 3
-    """A candidate is dropped when it was in view and not seen at so many kept poses in a row."""
-    candidates: Count = 200
-    """At most so many candidates, the most persistent ones."""
-
-
-Initialization = Annotated[
-    Annotated[ImmediateInitialization, Tag("immediate")]
-    | Annotated[DelayedInitialization, Tag("delayed")]
-    | Annotated[TrilaterationConfig, Tag("trilateration")]
-    | Annotated[HypothesesConfig, Tag("hypotheses")],
-    Discriminator(type_or("immediate")),
-]
+    """How landmarks are found in raw scans: of sensors of ranges and bearings, else reserved."""
 
 
 class PlaneMounted(Mounted):
     """What every sensor of the plane has."""
 
-    initialization: Initialization = ImmediateInitialization()
+    initialization: Initialization = section_of("initialization", "immediate")()
     """Start landmarks at first sight, or late; late ones are points."""
-
     mount: MountConfig = MountConfig()
     """Where the sensor sits on the robot."""
+    preset: Literal["laser", "sonar", "camera", "rgbd", "arva", "rfid"] | None = None
+    """Take what is not given from a documented sensor: camera for bearing, arva for range, others for range_bearing."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_from_preset(cls, value: Any) -> Any:
+        from kalmark import presets
+
+        if not isinstance(value, dict) or str(value.get("preset")) not in presets.ALL:
+            return value
+        sensor = presets.ALL[value["preset"]].sensor
+        measured = [part for part, unit in _UNITS.items() if f"{part}_{unit}" in sensor.columns]
+        fits = all((f"sigma_{part}_{unit}" in cls.model_fields) == (part in measured) for part, unit in _UNITS.items())
+        if not fits:
+            raise expected(f"a preset of this type of sensor: {value['preset']} is a {'_'.join(measured)}", "preset")
+        return vars(sensor) | value
 
 
 class SpaceMounted(Mounted):
@@ -234,10 +165,35 @@ class SpaceMounted(Mounted):
     """Where the sensor sits on the robot."""
 
 
-class Ranging(Section):
-    """How far a sensor sees, in the plane and in space."""
+BASES |= {("sensor", "plane"): PlaneMounted, ("sensor", "space"): SpaceMounted}
+PlaneSensor = Annotated[Any, Choice("sensor", "plane")]
+SpaceSensor = Annotated[Any, Choice("sensor", "space")]
 
-    range_min_m: NotNegative = 0.0
-    """Nearest landmark the sensor sees."""
-    range_max_m: Limit = math.inf
-    """Farthest landmark the sensor sees."""
+
+def pose_of(section: PlanePose | SpacePose) -> Array:
+    """Return the pose that a mount or a start describes: (3,) in the plane, (7,) in space."""
+    if isinstance(section, PlanePose):
+        return np.array([section.x_m, section.y_m, section.theta_rad])
+    q, _ = from_euler(np.radians([section.roll_deg, section.pitch_deg, section.yaw_deg]))
+    return np.array([section.x_m, section.y_m, section.z_m, *q])
+
+
+def velocity_of(section: SpaceStartConfig) -> Array:
+    """Return the velocity in the world and the body rate (6,) at a start."""
+    s = section
+    return np.array([s.vx_mps, s.vy_mps, s.vz_mps, s.wx_radps, s.wy_radps, s.wz_radps])
+
+
+def covariance_of(section: PlanePose | SpacePose, dof: int) -> Array | None:
+    """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly."""
+    if isinstance(section, PlanePose):
+        sigmas = [section.sigma_xy_m, section.sigma_xy_m, section.sigma_theta_rad]
+    else:
+        sigmas = [*_three(section.sigma_position_m), *np.radians(_three(section.sigma_rotation_deg))]
+    if isinstance(section, SpaceStartConfig):
+        sigmas += [*_three(section.sigma_v_mps), *_three(section.sigma_w_radps)]
+    return np.diag(np.square(sigmas[:dof])) if any(sigmas[:dof]) else None
+
+
+def _three(sigma: float | tuple[float, ...]) -> Array:
+    return np.broadcast_to(np.asarray(sigma, dtype=np.float64), 3)

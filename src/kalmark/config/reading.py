@@ -12,24 +12,14 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from kalmark.config.detectors import Detector
-from kalmark.config.landmarks import Association, Landmark
-from kalmark.config.models import Motion, PlaneSensor, Sensor, SpaceSensor
-from kalmark.config.schema import Config, Estimator
-from kalmark.config.sections import LATER, types
-from kalmark.config.tree import Tree, read_tree, show
-from kalmark.errors import ConfigError
+from kalmark.config.schema import Config
+from kalmark.config.sections import LATER
+from kalmark.config.tree import OVERRIDE, Tree, read_tree, show
+from kalmark.declare import classes, load_plugin
+from kalmark.errors import ConfigError, KalmarkError
 
 Model = TypeVar("Model", bound=BaseModel)
 
-_CHOICES = {
-    "motion": Motion,
-    "sensor": Sensor,
-    "landmark": Landmark,
-    "association": Association,
-    "estimator": Estimator,
-    "detector": Detector,
-}
 _ENDINGS = (".yaml", ".yml")
 _EXPECTED = {
     "float_type": "a number",
@@ -57,10 +47,27 @@ def load_config(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Conf
 
 def config_of(tree: Tree, path: Path | None) -> Config:
     """Return the configuration that a tree read from the file `path` is.  Raises ConfigError."""
+    run_plugins(tree, path)
     config = validate(tree, Config)
     config._file = path
     config._where.update(tree.places)
     return config
+
+
+def run_plugins(tree: Tree, path: Path | None) -> None:
+    """Run the `plugins` that a tree read from the file `path` names, and replace their paths by absolute ones.
+
+    They are looked for beside that file, those of an override in the working directory.  Raises ConfigError.
+    """
+    plugins = tree.values.get("plugins")
+    for n, plugin in enumerate(plugins if isinstance(plugins, list) else ()):
+        place = tree.place(("plugins", str(n)))
+        beside = Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
+        try:
+            load_plugin(beside / str(plugin))
+        except KalmarkError as error:
+            raise ConfigError(f"{place}: plugins: {error}") from None
+        tree.values["plugins"][n] = str((beside / str(plugin)).resolve())
 
 
 def shipped_configs() -> dict[str, Path]:
@@ -125,11 +132,12 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
     value = _at(tree.values, path)
     if kind == "union_tag_invalid":
         path = (*path, "type")
-        message = _not_one_of(value.get("type"), _quoted(context["expected_tags"]), path)
+        message = _not_one_of(value.get("type"), context.get("types") or _quoted(context["expected_tags"]), path)
     elif kind == "literal_error":
         message = _not_one_of(value, _quoted(context["expected"]), path)
     elif kind == "union_tag_not_found":
-        message = f"got {show(value)}, expected a mapping with a type: {_one_of(types(_CHOICES[_kind(path)]))}"
+        names = f": {_one_of(context['types'])}" if "types" in context else ""
+        message = f"got {show(value)}, expected a mapping with a type{names}"
         if _kind(path) == "sensor":
             others = [name for name in _at(tree.values, path[:-1]) if name != path[-1]]
             message += did_you_mean(path[-1], others).replace("mean ", "mean the sensor ")
@@ -169,8 +177,8 @@ def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
     kind = _kind(path[:-1])
     if path[-1] == "type" and got in LATER.get(kind, ()):
         return f"got {show(got)}, which is not available yet, expected {_one_of(words)}"
-    for here, there, choice in (("space", "the plane", PlaneSensor), ("the plane", "space", SpaceSensor)):
-        if kind == "sensor" and path[-1] == "type" and got in types(choice):
+    for here, there, world in (("space", "the plane", "plane"), ("the plane", "space", "space")):
+        if kind == "sensor" and path[-1] == "type" and got in classes("sensor", world):
             return f"got {show(got)}, a sensor of {there} on a robot of {here}, expected {_one_of(words)}"
     return f"got {show(got)}, expected {_one_of(words)}{did_you_mean(str(got), words)}"
 

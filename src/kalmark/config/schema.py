@@ -7,12 +7,25 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
-from kalmark.config.landmarks import Association, IdentityAssociation, Landmark
-from kalmark.config.models import Motion, PlaneSensor, SpaceSensor, UnicycleMotion, world_of
-from kalmark.config.mounting import VELOCITY, SpaceStartConfig, StartConfig, UpkeepConfig
-from kalmark.config.sections import Linearity, NotNegative, Number, Positive, RobotName, Section, expected, type_or
+from kalmark.config.choices import Choice, ModelSection, model_of, section_of
+from kalmark.config.mounting import (
+    VELOCITY,
+    Association,
+    Landmark,
+    PlaneSensor,
+    Plugins,
+    SpaceSensor,
+    SpaceStartConfig,
+    StartConfig,
+    Upkeep,
+)
+from kalmark.config.sections import Linearity, NotNegative, Number, Positive, RobotName, Section, expected
 from kalmark.config.tree import OVERRIDE, name_of
+from kalmark.declare import classes
 from kalmark.errors import ConfigError
+
+Motion = Annotated[Any, Choice("motion")]
+Estimator = Annotated[Any, Choice("estimator", default="invariant")]
 
 
 class LogConfig(Section):
@@ -66,7 +79,7 @@ class LogConfig(Section):
 
 
 class _AnyRobot(Section):
-    motion: Motion = UnicycleMotion()
+    motion: Motion = section_of("motion", "unicycle")()
     """Motion model."""
 
 
@@ -89,45 +102,24 @@ class SpaceRobotConfig(_AnyRobot):
 
     @model_validator(mode="after")
     def _start_fits(self) -> SpaceRobotConfig:
-        if self.start is not None and self.motion.type != "constant_velocity_3d":
+        if self.start is not None and model_of(self.motion).space.size == 7:
             for key in VELOCITY:
-                if getattr(self.start, key) not in (0, (0, 0, 0)):
+                if self.start.model_dump()[key] not in (0, (0, 0, 0)):
                     raise expected(f"0: {self.motion.type} has no velocity in its state", "start", key)
         return self
 
 
+def robot_world(robot: Any) -> str:
+    """Return where a robot (a section, or the mapping it is made from) moves by its motion: "(plane)" or "(space)"."""
+    motion = robot.get("motion") if isinstance(robot, dict) else robot.motion if isinstance(robot, _AnyRobot) else None
+    kind = (
+        motion.get("type") if isinstance(motion, dict) else motion.of_name if isinstance(motion, ModelSection) else None
+    )
+    return "(space)" if isinstance(kind, str) and kind in classes("motion", "space") else "(plane)"
+
+
 AnyRobot = Annotated[
-    Annotated[RobotConfig, Tag("(plane)")] | Annotated[SpaceRobotConfig, Tag("(space)")], Discriminator(world_of)
-]
-
-
-class EkfEstimator(Section):
-    """The textbook filter, landmark by landmark."""
-
-    type: Literal["ekf"] = "ekf"
-
-
-class InvariantEstimator(Section):
-    """The iterated invariant filter."""
-
-    type: Literal["invariant"] = "invariant"
-    iterations: Annotated[int, Field(ge=1)] = 30
-    """At most this many linearisations of a scan."""
-    tolerance: Positive = 1e-3
-    """No more once nothing moves by more than this many of its sigmas."""
-
-
-class FejEstimator(Section):
-    """First-estimates Jacobians."""
-
-    type: Literal["fej"] = "fej"
-
-
-Estimator = Annotated[
-    Annotated[InvariantEstimator, Tag("invariant")]
-    | Annotated[EkfEstimator, Tag("ekf")]
-    | Annotated[FejEstimator, Tag("fej")],
-    Discriminator(type_or("invariant")),
+    Annotated[RobotConfig, Tag("(plane)")] | Annotated[SpaceRobotConfig, Tag("(space)")], Discriminator(robot_world)
 ]
 
 
@@ -158,17 +150,19 @@ class Config(Section):
     """kalmark version that saved this file."""
     seed: int | None = None
     """Seed of the simulation the log came from."""
+    plugins: Plugins = ()
+    """Python files with models of your own.  This runs the code of those files."""
     log: LogConfig = LogConfig()
     """The log."""
     robots: dict[str, AnyRobot] = Field(default_factory=_each)
     """Robots by name; `each` stands for every robot not named."""
     landmarks: Landmark | None = None
     """Landmark type; what fits each sensor if absent."""
-    association: Association = IdentityAssociation()
+    association: Association = section_of("association", "identity")()
     """Which landmark was that."""
-    upkeep: UpkeepConfig = UpkeepConfig()
+    upkeep: Upkeep = section_of("upkeep", "upkeep")()
     """What makes a landmark of sightings without an id."""
-    estimator: Estimator = InvariantEstimator()
+    estimator: Estimator = section_of("estimator", "invariant")()
     """Filter."""
     map: MapConfig = MapConfig()
     """Covariance storage."""

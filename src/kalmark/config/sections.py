@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, ClassVar, get_args
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, model_validator
 from pydantic_core import PydanticCustomError
@@ -12,9 +12,6 @@ from pydantic_core import PydanticCustomError
 Number = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Limit = Annotated[float, Field(gt=0, allow_inf_nan=True)]
-
-Probability = Annotated[float, Field(gt=0, lt=1)]
 
 # What the contract names and later versions bring: refused by name, not as a spelling mistake.
 LATER: dict[str, tuple[str, ...]] = {
@@ -33,7 +30,9 @@ class Section(BaseModel):
     `elsewhere` says of keys that another section of this kind has what they are here.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
     elsewhere: ClassVar[dict[str, str]] = {}
 
     @model_validator(mode="before")
@@ -63,28 +62,6 @@ def type_or(default: str | None = None) -> Callable[[Any], str | None]:
         return kind if kind is None or isinstance(kind, str) else repr(kind)
 
     return discriminate
-
-
-def members(choice: Any) -> dict[str, Any]:
-    """Return the sections of a choice, an annotated union of tagged sections, by type name."""
-    pairs = (get_args(member) for member in get_args(get_args(choice)[0]))
-    return {tag.tag: section for section, tag in pairs}
-
-
-def types(choice: Any) -> list[str]:
-    """Return the type names of a choice."""
-    return [*members(choice)]
-
-
-def _gate(value: Any) -> float | str:
-    if value in ("off", "default"):
-        return str(value)
-    if isinstance(value, int | float) and 0 < value < 1:
-        return float(value)
-    raise expected("a probability between 0 and 1, off or default")
-
-
-Gate = Annotated[float | str, PlainValidator(_gate)]
 
 
 def _is_number(value: Any) -> bool:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from kalmark.declare import Count, NotNegative, Positive, declared, register
 from kalmark.detect.lines import grown, lines, straight_pieces
-from kalmark.detect.scan import Array, Detections, Laser
+from kalmark.detect.scan import Acute, Array, Detections, Laser
 from kalmark.geometry.gaussian import gate
 
 TRIM = 2  # beams at the ends of a wall that are left out of the fit: which of two walls they hit is not sure
 PROBABILITY = 0.9999  # with which a straight wall passes for one
 
 
-@dataclass(frozen=True)
+@declared
 class Walls(Laser):
     """Straight walls, by the distance of their line from the laser, m, and the direction of its normal, rad.
 
@@ -24,9 +25,9 @@ class Walls(Laser):
     where the beams on it end, so it may be longer.  kalmark has no landmark for a wall of the plane yet.
     """
 
-    split_m: float = 0.2
-    beams: int = 8
-    length_m: float = 0.5
+    split_m: Annotated[Positive, "A wall is straight to this."] = 0.2
+    beams: Annotated[Count, "Beams on a wall, at least."] = 8
+    length_m: Annotated[NotNegative, "Length of a wall, at least."] = 0.5
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
         pieces, _ = self.pieces(r, a)
@@ -51,16 +52,16 @@ class Walls(Laser):
         return Detections(found.columns, found.y, cov, found.beams, found.attributes)
 
 
-@dataclass(frozen=True)
+@register("detector", "corners")
 class Corners(Walls):
-    """Corners, by range, bearing and opening angle, rad: the signature, over pi where the corner stands out.
+    """Corners of walls: range, bearing and opening angle.
 
-    One is where two walls meet that follow each other in the scan: within `gap_m` of the ends of both, and at
-    `bend_deg` at least.
+    The angle, rad, is the signature, over pi where the corner stands out.  One is where two walls meet that follow each
+    other in the scan: within `gap_m` of the ends of both, and at `bend_deg` at least.
     """
 
-    gap_m: float = 0.3
-    bend_deg: float = 30.0
+    gap_m: Annotated[NotNegative, "How far from the corner the ends of its walls may be."] = 0.3
+    bend_deg: Annotated[Acute, "Angle between the walls, at least."] = 30.0
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
         walls = super()._find(r, a, intensities)

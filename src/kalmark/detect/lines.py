@@ -22,7 +22,7 @@ NEAR2 = 16.0  # a beam within 4 sigma of a line is on it
 
 @compiled
 def farthest(x: Array, y: Array, i: int, j: int) -> tuple[int, float]:
-    """Return which of the points i to j is farthest from the chord between them, and how far."""
+    """Return which of the points i to j of x, y (N,) is farthest from the chord between these two, and its distance."""
     dx, dy = x[j] - x[i], y[j] - y[i]
     length, at, most = math.hypot(dx, dy), i, 0.0
     for k in range(i + 1, j):

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from kalmark.declare import Limit, NotNegative, register
 from kalmark.detect.scan import Array, Detections, Laser
 from kalmark.errors import EventError
 
 
-@dataclass(frozen=True)
+@register("detector", "reflectors")
 class Reflectors(Laser):
-    """Cylinders of a radius that is known, `radius_m` (0: flat and small), by range and bearing of their centres.
+    """Reflectors, by the intensity of the beams: range and bearing of their centres.
 
-    One is a run of beams whose intensity is at least `intensity_min`, on one surface.  Its radius is too large if it is
-    wider than `width_max_m`.  The bearing lies anywhere where the outermost beams still hit and the next ones do not:
-    its variance is that of the interval.
+    They are cylinders of a radius that is known, `radius_m` (0: flat and small).  One is a run of beams whose intensity
+    is at least `intensity_min`, on one surface.  Its radius is too large if it is wider than `width_max_m`.  The
+    bearing lies anywhere where the outermost beams still hit and the next ones do not: its variance is that of the
+    interval.
     """
 
-    intensity_min: float = 1.0
-    radius_m: float = 0.0
-    width_max_m: float = 0.5
+    intensity_min: Annotated[NotNegative, "A beam from a reflector is as bright as this at least."] = 1.0
+    radius_m: Annotated[NotNegative, "Radius of the cylinders; 0: small and flat."] = 0.0
+    width_max_m: Annotated[Limit, "What is wider is no reflector."] = 0.5
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
         if intensities is None:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.declare import Limit, NotNegative, Within, declared
 from kalmark.detect.circles import segments
-from kalmark.errors import EventError, ModelError
-from kalmark.events import Scan, shown, when
+from kalmark.errors import EventError
+from kalmark.events import Scan, when
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 TURN = 2.01 * math.pi
+Acute = Annotated[float, Within(gt=0, lt=90)]
 RAW = ("range_m", "bearing_rad", "intensity")
 
 
@@ -42,38 +44,35 @@ class Detections:
         return Detections(self.columns, self.y[keep], self.cov[keep], self.beams[keep], rest)
 
 
-@dataclass(frozen=True)
+@declared
 class Laser:
-    """A scanning laser: N ranges at increasing angles, of which those below `range_min_m`, from `range_max_m` on and
-    those that are not finite are no returns.
+    """A scanning laser: N ranges at increasing angles.
 
-    `sigma_range_m` is the noise of a range.  Neighbouring beams hit one surface unless their ranges differ by more than
-    they would on one that is hit under `incidence_deg`, and `jump_m` more.  `sigma_position_m` and `sigma_bearing_rad`
-    are added to what is found: how far a real thing is from what the detector takes it for, and how far the whole scan
-    is turned, by the robot's motion while it was taken, or a time stamp that is late.  With `signature` the third
-    component of a detection is kept.
+    Ranges below `range_min_m`, from `range_max_m` on, and not finite are no returns.  `sigma_range_m` is the noise of a
+    range.  Neighbouring beams hit one surface unless their ranges differ by more than on a surface hit under
+    `incidence_deg`, and `jump_m` more.  `sigma_position_m` and `sigma_bearing_rad` are added to the noise of a
+    detection: the distance of the real object from the fitted one, and the rotation of the whole scan by the robot's
+    motion during it or by a late time stamp.  With `signature` the third component of a detection is kept.
     """
 
-    sigma_range_m: float = 0.03
-    sigma_position_m: float = 0.0
-    sigma_bearing_rad: float = 0.0
-    range_min_m: float = 0.05
-    range_max_m: float = math.inf
-    incidence_deg: float = 12.0
-    jump_m: float = 0.15
-    signature: bool = False
-
-    def __post_init__(self) -> None:
-        for name, default in ((own.name, own.default) for own in fields(self)):
-            what, value = f"{type(self).__name__}: {name} is {shown(getattr(self, name))}", getattr(self, name)
-            if isinstance(default, bool):
-                if not isinstance(value, bool | np.bool_):
-                    raise ModelError(f"{what}, expected True or False")
-            elif isinstance(default, int):
-                if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                    raise ModelError(f"{what}, expected a whole number of at least 1")
-            elif isinstance(default, float):
-                _refuse_odd_number(what, name, value)
+    sigma_range_m: Annotated[float, Within(ge=1e-6), "Noise of the range of one beam."] = 0.03
+    sigma_position_m: Annotated[
+        NotNegative, "Added to what is found: how far the real thing is from what it is taken for, in every direction."
+    ] = 0.0
+    sigma_bearing_rad: Annotated[
+        NotNegative,
+        "Added to what is found: how far a whole scan is turned, by the motion during it or a late time stamp.",
+    ] = 0.0
+    range_min_m: Annotated[NotNegative, "A smaller range is no return."] = 0.05
+    range_max_m: Annotated[Limit, "A range from here on is no return."] = math.inf
+    incidence_deg: Annotated[
+        Acute, "Neighbouring beams are on one surface if it can be hit under this angle at least."
+    ] = 12.0
+    jump_m: Annotated[NotNegative, "How much more their ranges may differ."] = 0.15
+    signature: Annotated[
+        bool | None,
+        "Give the third number of what is found to the filter; if absent, where the sensor has a signature.",
+    ] = None
 
     def detect(self, ranges: Any, angles: Any, intensities: Any = None) -> Detections:
         """Return what is found among beams of these ranges (N,) m at these angles (N,) rad.  Raises EventError."""
@@ -120,21 +119,6 @@ class Laser:
         if step >= least:  # neighbours that no surface joins
             return np.empty((0, 2), np.int64), step
         return segments(r, a, step, least, self.jump_m), step
-
-
-def _refuse_odd_number(what: str, name: str, value: Any) -> None:
-    """Refuse a parameter that is no number, or not one that it may be: only limits, `..._max_m`, may be infinite."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ModelError(f"{what}, expected a number")
-    if name in ("incidence_deg", "bend_deg"):
-        if not 0 < value < 90:
-            raise ModelError(f"{what}, expected an angle between 0 and 90")
-        return
-    low = 0.0 if name != "sigma_range_m" else 1e-6
-    if not value >= low:
-        raise ModelError(f"{what}, expected at least {low:g}")
-    if value == math.inf and not name.endswith("_max_m"):
-        raise ModelError(f"{what}, expected a finite number")
 
 
 def _beams(ranges: Any, angles: Any, intensities: Any) -> tuple[Array, Array, Array | None]:

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from kalmark.declare import Count, Limit, NotNegative, Positive, register
 from kalmark.detect.circles import circles
 from kalmark.detect.scan import Array, Detections, Laser
 
 LINEAR = 0.75  # of a step: beams are taken to be so wide at least, for an edge is straight only from there on
 
 
-@dataclass(frozen=True)
+@register("detector", "trunks")
 class Trunks(Laser):
-    """Circles, by range and bearing of the centre and the radius, m: the signature.
+    """Tree trunks and posts: range, bearing and radius of circles that stand alone.
 
-    One is seen by `beams` at least, with nothing before its edges; its radius lies between `radius_min_m` and
-    `radius_max_m`, and its beams within `roughness_m` of the circle, RMS.  `beam_width_rad` is the divergence of a
-    beam, full angle: where it grazes an edge it is reflected from anywhere across it.  `sigma_position_m` is added to
-    the radius too.
+    The radius, m, is the signature.  One is seen by `beams` at least, with nothing before its edges; its radius lies
+    between `radius_min_m` and `radius_max_m`, and its beams within `roughness_m` of the circle, RMS.  `beam_width_rad`
+    is the divergence of a beam, full angle: where it grazes an edge it is reflected from anywhere across it.
+    `sigma_position_m` is added to the radius too.
     """
 
-    beams: int = 2
-    radius_min_m: float = 0.0
-    radius_max_m: float = 1.0
-    roughness_m: float = 0.1
-    beam_width_rad: float = 0.0
+    beams: Annotated[Count, "Beams on a trunk, at least."] = 2
+    radius_min_m: Annotated[NotNegative, "Smallest radius."] = 0.0
+    radius_max_m: Annotated[Limit, "Largest radius."] = 1.0
+    roughness_m: Annotated[Positive, "Beams lie so far off the circle at most, RMS."] = 0.1
+    beam_width_rad: Annotated[
+        NotNegative, "Divergence of a beam, full angle; three quarters of the step between beams at least are taken."
+    ] = 0.0
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
         pieces, step = self.pieces(r, a)

@@ -13,11 +13,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba.extending import register_jitable
 
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import (
+    Array,
+    Flags,
     Index,
     add_square,
     cholesky_inverse,
@@ -45,8 +46,6 @@ from kalmark.filter.parallax import anchored, carried, carry_back, retract_paral
 from kalmark.geometry.spaces import Table, generator, retract
 from kalmark.models.observe import linearize, sensor_at
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 Map = tuple[Array, Array, int, Table, Table, int]  # x, P, n, blocks, atoms, axes
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
 
@@ -66,21 +65,13 @@ def gauge(mean: Array, correction: Array, pose: int, axes: int) -> Array:
 
 @register_jitable  # type: ignore[untyped-decorator]
 def iterate(
-    view: Any,
-    sizes: tuple[int, int, int],
-    table: Table,
-    mean: Array,
-    P_ss: Array,
-    y: Array,
-    R: Array,
-    linear: Linear,
+    model: Any, sizes: tuple[int, int, int], table: Table, mean: Array, P_ss: Array, y: Array, R: Array, linear: Linear,
     limits: tuple[int, float],
-) -> tuple[Array, Array, Array, bool]:
+) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
 
-    It begins with what `linearized` tells at the mean.
-
-    `limits`: at most so many times, until nothing moves by more than that many of its sigmas.
+    The first time is `linear`, at the mean.  `limits`: at most so many times, until nothing moves by more than that
+    many of its sigmas.
 
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
@@ -92,13 +83,13 @@ def iterate(
     correction = np.zeros(len(P_ss))
     turned = generator(table, mean, len(P_ss), axes, mean[:3])
     depths = anchored(table if most > 1 else table[:0])  # a single step is worse off with it: docs/bearing_only.md
-    s, S = s_j, S_j = sensor_at(view, mean[:head])
+    s, S = s_j, S_j = sensor_at(model, mean[:head])
     h = S.shape[1]
     baselines = (depths, s, S, spread(P_ss, np.arange(h), mean, s, S, depths))
     x_j, (v, H, HP, Z) = mean, linear
     for j in range(most):
         if j > 0:
-            _e, z, E_r, E_l = linearize(view, x_j[:head], x_j[head:].reshape(k, d), y)
+            _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, d), y)
             H, v = stacked(E_r, E_l), z.copy().ravel()
             carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
             turn = generator(table, x_j, len(P_ss), axes, mean[:3]) - turned
@@ -114,7 +105,7 @@ def iterate(
             break
         x_j = mean.copy()
         retract(table, x_j, correction, gauge(mean, correction, pose, axes))
-        s_j, S_j = sensor_at(view, x_j[:head])
+        s_j, S_j = sensor_at(model, x_j[:head])
         retract_parallax(x_j, mean, baselines, correction, correction[:h], s_j)
     return H, M, v, positive
 
@@ -132,36 +123,35 @@ def gain(
 
 
 def invariant(
-    view: Any, map_: Map, scan: Scan, limits: tuple[int, float]
+    model: Any, map_: Map, scan: Scan, limits: tuple[int, float]
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan: gate, iterate, fuse, retract, transport; inverse distances by their parallax.
 
-    docs/invariant.md, docs/bearing_only.md.
-
-    Returns e, z, Z, d2 at the prediction, which were fused, and whether the filter can go on.
+    docs/invariant.md, docs/bearing_only.md.  Returns e, z, Z, d2 at the prediction, which were fused, and whether the
+    covariances are valid.
     """
     x, P, n, blocks, atoms, axes = map_
     robot, mount, slots, d, y, R, gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
-    e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
+    e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     P_ss = submatrix(P, index)
     linear = linearized(z, E_r, E_l, P_ss, R)
     Z = diagonal_blocks(linear[3], z.shape[1])
-    d2, healthy = squared_distances(Z, z)
+    d2, valid = squared_distances(Z, z)
     near = (d2 <= gate) & (d2 < np.inf)
-    if not healthy or not near.any():
-        return e, z, Z, d2, near, healthy
+    if not valid or not near.any():
+        return e, z, Z, d2, near, valid
     if not near.all():
         index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
         y, R, P_ss = y[near], R[near], submatrix(P, index)
         linear = linearized(z[near], E_r[near], E_l[near], P_ss, R)
-    H, M, v, positive = iterate(view, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
+    H, M, v, positive = iterate(model, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return e, z, Z, d2, near, False
     before, x_before = generator(atoms, x, n, axes, mean[:3]), x.copy()
     depths = anchored(atoms if limits[0] > 1 else atoms[:0])
-    s, S = sensor_at(view, mean[:head])
+    s, S = sensor_at(model, mean[:head])
     rows = index[: S.shape[1]]
     baselines = (depths, s, S, spread(P, rows, x, s, S, depths))
     V, correction = gain(P, n, index, H, M, v, (len(rows), len(y)))
@@ -169,33 +159,33 @@ def invariant(
     theta = index[(3 if pose == 3 else 6) - axes]
     downdate_and_transport(P, V, generator(atoms, x, n, axes, mean[:3]) - before, theta)
     if len(depths):
-        s_now, S_now = sensor_at(view, observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2])
+        s_now, S_now = sensor_at(model, observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2])
         retract_parallax(x, x_before, baselines, correction, correction[rows], s_now)
         transport_parallax(P, n, rows, depths, carried(x_before, x, baselines, s_now, S_now))
     return e, z, Z, d2, near, True
 
 
-def compared(view: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
+def compared(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
     """Return each observation's innovation covariance Z (K, p, p) and d2 (K,); nothing is corrected.  [S] (83)."""
     x, P, _n, blocks, atoms, _axes = map_
     robot, mount, slots, d, y, R, _gate = scan
     index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     head = head_sizes(blocks, atoms, robot, mount)[1]
-    _e, z, E_h, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
-    Z, d2, _healthy = innovation(P, index, E_h, E_l, R, z)
+    _e, z, E_h, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
+    Z, d2, _valid = innovation(P, index, E_h, E_l, R, z)
     return Z, d2
 
 
-def fit(view: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
-    """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if it is sick."""
+def fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
+    """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if not valid."""
     x, P, _n, blocks, atoms, axes = map_
     robot, mount, slots, d, y, R, _gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
-    _e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(slots), d), y)
+    _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     P_ss = submatrix(P, index)
     linear = linearized(z, E_r, E_l, P_ss, R)
-    _H, M, v, positive = iterate(view, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
+    _H, M, v, positive = iterate(model, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return np.inf, np.inf
     w, log_det = M @ v, 0.0
@@ -205,13 +195,13 @@ def fit(view: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[fl
 
 
 def averaged(
-    view: Any, map_: Map, scan: Scan, limits: tuple[int, float], pairs: Index, weights: Array, transports: bool
+    model: Any, map_: Map, scan: Scan, limits: tuple[int, float], pairs: Index, weights: Array, transports: bool
 ) -> tuple[Array, bool]:
     """Correct by the mean over H matchings: x <- sum w_h x_h, P <- sum w_h (P_h + (x_h - x) (x_h - x)').  [F], JPDA.
 
     `pairs` (H, K) are the numbers of slots, -1 for none; `weights` (H,) add up to 1.  Each matching is linearised where
     it would be alone; inverse distances are corrected as they are.  Returns d2 (K,) of the first matching's pairs, each
-    for itself, NaN for none, and whether the filter can go on.
+    for itself, NaN for none, and whether the covariances are valid.
     """
     x, P, n, blocks, atoms, axes = map_
     robot, mount, slots, d, y, R, _gate = scan
@@ -224,12 +214,12 @@ def averaged(
         if len(rows) == 0:
             continue
         index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[pairs[i][rows]], d)
-        _e, z, E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(len(rows), d), y[rows])
+        _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(rows), d), y[rows])
         if i == 0:
             d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
         S = submatrix(P, index)
         linear = linearized(z, E_r, E_l, S, R[rows])
-        H, M, v, positive = iterate(view, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
+        H, M, v, positive = iterate(model, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
         if not positive:
             return d2, False
         V_i, D[:, i] = gain(P, n, index, H, M, v, (E_r.shape[2], len(rows)))
@@ -249,31 +239,31 @@ def averaged(
 
 
 def textbook(
-    view: Any, map_: Map, scan: Scan, _: None
+    model: Any, map_: Map, scan: Scan, _: None
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3."""
     x, P, n, blocks, atoms, _axes = map_
     robot, mount, slots, d, y, R, gate = scan
     k, p = len(y), R.shape[1]
     e, z, Z, d2 = np.empty((k, y.shape[1])), np.empty((k, p)), np.empty((k, p, p)), np.empty(k)
-    near, healthy, head = np.zeros(k, np.bool_), True, head_sizes(blocks, atoms, robot, mount)[1]
+    near, valid, head = np.zeros(k, np.bool_), True, head_sizes(blocks, atoms, robot, mount)[1]
     for i in range(k):
         one = slice(i, i + 1)
         index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots[one], d)
-        e[one], z[one], E_r, E_l = linearize(view, mean[:head], mean[head:].reshape(1, d), y[one])
-        Z[one], d2[one], sound = innovation(P, index, E_r, E_l, R[one], z[one])
-        healthy = healthy and sound
+        e[one], z[one], E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(1, d), y[one])
+        Z[one], d2[one], positive = innovation(P, index, E_r, E_l, R[one], z[one])
+        valid = valid and positive
         near[i] = d2[i] < gate
         if near[i]:
             M, _positive = cholesky_inverse(Z[i])
             V, correction = gain(P, n, index, stacked(E_r, E_l), M, z[i].copy(), (E_r.shape[2], 1))
             downdate(P, V)
             retract(atoms, x, correction, np.zeros(0))
-    return e, z, Z, d2, near, healthy
+    return e, z, Z, d2, near, valid
 
 
 def first_estimates(
-    view: Any, map_: Map, scan: Scan, x_first: Array
+    model: Any, map_: Map, scan: Scan, x_first: Array
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
     x, P, n, blocks, atoms, _axes = map_
@@ -281,12 +271,12 @@ def first_estimates(
     k, head = len(slots), head_sizes(blocks, atoms, robot, mount)[1]
     index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     _, _, first = observed_block(x_first, blocks, atoms, robot, mount, slots, d)
-    e, z, _, _ = linearize(view, mean[:head], mean[head:].reshape(k, d), y)
-    _, _, E_r, E_l = linearize(view, first[:head], first[head:].reshape(k, d), y)
-    Z, d2, healthy = innovation(P, index, E_r, E_l, R, z)
+    e, z, _, _ = linearize(model, mean[:head], mean[head:].reshape(k, d), y)
+    _, _, E_r, E_l = linearize(model, first[:head], first[head:].reshape(k, d), y)
+    Z, d2, valid = innovation(P, index, E_r, E_l, R, z)
     near = (d2 <= gate) & (d2 < np.inf)
-    if not healthy or not near.any():
-        return e, z, Z, d2, near, healthy
+    if not valid or not near.any():
+        return e, z, Z, d2, near, valid
     index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
     H = stacked(E_r[near], E_l[near])
     sizes = E_r.shape[2], len(H) // R.shape[1]

@@ -1,4 +1,4 @@
-"""The estimators to choose from.  They differ in the correction alone; prediction and augmentation are the textbook's.
+"""The estimators to choose from.  They differ in the correction and in where the motion is linearised.
 
 `Invariant` is the default: its unobservable directions do not depend on the estimate, which keeps it consistent.
 """
@@ -7,60 +7,73 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
-import numpy.typing as npt
-
-from kalmark.errors import ModelError
+from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections
-from kalmark.filter.map import StochasticMap
-from kalmark.filter.postponed import PostponedMap
+from kalmark.filter.kernels import Array, Flags, Index
+from kalmark.filter.map import Map, StochasticMap
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
-Map = StochasticMap | PostponedMap
+class Update(NamedTuple):
+    """One correction: y (K, m) with noise R (K, p, p), of the first d numbers of the K blocks `slots`.
+
+    `model` is the observation model, compiled (a tuple) or in Python; `robot` and `mount` are slots, `mount` -1 if it
+    is not in the map.  What has d2 > gate is not fused.
+    """
+
+    model: Any
+    robot: int
+    mount: int
+    slots: Index
+    d: int
+    y: Array
+    R: Array
+    gate: float = math.inf
 
 
 class Correction(NamedTuple):
-    """What K known landmarks said: expectation, innovation and its covariance, squared distance, fused, health."""
+    """Of K observations: expectation, innovation and its covariance, squared distance, and which were fused.
+
+    Where the correction is not `valid`, a covariance is no longer positive definite: the filter has diverged.
+    """
 
     e: Array
     z: Array
     Z: Array
     d2: Array
-    fused: npt.NDArray[np.bool_]
-    healthy: bool
+    fused: Flags
+    valid: bool
 
 
 class Estimator(Protocol):
-    """How a scan corrects the map."""
+    """How motions and scans change the map."""
 
     coordinates: ClassVar[str]
     default_gate: ClassVar[float]
 
-    def correct(
-        self, map_: Map, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
-        gate: float,
-    ) -> Correction:  # fmt: skip
-        """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate.
+    def predict(self, map_: Map, robot: int, index: Index, F: Array, Q: Array, moved: Array) -> None:
+        """Move a robot to the mean `moved`: P <- F P F' + Q on the rows `index`.  [S] (14)-(17)."""
 
-        `mount` is the slot of the sensor's mount, -1 if it is not in the map.
-        """
-
-    def average(
-        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
-        pairs: Index, weights: Array,
-    ) -> tuple[Array, bool]:  # fmt: skip
-        """Fuse the mean over matchings; only `km.association.Averaged` asks for it."""
+    def correct(self, map_: Map, update: Update) -> Correction:
+        """Fuse a scan."""
 
     def for_fixes(self) -> Estimator:
         """Return the estimator that fuses absolute positions."""
 
     def pose_jacobian(self, map_: Map, robot: int, J: Array) -> Array:
         """Return the Jacobian J (., 3 or more) in the robot's state, taken where this estimator linearises."""
+
+
+@runtime_checkable
+class Averaging(Protocol):
+    """An estimator that can fuse the mean over matchings, as `km.association.Averaged` wants."""
+
+    def average(self, map_: Map, update: Update, pairs: Index, weights: Array) -> tuple[Array, bool]:
+        """Fuse the mean over matchings (H, K), numbers of slots or -1, of these weights (H,).
+
+        Returns d2 (K,) of the pairs of the first one, and whether the covariances are valid.
+        """
 
 
 class _Estimator:
@@ -70,31 +83,32 @@ class _Estimator:
     compiled: ClassVar[Callable[..., Any]]
     transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
 
-    def correct(
-        self, map_: Map, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
-        gate: float,
-    ) -> Correction:  # fmt: skip
-        """Fuse y (K, m), noise R (K, p, p), of the first d numbers of the blocks `slots`, where d2 <= gate."""
-        run = type(self).compiled if isinstance(view, tuple) else type(self).source
-        m, *here = map_.opened(robot, mount, slots, self.transports)
-        scan = (*here, d, y, R, gate)
-        done = Correction(*run(view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, self._option(m)))
+    def predict(self, map_: Map, robot: int, index: Index, F: Array, Q: Array, moved: Array) -> None:
+        """Move a robot to the mean `moved`: P <- F P F' + Q on the rows `index`.  [S] (14)-(17)."""
+        map_.predict(index, F, Q)
+        map_.set_predicted(robot, moved)
+
+    def correct(self, map_: Map, update: Update) -> Correction:
+        """Fuse a scan, where d2 is within the gate."""
+        model, robot, mount, slots, d, y, R, gate = update
+        run = type(self).compiled if isinstance(model, tuple) else type(self).source
+        m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
+        where, scan = (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), (robot_here, mount_here, here, d, y, R, gate)
+        done = Correction(*run(model, where, scan, self._option(m)))
         map_.corrected(robot, self.transports)
         return done
 
-    def average(
-        self, map_: StochasticMap, view: Any, robot: int, mount: int, slots: Index, d: int, y: Array, R: Array,
-        pairs: Index, weights: Array,
-    ) -> tuple[Array, bool]:  # fmt: skip
-        """Correct by the mean over matchings (H, K), numbers of slots or -1, of these weights (H,).
+    def average(self, map_: Map, update: Update, pairs: Index, weights: Array) -> tuple[Array, bool]:
+        """Fuse the mean over matchings (H, K), numbers of slots or -1, of these weights (H,); nothing is gated.
 
-        Returns d2 (K,) of the first one's pairs, and whether the filter can go on.
+        Returns d2 (K,) of the pairs of the first one, and whether the covariances are valid.
         """
-        run = corrections.compiled_averaged if isinstance(view, tuple) else corrections.averaged
-        scan = robot, mount, slots, d, y, R, math.inf
-        where = map_.x, map_.P, map_.n, map_.blocks, map_.atoms, map_.axes
-        d2, healthy = run(view, where, scan, self._limits(), pairs, weights, self.transports)
-        return d2, bool(healthy)
+        model, *scan = update
+        run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
+        m = map_.opened(update.robot, update.mount, update.slots, self.transports).map
+        where = m.x, m.P, m.n, m.blocks, m.atoms, m.axes
+        d2, valid = run(model, where, tuple(scan), self._limits(), pairs, weights, self.transports)
+        return d2, bool(valid)
 
     def _option(self, map_: StochasticMap) -> Any:
         return None
@@ -111,9 +125,12 @@ class _Estimator:
         return J
 
 
-@dataclass(frozen=True)
+@register("estimator", "ekf")
 class Ekf(_Estimator):
-    """The textbook filter, landmark by landmark, gate 3 sigma.  [S] (26)-(30), C.3.  Overconfident: for comparison."""
+    """The textbook filter, landmark by landmark.
+
+    Gate 3 sigma.  [S] (26)-(30), C.3.  Overconfident: for comparison.
+    """
 
     coordinates: ClassVar[str] = "world"
     default_gate: ClassVar[float] = 9.0
@@ -121,29 +138,24 @@ class Ekf(_Estimator):
     compiled = corrections.compiled_textbook
 
 
-@dataclass(frozen=True)
+@register("estimator", "invariant")
 class Invariant(_Estimator):
-    """The iterated right-invariant filter: honest about what cannot be observed (docs/invariant.md).
+    """The iterated invariant filter.
 
-    A scan is linearised at most so many times, until nothing seen moves by more than `tolerance` of its sigma; the next
-    time would change about a thousandth of that.  Once is enough for small corrections by relative measurements; fixes
-    are always iterated, and so should be landmarks known beforehand.
+    Its unobservable directions are exact (docs/invariant.md).  A scan is linearised at most so many times, until
+    nothing seen moves by more than `tolerance` of its sigma; the next time would change about a thousandth of that.
+    Once is enough for small corrections by relative measurements; fixes are always iterated, and so should be landmarks
+    known beforehand.
     """
 
-    iterations: int = 30
-    tolerance: float = 1e-3
+    iterations: Annotated[Count, "At most this many linearisations of a scan."] = 30
+    tolerance: Annotated[Positive, "No more once nothing moves by more than this many of its sigmas."] = 1e-3
 
     coordinates: ClassVar[str] = "log"
     transports: ClassVar[bool] = True
     default_gate: ClassVar[float] = math.inf
     source = corrections.invariant
     compiled = corrections.compiled_invariant
-
-    def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ModelError(f"Invariant: iterations is {self.iterations}, expected at least 1")
-        if not 0 < self.tolerance < math.inf:
-            raise ModelError(f"Invariant: tolerance is {self.tolerance}, expected a positive number of sigmas")
 
     def _limits(self) -> tuple[int, float]:
         return self.iterations, float(self.tolerance)
@@ -156,9 +168,12 @@ class Invariant(_Estimator):
         return Invariant(max(30, self.iterations), self.tolerance)
 
 
-@dataclass(frozen=True)
+@register("estimator", "fej")
 class Fej(_Estimator):
-    """First-estimates Jacobians: consistent while the first estimates are good, lost when they are not."""
+    """First-estimates Jacobians.
+
+    Consistent while the first estimates are good, diverged when they are not.
+    """
 
     coordinates: ClassVar[str] = "world"
     default_gate: ClassVar[float] = math.inf

@@ -24,6 +24,7 @@ from kalmark.compiled import compiled
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 
 def _load_blas(module: str) -> str:
@@ -114,14 +115,14 @@ def product(A: Array, B: Array) -> Array:
 
 @compiled
 def quadratic(A: Array, S: Array) -> Array:
-    """Return A S A', symmetric to the last bit."""
+    """Return A S A' (m, m) of A (m, n) and S (n, n), symmetric to the last bit."""
     C = product(product(A, S), A.T.copy())
     return 0.5 * (C + C.T)
 
 
 @compiled
 def moved_noise(moved: Array, F: Array, R_u: Array, N: Array) -> tuple[Array, bool]:
-    """Return Q = R_u N R_u', and whether that and what a motion has come to are finite numbers."""
+    """Return Q = R_u N R_u' (n, n), and whether Q, the moved mean (n,) and F (n, n) are finite."""
     Q = quadratic(R_u, N)
     return Q, bool(np.isfinite(moved).all() and np.isfinite(F).all() and np.isfinite(Q).all())
 
@@ -154,7 +155,7 @@ def augment(P: Array, n: int, at: int, index: Index, G: Array, Q: Array) -> None
 
 @compiled
 def clear(P: Array, n: int, at: int, d: int) -> None:
-    """Set the rows and columns at..at+d to zero: a removed block, or a fresh one known exactly."""
+    """Set the rows and columns at..at+d of P (n, n) to zero: a removed block, or a new one that is known exactly."""
     for a in range(at, at + d):
         P[a, : a + 1] = 0.0
         P[a:n, a] = 0.0
@@ -222,7 +223,7 @@ def subtract_outer(C: int, stride: int, L: int, rows: int, R: int, columns: int,
 
 @compiled
 def downdate_and_transport(P: Array, V: Array, a: Array, theta: int) -> None:
-    """P <- A (P - V' V) A', `downdate` and `transport` in one pass over a P that is larger than a cache."""
+    """Compute P (n, n) <- A (P - V' V) A', V (m, n): `downdate` and `transport` in one pass over a large P."""
     n, axes = a.shape
     if n <= CACHED:
         downdate(P, V)
@@ -244,7 +245,7 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: int) -> None:
 
 @compiled
 def cholesky_inverse(S: Array) -> tuple[Array, bool]:
-    """Return L^-1 with L L' = S, and whether S is positive definite.
+    """Return L^-1 (n, n) with L L' = S (n, n), and whether S is positive definite.
 
     Elimination of [S, 1], each row by those above it, four at a time: what is left of S is L', what has become of 1 is
     L^-1.

@@ -6,113 +6,117 @@ size.  The buffers double when they are full, so that a new landmark costs O(n),
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from kalmark.compiled import compiled
-from kalmark.errors import MapError
 from kalmark.filter import kernels
-from kalmark.filter.fresh import Fresh
-from kalmark.geometry.spaces import REMOVED, Space, Table
+from kalmark.filter.kernels import Array, Index
+from kalmark.filter.layout import CAPACITY, P_AT, P_SIZE, Layout, Read, State, next_capacity, spaces_of
+from kalmark.filter.neighbours import Sorts, distances, near_places, paired
+from kalmark.filter.prefault import Prefault
+from kalmark.geometry.spaces import Space, Table
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-
-CAPACITY = 72  # an odd number of cache lines, and so its successors: rows of 2^k keep a column in few places of a cache
-
-X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
+AT_ONCE = 32  # inactive blocks to be read jointly, where the caller does not ask for it
 
 
-def next_capacity(capacity: int) -> int:
-    """Return the capacity that follows when this one is full."""
-    return 2 * capacity + 8
+class Marginal(NamedTuple):
+    """A dense map that has the joint marginal of some blocks, and their slots there."""
+
+    map: StochasticMap
+    robot: int
+    mount: int
+    slots: Index
 
 
-class Layout:
-    """Where blocks are: their slots, means, and the rows they have in a covariance that a subclass keeps.
+class Pairs(NamedTuple):
+    """Places (M,) and the `numbers` (M,) of blocks that are near them.
 
-    Blocks are addressed by slots, the rows of `blocks`; names are the caller's business.
+    Of the blocks: their slots (L,), means (L, 2 or 3) and, if not too many are inactive, their joint marginal.
     """
 
-    def __init__(self, capacity: int = CAPACITY) -> None:
-        self.x: Array = np.zeros(capacity)
-        self.x_first: Array = np.zeros(capacity)  # where each block was first estimated, robots last predicted
-        self.blocks: Table = np.zeros((0, 6), dtype=np.int64)
-        self.atoms: Table = np.zeros((0, 3), dtype=np.int64)
-        self.spaces: list[Space | None] = []
-        self.used = 0  # slots
-        self.axes = 1  # of the gauge: 1 in the plane, 3 in space, 6 where translations have a generator, too
-        self.n = 0  # rows of P in use
-        self.x_n = 0  # numbers of x in use
-        self._free: dict[tuple[int, ...], list[int]] = {}
-        self._rows: dict[int, Index] = {}  # and the numbers, by slot, as far as anyone has asked for them
-        self._numbers: dict[int, slice] = {}
+    rows: Index
+    numbers: Index
+    slots: Index
+    places: Array
+    marginal: Marginal | None
+
+    @classmethod
+    def of(cls, slots: Index, places: Array, read: Marginal | None, p: Array, nearest: int, farther: float) -> Pairs:
+        """Return the pairs of p (K, d) and blocks at `places` (N, d): the `nearest` of each, as `limits` has it."""
+        rows, numbers, used = paired(p, places, nearest, farther)
+        marginal = None if read is None else read._replace(slots=read.slots[used])
+        return cls(rows, numbers, slots[used], places[used], marginal)
+
+
+class Map(Protocol):
+    """A joint Gaussian over blocks, addressed by their slots: dense or compressed.
+
+    An index of rows holds until the next correction or until a block is added.
+    """
+
+    averages: bool  # whether a scan can be fused by the mean over matchings
+    blocks: Table
+    spaces: list[Space | None]
+
+    def index(self, slot: int) -> Index:
+        """Return the rows of a block, for `predict` and `augment`."""
 
     def rows(self, slot: int) -> Index:
-        """Return the rows of P of a block, to be read only."""
-        rows = self._rows.get(slot)
-        if rows is None:
-            at = self.blocks[slot, P_AT]
-            rows = self._rows[slot] = np.arange(at, at + self.blocks[slot, P_SIZE])
-        return rows
+        """Return the rows of a block in the covariance of all blocks: as many as it has degrees of freedom."""
 
-    def numbers(self, slot: int) -> slice:
-        """Return where a block's mean is in x."""
-        where = self._numbers.get(slot)
-        if where is None:
-            at = int(self.blocks[slot, X_AT])
-            where = self._numbers[slot] = slice(at, at + int(self.blocks[slot, X_SIZE]))
-        return where
+    def mean(self, slot: int) -> Array:
+        """Return a copy of a block's mean."""
 
-    def _place(self, space: Space, mean: Array) -> int:
-        """Return a slot for a block, its mean written, its rows of P not yet."""
-        if mean.shape != (space.size,):
-            raise MapError(f"a {space.name} has {space.size} numbers, got an array of shape {mean.shape}")
-        free = self._free.get(space.kinds)
-        slot = free.pop() if free else self._append(space)
-        _, _, _, _, atom_at, count = self.blocks[slot]
-        self.atoms[atom_at : atom_at + count, 0] = space.kinds
-        self.spaces[slot], self.used = space, self.used + 1
-        self.axes = max(self.axes, 6 if space.steps else space.axes)
-        where = self.numbers(slot)
-        self.x[where] = self.x_first[where] = mean
-        return slot
+    def first(self, slot: int) -> Array:
+        """Return a copy of a block's first estimate, of a robot its last predicted one."""
 
-    def _append(self, space: Space) -> int:
-        first = self._first_row(space.dof)
-        self._reserve(max(self.x_n + space.size, first + space.dof))
-        row = [self.x_n, space.size, first, space.dof, len(self.atoms), len(space.kinds)]
-        self.blocks = _appended(self.blocks, np.array([row]))
-        self.atoms = _appended(self.atoms, space.atoms + np.array([0, self.x_n, first]))
-        self.spaces.append(space)
-        self.x_n, self.n = self.x_n + space.size, first + space.dof
-        return len(self.blocks) - 1
+    def means(self, slots: Index, d: int) -> Array:
+        """Return the first d numbers (K, d) of blocks."""
 
-    def _first_row(self, dof: int) -> int:
-        """Return where the rows of a new block begin."""
-        return self.n
+    def covariance(self, slots: Sequence[int]) -> Array:
+        """Return the joint covariance of blocks, in the order given."""
 
-    def _reserve(self, size: int) -> None:
-        """Make room for a mean and a covariance of that size."""
-        capacity = len(self.x)
-        if size > capacity:
-            bigger = max((size + 7) // 16 * 16 + 8, next_capacity(capacity))
-            x, x_first = np.zeros(bigger), np.zeros(bigger)
-            x[:capacity], x_first[:capacity] = self.x, self.x_first
-            self.x, self.x_first = x, x_first
+    def marginal(self, robot: int, mount: int, slots: Index) -> Marginal:
+        """Return the joint marginal of a robot, its mount (-1: not in the map) and blocks, to be read only."""
 
-    def _vacate(self, slot: int) -> None:
-        """Forget a block; its slot is free for another of its shape."""
-        space = self.spaces[slot]
-        assert space is not None
-        self.x[self.numbers(slot)] = 0.0
-        self._free.setdefault(space.kinds, []).append(slot)
-        atom_at, count = self.blocks[slot, ATOM_AT], self.blocks[slot, ATOMS]
-        self.atoms[atom_at : atom_at + count, 0] = REMOVED
-        self.spaces[slot], self.used = None, self.used - 1
+    def pairs(self, sorts: Sorts, robot: int, mount: int, p: Array, nearest: int, farther: float) -> Pairs:
+        """Return the wanted blocks near p (K, 2 or 3): of each place the `nearest`, at most `farther` times the least.
+
+        They are read jointly with the robot and, if it is in the map, the mount.
+        """
+
+    def around(self, sorts: Sorts, p: Array, count: int) -> Index:
+        """Return the slots (N,) of the wanted blocks nearest to p (2 or 3,), nearest first."""
+
+    def add(self, space: Space, mean: Any, cov: Any = None) -> int:
+        """Add a block that is independent of all others (`cov` None: known exactly); return its slot."""
+
+    def augment(self, space: Space, mean: Array, index: Index, G: Array, Q: Array) -> int:
+        """Add a block computed from the rows `index`: P_Lx = G P_x, P_LL = G P G' + Q.  [S] (35)-(38)."""
+
+    def remove(self, slot: int) -> None:
+        """Marginalise a block out; its slot is free for another of its shape.  [S] Table 1, state reduction."""
+
+    def predict(self, index: Index, F: Array, Q: Array) -> None:
+        """P <- F P F' + Q, F and Q acting on the rows `index` alone.  [S] (15)-(17)."""
+
+    def set_predicted(self, slot: int, mean: Array) -> None:
+        """Write a block's mean after a motion."""
+
+    def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> Marginal:
+        """Return the dense map on which a scan of these blocks is fused, and their slots there."""
+
+    def corrected(self, robot: int, transports: bool) -> None:
+        """Complete the correction of what `opened` returned, by a scan of `robot`."""
+
+    def state(self) -> State:
+        """Return the description of the map for a file."""
+
+    def arrays(self) -> Iterator[tuple[str, Array]]:
+        """Return the arrays for a file by name."""
 
 
 class StochasticMap(Layout):
@@ -121,11 +125,13 @@ class StochasticMap(Layout):
     P is a lower triangle.
     """
 
+    averages = True
+
     def __init__(self, capacity: int = CAPACITY) -> None:
         super().__init__(capacity)
         self.P: Array = np.zeros((capacity, capacity))
         self._next: Array | None = None  # a larger one
-        self.fresh = Fresh()
+        self.prefault = Prefault()
 
     @classmethod
     def of(cls, x: Array, P: Array, blocks: Table, atoms: Table, axes: int) -> StochasticMap:
@@ -136,9 +142,7 @@ class StochasticMap(Layout):
         return m
 
     # ------------------------------------------------------------------ reading
-    def index(self, slot: int) -> Index:
-        """Return the rows of P of a block."""
-        return self.rows(slot)
+    index, means = Layout.rows, Layout.stored
 
     def mean(self, slot: int) -> Array:
         """Return a copy of a block's mean."""
@@ -152,17 +156,21 @@ class StochasticMap(Layout):
         """Return the joint covariance of blocks, in the order given."""
         return kernels.submatrix(self.P, np.concatenate([self.index(s) for s in slots]))
 
-    def means(self, slots: Index, d: int) -> Array:
-        """Return the first d numbers (K, d) of blocks."""
-        return self.x[self.blocks[slots, X_AT][:, None] + np.arange(d)]
+    def marginal(self, robot: int, mount: int, slots: Index) -> Marginal:
+        """Return this map, and the slots as they are."""
+        return Marginal(self, robot, mount, slots)
 
-    def awake(self) -> tuple[Array, Table, Index]:
-        """Return the means that are kept up to date, the blocks they belong to and the slots of these, -1 for none."""
-        return self.x, self.blocks, np.arange(len(self.blocks))
+    def pairs(self, sorts: Sorts, robot: int, mount: int, p: Array, nearest: int, farther: float) -> Pairs:
+        """Return the wanted blocks near p (K, 2 or 3), all compared."""
+        slots, _ = near_places(p, self.x, self.blocks, np.arange(len(self.blocks)), sorts, nearest, farther)
+        places = self.stored(slots, p.shape[1])
+        return Pairs.of(slots, places, self.marginal(robot, mount, slots), p, nearest, farther)
 
-    def excerpt(self, robot: int, mount: int, slots: Index) -> tuple[StochasticMap, int, int, Index]:
-        """Return a dense map to read these blocks from, and their slots there."""
-        return self, robot, mount, slots
+    def around(self, sorts: Sorts, p: Array, count: int) -> Index:
+        """Return the slots (N,) of the wanted blocks nearest to p (2 or 3,), nearest first."""
+        slots, _ = near_places(p[None], self.x, self.blocks, np.arange(len(self.blocks)), sorts, count, math.inf)
+        gaps = distances(p[None], self.stored(slots, len(p)))[0]
+        return slots[np.argsort(gaps, kind="stable")[:count]]
 
     # ------------------------------------------------------------------ growing and shrinking
     def add(self, space: Space, mean: Any, cov: Any = None) -> int:
@@ -186,7 +194,7 @@ class StochasticMap(Layout):
         self._vacate(slot)
 
     def reset(self) -> None:
-        """Forget all blocks, keep the room."""
+        """Remove all blocks, keep the buffers."""
         self.blocks, self.atoms, self.spaces, self.used = self.blocks[:0], self.atoms[:0], [], 0
         self.n, self.x_n, self._free, self._rows, self._numbers = 0, 0, {}, {}, {}
 
@@ -201,12 +209,12 @@ class StochasticMap(Layout):
             self.P = P
 
     def prepare(self) -> int:
-        """Have a larger buffer ready in time; return how many bytes of it were used for the first time now."""
+        """Prefault a larger buffer bit by bit; return the number of bytes of this call."""
         if self._next is None and 2 * self.n > len(self.P):
             size = next_capacity(len(self.P))
             self._next = np.zeros((size, size))
-            self.fresh.put(self._next, 0, size * size)
-        return self.fresh.use_some()
+            self.prefault.add(self._next, 0, size * size)
+        return self.prefault.some()
 
     # ------------------------------------------------------------------ moving
     def predict(self, index: Index, F: Array, Q: Array) -> None:
@@ -219,41 +227,30 @@ class StochasticMap(Layout):
         self.x[where] = self.x_first[where] = mean
 
     # ------------------------------------------------------------------ correcting
-    def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> tuple[StochasticMap, int, int, Index]:
-        """Return the dense map on which a scan of these blocks is fused, and their slots there."""
-        return self, robot, mount, slots
+    def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> Marginal:
+        """Return this map, and the slots as they are."""
+        return Marginal(self, robot, mount, slots)
 
     def corrected(self, robot: int, transports: bool) -> None:
-        """Take note that `robot` has corrected what `opened` returned."""
+        """Prepare a larger buffer in time."""
         self.prepare()
 
+    # ------------------------------------------------------------------ files
+    def arrays(self) -> Iterator[tuple[str, Array]]:
+        """Return the arrays for a file by name."""
+        yield from super().arrays()
+        yield "P", self.P[: self.n, : self.n][np.tril_indices(self.n)]
 
-def _appended(table: Table, rows: Table) -> Table:
-    """Return the table with rows at its end, in a buffer that doubles when it is full."""
-    count = len(table)
-    buffer = table.base
-    if buffer is None or count + len(rows) > len(buffer):
-        buffer = np.zeros((max(64, 2 * (count + len(rows))), table.shape[1]), dtype=np.int64)
-        buffer[:count] = table
-    buffer[count : count + len(rows)] = rows
-    return buffer[: count + len(rows)]
-
-
-@compiled
-def laid_out(blocks: Table, atoms: Table) -> tuple[Table, Table, Index, Index]:
-    """Return the tables of these blocks, one after the other, and the numbers and rows they had before."""
-    own, table = np.empty_like(blocks), np.empty((blocks[:, 5].sum(), 3), np.int64)
-    numbers, rows = np.empty(blocks[:, 1].sum(), np.int64), np.empty(blocks[:, 3].sum(), np.int64)
-    x_to = p_to = atom_to = 0
-    for k in range(len(blocks)):
-        x_at, x_size, p_at, p_size, atom_at, count = blocks[k]
-        own[k, 0], own[k, 1], own[k, 2], own[k, 3], own[k, 4], own[k, 5] = x_to, x_size, p_to, p_size, atom_to, count
-        for i in range(x_size):
-            numbers[x_to + i] = x_at + i
-        for i in range(p_size):
-            rows[p_to + i] = p_at + i
-        for i in range(count):
-            kind, x, p = atoms[atom_at + i]
-            table[atom_to + i, 0], table[atom_to + i, 1], table[atom_to + i, 2] = kind, x - x_at + x_to, p - p_at + p_to
-        x_to, p_to, atom_to = x_to + x_size, p_to + p_size, atom_to + count
-    return own, table, numbers, rows
+    @classmethod
+    def restored(cls, state: State, read: Read, prefix: str = "") -> StochasticMap:
+        """Build a map of a file block by block, then remove what was removed: its tables fit by construction."""
+        spaces = spaces_of(state)
+        m = cls(state["capacity"])
+        for space in spaces:
+            m.add(space, np.zeros(space.size))
+        for slot in state["free"]:
+            m.remove(m.removed(slot))
+        n, x_n = m.n, m.x_n
+        m.x[:x_n], m.x_first[:x_n] = read(f"{prefix}x", (x_n,)), read(f"{prefix}x_first", (x_n,))
+        m.P[:n, :n][np.tril_indices(n)] = read(f"{prefix}P", (n * (n + 1) // 2,))
+        return m

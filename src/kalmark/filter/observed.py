@@ -8,14 +8,12 @@ is zero.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
-from kalmark.filter.kernels import Index
+from kalmark.filter.kernels import Array, Index
 from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table
 
-Array = npt.NDArray[np.float64]
 Linear = tuple[Array, Array, Array, Array]  # of all observations at once: innovation v (K p,), H, H P, Z
 
 
@@ -59,7 +57,7 @@ def observed_block(
 
 @compiled
 def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array, bool]:
-    """Return each observation's innovation covariance Z (K, p, p), its d2 (K,), and whether the filter is sound.
+    """Return each observation's innovation covariance Z (K, p, p), its d2 (K,), and whether all Z are valid.
 
     [S] (27), (83); `squared_distances`.
     """
@@ -89,19 +87,19 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
                 for c in range(n):
                     s += H[a, c] * HP[b, c]
                 Z[i, a, b] = s + R[i, a, b]
-    d2, healthy = squared_distances(Z, z)
-    return Z, d2, healthy
+    d2, valid = squared_distances(Z, z)
+    return Z, d2, valid
 
 
 @compiled
 def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
     """Return d2 = z' Z^-1 z (K,) of innovations z (K, p) with their covariances Z (K, p, p).
 
-    d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a Z is not positive
-    definite: the filter is broken.
+    d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a finite Z is not
+    positive definite.
     """
     k, p = z.shape
-    d2, healthy = np.zeros(k), True
+    d2, valid = np.zeros(k), True
     L, w = np.empty((p, p)), np.empty(p)
     for i in range(k):
         positive = True
@@ -121,8 +119,8 @@ def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
             d2[i] += w[a] * w[a]
         if not positive:
             d2[i] = np.nan
-            healthy = healthy and not np.isfinite(Z[i]).all()
-    return d2, healthy
+            valid = valid and not np.isfinite(Z[i]).all()
+    return d2, valid
 
 
 @compiled

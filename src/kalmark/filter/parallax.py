@@ -15,13 +15,10 @@ at s, (2 or 3,), with the Jacobian S (., h) in the head: the robot's pose and, i
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Index, rows_of, submatrix
+from kalmark.filter.kernels import Array, Index, rows_of, submatrix
 from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, VECTOR, X_AT, Table
-
-Array = npt.NDArray[np.float64]
 
 Baselines = tuple[Table, Array, Array, Array]  # of the anchored at the prediction: table, s, S, c2
 RHO_X, RHO_P, ANCHOR_X, ANCHOR_P = range(4)

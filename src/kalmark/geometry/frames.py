@@ -136,14 +136,20 @@ def inv_scan(y: Any) -> tuple[Array, Array]:
 
 
 def observe(r: Any, p: Any) -> tuple[Array, Array, Array]:
-    """Measure range and bearing of global points p from robot r: y, Y_r, Y_p.  [S] (63); the chain rule of C.2.2."""
+    """Measure range and bearing y (K, 2) of global points p (K, 2) from robot r (3,).  [S] (63), C.2.2.
+
+    Returns y, Y_r (K, 2, 3) and Y_p (K, 2, 2); one point (2,) is measured without the leading dimension.
+    """
     pr, PR_r, PR_p = to_frame(r, p)
     y, Y_pr = scan(pr)
     return y, Y_pr @ PR_r, Y_pr @ PR_p
 
 
 def inv_observe(r: Any, y: Any) -> tuple[Array, Array, Array]:
-    """Find the global points p that robot r sees at ranges and bearings y: p, P_r, P_y.  [S] (64), C.2.3."""
+    """Return the global points p (K, 2) that robot r (3,) observes at ranges and bearings y (K, 2).  [S] (64), C.2.3.
+
+    Returns p, P_r (K, 2, 3) and P_y (K, 2, 2); one measurement (2,) gives them without the leading dimension.
+    """
     pr, PR_y = inv_scan(y)
     p, P_r, P_pr = from_frame(r, pr)
     return p, P_r, P_pr @ PR_y

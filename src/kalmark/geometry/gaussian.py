@@ -60,7 +60,7 @@ def sigma_probability(sigmas: float, dof: int) -> float:
 
 
 def sigma_table(sigmas: tuple[float, ...] = (1, 2, 3, 4), dofs: tuple[int, ...] = (2, 3)) -> Array:
-    """Return the probabilities of [S] Table 3, one row a dimension, one column a number of sigmas."""
+    """Return the probabilities (D, S) of [S] Table 3 for D dimensions and S numbers of sigmas."""
     return np.array([[sigma_probability(n, dof) for n in sigmas] for dof in dofs])
 
 

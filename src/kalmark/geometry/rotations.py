@@ -29,13 +29,13 @@ def skew(v: Array) -> Array:
 
 @compiled
 def normalised(q: Array) -> Array:
-    """Return the unit quaternion along q."""
+    """Return q (4,) divided by its norm."""
     return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
 
 
 @compiled
 def multiply(a: Array, b: Array) -> Array:
-    """Return the product of two unit quaternions, normalised: the rotation b, then a."""
+    """Return the normalised product (4,) of two unit quaternions a, b (4,): the rotation b, then a."""
     return normalised(
         np.array(
             [
@@ -50,7 +50,7 @@ def multiply(a: Array, b: Array) -> Array:
 
 @compiled
 def conjugate(q: Array) -> Array:
-    """Return the inverse of a unit quaternion."""
+    """Return the inverse (4,) of a unit quaternion q (4,)."""
     return np.array([-q[0], -q[1], -q[2], q[3]])
 
 

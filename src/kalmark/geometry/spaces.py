@@ -57,11 +57,11 @@ KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 
 @compiled
 def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
-    """Move the mean in place by the correction d: plain plus without `turn`, else the exponential for turn = d_theta.
+    """Move the mean x (size,) in place by the correction d (dof,): by plain plus, with `turn` by the exponential.
 
-    `turn` has 0, 1 (plane) or 3 (space) components, or 6: (xi_p, d_theta), where a translation matters.  Points move by
-    V(d_theta) d: rotated by Exp(d_theta), then carried along V xi, since V (generator d_theta) = (E - I) l.
-    Orientations turn by Exp(d_theta), then by their own xi.
+    `turn` is (0,), d_theta (1,) in the plane, (3,) in space, or (xi_p, d_theta) (6,) where a translation matters.
+    Points move by V(d_theta) d: rotated by Exp(d_theta), then carried along V xi, since V (generator d_theta) =
+    (E - I) l.  Orientations turn by Exp(d_theta), then by their own xi.
     """
     p, q = exponential_v(turn[0]) if len(turn) == 1 else (1.0, 0.0)
     whole = turn[len(turn) - 3 :] if len(turn) >= 3 else np.zeros(3)
@@ -83,14 +83,26 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
         elif kind == DIRECTION:
             _retract_direction(x[at : at + 2], d[k : k + 2], whole)
         elif kind >= VECTOR3:
-            if kind == PLUECKER and len(turn) == 6:  # what a large turn and a large step together do to the moment
-                v, step = x[at + 3 : at + 6].copy(), turn[:3].copy()
-                x[at : at + 3] += skew(V @ step) @ (matrix(exp(whole)) @ v) - V @ (skew(step) @ v)
-            for a in range(0, LINEAR[kind], 3):
-                for j in range(3):
-                    x[at + a + j] += V[j, 0] * d[k + a] + V[j, 1] * d[k + a + 1] + V[j, 2] * d[k + a + 2]
+            if kind == PLUECKER and len(turn) == 6:
+                _move_moment(x[at : at + 6], turn[:3].copy(), V, whole)
+            _add_vectors(x[at : at + LINEAR[kind]], V, d[k : k + LINEAR[kind]])
             if kind == HOMOGENEOUS:
                 x[at + 3] += d[k + 3]
+
+
+@compiled
+def _add_vectors(x: Array, V: Array, d: Array) -> None:
+    """Add V d to each vector of three in x (3 k,)."""
+    for a in range(0, len(x), 3):
+        for j in range(3):
+            x[a + j] += V[j, 0] * d[a] + V[j, 1] * d[a + 1] + V[j, 2] * d[a + 2]
+
+
+@compiled
+def _move_moment(x: Array, step: Array, V: Array, turn: Array) -> None:
+    """Add to the moment of a Pluecker line x (6,) the product of a large turn and a large step."""
+    v = x[3:].copy()
+    x[:3] += skew(V @ step) @ (matrix(exp(turn)) @ v) - V @ (skew(step) @ v)
 
 
 @compiled
@@ -158,7 +170,7 @@ class Space:
 
     @cached_property
     def atoms(self) -> Table:
-        """The atoms as rows (kind, offset in the mean, offset in the error)."""
+        """The atoms (N, 3), rows of kind, offset in the mean, offset in the error."""
         rows, x_at, p_at = [], 0, 0
         for kind in self.kinds:
             rows.append((kind, x_at, p_at))
@@ -176,13 +188,13 @@ class Space:
         return sum(int(ERROR_SIZE[k]) for k in self.kinds)
 
     def plus(self, x: Array, d: Array) -> Array:
-        """Return x moved by the error d."""
+        """Return x (size,) moved by the error d (dof,)."""
         x = np.array(x, dtype=np.float64)
         retract(self.atoms, x, np.array(d, dtype=np.float64), NO_TURN)
         return x
 
     def minus(self, x2: Array, x1: Array) -> Array:
-        """Return the error d with x1 plus d = x2."""
+        """Return the error d (dof,) with x1 plus d = x2, both (size,)."""
         d = np.empty(self.dof)
         x1, x2 = np.asarray(x1, dtype=np.float64), np.asarray(x2, dtype=np.float64)
         for kind, at, k in self.atoms:
@@ -213,7 +225,7 @@ class Space:
         return "plane" if any(kind in (VECTOR, HEADING) for kind in self.kinds) else ""
 
     def rotated(self, x: Array, phi: Any) -> Array:
-        """Return x after rotating the world by phi (rad; in space a rotation vector) about its origin."""
+        """Return x (size,) after a rotation of the world about its origin by phi (rad), in space a vector (3,)."""
         x = np.array(x, dtype=np.float64)
         turn = exp(np.array(phi, dtype=np.float64)) if self.axes == 3 else np.zeros(4)
         for kind, at, _ in self.atoms:

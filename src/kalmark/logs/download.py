@@ -278,9 +278,11 @@ def unpack(path: Path) -> None:
 
 
 def find_data(path: Path | str, base: Path | str | None = None) -> Path:
-    """Return where a log is: a relative path is looked for in `base` (default: the working folder), then in
-    `KALMARK_DATA`, `KALMARK_ORACLE` and the download cache; it may begin with the name of these folders themselves, as
-    oracle/NAME.json.gz does for a `KALMARK_ORACLE` that ends in /oracle.  Raises LogError if it is in none of them.
+    """Return the path of a log; raise LogError if it does not exist.
+
+    A relative path is searched in `base` (default: the working folder), then in `KALMARK_DATA`, `KALMARK_ORACLE` and
+    the download cache.  It may begin with the name of these folders themselves, as oracle/NAME.json.gz does for a
+    `KALMARK_ORACLE` that ends in /oracle.
     """
     path = Path(path).expanduser()
     folders: list[Path | str | None] = [

@@ -70,7 +70,7 @@ def read(path: Path, request: Request, min_disparity_px: Any = 1.0, rates: Any =
 
 
 def checked_times(path: Path, data: dict[str, Array]) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Return the times in ns.  Raises LogError if something is not finite, of another size or not in order."""
+    """Return the times (N,) in ns.  Raises LogError if something is not finite, of another size or not in order."""
     times = data["time_stamps"].reshape(-1)
     features = data["features"].shape[1] if data["features"].ndim == 3 else 0
     wanted: dict[str, tuple[int, ...]] = {

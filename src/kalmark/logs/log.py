@@ -20,8 +20,11 @@ Times = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Hold the true poses of one robot: `t_ns` (N,) strictly increasing, `poses` (N, 3) x y theta or (N, 7)
-    x y z qx qy qz qw (m, rad; quaternions Hamilton, local to global).  Raises LogError on anything else."""
+    """The true poses of one robot; anything else than below raises LogError.
+
+    `t_ns` (N,) is strictly increasing; `poses` is (N, 3) x y theta or (N, 7) x y z qx qy qz qw (m, rad; quaternions
+    Hamilton, local to global).
+    """
 
     t_ns: Times
     poses: Array
@@ -86,8 +89,10 @@ def slerp(p: Array, q: Array, a: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PositionTrack:
-    """Hold position fixes that serve only to score a run: `t_ns` (N,), `xy` (N, 2) m in a frame of their own,
-    taken at `antenna` (2,) m in the robot's frame."""
+    """Position fixes that only score a run.
+
+    `t_ns` (N,); `xy` (N, 2) m in a frame of their own, of the antenna at `antenna` (2,) m in the robot's frame.
+    """
 
     t_ns: Times
     xy: Array

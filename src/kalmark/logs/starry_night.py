@@ -66,7 +66,7 @@ def read(path: Path, request: Request) -> Log:
 
 
 def checked_times(path: Path, data: dict[str, Array]) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Return the times in ns.  Raises LogError if they do not increase or another variable has other sizes."""
+    """Return the times (N,) in ns.  Raises LogError if they do not increase or another variable has other sizes."""
     t_ns = np.rint(column(data["t"]) * 1e9).astype(np.int64)
     steps, landmarks = len(t_ns), data["rho_i_pj_i"].shape[-1]
     wanted: dict[str, tuple[int, ...]] = {

@@ -4,47 +4,50 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import ModelError
+from kalmark.declare import NotNegative, Within, register
 
 Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@register("attention", "attention")
 class Attention:
-    """A budget for each scan of a sensor, and when a landmark is given up; by default all is used and none given up.
+    """Which landmarks of a scan are corrected, where new ones are taken, and when one is given up.
 
-    `updates`: most landmarks corrected by a scan, those whose measurement tells most first; `sequential`: one after the
-    other instead of jointly.  `starts`: most new landmarks a scan, `first_starts` while the map is empty, spread over a
-    `grid` (columns, rows) of the image and `margin_px` from its borders.  With `delete`, a landmark that should be in
-    view is removed after `searches` scans if it was found in less than `match_ratio` of them, or fitted in less than
-    `inlier_ratio` of those.
+    By default all is used and none given up.
     """
 
-    updates: int | None = None
-    sequential: bool = False
-    starts: int | None = None
-    first_starts: int | None = None
-    grid: tuple[int, int] = (1, 1)
-    margin_px: float = 0.0
-    delete: bool = False
-    searches: int = 10
-    match_ratio: float = 0.1
-    inlier_ratio: float = 0.5
+    updates: Annotated[
+        int | None,
+        Within(ge=0),
+        "At most so many landmarks corrected a scan, those of most expected information first; all if absent.",
+    ] = None
+    sequential: Annotated[bool, "Correct one landmark after the other, not all of a scan jointly."] = False
+    starts: Annotated[int | None, Within(ge=0), "At most so many new landmarks a scan; all if absent."] = None
+    first_starts: Annotated[int | None, Within(ge=0), "The same while the map is empty; `starts` if absent."] = None
+    grid: Annotated[
+        tuple[int, int], Within(ge=1), "New landmarks are spread over so many columns and rows of the image."
+    ] = (1, 1)
+    margin_px: Annotated[NotNegative, "No new landmark nearer to the image's border than this."] = 0.0
+    delete: Annotated[bool, "Give up landmarks that are not found again."] = False
+    searches: Annotated[
+        int, Within(ge=0), "With `delete`: how often a landmark was expected before it may be given up."
+    ] = 10
+    match_ratio: Annotated[
+        float, Within(ge=0, le=1), "With `delete`: give it up if it was found in less than this share of them."
+    ] = 0.1
+    inlier_ratio: Annotated[
+        float,
+        Within(ge=0, le=1),
+        "With `delete`: give it up if less than this share of what was found passed the gate.",
+    ] = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("updates", "starts", "first_starts", "searches"):
-            value = getattr(self, name)
-            if value is not None and (type(value) is not int or value < 0):
-                raise ModelError(f"Attention: {name} is {value!r}, expected a whole number of at least 0")
         object.__setattr__(self, "grid", tuple(self.grid))
-        if len(self.grid) != 2 or not all(type(n) is int and n > 0 for n in self.grid):
-            raise ModelError(f"Attention: grid is {self.grid!r}, expected two positive numbers: columns and rows")
 
     def worth_a_correction(self, information: Array) -> npt.NDArray[np.bool_]:
         """Return which of the observations are corrected by, given what they tell (K,): the best `updates` of them."""
@@ -57,7 +60,7 @@ class Attention:
     ) -> dict[int, str]:
         """Return why some of the observations `new` do not become landmarks; the others do.
 
-        `used` are those of landmarks in the map; `image` is (width, height) px or None.
+        `y` (K, m) are all observations, `used` those of landmarks in the map; `image` is (width, height) px or None.
         """
         most = self.first_starts if empty and self.first_starts is not None else self.starts
         reasons: dict[int, str] = {}

@@ -1,44 +1,44 @@
-"""What of a scan is worth a correction, and what is worth a start, where `Attention` sets a limit."""
+"""Measurement selection: which observations correct the map, and which start landmarks.  Davison 2005; [TB]."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from kalmark.association.protocol import ANEW, DEFERRED, Decision
-from kalmark.events import Scan
-from kalmark.tracks.scene import Look, View
+from kalmark.association.protocol import DEFERRED, REMAP, Answer, Decision
+from kalmark.management.attention import Attention
+from kalmark.models.protocols import image_size
+from kalmark.tracks.channel import ObservationModel
+from kalmark.tracks.scan import ScanContext
 
-if TYPE_CHECKING:
-    from kalmark.slam.slam import Slam
-
-Array = npt.NDArray[np.float64]
+Group = tuple[ObservationModel, list[int]]
 
 
-def least(
-    slam: Slam, event: Scan, view: View, groups: list[tuple[Look, list[int]]], decisions: Sequence[Decision], R: Array
-) -> list[int]:
-    """Take out of the groups what is not worth a correction and return it."""
-    robot, order, told = slam.members.slots[event.robot], [], []
-    for look, rows in groups:
-        slots = slam.members.slots_of([decisions[k][0] for k in rows])
-        order += rows
-        told += view.information(slam.map, robot, look, slots, event, rows, R[rows]).tolist()
-    worth = view.attention.worth_a_correction(np.array(told))
-    out = [k for k, good in zip(order, worth, strict=True) if not good]
-    for _, rows in groups:
-        rows[:] = [k for k in rows if k not in out]
-    return out
+def chosen(
+    scan: ScanContext, attention: Attention, groups: Sequence[Group], decisions: Sequence[Decision]
+) -> tuple[list[Group], list[int]]:
+    """Return the groups of observations with those alone that correct the map, and the rows that are left out."""
+    rows, information = [], []
+    for model, some in groups:
+        slots = scan.tracks.slots_of([decisions[k][0] for k in some])
+        Z, _, R = scan.predict(model, slots, some)
+        rows += some
+        information.append(np.nan_to_num(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(R)[1], nan=-np.inf))
+    worth = attention.worth_a_correction(np.concatenate(information))
+    out = [k for k, good in zip(rows, worth, strict=True) if not good]
+    return [(model, [k for k in some if k not in out]) for model, some in groups], out
 
 
-def starts(
-    slam: Slam, view: View, new: list[int], known: list[int], y: Array, decisions: Sequence[Decision]
-) -> dict[int, str]:
-    """Return why some of the observations that could start landmarks do not."""
-    held = [None, *(answer for answer in (DEFERRED, ANEW) if answer not in view.starts)]
-    wanted = [k for k in new if decisions[k][0] not in held and decisions[k][0] not in slam.members.slots]
-    image, empty = getattr(view.sensor, "image", None), not slam.members.kinds
-    return view.attention.worth_a_start(wanted, known, y, image, empty)
+def left_out(
+    scan: ScanContext, attention: Attention, starts: Collection[Answer], new: Sequence[int], known: Sequence[int],
+    decisions: Sequence[Decision],
+) -> dict[int, str]:  # fmt: skip
+    """Return why some of the observations that could start landmarks do not.
+
+    `starts` are the answers that start a landmark; `known` are the observations of landmarks in the map.
+    """
+    held = [None, *(answer for answer in (DEFERRED, REMAP) if answer not in starts)]
+    wanted = [k for k in new if decisions[k][0] not in held and decisions[k][0] not in scan.tracks.slots]
+    empty = not scan.tracks.confirmed
+    return attention.worth_a_start(wanted, known, scan.y, image_size(scan.channel.sensor), empty)

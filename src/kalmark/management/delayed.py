@@ -1,38 +1,35 @@
 """Landmarks started late: when enough past measurements of one, each too little by itself, meet in one place.
 
-[T] 2 (exercise 2); Costa, Kantor and Choset 2004.  What belongs to no landmark is kept with the pose it was seen from.
-Two such measurements intersect in a place, with the Gaussian of what both poses and both measurements leave open
-(compounded); a place near enough (Bhattacharyya) to a candidate is merged into it and its persistence counted; a
+[T] 2 (exercise 2); Costa, Kantor and Choset 2004.  A measurement of no landmark is kept with a clone of the pose it was
+made from.  Two such measurements intersect in a place, with the Gaussian of what both poses and both measurements leave
+open (compounded); a place near enough (Bhattacharyya) to a candidate is merged into it and its persistence counted; a
 candidate that has persisted, and that all its measurements agree with, becomes a landmark.
 
-The past poses are blocks of the map, copies of the robot's pose at the time, as long as anything waits for them.  So
-they stay correlated with all else and go along with every correction, loop closures too; a landmark started from them
-has its right covariance with the robot and the map (docs/bearing_only.md).  The candidates themselves correct nothing.
+The clones are blocks of the map, so that they stay correlated with all else and take part in every correction, loop
+closures too; a landmark started from them has its right covariance with the robot and the map
+(docs/bearing_only.md).  The candidates themselves correct nothing.
 
 A sensor that can do this says where two of its measurements `meet`; all else is the same for bearings and ranges.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.association.protocol import NEW, Decision
-from kalmark.errors import MapError, ModelError
-from kalmark.events import Id, Scan
+from kalmark.declare import Count, Positive, Within, register
+from kalmark.events import Id
 from kalmark.geometry.frames import compose
 from kalmark.geometry.gaussian import between, bhattacharyya, gate, merge
-from kalmark.geometry.spaces import SE2
-from kalmark.management.candidates import Candidate, Sight, Solution, Waiting, linearized, mount_of, solved
-from kalmark.report import Observation
-
-if TYPE_CHECKING:
-    from kalmark.slam.slam import Slam
-    from kalmark.tracks.scene import View
+from kalmark.models.observe import linearize
+from kalmark.tracks.clones import Measurement
+from kalmark.tracks.scan import ScanContext, Start
+from kalmark.tracks.track import Pending
 
 Array = npt.NDArray[np.float64]
 
@@ -40,150 +37,133 @@ VAGUE = 0.5  # a place less sure than this part of its distance is no Gaussian: 
 FITS = 0.999  # probability with which the measurements of a true landmark agree
 
 
-@dataclass(frozen=True)
+@register("initialization", "delayed")
 class Delayed:
-    """Start landmarks when `persistence` intersections of past measurements have been merged into one.
+    """Start landmarks when intersections of past measurements have persisted: docs/bearing_only.md.
 
-    `distance` is the Bhattacharyya distance up to which two Gaussians are of one landmark.  Poses are kept every
-    `spacing_m` of the way, the last `poses` of them.  A candidate starts when its sigma is below `precision` of its
-    distance, even without any one of its measurements, and is dropped when at `patience` kept poses in a row it was in
-    view and not seen; the best `candidates` are kept.
+    `distance` is the Bhattacharyya distance up to which two Gaussians are of one landmark.  Poses are cloned every
+    `spacing_m` of the way, the last `poses` of them kept.  A candidate starts when its sigma is below `precision` of
+    its distance, even without any one of its measurements, and is dropped when at `patience` clones in a row it was in
+    view and not observed; the best `candidates` are kept.
     """
 
-    persistence: int = 4
-    distance: float = 3.0
-    spacing_m: float = 0.5
-    poses: int = 20
-    precision: float = 0.1
-    patience: int = 3
-    candidates: int = 200
+    persistence: Annotated[Count, "Intersections that must have been merged into one."] = 4
+    distance: Annotated[Positive, "Bhattacharyya distance up to which two Gaussians are of one landmark."] = 3.0
+    spacing_m: Annotated[Positive, "Poses are kept every so many m of the way."] = 0.5
+    poses: Annotated[int, Within(ge=3), "So many of them, the last ones."] = 20
+    precision: Annotated[Positive, "A landmark starts when its sigma is below this part of its distance."] = 0.1
+    patience: Annotated[
+        Count, "A candidate is dropped when it was in view and not seen at so many kept poses in a row."
+    ] = 3
+    candidates: Annotated[Count, "At most so many candidates, the most persistent ones."] = 200
 
-    def __post_init__(self) -> None:
-        for name, least in (("persistence", 1), ("poses", 3), ("patience", 1), ("candidates", 1)):
-            value = getattr(self, name)
-            if type(value) is not int or value < least:
-                raise ModelError(f"Delayed: {name} is {value!r}, expected a whole number of at least {least}")
-        for name in ("distance", "spacing_m", "precision"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
-                raise ModelError(f"Delayed: {name} is {value!r}, expected a positive number")
-
-    def is_ripe(self, merged: int) -> bool:
+    def is_ready(self, merged: int) -> bool:
         """Return whether a candidate of so many merged intersections has persisted."""
         return merged >= self.persistence
 
 
-def sightings(
-    slam: Slam, view: View, event: Scan, new: Sequence[int], decisions: Sequence[Decision], R: Array
-) -> Iterator[tuple[int, Observation]]:
-    """Take what belongs to no landmark yet, and yield what became of each observation: still waiting, or a landmark."""
-    names = {k: decisions[k][0] for k in new}
-    rows = [k for k, n in names.items() if n is NEW or (isinstance(n, int | str) and n not in slam.members.slots)]
-    if view.delayed is None or not rows:
-        return
-    waiting, robot = view.waiting, slam.members.slots[event.robot]
-    ids: dict[int, Id | None] = {k: None if names[k] is NEW else names[k] for k in rows}  # type: ignore[misc]
-    if waiting.poses and _way(slam, waiting, robot) < view.delayed.spacing_m:
-        for k in rows:
-            yield k, Observation(k, ids[k], "deferred", None, None, "until the robot has moved on")
-        return
-    try:
-        here = _keep_pose(slam, waiting, robot)
-    except MapError as full:
-        for k in rows:
-            yield k, Observation(k, ids[k], "ignored", None, None, str(full))
-        return
-    joined = _joined(slam, view, {k: Sight(here, k, event.y[k], R[k]) for k in rows}, ids)
-    _forget_hopeless(view)
-    for k in rows:
-        most = max(joined[k], key=lambda c: len(c.sights))
-        landmark, reason = _started(slam, view, most)
-        yield k, Observation(k, ids[k], "new" if landmark is not None else "deferred", landmark, None, reason)
-    _forget_poses(slam, view)
+Candidates = list[Pending]
 
 
-def _way(slam: Slam, waiting: Waiting, robot: int) -> float:
-    """Return how far a robot is from where the last pose was kept."""
-    last = next(reversed(waiting.poses.values()))
-    return float(np.linalg.norm(slam.map.mean(robot)[:2] - slam.map.mean(last)[:2]))
-
-
-def _keep_pose(slam: Slam, waiting: Waiting, robot: int) -> int:
-    """Copy a robot's pose into a block of its own and return its number.  Raises MapError if the map is full."""
-    mean, index = slam.map.mean(robot)[:3], slam.map.index(robot)[:3]
-    slot = slam.map.augment(SE2, mean, index, np.eye(3), np.zeros((3, 3)))
-    waiting.numbered += 1
-    waiting.poses[waiting.numbered] = slot
-    return waiting.numbered
+def has_moved(scan: ScanContext, last: int | None, policy: Delayed) -> bool:
+    """Return whether the robot is far enough from where its pose was cloned last, the number of that clone."""
+    if last is None:
+        return True
+    return bool(
+        np.linalg.norm(scan.map.mean(scan.robot)[:2] - scan.map.mean(scan.clones[last])[:2]) >= policy.spacing_m
+    )
 
 
 # ---------------------------------------------------------------------- candidates
-def _joined(
-    slam: Slam, view: View, sights: dict[int, Sight], names: dict[int, Id | None]
-) -> dict[int, list[Candidate]]:
-    """Add measurements to the candidates they fit, make new ones where they meet single ones; return those of each.
+def joined(
+    scan: ScanContext, policy: Delayed, candidates: Candidates, new: Mapping[int, Measurement],
+    names: Mapping[int, Id | None],
+) -> tuple[Candidates, dict[int, Pending]]:  # fmt: skip
+    """Add measurements to the candidates they fit, make new ones where they meet single ones.
 
-    A candidate takes the nearest one; what joined one starts no others.
+    A candidate takes the nearest one; what joined one starts no others.  Returns the candidates left and, of each
+    measurement, the candidate with most measurements that it is in.
     """
-    waiting, policy = view.waiting, view.delayed
-    assert policy is not None
-    joined: dict[int, list[Candidate]] = {k: [] for k in sights}
-    made: dict[int, list[Candidate]] = {k: [] for k in sights}
-    sensor, here = view.calibrated(slam.map), next(iter(sights.values())).at
+    joined_: dict[int, Candidates] = {k: [] for k in new}
+    made: dict[int, Candidates] = {k: [] for k in new}
+    here = next(iter(new.values())).clone
     frames: dict[int, tuple[Array, Array]] = {}
-    for c in waiting.candidates:
-        first, best = c.sights[0], None
-        if first.at not in frames:
-            frames[first.at] = _relative(slam, view, first.at, here)
-        mine = {k: sight for k, sight in sights.items() if names[k] == c.name}
-        for k, mean, cov in _places(view, sensor, frames[first.at], first, mine) if mine else ():
+    kept: Candidates = []
+    for c in candidates:
+        first, best = c.measurements[0], None
+        if first.clone not in frames:
+            frames[first.clone] = _relative(scan, first.clone, here)
+        mine = {k: m for k, m in new.items() if names[k] == c.name}
+        for k, mean, cov in _places(scan, frames[first.clone], first, mine) if mine else ():
             if c.mean is None:
-                made[k].append(Candidate(c.name, [first, sights[k]], mean, cov))
+                made[k].append(Pending(scan.key, c.name, (first, new[k]), mean, cov))
                 continue
             far = bhattacharyya(c.mean, c.cov, mean, cov)
             if far <= policy.distance and (best is None or far < best[0]):
                 best = far, k, mean, cov
         if best is not None:
-            c.mean, c.cov = merge(c.mean, c.cov, *best[2:])
-            c.sights.append(sights[best[1]])
-            c.missed = 0
-            joined[best[1]].append(c)
+            mean, cov = merge(c.mean, c.cov, *best[2:])
+            more = replace(c, mean=mean, cov=cov, measurements=(*c.measurements, new[best[1]]), missed=0)
+            joined_[best[1]].append(more)
+            kept.append(more)
         elif c.mean is not None:
-            c.missed += _in_view(view, frames[first.at][0], c.mean)
-    for k, sight in sights.items():
-        joined[k] = joined[k] or made[k]
-        waiting.candidates += [c for c in made[k] if c in joined[k]]
-        alone = Candidate(names[k], [sight])
-        waiting.candidates.append(alone)
-        joined[k] = joined[k] or [alone]
-    return joined
+            kept.append(replace(c, missed=c.missed + _in_view(scan, frames[first.clone][0], c.mean)))
+        else:
+            kept.append(c)
+    for k, m in new.items():
+        if not joined_[k]:
+            joined_[k] = made[k]
+            kept += made[k]
+        alone = Pending(scan.key, names[k], (m,))
+        kept.append(alone)
+        joined_[k] = joined_[k] or [alone]
+    return _hopeful(kept, policy), {k: max(mine, key=lambda c: len(c.measurements)) for k, mine in joined_.items()}
 
 
-def _in_view(view: View, T: Array, p: Array) -> int:
-    """Return 1 if the sensor at T should see a point (2,), 0 if not."""
-    sensor: Any = view.sensor
-    return int(sensor.sees(view.landmark.seen_from(T, p[None])[0])[0])
+def _hopeful(candidates: Candidates, policy: Delayed) -> Candidates:
+    """Return the candidates without those that were expected and not found, and without the least of too many."""
+    alone = [c for c in candidates if c.mean is None]
+    several = [c for c in candidates if c.mean is not None and c.missed < policy.patience]
+    several.sort(key=lambda c: (len(c.measurements), -c.missed), reverse=True)
+    return several[: policy.candidates] + alone
+
+
+def without_clone(scan: ScanContext, candidates: Candidates, number: int) -> Candidates:
+    """Return the candidates without the measurements made from a clone that is to go."""
+    kept: Candidates = []
+    for c in candidates:
+        if c.measurements[0].clone == number and len(c.measurements) > 1:
+            c = _seen_from_the_next(scan, c)  # noqa: PLW2901
+        left = tuple(m for m in c.measurements if m.clone != number)
+        if left and (c.mean is None or len(left) > 1):
+            kept.append(replace(c, measurements=left))
+    return kept
+
+
+def _in_view(scan: ScanContext, T: Array, p: Array) -> int:
+    """Return 1 if the sensor at T should observe a point (2,), 0 if not."""
+    return int(scan.channel.sensor.sees(scan.channel.landmark.seen_from(T, p[None])[0])[0])
 
 
 def _places(
-    view: View, sensor: Any, frame: tuple[Array, Array], first: Sight, others: dict[int, Sight]
+    scan: ScanContext, frame: tuple[Array, Array], first: Measurement, others: dict[int, Measurement]
 ) -> Iterator[tuple[int, Array, Array]]:
     """Yield the Gaussians (2,), (2, 2) of where measurements meet a first one, in the frame of the first one's sensor.
 
     The first measurement is of the place itself, the other one of it as seen from T, both poses being uncertain: the
     Jacobians follow from those of what is expected, F p_x = -F_x.
     """
-    T, C = frame
-    y = np.array([sight.y for sight in others.values()])
-    p = sensor.meet(T, np.tile(first.y, (len(y), 1)), y)
+    (T, C), landmark, s = frame, scan.channel.landmark, scan.channel.calibrated(scan.map)
+    y = np.array([m.y for m in others.values()])
+    p = s.meet(T, np.tile(first.y, (len(y), 1)), y)
     rows, which = np.nonzero(np.isfinite(p).all(axis=2))
     p = p[rows, which]
     if not len(p):
         return
-    v, V_T, V_p = view.landmark.seen_from(T, p)
-    E, F_p = sensor.expect(p)[1], sensor.expect(v)[1]
+    v, V_T, V_p = landmark.seen_from(T, p)
+    E, F_p = s.expect(p)[1], s.expect(v)[1]
     F, F_T, m = np.concatenate([E, F_p @ V_p], axis=1), F_p @ V_T, len(first.y)
-    seen, reach = sensor.sees(p) & sensor.sees(v), np.minimum(np.linalg.norm(p, axis=1), np.linalg.norm(v, axis=1))
+    seen, reach = s.sees(p) & s.sees(v), np.minimum(np.linalg.norm(p, axis=1), np.linalg.norm(v, axis=1))
     ks = list(others)
     for i in np.flatnonzero(seen).tolist():
         k, S = ks[rows[i]], np.zeros((2 * m, 2 * m))
@@ -194,119 +174,188 @@ def _places(
             yield k, p[i], (cov + cov.T) / 2
 
 
-def _relative(slam: Slam, view: View, a: int, b: int) -> tuple[Array, Array]:
-    """Return the pose of the sensor at b as seen from that at a, (3,), and its covariance (3, 3)."""
-    slots = [view.waiting.poses[a], view.waiting.poses[b]]
-    (S, S_a, _), (T, T_b, _) = (compose(slam.map.mean(slot), mount_of(slam, view)) for slot in slots)
+def _relative(scan: ScanContext, a: int, b: int) -> tuple[Array, Array]:
+    """Return the pose of the sensor at clone b as seen from that at a, (3,), and its covariance (3, 3)."""
+    slots = [scan.clones[a], scan.clones[b]]
+    (S, S_a, _), (T, T_b, _) = (compose(scan.map.mean(slot), _mount(scan)) for slot in slots)
     c, C_S, C_T = between(S, T)
     J = np.hstack([C_S @ S_a, C_T @ T_b])
-    return c, J @ slam.map.covariance(slots) @ J.T
+    return c, J @ scan.map.covariance(slots) @ J.T
 
 
-def _forget_hopeless(view: View) -> None:
-    """Drop the candidates that were looked for and not found, and the least of too many."""
-    waiting, policy = view.waiting, view.delayed
-    assert policy is not None
-    alone = [c for c in waiting.candidates if c.mean is None]
-    several = [c for c in waiting.candidates if c.mean is not None and c.missed < policy.patience]
-    several.sort(key=lambda c: (len(c.sights), -c.missed), reverse=True)
-    waiting.candidates = several[: policy.candidates] + alone
+def _seen_from_the_next(scan: ScanContext, c: Pending) -> Pending:
+    """Return a candidate with its Gaussian in the frame of its second measurement: compounded.  [T] 2."""
+    assert c.mean is not None
+    T, C = _relative(scan, c.measurements[0].clone, c.measurements[1].clone)
+    p, P_T, P_p = scan.channel.landmark.seen_from(T, c.mean[None])
+    return replace(c, mean=p[0], cov=P_T[0] @ C @ P_T[0].T + P_p[0] @ c.cov @ P_p[0].T)
 
 
 # ---------------------------------------------------------------------- landmarks
-def _started(slam: Slam, view: View, c: Candidate) -> tuple[Id | None, str]:
-    """Make a landmark of a candidate that is ripe; return its name, or None, and why."""
-    policy, waiting, merged = view.delayed, view.waiting, len(c.sights) - 1
-    assert policy is not None
-    if not policy.is_ripe(merged):
-        return None, f"{merged} of {policy.persistence} intersections agree"
-    found = solved(slam, view, c)
+class Outcome(NamedTuple):
+    """What becomes of a candidate: the candidates left, why, and the landmark it starts, from which measurements."""
+
+    candidates: Candidates
+    reason: str
+    start: Start | None = None
+    used: Pending | None = None
+
+
+class Solution(NamedTuple):
+    """A point p (2,) with covariance G P G' + Q, P of the `slots`; its chi-square.
+
+    `relative_sigma` is its sigma by its distance, seen from the last pose, without that measurement that would be
+    missed most: two landmarks seen in one direction for a while, and once something else across, are none.
+    """
+
+    p: Array
+    G: Array
+    Q: Array
+    slots: list[int]
+    chi2: float
+    dof: int
+    relative_sigma: float
+
+    def start(self, scan: ScanContext) -> Start:
+        """Return the landmark as a block."""
+        parts = tuple((slot, len(scan.map.rows(slot))) for slot in self.slots)
+        return Start(scan.channel.landmark.space, self.p, parts, self.G, self.Q)
+
+
+def started(scan: ScanContext, policy: Delayed, candidates: Candidates, c: Pending) -> Outcome:
+    """Return the landmark that a candidate starts, or why not yet."""
+    merged = len(c.measurements) - 1
+    if not policy.is_ready(merged):
+        return Outcome(candidates, f"{merged} of {policy.persistence} intersections agree")
+    found = solved(scan, c)
     if not found.chi2 <= gate(FITS, found.dof):
-        waiting.candidates = [other for other in waiting.candidates if other is not c]
-        return None, f"its {len(c.sights)} measurements do not agree: chi-square {found.chi2:.1f} of {found.dof}"
-    if not found.vagueness < policy.precision:
-        return None, f"without one of its measurements its place is not known to {policy.precision:.0%}"
-    found, gap = _filled(slam, view, c, found)
+        left = [other for other in candidates if other is not c]
+        return Outcome(left, f"its {merged + 1} measurements do not agree: chi-square {found.chi2:.1f} of {found.dof}")
+    if not found.relative_sigma < policy.precision:
+        return Outcome(candidates, f"without one of its measurements its place is not known to {policy.precision:.0%}")
+    found, filled, gap = _filled(scan, candidates, c, found)
     if gap >= policy.patience:
-        return None, f"in view and not seen at {gap} kept poses in a row"
-    try:
-        slot = slam.map.augment(view.landmark.space, found.p, found.rows, found.G, found.Q)
-    except MapError as full:
-        return None, str(full)
-    name = slam.members.new_name() if c.name is None else c.name
-    slam.members.start(name, slot, view.landmark)
-    slam.members.seen[name] = len(c.sights)
-    used = {(sight.at, sight.k) for sight in c.sights} | _explained(slam, view, c.name, slot)
-    waiting.candidates = [
-        other for other in waiting.candidates
-        if not used & {(sight.at, sight.k) for sight in other.sights} and (c.name is None or other.name != c.name)
+        left = [filled if other is c else other for other in candidates]
+        return Outcome(left, f"in view and not seen at {gap} kept poses in a row")
+    return Outcome(candidates, f"{merged} intersections agree", found.start(scan), filled)
+
+
+def unexplained(scan: ScanContext, candidates: Candidates, used: Pending, slot: int) -> Candidates:
+    """Return the candidates without the measurements that a new landmark on a slot explains."""
+    model = scan.channel.models[scan.channel.landmark.kind]
+    gone = {(m.clone, m.k) for m in used.measurements}
+    waiting = {(m.clone, m.k): m for c in candidates if c.name == used.name for m in c.measurements}
+    for key, m in waiting.items():
+        pose = scan.clones[m.clone]
+        d2 = scan.channel.predict(scan.map, pose, model, np.array([slot]), m.y[None], m.R[None])[1][0]
+        if d2 <= gate(FITS, len(m.y)):
+            gone.add(key)
+    return [
+        other for other in candidates
+        if not gone & {(m.clone, m.k) for m in other.measurements} and (used.name is None or other.name != used.name)
     ]  # fmt: skip
-    return name, f"{merged} intersections agree"
 
 
-def _filled(slam: Slam, view: View, c: Candidate, found: Solution) -> tuple[Solution, int]:
-    """Join what was seen of a candidate at poses between its own; return its solution and the longest gap that is left.
+def solved(scan: ScanContext, c: Pending) -> Solution:
+    """Return the point that fits all measurements of a candidate best.
+
+    Least squares weighted by S = H P H' + R, P of the poses: with W = (E' S^-1 E)^-1 E' S^-1 the point errs by
+    -W (H d + v), d the error of the poses and v that of the measurements, so that G = -W H and Q = W R W'.
+    """
+    map_, slots, n, m = scan.map, _slots(scan, c), len(c.measurements), len(c.measurements[0].y)
+    P = map_.covariance(slots)
+    R = np.zeros((n * m, n * m))
+    for i, measurement in enumerate(c.measurements):
+        R[i * m : (i + 1) * m, i * m : (i + 1) * m] = measurement.R
+    p = _in_the_map(scan, c)
+    for _ in range(10):
+        z, E, H = _linearized(scan, c, p, len(P))
+        W = _weights(E, H @ P @ H.T + R)
+        step = W @ z
+        p = p + step
+        if not np.linalg.norm(step) >= 1e-9 * (1 + np.linalg.norm(p)):
+            break
+    z = z - E @ step
+    chi2 = float(z @ np.linalg.solve(H @ P @ H.T + R, z)) if np.isfinite(z).all() else math.inf
+    if not math.isfinite(chi2):
+        return Solution(p, -W @ H, W @ R @ W.T, slots, math.inf, n * m - 2, math.inf)
+    last = scan.channel.pose(map_, slots[n - 1])
+    v, V_T, V_p = (a[0] for a in scan.channel.landmark.seen_from(last, p[None]))
+    V_P = np.zeros((2, len(P)))
+    V_P[:, 3 * (n - 1) : 3 * n] = V_T @ compose(map_.mean(slots[n - 1]), _mount(scan))[1]
+    worst = 0.0
+    for i in range(n):
+        keep = np.repeat(np.arange(n) != i, m)
+        W_i = _weights(E[keep], (H @ P @ H.T + R)[np.ix_(keep, keep)])
+        J = V_P - V_p @ W_i @ H[keep]
+        cov = J @ P @ J.T + V_p @ W_i @ R[np.ix_(keep, keep)] @ W_i.T @ V_p.T
+        worst = max(worst, float(np.linalg.norm(cov, 2)) if np.isfinite(cov).all() else math.inf)
+    return Solution(p, -W @ H, W @ R @ W.T, slots, chi2, n * m - 2, math.sqrt(worst) / float(np.linalg.norm(v)))
+
+
+def _filled(
+    scan: ScanContext, candidates: Candidates, c: Pending, found: Solution
+) -> tuple[Solution, Pending, int]:  # fmt: skip
+    """Join what was measured of a candidate at clones between its own; return solution, candidate and longest gap left.
 
     Where two landmarks were in line for a while and something else across, there was nothing to be seen in between.
     """
-    waiting, gap, longest = view.waiting, 0, 0
-    own, size = {sight.at for sight in c.sights}, len(found.rows) - 3 * (len(c.sights) - 1)
-    sights = {(s.at, s.k): s for other in waiting.candidates if other.name == c.name for s in other.sights}
-    for at in [n for n in waiting.poses if c.sights[0].at < n < c.sights[-1].at]:
-        T = view.pose(slam.map, waiting.poses[at])
-        if at in own or not _in_view(view, T, found.p):
+    gap, longest, size = 0, 0, sum(len(scan.map.rows(slot)) for slot in found.slots) - 3 * (len(c.measurements) - 1)
+    own = {m.clone for m in c.measurements}
+    others = {(m.clone, m.k): m for other in candidates if other.name == c.name for m in other.measurements}
+    first, last = c.measurements[0].clone, c.measurements[-1].clone
+    for at in [n for n in scan.clones.of(scan.key) if first < n < last]:
+        if at in own or not _in_view(scan, scan.channel.pose(scan.map, scan.clones[at]), found.p):
             gap = 0
             continue
-        gap, here = gap + 1, [s for s in sights.values() if s.at == at]
-        off = [linearized(slam, view, Candidate(c.name, [s]), found.p, size)[0] for s in here]
+        gap, here = gap + 1, [m for m in others.values() if m.clone == at]
+        off = [_linearized(scan, Pending(scan.key, c.name, (m,)), found.p, size)[0] for m in here]
         for i in np.argsort([np.linalg.norm(z) for z in off])[:1].tolist():
-            more = Candidate(c.name, sorted([*c.sights, here[i]], key=lambda s: s.at), c.mean, c.cov)
-            better = solved(slam, view, more)
+            more = replace(c, measurements=tuple(sorted([*c.measurements, here[i]], key=lambda m: m.clone)))
+            better = solved(scan, more)
             if better.chi2 - found.chi2 <= gate(FITS, len(here[i].y)):
-                c.sights, found, gap = more.sights, better, 0
+                c, found, gap = more, better, 0
         longest = max(longest, gap)
-    return found, longest
+    return found, c, longest
 
 
-def _explained(slam: Slam, view: View, name: Id | None, slot: int) -> set[tuple[int, int]]:
-    """Return which measurements that wait fit a new landmark: they are no evidence of another one."""
-    look, map_ = view.looks[view.landmark.kind], slam.map
-    sights = {(s.at, s.k): s for c in view.waiting.candidates if c.name == name for s in c.sights}
-    found = set()
-    for key, sight in sights.items():
-        pose = view.waiting.poses[sight.at]
-        d2 = view.predict(map_, pose, look, np.array([slot]), sight.y[None], sight.R[None])[1][0]
-        if d2 <= gate(FITS, len(sight.y)):
-            found.add(key)
-    return found
+def _linearized(scan: ScanContext, c: Pending, p: Array, size: int) -> tuple[Array, Array, Array]:
+    """Return the innovations z (n m,) of a point p and their Jacobians E (n m, 2) in it and H (n m, size) in poses."""
+    model, n, m = scan.channel.models[scan.channel.landmark.kind], len(c.measurements), len(c.measurements[0].y)
+    z, E, H = np.empty(n * m), np.empty((n * m, 2)), np.zeros((n * m, size))
+    for i, measurement in enumerate(c.measurements):
+        rows, pose = slice(i * m, (i + 1) * m), scan.clones[measurement.clone]
+        observer = scan.channel.observer(scan.map, pose)
+        _, z_i, E_h, E_l = linearize(model.model, observer, p[None], measurement.y[None])
+        E_i = scan.estimator.pose_jacobian(scan.map, pose, E_h[0])
+        z[rows], E[rows], H[rows, 3 * i : 3 * i + 3] = z_i[0], E_l[0], E_i[:, :3]
+        H[rows, 3 * n :] = E_i[:, 3:]
+    return z, E, H
 
 
-# ---------------------------------------------------------------------- kept poses
-def _forget_poses(slam: Slam, view: View) -> None:
-    """Remove the oldest of too many poses, and those that nothing waits for any more, but for the last one."""
-    waiting, most = view.waiting, view.delayed.poses  # type: ignore[union-attr]
-    for number in list(waiting.poses)[:-most]:
-        _drop_pose(slam, view, number)
-    used = {sight.at for c in waiting.candidates for sight in c.sights}
-    for number in [n for n in list(waiting.poses)[:-1] if n not in used]:
-        slam.map.remove(waiting.poses.pop(number))
+def _weights(E: Array, S: Array) -> Array:
+    """Return W = (E' S^-1 E)^-1 E' S^-1, NaN where there is none: where the measurements do not meet."""
+    try:
+        S_E = np.linalg.solve(S, E)
+        return np.linalg.solve(E.T @ S_E, S_E.T)
+    except np.linalg.LinAlgError:
+        return np.full(E.T.shape, np.nan)
 
 
-def _drop_pose(slam: Slam, view: View, number: int) -> None:
-    """Remove a kept pose with the measurements made there."""
-    waiting, kept = view.waiting, []
-    for c in waiting.candidates:
-        if c.sights[0].at == number and len(c.sights) > 1:
-            _lean_on_the_next(slam, view, c)
-        c.sights = [sight for sight in c.sights if sight.at != number]
-        if c.sights and (c.mean is None or len(c.sights) > 1):
-            kept.append(c)
-    waiting.candidates = kept
-    slam.map.remove(waiting.poses.pop(number))
+def _slots(scan: ScanContext, c: Pending) -> list[int]:
+    """Return the slots that a candidate's measurements depend on: the clones and, if it is in the map, the mount."""
+    slots = [scan.clones[m.clone] for m in c.measurements]
+    return slots if scan.channel.mount < 0 else [*slots, scan.channel.mount]
 
 
-def _lean_on_the_next(slam: Slam, view: View, c: Candidate) -> None:
-    """Move a candidate's Gaussian from the frame of its first measurement to that of its second: compounded.  [T] 2."""
-    T, C = _relative(slam, view, c.sights[0].at, c.sights[1].at)
-    p, P_T, P_p = view.landmark.seen_from(T, c.mean[None])  # type: ignore[index]
-    c.mean, c.cov = p[0], P_T[0] @ C @ P_T[0].T + P_p[0] @ c.cov @ P_p[0].T
+def _in_the_map(scan: ScanContext, c: Pending) -> Array:
+    """Return the mean of a candidate in the map's frame."""
+    assert c.mean is not None
+    T = scan.channel.pose(scan.map, scan.clones[c.measurements[0].clone])
+    p: Array = scan.channel.landmark.from_view(T, c.mean[None])[0][0]
+    return p
+
+
+def _mount(scan: ScanContext) -> Array:
+    """Return where the sensor sits on its robot, as it is estimated."""
+    return scan.channel.at if scan.channel.mount < 0 else scan.map.mean(scan.channel.mount)[:3]

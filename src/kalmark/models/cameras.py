@@ -111,7 +111,7 @@ def valid_radius(d: Any) -> float:
 
 
 def fit_correction(d: Any, k: Any, size: Any, tolerance_px: float = 0.005, radius: float | None = None) -> Array:
-    """Fit the shortest correction c that undoes the distortion d within `tolerance_px` over an image (width, height).
+    """Fit the shortest correction c (n,) of the distortion d (k,) within `tolerance_px` over an image (width, height).
 
     Least squares of pixels at Chebyshev nodes of r_d^2 from the centre to the farthest corner, or to `radius` on the
     plane z = 1.  Raise ModelError where that is more than the distortion can reach, or if 20 coefficients do not
@@ -155,7 +155,7 @@ def _undistorted(rd: Array, d: Array) -> Array:
 
 @compiled
 def polynomial(a: Array, x: float) -> tuple[float, float]:
-    """Return a0 + a1 x + a2 x^2 + ... and its derivative."""
+    """Return a0 + a1 x + a2 x^2 + ... of a (n,), and its derivative."""
     value, rate = 0.0, 0.0
     for j in range(len(a) - 1, -1, -1):
         rate = rate * x + value

@@ -6,12 +6,12 @@ expected of the rest.  How they look from a sensor is in `landmarks2d`, `landmar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.declare import NotNegative, Number, built_in, declared, register
 from kalmark.geometry.directions import unit_many
 from kalmark.geometry.spaces import (
     ANCHOR,
@@ -29,16 +29,18 @@ from kalmark.geometry.spaces import (
     Space,
 )
 from kalmark.models import landmarks2d, landmarks3d, lines, seen, segments, tags
-from kalmark.models.parameters import check_parameters
 
 Array = npt.NDArray[np.float64]
 
 TINY_M = 1e-12
 
+PriorDepth = Annotated[Number, "Inverse distance expected where the sensor sees none."]
+DepthSigma = Annotated[NotNegative, "Standard deviation of that."]
 
-@dataclass(frozen=True)
+
+@register("landmark", "point")
 class Point2D:
-    """A point (x, y) in metres."""
+    """A Euclidean point (x, y) of the plane."""
 
     kind: ClassVar[str] = "point"
     space: ClassVar[Space] = POINT2
@@ -52,18 +54,28 @@ class Point2D:
         """Return l (K, d), L_T (K, d, 3), L_v (K, d, d)."""
         return landmarks2d.point_from_view(T, np.ascontiguousarray(v))
 
+    def place(self, l: Array) -> tuple[Array, Array]:
+        """Return the positions (K, 2) and their Jacobian (K, 2, d)."""
+        return np.array(l[:, :2]), np.tile(np.eye(2, l.shape[1]), (len(l), 1, 1))
 
-@dataclass(frozen=True)
+
+@register("landmark", "point_signature")
 class PointSignature2D(Point2D):
-    """A point with a signature, (x, y, s): [T]'s landmark, d = 3N + 3."""
+    """A Euclidean point of the plane with a signature (x, y, s).
+
+    [T]'s landmark, d = 3N + 3.
+    """
 
     kind: ClassVar[str] = "point_signature"
     space: ClassVar[Space] = Space("point_signature", (VECTOR, SCALAR))
 
 
-@dataclass(frozen=True)
+@register("landmark", "polar")
 class Polar2D:
-    """Anchor, direction alpha and distance (4), for ranges with poor bearings: an arc of errors.  [S] 2.3.5."""
+    """A point of the plane by anchor, direction and distance (4 numbers), for ranges with poor bearings.
+
+    The errors are along an arc.  [S] 2.3.5.
+    """
 
     kind: ClassVar[str] = "polar"
     space: ClassVar[Space] = Space("polar", (VECTOR, HEADING, SCALAR))
@@ -81,6 +93,8 @@ class Polar2D:
         """Return the Euclidean points p (K, 2) and P_l (K, 2, 4)."""
         return landmarks2d.polar_to_point(np.ascontiguousarray(l))
 
+    place = to_point
+
     def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
         """Return how far the arc of a sigma leaves its tangent, in sigmas of the distance (K,); `sigmas` (K, 4)."""
         return np.asarray(0.5 * l[:, 3] * sigmas[:, 2] ** 2 / np.maximum(sigmas[:, 3], TINY_M))
@@ -96,9 +110,9 @@ class _Spatial:
         return self.look(T, np.ascontiguousarray(l))
 
 
-@dataclass(frozen=True)
+@register("landmark", "point")
 class Point3D(_Spatial):
-    """A point (x, y, z) in metres."""
+    """A Euclidean point (x, y, z) of space."""
 
     kind: ClassVar[str] = "point3"
     space: ClassVar[Space] = POINT3
@@ -119,23 +133,18 @@ class Point3D(_Spatial):
         """Return the points themselves (K, 3) and the identity."""
         return np.array(l), np.tile(np.eye(3), (len(l), 1, 1))
 
-
-class _Prior:
-    """What the kinds with a prior share."""
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
+    place = to_point
 
 
-@dataclass(frozen=True)
-class _Depth(_Prior, _Spatial):
+@declared
+class _Depth(_Spatial):
     """A point whose depth no measurement need tell: inverse distance rho, `prior_rho_per_m` +- `sigma_rho_per_m`.
 
     The prior is that of the first sight, by a sensor that sees a ray.
     """
 
-    prior_rho_per_m: float = 0.01
-    sigma_rho_per_m: float = 0.5
+    prior_rho_per_m: PriorDepth = 0.01
+    sigma_rho_per_m: DepthSigma = 0.5
 
     space: ClassVar[Space]
     _from_view: ClassVar[Any]
@@ -168,16 +177,19 @@ class _Depth(_Prior, _Spatial):
         p, P_l = type(self)._to_point(np.ascontiguousarray(l))
         return p, P_l
 
+    place = to_point
 
-@dataclass(frozen=True)
+
+@register("landmark", "inverse_depth")
 class InverseDepth2D(_Depth):
-    """Anchor, direction alpha and inverse depth rho (4), for sensors of bearings.  [S] 2.3.6, (48).
+    """A point of the plane by anchor, direction and inverse distance (4 numbers).
 
-    The default prior is [S] (47), rho in [0, 1 / d_min] with d_min = 1 m, as a Gaussian with both ends at two sigmas.
+    The nearest landmark at d m is in the prior if prior_rho_per_m + 2 sigma_rho_per_m is 1 / d.  [S] 2.3.6, (48).  The
+    default prior is [S] (47), rho in [0, 1 / d_min] with d_min = 1 m, as a Gaussian with both ends at two sigmas.
     """
 
-    prior_rho_per_m: float = 0.5
-    sigma_rho_per_m: float = 0.25
+    prior_rho_per_m: PriorDepth = 0.5
+    sigma_rho_per_m: DepthSigma = 0.25
 
     kind: ClassVar[str] = "inverse_depth_2d"
     space: ClassVar[Space] = Space("inverse_depth_2d", (VECTOR, HEADING, RHO))
@@ -190,9 +202,12 @@ class InverseDepth2D(_Depth):
         return landmarks2d.inverse_depth_linearity(T, l, sigmas[:, -1].copy())
 
 
-@dataclass(frozen=True)
+@register("landmark", "inverse_depth")
 class InverseDepth3D(_Depth):
-    """Anchor, azimuth and elevation of the ray, inverse depth (6).  [TB] idpPnt; Civera, Davison, Montiel 2008."""
+    """A point of space by anchor, direction and inverse distance (6 numbers).
+
+    [TB] idpPnt; Civera, Davison, Montiel 2008.
+    """
 
     kind: ClassVar[str] = "inverse_depth"
     space: ClassVar[Space] = Space("inverse_depth", (ANCHOR, DIRECTION, RHO))
@@ -205,9 +220,12 @@ class InverseDepth3D(_Depth):
         return landmarks3d.inverse_depth_linearity(T, l, sigmas[:, -1].copy())
 
 
-@dataclass(frozen=True)
+@register("landmark", "anchored_homogeneous")
 class AnchoredHomogeneous(_Depth):
-    """Anchor, ray and inverse depth (7).  [TB] ahmPnt; Sola 2012."""
+    """A point of space by anchor, ray and inverse distance (7 numbers).
+
+    [TB] ahmPnt; Sola 2012.
+    """
 
     kind: ClassVar[str] = "anchored_homogeneous"
     space: ClassVar[Space] = Space("anchored_homogeneous", (ANCHOR, VECTOR3, RHO))
@@ -220,9 +238,12 @@ class AnchoredHomogeneous(_Depth):
         return landmarks3d.anchored_linearity(T, l, sigmas[:, -1].copy())
 
 
-@dataclass(frozen=True)
+@register("landmark", "homogeneous")
 class Homogeneous(_Depth):
-    """The homogeneous point (h, rho), at h / rho (4).  [TB] hmgPnt."""
+    """A homogeneous point of space (4 numbers).
+
+    (h, rho) is at h / rho.  [TB] hmgPnt.
+    """
 
     kind: ClassVar[str] = "homogeneous"
     space: ClassVar[Space] = Space("homogeneous", (HOMOGENEOUS,))
@@ -231,9 +252,12 @@ class Homogeneous(_Depth):
     _to_point = landmarks3d.homogeneous_to_point
 
 
-@dataclass(frozen=True)
+@register("landmark", "tag")
 class Tag(_Spatial):
-    """A square tag: its pose (x, y, z, qx, qy, qz, qw), the tag in its plane z = 0.  Its size is the scan's to tell."""
+    """A square tag: its pose.
+
+    l = (x, y, z, qx, qy, qz, qw), the tag in its plane z = 0.  Its size is part of the measurement.
+    """
 
     kind: ClassVar[str] = "tag"
     space: ClassVar[Space] = SE3
@@ -247,9 +271,11 @@ class Tag(_Spatial):
         """Return the centres (K, 3) and their Jacobian (K, 3, 6)."""
         return np.array(l[:, :3]), np.tile(np.eye(3, 6), (len(l), 1, 1))
 
+    place = to_point
 
-@dataclass(frozen=True)
-class _Line(_Prior, _Spatial):
+
+@declared
+class _Line(_Spatial):
     """What the lines share: they start on the plane of two viewing rays, the rest is a prior (K, 2).
 
     With `extend`, the segment kept beside a line grows with what is seen of it; before, and without, it is what its
@@ -257,11 +283,14 @@ class _Line(_Prior, _Spatial):
     one instead (Pluecker kinds).  [TB] extPolicy, extSwitch.
     """
 
-    extend: bool = True
-    switch_px: float = 10.0
+    extend: Annotated[bool, "The segment kept beside the line grows with what is seen of it."] = True
+    switch_px: Annotated[
+        NotNegative, "Pluecker kinds: a segment whose ends are less certain than this follows the measured one instead."
+    ] = 10.0
 
     name: ClassVar[str]
     first_ends: ClassVar[tuple[float, float]]
+    anchored: ClassVar[bool] = True  # the first three numbers are the anchor
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, Array]:
         """Return both rays and the prior's mean (K, 8), V_y (K, 8, .) and the prior's covariance (K, 8, 8)."""
@@ -277,29 +306,44 @@ class _Line(_Prior, _Spatial):
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return l (K, n) of rays and prior v (K, 8), L_T (K, n, 6), L_v (K, n, 8)."""
-        run = getattr(lines, f"{self.name}_from_view")
+        run = vars(lines)[f"{self.name}_from_view"]
         l, L_T, L_rays, L_prior = run(T, np.ascontiguousarray(v[:, :6]), np.ascontiguousarray(v[:, 6:]))
         return l, L_T, np.concatenate([L_rays, L_prior], axis=2)
 
     def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
         """Return the points (K, 2, 3) at abscissas t (K, 2), and P_l (K, 2, 3, n)."""
-        p, P_l = getattr(segments, f"{self.name}_endpoints")(np.ascontiguousarray(l), np.ascontiguousarray(t))
+        p, P_l = vars(segments)[f"{self.name}_endpoints"](np.ascontiguousarray(l), np.ascontiguousarray(t))
         return p, P_l
 
     def abscissas(self, T: Array, l: Array, rays: Array) -> Array:
         """Return where (K, 2) on the lines two viewing rays (K, 6) from T pass nearest."""
-        t: Array = getattr(segments, f"{self.name}_abscissas")(T, np.ascontiguousarray(l), np.ascontiguousarray(rays))
+        t: Array = vars(segments)[f"{self.name}_abscissas"](T, np.ascontiguousarray(l), np.ascontiguousarray(rays))
         return t
 
+    def place(self, l: Array) -> tuple[Array, Array]:
+        """Return the points (K, 3) of the lines nearest to their anchors, or to the origin, and P_l (K, 3, n)."""
+        p, P_l = self.endpoints(l, np.tile([0.0, 1.0], (len(l), 1)))
+        a = l[:, :3] if self.anchored else np.zeros((len(l), 3))
+        A_l = np.eye(3, P_l.shape[3]) * self.anchored
+        d, D_l = p[:, 1] - p[:, 0], P_l[:, 1] - P_l[:, 0]
+        w, W_l = p[:, 0] - a, P_l[:, 0] - A_l
+        d2 = np.sum(d * d, axis=1)
+        s = np.sum(w * d, axis=1) / d2  # p = a + w - s d
+        S_l = np.einsum("ki,kij->kj", d, W_l) + np.einsum("ki,kij->kj", w - 2 * s[:, None] * d, D_l)
+        S_l /= d2[:, None]
+        return a + w - s[:, None] * d, P_l[:, 0] - s[:, None, None] * D_l - d[:, :, None] * S_l[:, None]
 
-@dataclass(frozen=True)
+
+@declared
 class _DirectionPrior(_Line):
     """Lines whose direction in the plane of sight is a prior, beta = (`prior_beta_1`, 0) +- sigmas.  [TB] plkLin."""
 
-    prior_beta_1: float = 0.1
-    prior_beta_2: float = 0.0
-    sigma_beta_1: float = 0.25
-    sigma_beta_2: float = 1.0
+    prior_beta_1: Annotated[
+        Number, "Direction expected in the plane of sight, which one image does not tell: first component."
+    ] = 0.1
+    prior_beta_2: Annotated[Number, "Second component."] = 0.0
+    sigma_beta_1: Annotated[NotNegative, "Standard deviation of the first component."] = 0.25
+    sigma_beta_2: Annotated[NotNegative, "Standard deviation of the second component."] = 1.0
 
     first_ends: ClassVar[tuple[float, float]] = segments.PLUECKER_ABSCISSAS_M
 
@@ -307,12 +351,12 @@ class _DirectionPrior(_Line):
         return (self.prior_beta_1, self.prior_beta_2), (self.sigma_beta_1, self.sigma_beta_2)
 
 
-@dataclass(frozen=True)
+@declared
 class _DepthsPrior(_Line):
     """Lines through two points of unknown depth."""
 
-    prior_rho_per_m: float = 0.1
-    sigma_rho_per_m: float = 0.5
+    prior_rho_per_m: Annotated[Number, "Inverse distance expected of both ends."] = 0.1
+    sigma_rho_per_m: Annotated[NotNegative, "Standard deviation of each."] = 0.5
 
     first_ends: ClassVar[tuple[float, float]] = segments.POINT_ABSCISSAS
 
@@ -320,19 +364,26 @@ class _DepthsPrior(_Line):
         return (self.prior_rho_per_m,) * 2, (self.sigma_rho_per_m,) * 2
 
 
-@dataclass(frozen=True)
+@register("landmark", "pluecker_line")
 class PlueckerLine(_DirectionPrior):
-    """Moment and direction (n, v), 6.  [TB] plkLin."""
+    """A line by moment and direction (6 numbers).
+
+    [TB] plkLin.
+    """
 
     kind: ClassVar[str] = "pluecker_line"
     space: ClassVar[Space] = Space("pluecker_line", (PLUECKER,))
     look: ClassVar[Any] = staticmethod(lines.pluecker_seen_from)
     name: ClassVar[str] = "pluecker"
+    anchored: ClassVar[bool] = False
 
 
-@dataclass(frozen=True)
+@register("landmark", "anchored_pluecker_line")
 class AnchoredPlueckerLine(_DirectionPrior):
-    """Anchor, moment about it and direction (9).  [TB] aplLin."""
+    """A line by anchor, moment about it and direction (9 numbers).
+
+    [TB] aplLin.
+    """
 
     kind: ClassVar[str] = "anchored_pluecker_line"
     space: ClassVar[Space] = Space("anchored_pluecker_line", (VECTOR3, VECTOR3, VECTOR3))
@@ -340,9 +391,12 @@ class AnchoredPlueckerLine(_DirectionPrior):
     name: ClassVar[str] = "anchored_pluecker"
 
 
-@dataclass(frozen=True)
+@register("landmark", "inverse_depth_line")
 class InverseDepthLine(_DepthsPrior):
-    """Anchor and two inverse-depth rays (9).  [TB] idpLin."""
+    """A line by anchor and azimuth, elevation and inverse distance of two points (9 numbers).
+
+    [TB] idpLin.
+    """
 
     kind: ClassVar[str] = "inverse_depth_line"
     space: ClassVar[Space] = Space("inverse_depth_line", (ANCHOR, DIRECTION, RHO, DIRECTION, RHO))
@@ -350,9 +404,12 @@ class InverseDepthLine(_DepthsPrior):
     name: ClassVar[str] = "inverse_depth_line"
 
 
-@dataclass(frozen=True)
+@register("landmark", "anchored_homogeneous_line")
 class AnchoredHomogeneousLine(_DepthsPrior):
-    """Anchor and two rays with inverse depths (11).  [TB] ahmLin."""
+    """A line by anchor and ray and inverse distance of two points (11 numbers).
+
+    [TB] ahmLin.
+    """
 
     kind: ClassVar[str] = "anchored_homogeneous_line"
     space: ClassVar[Space] = Space("anchored_homogeneous_line", (ANCHOR, VECTOR3, RHO, VECTOR3, RHO))
@@ -360,16 +417,19 @@ class AnchoredHomogeneousLine(_DepthsPrior):
     name: ClassVar[str] = "anchored_homogeneous_line"
 
 
-@dataclass(frozen=True)
+@register("landmark", "homogeneous_line")
 class HomogeneousLine(_DepthsPrior):
-    """Two homogeneous points (8).  [TB] hmgLin."""
+    """A line by two homogeneous points (8 numbers).
+
+    [TB] hmgLin.
+    """
 
     kind: ClassVar[str] = "homogeneous_line"
     space: ClassVar[Space] = Space("homogeneous_line", (HOMOGENEOUS, HOMOGENEOUS))
     look: ClassVar[Any] = staticmethod(lines.homogeneous_line_seen_from)
     name: ClassVar[str] = "homogeneous_line"
+    anchored: ClassVar[bool] = False
 
 
-POINTS = (Point3D, InverseDepth3D, AnchoredHomogeneous, Homogeneous)
-LINES = (PlueckerLine, AnchoredPlueckerLine, InverseDepthLine, AnchoredHomogeneousLine, HomogeneousLine)
-BUILT_IN = (Point2D, PointSignature2D, Polar2D, InverseDepth2D, *POINTS, Tag, *LINES)
+BUILT_IN = built_in("landmark")
+LINES = tuple(kind for kind in BUILT_IN if issubclass(kind, _Line))

@@ -131,7 +131,7 @@ def in_view(lens: int, v: Array, par: Array, size: Array) -> Bools:
 
 @compiled
 def grown(r: float, d: Array) -> tuple[float, float]:
-    """Return r_d = r (1 + d1 r^2 + d2 r^4 + ...) and its derivative."""
+    """Return r_d = r (1 + d1 r^2 + d2 r^4 + ...) of d (n,), and its derivative."""
     scale, rate = 0.0, 0.0  # of the sum, in r^2
     for j in range(len(d) - 1, -1, -1):
         rate = rate * r * r + scale
@@ -143,7 +143,7 @@ def grown(r: float, d: Array) -> tuple[float, float]:
 
 @compiled
 def shrunk(rd: float, d: Array, limit: float) -> float:
-    """Return the r in [0, limit) that `grown` carries to rd >= 0, by Newton within a bracket; NaN if there is none."""
+    """Return the r in [0, limit) with `grown(r, d)` = rd >= 0, d (n,), by bracketed Newton; NaN if there is none."""
     low, high = 0.0, min(limit, 100.0 + 2 * rd)
     if grown(high, d)[0] <= rd:
         return np.nan

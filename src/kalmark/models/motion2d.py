@@ -9,25 +9,31 @@ about the robot, while the control is not zero (a robot told to stand does not w
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.declare import NotNegative, Number, Positive, register
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import SE2, Space
-from kalmark.models.parameters import check_parameters
+
+__all__ = ["Ackermann", "Odometry2D", "Unicycle"]
 
 Array = npt.NDArray[np.float64]
+
+# parameters that several motions have
+Along = Annotated[NotNegative, "Random walk along the heading, while it moves."]
+Across = Annotated[NotNegative, "Random walk across the heading, while it moves."]
+Turning = Annotated[NotNegative, "Random walk of the heading, while it moves."]
 
 
 @compiled
 def increment(r: Array, u: Array) -> tuple[Array, Array, Array]:
-    """Move r by u = (dx, dy, dtheta) in its own frame.  [S] (59)-(60)."""
+    """Move r (3,) by u (3,) = (dx, dy, dtheta) in its own frame: the new r, R_r, R_u (3, 3).  [S] (59)-(60)."""
     return compose(r, u)
 
 
@@ -48,7 +54,7 @@ def arc(r: Array, v: float, w: float, dt: float) -> tuple[Array, Array, Array]:
 
 @compiled
 def ackermann(r: Array, u: Array, dt: float, wheelbase: float, offset: float) -> tuple[Array, Array, Array]:
-    """Move the rear axle's centre r by u = (speed of the left rear wheel, steering), along the exact arc."""
+    """Move the rear axle's centre r (3,) by u (2,) = (speed of the left rear wheel, steering), along the exact arc."""
     tan = math.tan(u[1])
     slip = 1.0 / (1.0 - tan * offset / wheelbase)
     v, w = u[0] * slip, u[0] * slip * tan / wheelbase
@@ -68,9 +74,6 @@ class Planar:
     sigma_across_m_per_sqrt_s: float
     sigma_theta_rad_per_sqrt_s: float
 
-    def __post_init__(self) -> None:
-        check_parameters(self)
-
     @cached_property
     def _density(self) -> Array | None:
         sigmas = (self.sigma_along_m_per_sqrt_s, self.sigma_across_m_per_sqrt_s, self.sigma_theta_rad_per_sqrt_s)
@@ -81,47 +84,24 @@ class Planar:
         return None if self._density is None or not u.any() else self._density * dt_s
 
 
-@dataclass(frozen=True)
-class Odometry2D(Planar):
-    """Odometry: u = (dx, dy, dtheta) in the robot's frame, the motion that ended at its time.  [S] (57)-(60).
+@register("motion", "unicycle")
+class Unicycle(Planar):
+    """Speed and turn rate, each held until the next control.
 
-    The sigmas are those of one increment.  A diffusion counts the time since the last increment, none for the first.
+    A control is u = (v m/s, w rad/s); the exact arc of [F] with both its limits.
     """
 
-    sigma_x_m: float = 0.01
-    sigma_y_m: float = 0.0
-    sigma_theta_rad: float = 0.02
-    sigma_along_m_per_sqrt_s: float = 0.0
-    sigma_across_m_per_sqrt_s: float = 0.0
-    sigma_theta_rad_per_sqrt_s: float = 0.0
-
-    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
-    held: ClassVar[bool] = False
-
-    @cached_property
-    def _N(self) -> Array:
-        return np.diag(np.square([self.sigma_x_m, self.sigma_y_m, self.sigma_theta_rad]))
-
-    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved pose (3,), R_r (3, 3), R_u (3, 3)."""
-        return increment(r, u)
-
-    def control_noise(self, u: Array) -> Array:
-        """Return N (3, 3) of one increment."""
-        return self._N
-
-
-@dataclass(frozen=True)
-class Unicycle(Planar):
-    """Unicycle: u = (v m/s, w rad/s), held from its time on; the exact arc of [F] with both its limits."""
-
-    sigma_v_mps: float = 0.1
-    sigma_w_radps: float = 0.05
-    sigma_along_m_per_sqrt_s: float = 0.0
-    sigma_across_m_per_sqrt_s: float = 0.0
-    sigma_theta_rad_per_sqrt_s: float = 0.0
-    sigma_v_bias_mps: float = 0.0
-    sigma_w_bias_radps: float = 0.0
+    sigma_v_mps: Annotated[NotNegative, "Error of the speed held over its interval."] = 0.1
+    sigma_w_radps: Annotated[NotNegative, "Error of the turn rate held over its interval."] = 0.05
+    sigma_along_m_per_sqrt_s: Along = 0.0
+    sigma_across_m_per_sqrt_s: Across = 0.0
+    sigma_theta_rad_per_sqrt_s: Turning = 0.0
+    sigma_v_bias_mps: Annotated[
+        NotNegative, "Constant part of the speed's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_w_bias_radps: Annotated[
+        NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
+    ] = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
     held: ClassVar[bool] = True
@@ -144,29 +124,62 @@ class Unicycle(Planar):
         return _bias_cov(self.sigma_v_bias_mps, self.sigma_w_bias_radps)
 
 
-@dataclass(frozen=True)
-class Ackermann(Planar):
-    """Car: u = (speed of the left rear wheel m/s, steering rad), held; the state is the rear axle's centre.
+@register("motion", "odometry_2d")
+class Odometry2D(Planar):
+    """Increments dx, dy, dtheta in the robot's frame.
 
+    A control u (3,) is the motion that ended at its time.  [S] (57)-(60).  The sigmas are those of one increment.  A
+    diffusion counts the time since the last increment, none for the first.
+    """
+
+    sigma_x_m: Annotated[NotNegative, "Error of one increment, forward."] = 0.01
+    sigma_y_m: Annotated[NotNegative, "Error of one increment, to the left."] = 0.0
+    sigma_theta_rad: Annotated[NotNegative, "Error of one increment, heading."] = 0.02
+    sigma_along_m_per_sqrt_s: Along = 0.0
+    sigma_across_m_per_sqrt_s: Across = 0.0
+    sigma_theta_rad_per_sqrt_s: Turning = 0.0
+
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
+    held: ClassVar[bool] = False
+
+    @cached_property
+    def _N(self) -> Array:
+        return np.diag(np.square([self.sigma_x_m, self.sigma_y_m, self.sigma_theta_rad]))
+
+    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        """Return the moved pose (3,), R_r (3, 3), R_u (3, 3)."""
+        return increment(r, u)
+
+    def control_noise(self, u: Array) -> Array:
+        """Return N (3, 3) of one increment."""
+        return self._N
+
+
+@register("motion", "ackermann")
+class Ackermann(Planar):
+    """A car: wheel speed and steering angle, each held until the next control.
+
+    A control is u = (speed of the left rear wheel m/s, steering rad); the state is the rear axle's centre.
     `encoder_offset_m` is the wheel's distance to the left of the centre line, negative to the right; 0 for a speed that
     is the axle's own.
     """
 
-    wheelbase_m: float = 2.83
-    encoder_offset_m: float = 0.76
-    sigma_v_mps: float = 0.1
-    sigma_steering_rad: float = 0.02
-    sigma_along_m_per_sqrt_s: float = 0.0
-    sigma_across_m_per_sqrt_s: float = 0.0
-    sigma_theta_rad_per_sqrt_s: float = 0.0
-    sigma_v_bias_mps: float = 0.0
-    sigma_steering_bias_rad: float = 0.0
+    wheelbase_m: Annotated[Positive, "Distance between the axles."] = 2.83
+    encoder_offset_m: Annotated[Number, "Wheel encoder, left of the middle of the rear axle."] = 0.76
+    sigma_v_mps: Annotated[NotNegative, "Error of the wheel speed held over its interval."] = 0.1
+    sigma_steering_rad: Annotated[NotNegative, "Error of the steering angle held over its interval."] = 0.02
+    sigma_along_m_per_sqrt_s: Along = 0.0
+    sigma_across_m_per_sqrt_s: Across = 0.0
+    sigma_theta_rad_per_sqrt_s: Turning = 0.0
+    sigma_v_bias_mps: Annotated[
+        NotNegative, "Constant part of the wheel speed's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_steering_bias_rad: Annotated[
+        NotNegative, "Constant part of the steering angle's error; above 0 it is in the map and is estimated."
+    ] = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
     held: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_parameters(self, positive=("wheelbase_m",))
 
     @cached_property
     def _N(self) -> Array:

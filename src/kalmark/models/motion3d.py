@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.declare import NotNegative, register
 from kalmark.geometry import frames3d
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
 from kalmark.geometry.spaces import ROTATION, SCALAR, SE3, VECTOR3, Space
-from kalmark.models.parameters import check_parameters
+
+__all__ = ["ConstantVelocity3D", "Odometry3D", "Velocity3D"]
 
 Array = npt.NDArray[np.float64]
 
@@ -51,24 +52,21 @@ def coast(r: Array, u: Array, dt: float) -> tuple[Array, Array, Array]:
     return moved, R_r, R_u
 
 
-@dataclass(frozen=True)
+@register("motion", "odometry_3d")
 class Odometry3D:
-    """Odometry in space: u = (dx, dy, dz, rx, ry, rz), translation and rotation vector in the robot's frame, m and rad.
+    """Increments dx, dy, dz and a rotation vector rx, ry, rz, in the robot's frame.
 
-    The sigmas are those of one increment.
+    A control is u (6,), m and rad.  The sigmas are those of one increment.
     """
 
-    sigma_x_m: float = 0.01
-    sigma_y_m: float = 0.01
-    sigma_z_m: float = 0.01
-    sigma_rotation_rad: float = 0.005
+    sigma_x_m: Annotated[NotNegative, "Error of one increment, forward."] = 0.01
+    sigma_y_m: Annotated[NotNegative, "Error of one increment, to the left."] = 0.01
+    sigma_z_m: Annotated[NotNegative, "Error of one increment, upwards."] = 0.01
+    sigma_rotation_rad: Annotated[NotNegative, "Error of one increment, rotation about each axis."] = 0.005
 
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
     held: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
     @cached_property
     def _N(self) -> Array:
@@ -83,28 +81,33 @@ class Odometry3D:
         return self._N
 
     def diffusion(self, u: Array, dt_s: float) -> None:
-        """Return None: an increment's noise is all in its control."""
+        """Return None: all noise of an increment is in its control u (6,)."""
 
 
-@dataclass(frozen=True)
+@register("motion", "velocity_3d")
 class Velocity3D:
-    """Velocity: u = (vx, vy, vz, wx, wy, wz) in the robot's frame, m/s and rad/s, held from its time on."""
+    """Velocity and turn rate in the robot's frame, each held until the next control.
 
-    sigma_vx_mps: float = 0.1
-    sigma_vy_mps: float = 0.1
-    sigma_vz_mps: float = 0.1
-    sigma_wx_radps: float = 0.05
-    sigma_wy_radps: float = 0.05
-    sigma_wz_radps: float = 0.05
-    sigma_v_bias_mps: float = 0.0
-    sigma_w_bias_radps: float = 0.0
+    A control is u = (vx, vy, vz, wx, wy, wz), m/s and rad/s.
+    """
+
+    sigma_vx_mps: Annotated[NotNegative, "Error of the velocity held over its interval, forward."] = 0.1
+    sigma_vy_mps: Annotated[NotNegative, "Error of the velocity held over its interval, to the left."] = 0.1
+    sigma_vz_mps: Annotated[NotNegative, "Error of the velocity held over its interval, upwards."] = 0.1
+    sigma_wx_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about x."] = 0.05
+    sigma_wy_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about y."] = 0.05
+    sigma_wz_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about z."] = 0.05
+    sigma_v_bias_mps: Annotated[
+        NotNegative, "Constant part of the speed's error on each axis; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_w_bias_radps: Annotated[
+        NotNegative,
+        "Constant part of the turn rate's error about each axis; above 0 it is in the map and is estimated.",
+    ] = 0.0
 
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
     held: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
     @cached_property
     def _N(self) -> Array:
@@ -126,29 +129,27 @@ class Velocity3D:
         return np.diag(sigmas**2) if sigmas.any() else None
 
     def diffusion(self, u: Array, dt_s: float) -> None:
-        """Return None: the noise is all in the control."""
+        """Return None: all noise is in the control u (6,)."""
 
 
-@dataclass(frozen=True)
+@register("motion", "constant_velocity_3d")
 class ConstantVelocity3D:
-    """Constant velocity: the state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.
+    """Velocity and turn rate are in the state: it goes on as it goes, controls are changes of both, and needs none.
 
-    It needs no control: it coasts to the time of each event.  A control is an impulse u = (dv (world), dw (body)) at
-    its time, with sigmas `sigma_v_mps`, `sigma_w_radps`; `..._per_sqrt_s` are random walks of velocity and rate.
+    The state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.  The robot coasts to the
+    time of each event.  A control is an impulse u = (dv (world), dw (body)) at its time, with sigmas `sigma_v_mps`,
+    `sigma_w_radps`; `..._per_sqrt_s` are random walks of velocity and rate.
     """
 
-    sigma_v_mps: float = 0.01
-    sigma_w_radps: float = 0.002
-    sigma_v_mps_per_sqrt_s: float = 0.0
-    sigma_w_radps_per_sqrt_s: float = 0.0
+    sigma_v_mps: Annotated[NotNegative, "Error of the change of velocity that a control is."] = 0.01
+    sigma_w_radps: Annotated[NotNegative, "Error of the change of turn rate that a control is."] = 0.002
+    sigma_v_mps_per_sqrt_s: Annotated[NotNegative, "Random walk of the velocity, all the time."] = 0.0
+    sigma_w_radps_per_sqrt_s: Annotated[NotNegative, "Random walk of the turn rate, all the time."] = 0.0
 
     space: ClassVar[Space] = Space("SE3 with velocity", (VECTOR3, ROTATION, VECTOR3, SCALAR, SCALAR, SCALAR))
     columns: ClassVar[tuple[str, ...]] = ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps")
     held: ClassVar[bool] = False
     coasts: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
     @cached_property
     def _N(self) -> Array:

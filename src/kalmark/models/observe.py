@@ -21,7 +21,7 @@ from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.models import landmarks, seen, sensors
 from kalmark.models.landmarks3d import chained
-from kalmark.models.protocols import FullSensor, Landmark, Sensor
+from kalmark.models.protocols import Completing, FullSensor, Landmark, Parametrized, Sensor, finds_depth
 from kalmark.models.seen import EXPECT, LOOK, residual
 
 Array = npt.NDArray[np.float64]
@@ -55,17 +55,17 @@ def inverse_expectation(r: Array, mount: Array, sensor: FullSensor, landmark: La
 
     The prior (K, n, n) is the covariance of what y does not tell.
     """
-    return landmark_at(r, mount, landmark, *sensor.invert(y), getattr(sensor, "finds_depth", True))
+    return landmark_at(r, mount, landmark, *sensor.invert(y), finds_depth(sensor))
 
 
 def landmark_at(
-    r: Array, mount: Array, landmark: Landmark, v: Array, V_y: Array, finds_depth: bool = True
+    r: Array, mount: Array, landmark: Landmark, v: Array, V_y: Array, depth: bool = True
 ) -> tuple[Array, ...]:
     """Return the landmarks l (K, n) at v (K, d) in the sensor's frame; see `inverse_expectation`."""
     T, T_r, T_s = composed(r, mount)
     N = None
-    if hasattr(landmark, "complete"):
-        v, V_y, N = landmark.complete(v, V_y, finds_depth)
+    if isinstance(landmark, Completing):
+        v, V_y, N = landmark.complete(v, V_y, depth)
     l, L_T, L_v = landmark.from_view(T, v)
     prior = np.zeros((len(l), L_v.shape[1], L_v.shape[1])) if N is None else L_v @ N @ L_v.swapaxes(1, 2)
     return l, L_T @ T_r, L_T @ T_s, L_v @ V_y, prior
@@ -103,7 +103,7 @@ def fix_view(antenna: Array) -> View:
 def built_in_view(
     look: Any, expect: Any, code: int, mount: Array, par: Array, angular: npt.NDArray[np.bool_]
 ) -> View:  # fmt: skip
-    """Return the view through a landmark's `look` and a sensor's `expected`, which are compiled now if need be."""
+    """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,)."""
     linearize_at = address_of(linearize_built_in, LINEARIZE)
     return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular
 
@@ -114,10 +114,10 @@ def is_built_in(sensor: Any, landmark: Any) -> bool:
 
 
 def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
-    """Return what `linearize` takes: a `View` for the compiled models, a `PythonView` for others."""
+    """Return the argument of `linearize`, a `View` of compiled models or a `PythonView`; `mount` (3,) or (7,)."""
     angular = np.array(sensor.angular, dtype=np.bool_)
     if is_built_in(sensor, landmark):
-        par = np.array(getattr(sensor, "parameters", NOTHING), dtype=np.float64)
+        par = np.array(sensor.parameters if isinstance(sensor, Parametrized) else NOTHING, dtype=np.float64)
         return built_in_view(landmark.look, type(sensor).expected, int(sensor.code), mount, par, angular)
     return PythonView(sensor, landmark, mount, angular)
 
@@ -149,7 +149,7 @@ def _compiled_sensor_at(view: Any, head: Any) -> Any:
 
 @compiled
 def position_of_mount(mount: Array, head: Array) -> tuple[Array, Array]:
-    """Return the position of a mount on a robot, S, and S_h, h being the pose and, if it is in the map, the mount."""
+    """Return the position S (d,) of a mount on a robot, and S_h (d, h); h is the pose and, if in the map, the mount."""
     pose = len(mount)
     at = head[pose : 2 * pose] if len(head) > pose else mount
     size = 2 if pose == 3 else 3
@@ -164,7 +164,10 @@ def position_of_mount(mount: Array, head: Array) -> tuple[Array, Array]:
 
 @compiled
 def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """`expectation`, compiled."""
+    """Return what `expectation` returns, compiled.
+
+    The landmarks l are (K, n), the measurements y (K, m); e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n).
+    """
     _, look_at, expect_at, code, at, par, angular = view
     pose = len(at)
     mount = head[pose : 2 * pose] if len(head) > pose else at
@@ -189,7 +192,7 @@ def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Arr
 
 @compiled
 def turned(E_T: Array, T_r: Array) -> Array:
-    """Return E_T @ T_r in place: T_r is the identity but for how a turn of the robot moves the sensor."""
+    """Return E_T @ T_r (K, m, n) in place: T_r is the identity except for the rotation of the robot."""
     k, m, n = E_T.shape
     first = 2 if n == 3 else 3
     for i in range(k):

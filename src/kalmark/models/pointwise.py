@@ -16,7 +16,7 @@ Array = npt.NDArray[np.float64]
 
 
 def jacobian(function: Callable[[Array], Array], x: Array, angular: tuple[bool, ...] = ()) -> Array:
-    """Return d f / d x by central differences with a step fit for each coordinate; angles' differences wrapped."""
+    """Return d f / d x (m, n) at x (n,) by central differences, one step a coordinate; angles wrap."""
     x = np.asarray(x, dtype=np.float64)
     columns = []
     for i in range(len(x)):

@@ -1,18 +1,26 @@
-"""What a motion, a sensor and a landmark must offer.  N + M, not N x M: a sensor knows a point in its own frame only.
+"""What a motion, a sensor and a landmark must offer, and what they may offer besides.
 
-Models are batched: K landmarks at once, values (K, d), Jacobians (K, m, d).  `pointwise` lifts one-point functions.
+N + M, not N x M: a sensor knows a point in its own frame only.  Models are batched: K landmarks at once, values (K, d),
+Jacobians (K, m, d).  `pointwise` lifts one-point functions.
+
+A capability is optional.  One with a default is read by the function of its name, as in `finds_depth(sensor)`; one that
+decides what is done with a model is a Protocol, as in `isinstance(sensor, Visible)`.
 """
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+import difflib
+import math
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.geometry.spaces import Space
+from kalmark.errors import ModelError
+from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 
 @runtime_checkable
@@ -32,7 +40,7 @@ class Motion(Protocol):
         """True for a rate held until the next control, False for an increment that ended at its time."""
 
     def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved state, R_r and R_u."""
+        """Return the moved state (size,), R_r (dof, dof) and R_u (dof, m)."""
 
     def control_noise(self, u: Array) -> Array:
         """Return the covariance N (k, k) of the control's error, which is held as long as the control is."""
@@ -101,3 +109,324 @@ class Landmark(Protocol):
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return landmarks l (K, n) that look like v (K, d) from the pose T, L_T (K, n, 3) and L_v (K, n, d)."""
+
+
+# ------------------------------------------------------------------ capabilities with a default
+@runtime_checkable
+class _FindsDepth(Protocol):
+    finds_depth: bool
+
+
+@runtime_checkable
+class _SeesKinds(Protocol):
+    sees_kinds: tuple[str, ...]
+
+
+@runtime_checkable
+class _OfWorld(Protocol):
+    world: str
+
+
+@runtime_checkable
+class _Image(Protocol):
+    image: tuple[float, float]
+
+
+@runtime_checkable
+class _RangeLimit(Protocol):
+    range_max_m: float
+
+
+@runtime_checkable
+class _FieldOfView(Protocol):
+    fov_rad: float
+
+
+@runtime_checkable
+class _Coasts(Protocol):
+    coasts: bool
+
+
+@runtime_checkable
+class _Biased(Protocol):
+    bias_cov: Array | None
+
+
+@runtime_checkable
+class _UncertainParameters(Protocol):
+    parameter_cov: Array | None
+
+
+@runtime_checkable
+class _InnovationSize(Protocol):
+    cov_size: int
+
+
+def finds_depth(sensor: object) -> bool:
+    """Return whether one measurement determines how far the landmark is; by default it does."""
+    return sensor.finds_depth if isinstance(sensor, _FindsDepth) else True
+
+
+def sees_kinds(sensor: object) -> tuple[str, ...] | None:
+    """Return the kinds of landmarks that a sensor measures; by default None: any that fits."""
+    return sensor.sees_kinds if isinstance(sensor, _SeesKinds) else None
+
+
+def world_of(model: object) -> str:
+    """Return "plane" or "space"; by default "": a model of either."""
+    return model.world if isinstance(model, _OfWorld) else ""
+
+
+def image_size(sensor: object) -> tuple[float, float] | None:
+    """Return the width and height of a sensor's image, px; by default None: it has none."""
+    return sensor.image if isinstance(sensor, _Image) else None
+
+
+def range_limit(sensor: object) -> float:
+    """Return the distance of the farthest landmark that a sensor measures, m; by default infinity."""
+    return sensor.range_max_m if isinstance(sensor, _RangeLimit) else math.inf
+
+
+def field_of_view(sensor: object) -> float:
+    """Return a sensor's field of view about its x axis, rad; by default 2 pi."""
+    return sensor.fov_rad if isinstance(sensor, _FieldOfView) else 2 * math.pi
+
+
+def coasts(motion: object) -> bool:
+    """Return whether a robot moves without a control, as its state has a velocity; by default it does not."""
+    return motion.coasts if isinstance(motion, _Coasts) else False
+
+
+def bias_covariance(motion: object) -> Array | None:
+    """Return the covariance (k, k) of the constant error of a control; by default None: there is none."""
+    return motion.bias_cov if isinstance(motion, _Biased) else None
+
+
+def parameter_covariance(sensor: object) -> Array | None:
+    """Return the covariance (p, p) of a sensor's own parameters; by default None: they are known."""
+    return sensor.parameter_cov if isinstance(sensor, _UncertainParameters) else None
+
+
+def innovation_size(sensor: Sensor) -> int:
+    """Return how many numbers an innovation has; by default as many as the measurement."""
+    return sensor.cov_size if isinstance(sensor, _InnovationSize) else len(sensor.columns)
+
+
+# ------------------------------------------------------------------ capabilities of sensors
+@runtime_checkable
+class Visible(Protocol):
+    """A sensor with limits of sight."""
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, d), in the sensor's frame, can be measured."""
+
+
+@runtime_checkable
+class PinHoleView(Protocol):
+    """A camera with the intrinsics of a pin hole, px."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+
+
+@runtime_checkable
+class SegmentVisible(Protocol):
+    """A sensor that sees parts of line segments."""
+
+    def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
+        """Return which segments from p1 to p2 (K, 3) of the world are seen from T, and what is measured of them."""
+
+
+@runtime_checkable
+class Parametrized(Protocol):
+    """A sensor with parameters of its own, which its compiled expectation takes."""
+
+    @property
+    def parameters(self) -> Array:
+        """The parameters (p,)."""
+
+
+@runtime_checkable
+class Calibrated(Parametrized, Protocol):
+    """A sensor whose own parameters may be in the map, and estimated."""
+
+    @property
+    def parameter_cov(self) -> Array | None:
+        """Their covariance (p, p), None if they are known."""
+
+    def with_parameters(self, parameters: Array) -> Any:
+        """Return the sensor with other parameters (p,)."""
+
+    def parameters_jacobian(self, v: Array) -> Array:
+        """Return E_p (K, m, p): how the measurements of v (K, d) change with the parameters."""
+
+
+@runtime_checkable
+class Ranging(Protocol):
+    """A sensor whose first component is a range."""
+
+    def distances(self, y: Array) -> Array:
+        """Return the distances (K,) in m that measurements y (K, m) stand for."""
+
+    def range_variance(self, y: Array) -> Array:
+        """Return the variances (K,) of the ranges of measurements y (K, m), m^2."""
+
+
+@runtime_checkable
+class Intersecting(Protocol):
+    """A sensor of which two measurements, from two poses, determine a point."""
+
+    def meet(self, T: Array, y: Array, y2: Array) -> Array:
+        """Return the points (K, c, d) that explain y (K, m) from the origin and y2 (K, m) from T, NaN where none."""
+
+
+@runtime_checkable
+class Ambiguous(Protocol):
+    """A sensor of which one measurement fits two poses: planar pose ambiguity, Schweighofer and Pinz 2006."""
+
+    def both(self, y: Array) -> tuple[Array, Array, Array]:
+        """Return both poses (K, 2, 7) that explain y (K, m), the better first, V_y (K, 2, 6, p), chi-squares (K, 2)."""
+
+
+@runtime_checkable
+class FarCorrected(Protocol):
+    """A sensor whose measurements far from the expected ones are first corrected as poses."""
+
+    def is_far(self, y: Array, z: Array) -> Flags:
+        """Return which measurements y (K, m) are far from the expected ones by their innovations z (K, p)."""
+
+    def poses(self, y: Array, R: Array) -> tuple[Array, Array]:
+        """Return y (K, m) with noise R (K, p, p) as poses (K, 7) with covariances (K, 6, 6), or NaN."""
+
+
+@runtime_checkable
+class OwnNoise(Protocol):
+    """A sensor whose innovations are something else than its measurements, so that a scan's covariance is converted."""
+
+    def noise_from(self, y: Array, cov: Array) -> Array:
+        """Return the noise (K, p, p) of the innovations, of the covariances (K, m, m) of measurements y (K, m)."""
+
+
+@runtime_checkable
+class StartNoise(Protocol):
+    """A sensor whose noise when a landmark starts is another one than in a correction."""
+
+    def start_noise(self, y: Array) -> Array:
+        """Return the noise (K, m, m) of the measurements y (K, m) themselves."""
+
+
+@runtime_checkable
+class Checked(Protocol):
+    """A sensor that cannot have made every measurement of the right shape."""
+
+    def check(self, y: Array) -> None:
+        """Raise EventError if this sensor cannot have made the measurements y (K, m)."""
+
+
+# ------------------------------------------------------------------ capabilities of landmarks
+@runtime_checkable
+class UnknownDepth(Protocol):
+    """A landmark that starts at a prior inverse distance where the sensor finds no depth."""
+
+    prior_rho_per_m: float
+
+
+@runtime_checkable
+class Completing(Protocol):
+    """A landmark that supplies what a measurement does not determine of it."""
+
+    def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, Array | None]:
+        """Return what `from_view` takes (K, e) for a sensor's v (K, d), its Jacobian in y, and the prior (K, e, e)."""
+
+
+@runtime_checkable
+class Pointed(Protocol):
+    """A landmark that is one point."""
+
+    def to_point(self, l: Array) -> tuple[Array, Array]:
+        """Return the points p (K, 2 or 3) of landmarks l (K, n), m, and P_l (K, 2 or 3, n)."""
+
+
+@runtime_checkable
+class Reparametrizable(Pointed, Protocol):
+    """A landmark that becomes a Euclidean point once that is as good.  Civera, Davison and Montiel 2008."""
+
+    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
+        """Return the linearity indices (K,) of landmarks l (K, n) with `sigmas` (K, n), seen from the pose T."""
+
+
+@runtime_checkable
+class Segmented(Protocol):
+    """A line, of which a segment from abscissa to abscissa is kept."""
+
+    first_ends: tuple[float, float]
+    extend: bool
+
+    def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2, 3) of lines l (K, n) at abscissas t (K, 2), and P_l (K, 2, 3, n)."""
+
+    def abscissas(self, T: Array, l: Array, rays: Array) -> Array:
+        """Return the abscissas (K, 2) where two viewing rays (K, 6) from T pass lines l (K, n) nearest."""
+
+
+@runtime_checkable
+class Placed(Protocol):
+    """A landmark that is somewhere."""
+
+    def place(self, l: Array) -> tuple[Array, Array]:
+        """Return where landmarks l (K, n) are in the world, p (K, 2 or 3) in m, and P_l (K, 2 or 3, n)."""
+
+
+def place_of(landmark: Landmark, l: Array) -> tuple[Array, Array] | None:
+    """Return where landmarks l (K, n) are in the world, p (K, 2 or 3) in m, and P_l (K, 2 or 3, n).
+
+    By default that is the vector with which the landmark's space begins.  None if it begins with something else, or
+    has an inverse distance: then the vector is an anchor.
+    """
+    if isinstance(landmark, Placed):
+        return landmark.place(l)
+    kinds = landmark.space.kinds
+    size = None if RHO in kinds else {VECTOR: 2, VECTOR3: 3}.get(kinds[0])
+    if size is None:
+        return None
+    return np.array(l[:, :size]), np.tile(np.eye(size, landmark.space.dof), (len(l), 1, 1))
+
+
+# ------------------------------------------------------------------ spelling
+_OF: dict[type, tuple[type, ...]] = {
+    Motion: (Motion, _OfWorld, _Coasts, _Biased),
+    Sensor: (
+        FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
+        _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,
+        StartNoise, Checked,
+    ),
+    Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Placed),
+}  # fmt: skip
+_NEAR = 0.85  # of difflib: "see" is near "sees", "extent" is not near "extend"
+
+
+def refuse_misspelt(model: object, what: str) -> None:
+    """Refuse a user's model with a public name near that of a capability which the model does not have.
+
+    Raises ModelError with both names.  kalmark's own models are not looked at.
+    """
+    own = [cls for cls in type(model).__mro__ if not cls.__module__.startswith(("kalmark.", "builtins"))]
+    if not own:
+        return
+    given = set(dir(model))
+    parts = [part for role, all_of_it in _OF.items() if isinstance(model, role) for part in all_of_it]
+    known = {name for part in parts for name in _members(part)}
+    inherited = {name for cls in type(model).__mro__ if cls not in own for name in dir(cls)}
+    for name in sorted(given - known - inherited):
+        near = [] if name.startswith("_") else difflib.get_close_matches(name, known - given, n=1, cutoff=_NEAR)
+        if near:
+            raise ModelError(f"{what}: {type(model).__name__} has {name!r}, expected {near[0]!r}, or another name")
+
+
+def _members(protocol: type) -> set[str]:
+    """Return the public names that a Protocol and its bases declare."""
+    parts = [cls for cls in protocol.__mro__ if cls.__module__ == __name__]
+    names = {name for cls in parts for name in (*vars(cls), *vars(cls).get("__annotations__", ()))}
+    return {name for name in names if not name.startswith("_")}

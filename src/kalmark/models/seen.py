@@ -77,7 +77,7 @@ def oneself(T: Array, l: Array) -> tuple[Array, Array, Array]:
 # ------------------------------------------------------------------ sensors
 @compiled
 def position(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z, E_v of what is measured as it is seen."""
+    """Return e, z (K, d), E_v (K, d, d) of a measurement of v (K, d) itself."""
     k, d = v.shape
     E_v = np.zeros((k, d, d))
     for j in range(d):
@@ -87,14 +87,14 @@ def position(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple
 
 @compiled
 def range_bearing(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z, E_v of ranges, azimuths and elevations."""
+    """Return e, z (K, 3), E_v (K, 3, 3) of ranges, azimuths and elevations of v (K, 3)."""
     e, E_v = spherical_many(v)
     return e, residual(y, e, angular), E_v
 
 
 @compiled
 def camera(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z, E_v of the pixels of a camera, `code` its lens."""
+    """Return e, z (K, 2), E_v (K, 2, d) of the pixels of a camera, `code` its lens."""
     e, E_ray = lenses.project(code, v[:, :3].copy(), par)
     E_v = np.zeros((len(v), 2, v.shape[1]))  # the pixel of a ray does not depend on its inverse distance
     E_v[:, :, :3] = E_ray
@@ -103,27 +103,27 @@ def camera(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[A
 
 @compiled
 def stereo(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z, E_v of the pixels of a stereo pair."""
+    """Return e, z (K, 4), E_v (K, 4, 3) of the pixels of a stereo pair."""
     e, E_v = cameras.project_stereo(v, par[:4], par[4])
     return e, y - e, E_v
 
 
 @compiled
 def segment(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z, E_v of segments of lines: z are the distances of the measured ends."""
+    """Return e (K, 4), z (K, 2), E_v (K, 2, d) of segments of lines: z are the distances of the measured ends."""
     return lines.segment_innovation(v, y, par)
 
 
 @compiled
 def tag_pose(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z, E_v of poses of tags."""
+    """Return e (K, 7), z (K, 6), E_v (K, 6, 6) of poses of tags."""
     z, E_v = tags.pose_residual(y, v)
     return v.copy(), z, E_v
 
 
 @compiled
 def tag_corners(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z, E_v of the corners of tags, `code` the lens; y tells the sizes."""
+    """Return e (K, 9), z (K, 8), E_v (K, 8, 6) of the corners of tags, `code` the lens; y (K, 9) has the sizes."""
     pixels, E_v = tags.project_corners(code, v, y[:, 8].copy(), par)
     e = y.copy()
     e[:, :8] = pixels

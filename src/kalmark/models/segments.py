@@ -56,7 +56,7 @@ def pluecker_endpoints(l: Array, t: Array) -> tuple[Array, Array]:
 
 @compiled
 def points_between(a: tuple[Array, Array], b: tuple[Array, Array], t: Array, shared: int) -> tuple[Array, Array]:
-    """Return the points (1 - t) a + t b of lines through the points a and b; an unused one may be at infinity."""
+    """Return the points (1 - t) a + t b, t (K, 2), of lines through a, b (K, 3); an unused one may be at infinity."""
     nothing = np.zeros_like(a[1])
     A_l, B_l = joined(a[1], nothing, shared), joined(nothing, b[1], shared)
     p, P_l = np.zeros((len(t), 2, 3)), np.zeros((len(t), 2, 3, A_l.shape[2]))
@@ -113,7 +113,7 @@ def abscissas(T: Array, p: Array, rays: Array) -> Array:
 
 @compiled
 def unit_abscissas(k: int) -> Array:
-    """Return the abscissas 0 and 1 of k lines."""
+    """Return the abscissas (k, 2), 0 and 1, of k lines."""
     t = np.zeros((k, 2))
     t[:, 1] = 1.0
     return t
@@ -189,7 +189,7 @@ def extended(
 
 @compiled
 def clipped(a: Array, b: Array) -> tuple[float, float]:
-    """Return the first and last s in [0, 1] at which no component of a + s (b - a) is negative; none: first > last."""
+    """Return the first and last s in [0, 1] with all a + s (b - a) >= 0, a, b (n,); none: first > last."""
     first, last = 0.0, 1.0
     for j in range(len(a)):
         if a[j] < 0 and b[j] < 0:

@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from kalmark.compiled import compiled
+from kalmark.declare import Limit, NotNegative, Number, Positive, refuse, register
 from kalmark.errors import EventError
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
-from kalmark.models.parameters import check_parameters
 from kalmark.models.seen import residual
+
+__all__ = ["Bearing", "Position2D", "Range", "RangeBearing", "RangeBearingSignature"]
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+
+# parameters that several sensors have
+RangeNoise = Annotated[NotNegative, "Constant part a of the range noise sqrt(a^2 + (b r)^2)."]
+RangeNoiseRel = Annotated[NotNegative, "Part b of the range noise, growing with range."]
+BearingNoise = Annotated[Positive, "Noise of the bearing."]
+Nearest = Annotated[NotNegative, "Nearest landmark the sensor sees."]
+Farthest = Annotated[Limit, "Farthest landmark the sensor sees."]
+Sector = Annotated[Positive, "Field of view, centred forward."]
+Scale = Annotated[Positive, "Measured range per metre of distance."]
+Bias = Annotated[Number, "Added to every range."]
+ScaleSigma = Annotated[NotNegative, "Standard deviation of the scale; above 0 it is in the map and is estimated."]
+BiasSigma = Annotated[NotNegative, "Standard deviation of the bias; above 0 it is in the map and is estimated."]
 
 RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE = range(1, 6)
 
@@ -70,7 +84,7 @@ def constant(variances: tuple[float, ...], count: int) -> Array:
 
 
 def refuse_negative_ranges(y: Array) -> None:
-    """Refuse a measurement whose first component, a range, is negative."""
+    """Refuse measurements y (K, m) whose first component, a range, is negative."""
     ranges = y[:, 0].tolist()
     if min(ranges, default=0.0) < 0:
         i, value = next((i, value) for i, value in enumerate(ranges) if value < 0)
@@ -86,9 +100,6 @@ class Planar:
     range_min_m: float
     range_max_m: float
     fov_rad: float
-
-    def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma")
 
     def expect(self, v: Array) -> tuple[Array, Array]:
         """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
@@ -133,7 +144,8 @@ class _Ranging(Planar):
     sigma_bias_m: float
 
     def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma", positive=("scale",))
+        if not (self.sigma_range_m or self.sigma_range_rel):
+            raise refuse(self, "sigma_range_m", "a positive number")
 
     @property
     def parameters(self) -> Array:
@@ -193,20 +205,23 @@ class _Ranging(Planar):
         refuse_negative_ranges(y)
 
 
-@dataclass(frozen=True)
+@register("sensor", "range_bearing")
 class RangeBearing(_Ranging):
-    """Range (m) and bearing (rad), a laser.  sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61)."""
+    """Distance and direction of a landmark: a laser.
 
-    sigma_range_m: float = 0.1
-    sigma_bearing_rad: float = 0.02
-    sigma_range_rel: float = 0.0
-    range_min_m: float = 0.0
-    range_max_m: float = math.inf
-    fov_rad: float = 2 * math.pi
-    scale: float = 1.0
-    bias_m: float = 0.0
-    sigma_scale: float = 0.0
-    sigma_bias_m: float = 0.0
+    sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61).
+    """
+
+    sigma_range_m: RangeNoise = 0.1
+    sigma_bearing_rad: BearingNoise = 0.02
+    sigma_range_rel: RangeNoiseRel = 0.0
+    range_min_m: Nearest = 0.0
+    range_max_m: Farthest = math.inf
+    fov_rad: Sector = 2 * math.pi
+    scale: Scale = 1.0
+    bias_m: Bias = 0.0
+    sigma_scale: ScaleSigma = 0.0
+    sigma_bias_m: BiasSigma = 0.0
 
     code: ClassVar[int] = RANGE_BEARING
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")
@@ -226,14 +241,14 @@ class RangeBearing(_Ranging):
         return self.points(y)
 
 
-@dataclass(frozen=True)
+@register("sensor", "bearing")
 class Bearing(Planar):
-    """Bearing (rad) alone: a camera, a radio direction finder."""
+    """Direction of a landmark: a camera, a radio direction finder."""
 
-    sigma_bearing_rad: float = 0.02
-    range_min_m: float = 0.0
-    range_max_m: float = math.inf
-    fov_rad: float = 2 * math.pi
+    sigma_bearing_rad: BearingNoise = 0.02
+    range_min_m: Nearest = 0.0
+    range_max_m: Farthest = math.inf
+    fov_rad: Sector = 2 * math.pi
 
     code: ClassVar[int] = BEARING
     columns: ClassVar[tuple[str, ...]] = ("bearing_rad",)
@@ -257,19 +272,19 @@ class Bearing(Planar):
         return intersection(at_origin, at_T)[0][:, None]
 
 
-@dataclass(frozen=True)
+@register("sensor", "range")
 class Range(_Ranging):
-    """Range (m) alone: a radio beacon, a sonar with a wide lobe; sigmas as in `RangeBearing`."""
+    """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
 
-    sigma_range_m: float = 0.1
-    sigma_range_rel: float = 0.0
-    range_min_m: float = 0.0
-    range_max_m: float = math.inf
-    fov_rad: float = 2 * math.pi
-    scale: float = 1.0
-    bias_m: float = 0.0
-    sigma_scale: float = 0.0
-    sigma_bias_m: float = 0.0
+    sigma_range_m: RangeNoise = 0.1
+    sigma_range_rel: RangeNoiseRel = 0.0
+    range_min_m: Nearest = 0.0
+    range_max_m: Farthest = math.inf
+    fov_rad: Sector = 2 * math.pi
+    scale: Scale = 1.0
+    bias_m: Bias = 0.0
+    sigma_scale: ScaleSigma = 0.0
+    sigma_bias_m: BiasSigma = 0.0
 
     code: ClassVar[int] = RANGE
     columns: ClassVar[tuple[str, ...]] = ("range_m",)
@@ -280,15 +295,18 @@ class Range(_Ranging):
         return self.range_variance(y)[:, None, None]
 
 
-@dataclass(frozen=True)
+@register("sensor", "position")
 class Position2D(Planar):
-    """Position (x, y) in the sensor's frame, in metres: [F]'s second measurement model."""
+    """Position of a landmark (x, y) in the sensor's frame.
 
-    sigma_x_m: float = 0.1
-    sigma_y_m: float = 0.1
-    range_min_m: float = 0.0
-    range_max_m: float = math.inf
-    fov_rad: float = 2 * math.pi
+    [F]'s second measurement model.
+    """
+
+    sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1
+    sigma_y_m: Annotated[Positive, "Noise, to the left."] = 0.1
+    range_min_m: Nearest = 0.0
+    range_max_m: Farthest = math.inf
+    fov_rad: Sector = 2 * math.pi
 
     code: ClassVar[int] = POSITION
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
@@ -299,25 +317,28 @@ class Position2D(Planar):
         return constant((self.sigma_x_m**2, self.sigma_y_m**2), len(y))
 
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return the points themselves and the identity."""
+        """Return the points (K, 2) and the identities (K, 2, 2)."""
         return y.copy(), np.tile(np.eye(2), (len(y), 1, 1))
 
 
-@dataclass(frozen=True)
+@register("sensor", "range_bearing_signature")
 class RangeBearingSignature(_Ranging):
-    """Range (m), bearing (rad) and a signature that tells landmarks apart.  [T] 3: a landmark is (x, y, s)."""
+    """Distance, direction and signature of a landmark, a number that differs from landmark to landmark.
 
-    sigma_range_m: float = 0.1
-    sigma_bearing_rad: float = 0.02
-    sigma_signature: float = 0.1
-    sigma_range_rel: float = 0.0
-    range_min_m: float = 0.0
-    range_max_m: float = math.inf
-    fov_rad: float = 2 * math.pi
-    scale: float = 1.0
-    bias_m: float = 0.0
-    sigma_scale: float = 0.0
-    sigma_bias_m: float = 0.0
+    [T] 3: a landmark is (x, y, s).
+    """
+
+    sigma_range_m: RangeNoise = 0.1
+    sigma_bearing_rad: BearingNoise = 0.02
+    sigma_signature: Annotated[Positive, "Noise of the signature."] = 0.1
+    sigma_range_rel: RangeNoiseRel = 0.0
+    range_min_m: Nearest = 0.0
+    range_max_m: Farthest = math.inf
+    fov_rad: Sector = 2 * math.pi
+    scale: Scale = 1.0
+    bias_m: Bias = 0.0
+    sigma_scale: ScaleSigma = 0.0
+    sigma_bias_m: BiasSigma = 0.0
 
     code: ClassVar[int] = RANGE_BEARING_SIGNATURE
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "signature")
@@ -337,6 +358,3 @@ class RangeBearingSignature(_Ranging):
         V_y = np.zeros((len(y), 3, 3))
         V_y[:, :2, :2], V_y[:, 2, 2] = P_y, 1.0
         return np.column_stack([p, y[:, 2]]), V_y
-
-
-BUILT_IN = (RangeBearing, Bearing, Range, Position2D, RangeBearingSignature)

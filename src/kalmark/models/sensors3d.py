@@ -6,20 +6,22 @@ They look along x: x is forward, y left, z up.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.declare import Positive, register
 from kalmark.errors import EventError
 from kalmark.geometry.directions import inv_spherical_many
 from kalmark.models import seen
-from kalmark.models.parameters import check_parameters
-from kalmark.models.sensors2d import constant, refuse_negative_ranges
+from kalmark.models.sensors2d import Farthest, Nearest, constant, refuse_negative_ranges
+
+__all__ = ["Position3D", "RangeBearing3D", "TagPose"]
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+Cone = Annotated[Positive, "Field of view, a cone about the sensor's x axis."]
 
 
 class Spatial:
@@ -44,7 +46,7 @@ class Spatial:
 
     @property
     def parameters(self) -> Array:
-        """The numbers the compiled expectation needs."""
+        """The numbers (n,) of the compiled expectation."""
         return np.zeros(0)
 
     def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
@@ -66,9 +68,6 @@ class _Cone(Spatial):
     range_max_m: float
     fov_rad: float
 
-    def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma")
-
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, 3) lie within the range limits and the cone of sight about x."""
         distance = np.linalg.norm(v, axis=1)
@@ -76,16 +75,16 @@ class _Cone(Spatial):
         return (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
 
 
-@dataclass(frozen=True)
+@register("sensor", "range_bearing_3d")
 class RangeBearing3D(_Cone):
-    """Range (m), azimuth and elevation (rad) of a point in the sensor's frame: a 3-D laser, a radar."""
+    """Distance, azimuth and elevation of a landmark; x is forward, z up: a 3-D laser, a radar."""
 
-    sigma_range_m: float = 0.1
-    sigma_azimuth_rad: float = 0.02
-    sigma_elevation_rad: float = 0.02
-    range_min_m: float = 0.0
-    range_max_m: float = math.inf
-    fov_rad: float = 2 * math.pi
+    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.1
+    sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
+    sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
+    range_min_m: Nearest = 0.0
+    range_max_m: Farthest = math.inf
+    fov_rad: Cone = 2 * math.pi
 
     expected: ClassVar[Any] = seen.range_bearing
     columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad")
@@ -100,20 +99,20 @@ class RangeBearing3D(_Cone):
         return inv_spherical_many(np.ascontiguousarray(y))
 
     def check(self, y: Array) -> None:
-        """Refuse negative ranges."""
+        """Refuse negative ranges in y (K, 3)."""
         refuse_negative_ranges(y)
 
 
-@dataclass(frozen=True)
+@register("sensor", "position_3d")
 class Position3D(_Cone):
-    """Position (x, y, z) in the sensor's frame, in metres: an RGB-D camera, a lidar."""
+    """Position of a landmark (x, y, z) in the sensor's frame; x is forward, z up: an RGB-D camera, a lidar."""
 
-    sigma_x_m: float = 0.1
-    sigma_y_m: float = 0.1
-    sigma_z_m: float = 0.1
-    range_min_m: float = 0.0
-    range_max_m: float = math.inf
-    fov_rad: float = 2 * math.pi
+    sigma_x_m: Annotated[Positive, "Noise, along x."] = 0.1
+    sigma_y_m: Annotated[Positive, "Noise, along y."] = 0.1
+    sigma_z_m: Annotated[Positive, "Noise, along z."] = 0.1
+    range_min_m: Nearest = 0.0
+    range_max_m: Farthest = math.inf
+    fov_rad: Cone = 2 * math.pi
 
     expected: ClassVar[Any] = seen.position
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
@@ -124,25 +123,25 @@ class Position3D(_Cone):
         return constant((self.sigma_x_m**2, self.sigma_y_m**2, self.sigma_z_m**2), len(y))
 
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return the points themselves and the identity."""
+        """Return the points (K, 3) and the identities (K, 3, 3)."""
         return y.copy(), np.tile(np.eye(3), (len(y), 1, 1))
 
 
-@dataclass(frozen=True)
+@register("sensor", "tag_pose")
 class TagPose(Spatial):
-    """The pose (x, y, z, qx, qy, qz, qw) of a tag in the sensor's frame; innovations and noise have 6 numbers."""
+    """The poses of square tags (x, y, z, qx, qy, qz, qw) in the sensor's frame.
 
-    sigma_position_m: float = 0.02
-    sigma_rotation_rad: float = 0.02
+    Innovations and noise have 6 numbers.
+    """
+
+    sigma_position_m: Annotated[Positive, "Noise of each coordinate."] = 0.02
+    sigma_rotation_rad: Annotated[Positive, "Noise of the rotation about each axis."] = 0.02
 
     expected: ClassVar[Any] = seen.tag_pose
     cov_size: ClassVar[int] = 6
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     angular: ClassVar[tuple[bool, ...]] = (False,) * 7
     sees_kinds: ClassVar[tuple[str, ...]] = ("tag",)
-
-    def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma")
 
     def noise(self, y: Array) -> Array:
         """Return R (K, 6, 6)."""
@@ -153,14 +152,11 @@ class TagPose(Spatial):
         return y.copy(), np.tile(np.eye(6), (len(y), 1, 1))
 
     def sees(self, v: Array) -> Flags:
-        """Return that all tags are seen."""
+        """Return (K,) that all tags are in view."""
         return np.ones(len(v), dtype=np.bool_)
 
     def check(self, y: Array) -> None:
-        """Refuse quaternions that are not unit ones."""
+        """Refuse poses y (K, 7) whose quaternion is not of norm 1."""
         for i, row in enumerate(y):
             if abs(np.linalg.norm(row[3:]) - 1) > 1e-6:
                 raise EventError(f"observation {i}: the quaternion is {row[3:].tolist()}, expected one of length 1")
-
-
-BUILT_IN = (RangeBearing3D, Position3D, TagPose)

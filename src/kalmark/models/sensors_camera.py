@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import EventError, ModelError
+from kalmark.declare import NotNegative, Number, Positive, Within, declared, register
+from kalmark.errors import EventError
 from kalmark.models import cameras, lenses, lines, seen, segments, tags
-from kalmark.models.parameters import check_parameters
 from kalmark.models.sensors2d import constant
 from kalmark.models.sensors3d import Spatial
+
+__all__ = ["Omnidirectional", "PinHole", "Segments", "Stereo", "TagCorners"]
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -67,22 +68,43 @@ class _Camera(Spatial):
         return lenses.back_project(self.lens_code, np.ascontiguousarray(y), np.array(self.parameters))
 
 
-class _Lens:
-    """The intrinsics of a pin-hole camera with a lens."""
+FocalX = Annotated[Positive, "Focal length, across."]
+FocalY = Annotated[Positive, "Focal length, down."]
+CentreX = Annotated[Number, "Principal point, from the left."]
+CentreY = Annotated[Number, "Principal point, from above."]
+Width = Annotated[Positive, "Width of the image."]
+Height = Annotated[Positive, "Height of the image."]
+PixelNoise = Annotated[Positive, "Noise of each pixel coordinate."]
+Numbers = Annotated[tuple[float, ...], Within()]
 
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    width_px: float
-    height_px: float
-    lens: str
-    distortion: tuple[float, ...]
+
+@declared
+class _PinHole(_Camera):
+    """The intrinsics of a pin-hole camera."""
+
+    fx_px: FocalX = 320.0
+    fy_px: FocalY = 320.0
+    cx_px: CentreX = 320.0
+    cy_px: CentreY = 240.0
+    width_px: Width = 640
+    height_px: Height = 480
+
+
+@declared
+class _Lens(_PinHole):
+    """A pin-hole camera with a lens.
+
+    `lens`: "radial" (coefficients of r^2, r^4, ...), "radtan" (k1, k2, p1, p2, k3), "equidistant" (k1 to k4, fish-eye).
+    """
+
+    lens: Annotated[
+        Literal["radial", "radtan", "equidistant"],
+        "What `distortion` means: `radial` d1 r^2 + d2 r^4 + ..., `radtan` k1 k2 p1 p2 k3, `equidistant` k1 to k4.",
+    ] = "radial"
+    distortion: Annotated[Numbers, "Coefficients of the lens; none for an ideal one."] = ()
+    sigma_px: PixelNoise = 1.0
 
     def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma", positive=("fx_px", "fy_px", "width_px", "height_px"))
-        if self.lens not in PINHOLES:
-            raise ModelError(f"{type(self).__name__}: lens is {self.lens!r}, expected one of {', '.join(PINHOLES)}")
         object.__setattr__(self, "distortion", tuple(float(d) for d in self.distortion))
         self.parameters  # noqa: B018 - a lens that folds the image over is refused here
 
@@ -93,27 +115,17 @@ class _Lens:
 
     @cached_property
     def parameters(self) -> Array:
-        """The numbers of the lens as `lenses.project` takes them."""
+        """The numbers (n,) of the lens as `lenses.project` takes them."""
         k = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
         return lenses.parameters(self.lens, k, self.distortion, size=(self.width_px, self.height_px))
 
 
-@dataclass(frozen=True)
-class PinHole(_Lens, _Camera):
-    """Pixels (u, v) of points: a perspective camera with a lens.  [TB] pinHole.
+@register("sensor", "pinhole")
+class PinHole(_Lens):
+    """A camera that sees points: pixels u, v.
 
-    `lens`: "radial" (coefficients of r^2, r^4, ...), "radtan" (k1, k2, p1, p2, k3), "equidistant" (k1 to k4, fish-eye).
+    [TB] pinHole.
     """
-
-    fx_px: float = 320.0
-    fy_px: float = 320.0
-    cx_px: float = 320.0
-    cy_px: float = 240.0
-    width_px: float = 640
-    height_px: float = 480
-    lens: str = "radial"
-    distortion: tuple[float, ...] = ()
-    sigma_px: float = 1.0
 
     expected: ClassVar[Any] = seen.camera
     columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
@@ -124,29 +136,35 @@ class PinHole(_Lens, _Camera):
         return constant((self.sigma_px**2,) * 2, len(y))
 
 
-@dataclass(frozen=True)
+@register("sensor", "omnidirectional")
 class Omnidirectional(_Camera):
-    """Pixels (u, v) of points: Scaramuzza's camera; `cameras.project_omni` explains the polynomials.  [TB] omniCam."""
+    """Scaramuzza's camera with a wide view that sees points: pixels u, v.
 
-    cx_px: float = 640.0
-    cy_px: float = 400.0
-    c: float = 1.0
-    d: float = 0.0
-    e: float = 0.0
-    projection: tuple[float, ...] = FISHEYE
-    back_projection: tuple[float, ...] = FISHEYE_BACK
-    width_px: float = 1280
-    height_px: float = 800
-    sigma_px: float = 1.0
+    `cameras.project_omni` explains the polynomials.  [TB] omniCam.
+    """
+
+    cx_px: Annotated[Number, "Centre of the image, from the left."] = 640.0
+    cy_px: Annotated[Number, "Centre of the image, from above."] = 400.0
+    c: Annotated[Number, "Affine correction [c d; e 1] of the image."] = 1.0
+    d: Annotated[Number, "Affine correction."] = 0.0
+    e: Annotated[Number, "Affine correction."] = 0.0
+    projection: Annotated[
+        Numbers, "Polynomial from the ray's elevation to the distance from the centre, lowest power first."
+    ] = FISHEYE
+    back_projection: Annotated[
+        Numbers, "Polynomial from the distance from the centre to the ray's height, lowest power first."
+    ] = FISHEYE_BACK
+    width_px: Width = 1280
+    height_px: Height = 800
+    sigma_px: PixelNoise = 1.0
 
     expected: ClassVar[Any] = seen.camera
     columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
     angular: ClassVar[tuple[bool, ...]] = (False, False)
 
     def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma", positive=("width_px", "height_px"))
-        for name in ("projection", "back_projection"):
-            object.__setattr__(self, name, tuple(float(a) for a in getattr(self, name)))
+        object.__setattr__(self, "projection", tuple(float(a) for a in self.projection))
+        object.__setattr__(self, "back_projection", tuple(float(a) for a in self.back_projection))
 
     @property
     def lens_code(self) -> int:
@@ -155,7 +173,7 @@ class Omnidirectional(_Camera):
 
     @cached_property
     def parameters(self) -> Array:
-        """The numbers of the lens as `lenses.project` takes them."""
+        """The numbers (n,) of the lens as `lenses.project` takes them."""
         k = (self.cx_px, self.cy_px, self.c, self.d, self.e)
         return lenses.parameters("omnidirectional", k, self.projection, self.back_projection)
 
@@ -164,33 +182,32 @@ class Omnidirectional(_Camera):
         return constant((self.sigma_px**2,) * 2, len(y))
 
 
-@dataclass(frozen=True)
+@register("sensor", "stereo")
 class Stereo(_Camera):
-    """Pixels (u, v) of the left and (u, v) of the right camera of a rectified pair; the frame is the left camera's."""
+    """A rectified pair of cameras that sees points: u, v in the left image and u, v in the right one."""
 
-    fx_px: float = 320.0
-    fy_px: float = 320.0
-    cx_px: float = 320.0
-    cy_px: float = 240.0
-    baseline_m: float = 0.2
-    width_px: float = 640
-    height_px: float = 480
-    sigma_ul_px: float = 1.0
-    sigma_vl_px: float = 1.0
-    sigma_ur_px: float = 1.0
-    sigma_vr_px: float = 1.0
+    fx_px: FocalX = 320.0
+    fy_px: FocalY = 320.0
+    cx_px: CentreX = 320.0
+    cy_px: CentreY = 240.0
+    baseline_m: Annotated[Positive, "Distance of the right camera from the left one, whose frame is the sensor's."] = (
+        0.2
+    )
+    width_px: Width = 640
+    height_px: Height = 480
+    sigma_ul_px: Annotated[Positive, "Noise of the left u."] = 1.0
+    sigma_vl_px: Annotated[Positive, "Noise of the left v."] = 1.0
+    sigma_ur_px: Annotated[Positive, "Noise of the right u."] = 1.0
+    sigma_vr_px: Annotated[Positive, "Noise of the right v."] = 1.0
 
     expected: ClassVar[Any] = seen.stereo
     columns: ClassVar[tuple[str, ...]] = ("ul_px", "vl_px", "ur_px", "vr_px")
     angular: ClassVar[tuple[bool, ...]] = (False,) * 4
     finds_depth: ClassVar[bool] = True
 
-    def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma", positive=("fx_px", "fy_px", "baseline_m", "width_px", "height_px"))
-
     @cached_property
     def parameters(self) -> Array:
-        """The intrinsics and the baseline."""
+        """The intrinsics and the baseline (5,)."""
         return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.baseline_m])
 
     def noise(self, y: Array) -> Array:
@@ -208,27 +225,22 @@ class Stereo(_Camera):
         return cameras.in_image(e, v, self.image)
 
     def check(self, y: Array) -> None:
-        """Refuse points behind the cameras, whose disparity is negative."""
+        """Refuse observations y (K, 4) of points behind the cameras, with a negative disparity."""
         for i, row in enumerate(y):
             if row[0] < row[2]:
                 raise EventError(f"observation {i}: ul_px {row[0]} is less than ur_px {row[2]}, expected at least it")
 
 
-@dataclass(frozen=True)
-class Segments(_Camera):
-    """Pixels (u, v) of both ends of line segments.  [TB] Fig. 9: the innovation is two distances, `ortDst`.
+@register("sensor", "segments")
+class Segments(_PinHole):
+    """A camera that sees line segments: pixels of both ends, which lie anywhere on the line.
 
-    The ends wander along the line, so that only the distances of the measured ends from the expected line count.
+    So only the distances of the measured ends from the expected line count.  [TB] Fig. 9: the innovation is two
+    distances, `ortDst`.
     """
 
-    fx_px: float = 320.0
-    fy_px: float = 320.0
-    cx_px: float = 320.0
-    cy_px: float = 240.0
-    width_px: float = 640
-    height_px: float = 480
-    sigma_px: float = 1.0
-    min_length_px: float = 20.0
+    sigma_px: Annotated[Positive, "Noise of each pixel coordinate of an end."] = 1.0
+    min_length_px: Annotated[NotNegative, "Shortest segment that counts as seen."] = 20.0
 
     expected: ClassVar[Any] = seen.segment
     columns: ClassVar[tuple[str, ...]] = ("u1_px", "v1_px", "u2_px", "v2_px")
@@ -238,12 +250,9 @@ class Segments(_Camera):
         "homogeneous_line",
     )  # fmt: skip
 
-    def __post_init__(self) -> None:
-        check_parameters(self, noise="sigma", positive=("fx_px", "fy_px", "width_px", "height_px"))
-
     @cached_property
     def parameters(self) -> Array:
-        """The intrinsics."""
+        """The intrinsics (4,)."""
         return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px])
 
     def noise(self, y: Array) -> Array:
@@ -274,28 +283,18 @@ class Segments(_Camera):
         return constant((self.sigma_px**2,) * 4, len(y))
 
     def check(self, y: Array) -> None:
-        """Refuse segments whose ends coincide."""
+        """Refuse segments y (K, 4) whose ends coincide."""
         for i, row in enumerate(y):
             if row[0] == row[2] and row[1] == row[3]:
                 raise EventError(f"observation {i}: both ends are at {row[:2].tolist()} px, expected a segment")
 
 
-@dataclass(frozen=True)
-class TagCorners(_Lens, _Camera):
-    """Pixels of the four corners of square tags, and the tags' sizes, which are known.
+@register("sensor", "tag_corners")
+class TagCorners(_Lens):
+    """A camera that sees square tags of known size: pixels of their four corners.
 
     Corners in the tag's frame: (-s, -s), (s, -s), (s, s), (-s, s), s half the size.
     """
-
-    fx_px: float = 320.0
-    fy_px: float = 320.0
-    cx_px: float = 320.0
-    cy_px: float = 240.0
-    width_px: float = 640
-    height_px: float = 480
-    lens: str = "radial"
-    distortion: tuple[float, ...] = ()
-    sigma_px: float = 1.0
 
     expected: ClassVar[Any] = seen.tag_corners
     cov_size: ClassVar[int] = 8
@@ -338,10 +337,7 @@ class TagCorners(_Lens, _Camera):
         return v, V_y @ R @ V_y.swapaxes(1, 2)
 
     def check(self, y: Array) -> None:
-        """Refuse tags without a size."""
+        """Refuse tags y (K, 9) without a size."""
         for i, size in enumerate(y[:, 8].tolist()):
             if size <= 0:
                 raise EventError(f"observation {i}: size_m is {size}, expected a positive length")
-
-
-BUILT_IN = (PinHole, Omnidirectional, Stereo, Segments, TagCorners)

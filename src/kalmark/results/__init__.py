@@ -1,0 +1,1 @@
+"""What to make of the reports of a run: records, figures, pictures, pages."""

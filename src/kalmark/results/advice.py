@@ -14,24 +14,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.declare import registered_name
 from kalmark.events import Scan
 from kalmark.models import sensors
+from kalmark.results.columns import Array
 from kalmark.results.consistency import nis
-from kalmark.results.describe import TYPES
-from kalmark.results.history import Array, History
+from kalmark.results.history import History
+from kalmark.results.recording import Recording
 from kalmark.results.warnings import POSE_NEES
 from kalmark.results.words import figure
 
 if TYPE_CHECKING:
     from kalmark.report import Report
-    from kalmark.results.run import Run
     from kalmark.slam.slam import Slam
 
 LOW = 0.5  # squares over those of the stated noise: it is 1.4 times too large
 TINY_NIS = 0.1
 TINY = 1e-6  # of those squares, where a log has no noise
 NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
-COLUMNS = {TYPES[cls.__name__]: tuple(cls.columns) for cls in sensors.BUILT_IN if cls.__name__ in TYPES}
+COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 
 
 def stated_noise(slam: Slam, report: Report) -> Array:
@@ -47,7 +48,7 @@ def stated_noise(slam: Slam, report: Report) -> Array:
     return np.sqrt(np.einsum("kii->ki", R))
 
 
-def advice(run: Run, summary: Mapping[str, Any]) -> list[str]:
+def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for each sensor whose noise is stated far too large; one if the NIS is tiny for another reason."""
     lines, nis_ = list(_sensors(run, summary)), summary["nis_per_dof"]
     if not lines and nis_ is not None and nis_ < TINY_NIS and summary["associated"] >= NUMBER // 2:
@@ -55,7 +56,7 @@ def advice(run: Run, summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _sensors(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _sensors(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history = run.history
     nees = [figures["pose_nees"] for figures in summary["robots"].values() if figures.get("pose_nees") is not None]
     if summary["diverged"] or (nees and float(np.mean(nees)) > POSE_NEES[summary["pose_dof"]]):
@@ -88,7 +89,7 @@ def _of(history: History, sensor: str, mine: Any, columns: tuple[str, ...]) -> I
     )
 
 
-def _columns(run: Run, sensor: str) -> tuple[str, ...]:
+def _columns(run: Recording, sensor: str) -> tuple[str, ...]:
     """Return what a sensor of kalmark's own measures, () of others."""
     sections = [((robot or {}).get("sensors") or {}).get(sensor) for robot in (run.config.get("robots") or {}).values()]
     return next((COLUMNS.get(str(section.get("type")), ()) for section in sections if section), ())

@@ -32,7 +32,7 @@ class Rigid(NamedTuple):
 
     @property
     def quaternion(self) -> Array:
-        """The rotation of a 3-D alignment as a unit quaternion xyzw."""
+        """The rotation of an alignment in space as a unit quaternion xyzw (4,)."""
         return from_matrix(np.ascontiguousarray(self.rotation))
 
     def inverse(self) -> Rigid:
@@ -72,7 +72,7 @@ def rigid(source: Array, target: Array, weights: Array | None = None) -> Rigid:
 
 
 def rigid_robust(source: Array, target: Array, floor_m: float = 0.1, iterations: int = 200) -> Rigid:
-    """Fit the alignment that minimises the sum of the *distances* (not their squares): outliers barely pull.
+    """Fit the alignment of points (N, d) that minimises the sum of the *distances*, which limits outliers.
 
     Iteratively reweighted least squares with weights 1 / max(distance, `floor_m`), until the fit stands still.
     """

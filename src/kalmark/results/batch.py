@@ -1,103 +1,55 @@
-"""The maximum-likelihood trajectory and map of a log: the strongest check of a filter on data without truth.
+"""How far a filter is from the maximum likelihood of the same data: the entry `batch` of ``summary.json``.
 
-`solve_batch` takes the observations the filter used and finds, by sparse Gauss-Newton on all of them at once, the path
-and the points that explain them best, and the points' covariances.  A filter that is consistent ends with the same map
+The strongest check of a filter on data without truth.  A consistent filter ends with the same map as the batch solution
 to a fraction of its sigma, and with the same sigma; one that is not claims to know better than the optimum can.
-Derivation and figures: docs/batch.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.batch.data import Associations, Given, Known, replayed
+from kalmark.batch.problem import Problem
+from kalmark.batch.solver import Batch, optimum
+from kalmark.batch.state import LANDMARKS, POSES, State
 from kalmark.errors import KalmarkError
-from kalmark.events import Event, Id
-from kalmark.results.align import rmse
-from kalmark.results.batch_factors import State
-from kalmark.results.batch_input import Input, Known, batch_input
-from kalmark.results.batch_solve import Solution, minimise
-from kalmark.results.batch_tags_input import adjust_run
+from kalmark.events import Event, Scan
+from kalmark.geometry.frames3d import from_frame, minus
+from kalmark.models.landmarks import Point2D, Point3D, Tag
+from kalmark.models.sensors import TagCorners
+from kalmark.models.tags import corners
+from kalmark.results.align import rigid, rmse
+from kalmark.results.history import as_id
+from kalmark.results.progress import track
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
-    from kalmark.results.run import Run
+    from kalmark.results.recording import Recording
 
 Array = npt.NDArray[np.float64]
-MANY_NODES = 2000  # from here on a line tells how far it is
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """The optimum of a run's data: poses (S, 3) at its S steps, points (m, 2) and their covariances (m, 2, 2).
+def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
+    """Return the entry `batch` of a run's summary: `compare`, or of a run that saw tags `compare_tags`.
 
-    In space they are (S, 7), (m, 3) and (m, 3, 3).
-    `chi2` is the sum of squared whitened residuals (motion included), `dof` their number less what they determine;
-    `relative_step` is the last step of `iterations`, over the map's size.
+    The log is read again unless it is given or not needed.
     """
-
-    poses: Array
-    ids: list[Id]
-    means: Array
-    covariances: Array
-    chi2: float
-    dof: int
-    iterations: int
-    relative_step: float
-
-    def sigma(self) -> Array:
-        """Return the sigma (m,) of each point: the root of its covariance's trace, in metres."""
-        return np.sqrt(np.trace(self.covariances, axis1=1, axis2=2))
-
-    def compare(self, run: Run) -> dict[str, Any]:
-        """Return how far the filter's map and path are from the optimum of the same data.
-
-        `sigma_ratio`: median over landmarks of the filter's sigma over the batch's (1: honest, below: overconfident).
-        `map_difference_m`: RMS over landmarks of the distance between the two.  `map_difference_sigma`: the largest
-        such distance over the batch's sigma of that landmark.  `path_ratio`: with truth, the filter's raw position RMSE
-        over the batch's, which sees the future, else None.  `path_difference_m`: RMS over steps of the distance.
-        """
-        at = {str(name): k for k, name in enumerate(self.ids)}
-        rows = [(k, at[str(name)]) for k, name in enumerate(run.landmarks.ids) if str(name) in at]
-        d = self.means.shape[1]
-        mine = np.array([j for _, j in rows], dtype=np.int64)
-        theirs = [k for k, _ in rows]
-        sigma = self.sigma()[mine]
-        distance = np.array([np.linalg.norm(run.landmarks.means[k][:d] - self.means[j]) for k, j in rows])
-        filtered = np.array([np.sqrt(np.trace(run.landmarks.covariances[k][:d, :d])) for k in theirs])
-        free = sigma > 0
-        path = run.history.mean[:, :d] - self.poses[:, :d]
-        return {
-            "sigma_ratio": _or_none(np.median, filtered[free] / sigma[free]),
-            "map_difference_m": _or_none(lambda d: np.sqrt(np.mean(d**2)), distance),
-            "map_difference_sigma": _or_none(np.max, distance[free] / sigma[free]),
-            "path_ratio": self._path_ratio(run),
-            "path_difference_m": rmse(path) if len(path) else None,
-            "landmarks": len(rows),
-            "iterations": self.iterations,
-            "chi2_per_dof": self.chi2 / self.dof if self.dof > 0 else None,
-        }
-
-    def _path_ratio(self, run: Run) -> float | None:
-        truth = run.truth.poses_in_map()
-        known, d = np.isfinite(truth).all(axis=1), self.means.shape[1]
-        if not known.any():
-            return None
-        mine, theirs = (rmse(path[known, :d] - truth[known, :d]) for path in (self.poses, run.history.mean))
-        return theirs / mine if mine > 0 else None
+    if not np.isnan(run.history.left_px).all():
+        problem = tag_problem(run)
+        return compare_tags(run, problem, optimum(problem))
+    return compare(run, solve_batch(run, _log_of(run) if log is None else log))
 
 
 def solve_batch(
-    run: Run,
+    run: Recording,
     log: Log | Iterable[Event],
     *,
     known: Known | None = None,
-    initial: Batch | None = None,
+    initial: State | None = None,
     iterations: int = 100,
     progress: bool = True,
 ) -> Batch:
@@ -107,53 +59,144 @@ def solve_batch(
     landmarks that were in the map before the log, id: (mean, covariance or None for exactly).  Fixes are all used.
     Raises KalmarkError if something is not determined, or if it does not converge within `iterations`.
     """
-    given = batch_input(run, log, known)
-    start = given.start if initial is None else _replaced(given, initial)
-    with _telling(progress and len(start.poses) > MANY_NODES) as tell:
-        solution = minimise(given.problem, start, iterations=iterations, tell=tell)
-    return _batch(given, solution)
+    problem = replayed(given_by(run, known), log)
+    steps = track(range(1, iterations + 1), "batch solution: iteration", show=progress)
+    return optimum(problem, initial, iterations=steps)
 
 
-def compare(run: Run, log: Log | Iterable[Event] | None = None, *, progress: bool = True) -> dict[str, Any]:
-    """Return the entry `batch` of a run's summary (see `Batch.compare`, of a run that saw tags `TagBatch.compare`).
-
-    The log is read again unless it is given or not needed.
-    """
-    if not np.isnan(run.history.left_px).all():
-        return adjust_run(run).compare()
-    return solve_batch(run, _log_of(run) if log is None else log, progress=progress).compare(run)
-
-
-def _batch(given: Input, solution: Solution) -> Batch:
-    m, d = given.start.points.shape
-    blocks = solution.covariance.reshape(m, d, m, d)[np.arange(m), :, np.arange(m)]
-    residuals = given.problem.sighted(solution.state).z.size
-    return Batch(
-        poses=solution.state.poses[given.nodes],
-        ids=given.ids,
-        means=solution.state.points,
-        covariances=blocks,
-        chi2=solution.chi2,
-        dof=residuals - d * int(np.sum(~given.problem.fixed)),
-        iterations=solution.iterations,
-        relative_step=solution.relative_step,
+def given_by(run: Recording, known: Known | None = None) -> Given:
+    """Return what the batch solution needs of a run: of the observations exactly those that the filter used."""
+    if run.fixes_rejected:
+        raise KalmarkError(
+            f"batch solution: the filter rejected {run.fixes_rejected} fixes, expected a run that used all"
+        )
+    history, robots = run.history, run.final_slam().robots
+    landmarks = dict(
+        zip(run.landmarks.ids, zip(run.landmarks.means, run.landmarks.covariances, strict=True), strict=True)
+    )
+    ids = {str(id_): id_ for id_ in landmarks} | {name: name for name in robots}
+    rows = np.flatnonzero(history.fused)
+    names = [ids.get(name, as_id(name)) for name in history.landmark[rows].tolist()]
+    started = {name for name, outcome in zip(names, history.outcome[rows], strict=True) if outcome != "associated"}
+    beforehand = {ids.get(str(name), name): prior for name, prior in (known or {}).items()}
+    for name in dict.fromkeys(names):
+        if name not in started and name not in beforehand and name not in robots:
+            mean, covariance = landmarks.get(name, (None, np.ones(1)))
+            if covariance.any():
+                what = f"landmark {str(name)!r} was in the map beforehand"
+                raise KalmarkError(f"batch solution: {what}, expected its mean and covariance in `known`")
+            beforehand[name] = (mean, None)
+    return Given(
+        robots=robots,
+        landmark=Point3D() if history.in_space else Point2D(),
+        t_ns=history.t_ns,
+        robot=history.robot,
+        poses=history.poses,
+        associations=Associations(
+            history.step[rows], history.sensor[rows], history.index[rows], names, history.e[rows]
+        ),
+        landmarks=landmarks,
+        known=beforehand,
+        starts={start.robot: (start.mean, start.covariance) for start in history.starts},
+        fixes=run.fixes,
     )
 
 
-def _replaced(given: Input, initial: Batch) -> State:
-    """Return the start with the poses and points of an earlier solution of the same log."""
-    poses, points = given.start.poses.copy(), given.start.points.copy()
-    if len(initial.poses) != len(given.nodes):
-        raise KalmarkError(f"batch solution: initial has {len(initial.poses)} poses, expected {len(given.nodes)}")
-    poses[given.nodes] = initial.poses
-    at = {name: k for k, name in enumerate(given.ids)}
-    for name, mean in zip(initial.ids, initial.means, strict=True):
-        if name in at:
-            points[at[name]] = mean
-    return State(poses, points)
+def tag_problem(run: Recording) -> Problem:
+    """Return the corners of tags that a run used, which are in its history, without the motion: bundle adjustment.
+
+    Mounts that the filter calibrates may move.  Raises KalmarkError if no corners of a tag in the map were seen.
+    """
+    history, slam = run.history, run.final_slam()
+    mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
+    cameras = [key for key, mount in mounted.items() if isinstance(mount.sensor, TagCorners)]
+    ids = {str(id_): id_ for id_ in slam.landmarks().ids}
+    rows = np.flatnonzero(history.fused & np.isin(history.landmark, list(ids)))
+    rows = rows[[(history.robot[history.step[row]], history.sensor[row]) in cameras for row in rows]]
+    if not len(rows):
+        raise KalmarkError("tags: no camera saw the corners of a tag in the map, expected sightings of TagCorners")
+    steps, first, scan = np.unique(history.step[rows], return_index=True, return_inverse=True)
+    names, index = [ids[name] for name in history.landmark[rows].tolist()], np.arange(len(rows)) - first[scan]
+    t_ns, robot, sensor = history.t_ns[steps], history.robot[steps], history.sensor[rows]
+    given = Given(
+        robots=slam.robots,
+        landmark=Tag(),
+        t_ns=t_ns,
+        robot=robot,
+        poses=history.poses[steps],
+        associations=Associations(scan, sensor, index, names, history.e[rows]),
+        landmarks={id_: (slam.mean(id_), slam.covariance(id_)) for id_ in dict.fromkeys(names)},
+        motion=False,
+        mounts={key: slam.mean(".".join(key)) for key in cameras if mounted[key].cov is not None},
+    )
+    y = np.split(history.y[rows, :9], first[1:])
+    scans = zip(t_ns.tolist(), robot.tolist(), sensor[first].tolist(), y, strict=True)
+    return replayed(given, (Scan(t_ns=t, robot=name, sensor=camera, y=seen) for t, name, camera, seen in scans))
 
 
-def _log_of(run: Run) -> Iterable[Event]:
+def compare(run: Recording, batch: Batch) -> dict[str, Any]:
+    """Return how far the filter's map and path are from the optimum of the same data.
+
+    `sigma_ratio`: median over landmarks of the filter's sigma over the batch's (1: honest, below: overconfident).
+    `map_difference_m`: RMS over landmarks of the distance between the two.  `map_difference_sigma`: the largest
+    such distance over the batch's sigma of that landmark.  `path_ratio`: with truth, the filter's raw position RMSE
+    over the batch's, which sees the future, else None.  `path_difference_m`: RMS over steps of the distance.
+    """
+    rows = [(k, batch.ids.index(id_)) for k, id_ in enumerate(run.landmarks.ids) if id_ in batch.ids]
+    d, sigma = batch.state.d, batch.sigma()[np.array([j for _, j in rows], dtype=np.int64)]
+    distance = np.array([np.linalg.norm(run.landmarks.means[k][:d] - batch.means[j]) for k, j in rows])
+    filtered = np.array([np.sqrt(np.trace(run.landmarks.covariances[k][:d, :d])) for k, _ in rows])
+    free, path, truth = sigma > 0, run.history.mean[:, :d], run.truth.poses_in_map()
+    known = np.isfinite(truth).all(axis=1)
+    errors = [_or_none(rmse, poses[known, :d] - truth[known, :d]) for poses in (path, batch.poses)]
+    return {
+        "sigma_ratio": _or_none(np.median, filtered[free] / sigma[free]),
+        "map_difference_m": _or_none(rmse, distance[:, None]),
+        "map_difference_sigma": _or_none(np.max, distance[free] / sigma[free]),
+        "path_ratio": errors[0] / errors[1] if errors[0] is not None and errors[1] else None,
+        "path_difference_m": _or_none(rmse, path - batch.poses[:, :d]),
+        "landmarks": len(rows),
+        "iterations": batch.iterations,
+        "chi2_per_dof": batch.chi2 / batch.dof if batch.dof > 0 else None,
+    }
+
+
+def compare_tags(run: Recording, problem: Problem, batch: Batch) -> dict[str, Any]:
+    """Return the RMS of the corners, and how far apart path and map are when the tags' corners are aligned rigidly.
+
+    The filter's path is as it was then, with the map and the mounts that the run ended with.  `median_px`: of the
+    corners' distances.  `sigma_ratio`: median over the tags of the filter's sigma of position over the batch's, which
+    knows nothing of the motion: expect it below 1 where tags are seen briefly.
+    """
+    states, slam = (batch.state, problem.start), run.final_slam()
+    left, filter_left = (np.concatenate([z for _, z in problem.left(state)]) for state in states)
+    size = {name: float(y[8]) for name, y in zip(run.history.landmark.tolist(), run.history.y, strict=True)}
+    tags, filtered = batch.means, problem.start.groups[LANDMARKS]
+    places = [
+        np.concatenate([from_frame(l, corners(size[str(id_)]))[0] for l, id_ in zip(rows, batch.ids, strict=True)])
+        for rows in (tags, filtered)
+    ]
+    onto = rigid(*places)
+    apart = np.array([minus(a, b) for a, b in zip(filtered, onto.poses(tags), strict=True)])
+    path = problem.start.groups[POSES] - onto.poses(batch.state.groups[POSES])
+    sigma = np.sqrt([np.trace(slam.covariance(id_)[:3, :3]) for id_ in batch.ids])
+    distance, filter_distance = (np.hypot(x[:, ::2], x[:, 1::2]) for x in (left, filter_left))
+    return {
+        "rms_px": float(np.sqrt(np.mean(distance**2))),
+        "median_px": float(np.median(distance)),
+        "filter_rms_px": float(np.sqrt(np.mean(filter_distance**2))),
+        "filter_median_px": float(np.median(filter_distance)),
+        "map_difference_m": rmse(apart[:, :3]),
+        "map_difference_deg": float(np.degrees(rmse(apart[:, 3:]))),
+        "path_difference_m": rmse(path[:, :3]),
+        "sigma_ratio": float(np.median(sigma / batch.sigma())),
+        "tags": len(batch.ids),
+        "sightings": len(left),
+        "iterations": batch.iterations,
+    }
+
+
+def _log_of(run: Recording) -> Iterable[Event]:
     """Read again the log a run was made from, as its configuration says."""
     from kalmark.config.opening import open_config_log
     from kalmark.config.schema import Config
@@ -163,27 +206,10 @@ def _log_of(run: Run) -> Iterable[Event]:
     try:
         config = Config.model_validate({"log": run.config.get("log", {})})
     except ValueError as error:
-        raise KalmarkError(
-            f"batch solution: the run's configuration does not say how to read its log: {error}"
-        ) from None
+        what = "the run's configuration does not say how to read its log"
+        raise KalmarkError(f"batch solution: {what}: {error}") from None
     return open_config_log(config, run.log.path)
 
 
 def _or_none(figure: Callable[[Array], Any], values: Array) -> float | None:
     return float(figure(values)) if len(values) else None
-
-
-@contextmanager
-def _telling(show: bool) -> Iterator[Callable[[int, float, float], None] | None]:
-    """Yield what shows each iteration in a line on standard error, or None."""
-    if not show:
-        yield None
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status("batch solution: first iteration") as status:
-
-        def tell(iteration: int, chi2: float, size: float) -> None:
-            status.update(f"batch solution: iteration {iteration}, chi2 {chi2:.6g}, step {size:.1e}")
-
-        yield tell

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from kalmark.events import Id
-from kalmark.results.history import Array
+from kalmark.results.columns import Array
 from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.recording import Recording
 from kalmark.results.shapes import EUCLIDEAN, LINE
-
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
 
 LEAST = 3  # matched pairs
 
 
-def no_ids(run: Run) -> bool:
+def no_ids(run: Recording) -> bool:
     """Return whether a run's landmarks can be matched to the true ones by their positions alone."""
     history, true = run.history, {str(i) for i in run.truth.landmarks}
     told = (history.id != "") & ~np.isin(history.id, history.robots)

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.results.history import Array, Biased, Camera, Mounted
-from kalmark.slam.prediction import bias_name
+from kalmark.results.columns import Array
+from kalmark.results.history import Biased, Camera, Mounted
+from kalmark.slam.motion import bias_name
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
+
+
+@runtime_checkable
+class Imaging(Protocol):
+    """A sensor whose pixels are of an image of known size."""
+
+    width_px: float
+    height_px: float
+
+
+@runtime_checkable
+class Focal(Protocol):
+    """A camera with focal lengths and a principal point, in pixels."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+
 
 HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has no focal length
 
@@ -29,7 +49,7 @@ def cameras(slam: Slam) -> tuple[Camera, ...]:
         )
         for robot in slam.robots.values()
         for name, mount in robot.sensors.items()
-        if (columns := tuple(mount.sensor.columns))[0].endswith("_px") and hasattr(mount.sensor, "width_px")
+        if (columns := tuple(mount.sensor.columns))[0].endswith("_px") and isinstance(mount.sensor, Imaging)
     )
 
 
@@ -55,7 +75,7 @@ def biases(slam: Slam) -> tuple[Biased, ...]:
 
 def _in_map(slam: Slam, name: str) -> bool:
     try:
-        slam.slot(name)
+        slam.mean(name)
     except MapError:
         return False
     return True
@@ -67,15 +87,15 @@ def mount_now(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
     return np.array(slam.mean(name)[: len(at)] if _in_map(slam, name) else at, dtype=np.float64)
 
 
-def _size(sensor: Any) -> tuple[float, float]:
+def _size(sensor: Imaging) -> tuple[float, float]:
     return float(sensor.width_px), float(sensor.height_px)
 
 
-def _corners(sensor: Any) -> Array:
+def _corners(sensor: Imaging) -> Array:
     """Return the rays (4, 3), z = 1, to the corners of the image of a camera without distortion."""
     width, height = _size(sensor)
     u, v = np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height])
-    if not hasattr(sensor, "fx_px"):
+    if not isinstance(sensor, Focal):
         across, down = u / width - 0.5, v / height - 0.5
         return np.column_stack([2 * HALF_VIEW * across, 2 * HALF_VIEW * down * height / width, np.ones(4)])
     return np.column_stack([(u - sensor.cx_px) / sensor.fx_px, (v - sensor.cy_px) / sensor.fy_px, np.ones(4)])

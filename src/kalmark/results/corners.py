@@ -10,7 +10,7 @@ from kalmark.geometry.frames3d import compose
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.cameras import mount_now
-from kalmark.results.history import Array
+from kalmark.results.columns import Array
 
 if TYPE_CHECKING:
     from kalmark.events import Scan

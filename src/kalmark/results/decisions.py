@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+
+from kalmark.results.columns import Array, Arrays, Ints, Named, Texts, columns, rows_of, texts
 
 if TYPE_CHECKING:
     from kalmark.report import Report
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Texts = npt.NDArray[np.str_]
+KEYS = {key: f"candidate_{key}" for key in ("row", "landmark", "d2", "place")} | {"seen_at": "seen_at"}
+KEYS |= {f"share_{key}": f"share_{key}" for key in ("row", "landmark", "weight")}  # fields, as in ``history.npz``
 
 
 class Change(NamedTuple):
@@ -75,40 +75,24 @@ class Decisions:
         ]
         return cls(
             np.array([row for row, _ in seen], dtype=np.int64),
-            np.array([str(c.landmark) for _, c in seen], dtype=np.str_),
+            texts([c.landmark for _, c in seen]),
             np.array([c.d2 for _, c in seen], dtype=np.float64),
             np.array([c.place for _, c in seen], dtype=np.float64).reshape(-1, d),
             seen_at,
             tuple(changes),
             np.array([row for row, _, _ in shares], dtype=np.int64),
-            np.array([name for _, name, _ in shares], dtype=np.str_),
+            texts([name for _, name, _ in shares]),
             np.array([weight for _, _, weight in shares], dtype=np.float64),
         )
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self) -> Arrays:
         """Return everything as named arrays for ``history.npz``."""
-        columns: Any = zip(*self.changes, strict=True) if self.changes else [()] * 5
-        step, *texts = columns
-        named = {f"change_{k}": np.array(v, dtype=np.str_) for k, v in zip(Change._fields[1:], texts, strict=True)}
-        return named | {
-            "change_step": np.array(step, dtype=np.int64),
-            "candidate_row": self.row,
-            "candidate_landmark": self.landmark,
-            "candidate_d2": self.d2,
-            "candidate_place": self.place,
-            "seen_at": self.seen_at,
-            "share_row": self.share_row,
-            "share_landmark": self.share_landmark,
-            "share_weight": self.share_weight,
-        }
+        return columns("change", Change, self.changes) | {key: getattr(self, field) for field, key in KEYS.items()}
 
     @classmethod
-    def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> Decisions:
+    def from_arrays(cls, named: Named) -> Decisions:
         """Return what `arrays` gave, nothing if the run was saved without."""
         if "candidate_row" not in named:
             return cls(seen_at=_none(len(named["landmark"]), 2))
-        rows = zip(*(named[f"change_{key}"].tolist() for key in Change._fields), strict=True)
-        columns = (named[f"candidate_{key}"] for key in ("row", "landmark", "d2", "place"))
-        row, landmark, d2, place = columns
-        shares = [named[f"share_{key}"] for key in ("row", "landmark", "weight") if f"share_{key}" in named]
-        return cls(row, landmark, d2, place, named["seen_at"], tuple(Change(*each) for each in rows), *shares)
+        given = {field: named[key] for field, key in KEYS.items() if key in named}
+        return cls(**given, changes=rows_of("change", Change, named))

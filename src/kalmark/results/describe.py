@@ -2,70 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from kalmark.declare import own_name, parameters, plugin_of, registered_name
 from kalmark.geometry.rotations import to_euler
-
-TYPES = {
-    "Unicycle": "unicycle",
-    "Odometry2D": "odometry_2d",
-    "Ackermann": "ackermann",
-    "Odometry3D": "odometry_3d",
-    "Velocity3D": "velocity_3d",
-    "ConstantVelocity3D": "constant_velocity_3d",
-    "RangeBearing": "range_bearing",
-    "Bearing": "bearing",
-    "Range": "range",
-    "Position2D": "position",
-    "RangeBearingSignature": "range_bearing_signature",
-    "RangeBearing3D": "range_bearing_3d",
-    "Position3D": "position_3d",
-    "PinHole": "pinhole",
-    "Omnidirectional": "omnidirectional",
-    "Stereo": "stereo",
-    "Segments": "segments",
-    "TagPose": "tag_pose",
-    "TagCorners": "tag_corners",
-    "Point2D": "point",
-    "Point3D": "point",
-    "Polar2D": "polar",
-    "InverseDepth2D": "inverse_depth",
-    "InverseDepth3D": "inverse_depth",
-    "AnchoredHomogeneous": "anchored_homogeneous",
-    "Homogeneous": "homogeneous",
-    "Tag": "tag",
-    "PlueckerLine": "pluecker_line",
-    "AnchoredPlueckerLine": "anchored_pluecker_line",
-    "InverseDepthLine": "inverse_depth_line",
-    "AnchoredHomogeneousLine": "anchored_homogeneous_line",
-    "HomogeneousLine": "homogeneous_line",
-    "PointSignature2D": "point_signature",
-    "Delayed": "delayed",
-    "ByIdentity": "identity",
-    "NearestNeighbour": "nearest",
-    "GlobalAssignment": "global",
-    "JointCompatibility": "jcbb",
-    "Trunks": "trunks",
-    "Reflectors": "reflectors",
-    "Corners": "corners",
-    "Cliques": "clique",
-    "Sampled": "sample",
-    "Averaged": "jpda",
-    "Automatic": "auto",
-    "Ekf": "ekf",
-    "Invariant": "invariant",
-    "Fej": "fej",
-}
+from kalmark.logs.log import Log
 
 
 def type_name(model: Any) -> str:
-    """Return a model's name in configuration files, or module:Class for a user's own."""
-    cls = type(model)
-    return TYPES.get(cls.__name__, f"{cls.__module__}:{cls.__qualname__}")
+    """Return a model's name in configuration files, or file.py:Class for a user's own that has none."""
+    return registered_name(type(model)) or own_name(type(model))
 
 
 def plain(value: Any) -> Any:
@@ -82,27 +32,37 @@ def plain(value: Any) -> Any:
 
 
 def model(value: Any) -> dict[str, Any]:
-    """Return the type and the parameters of a model that is a dataclass, as a mapping."""
-    out: dict[str, Any] = {"type": type_name(value)}
-    if dataclasses.is_dataclass(value):
-        given = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init and f.repr}
-        out |= {key: plain(item) for key, item in given.items() if item is not None}
-    return out
+    """Return the type and the parameters of a model, as a mapping."""
+    given = {own.name: vars(value)[own.name] for own in parameters(type(value))}
+    return {"type": type_name(value)} | {key: plain(item) for key, item in given.items() if item is not None}
 
 
 def describe(slam: Any, log: Any = None) -> dict[str, Any]:
     """Return the configuration of a Slam: log, robots, sensors, landmarks, association, estimator, map."""
     out: dict[str, Any] = {}
-    if getattr(log, "path", None) is not None:
+    if isinstance(log, Log) and log.path is not None:
         out["log"] = {"path": str(log.path), "format": log.format, "robots": list(log.robots)}
+    plugins = sorted({str(file) for each in _models(slam) if (file := plugin_of(type(each))) is not None})
+    if plugins:
+        out["plugins"] = plugins
     out["robots"] = {name: _robot(robot) for name, robot in slam.robots.items()}
-    for key in ("landmarks", "association"):
-        value = getattr(slam, key, None)
-        if value is not None and not callable(value):
-            out[key] = model(value)
+    if slam.landmark_type is not None:
+        out["landmarks"] = model(slam.landmark_type)
+    out["association"] = model(slam.association)
     out["upkeep"] = _keys(slam.upkeep)
     out["estimator"] = model(slam.estimator)
+    reparametrize = "off" if slam.reparametrize is None else float(slam.reparametrize)
+    out["map"] = {"type": slam.map_type, "numbers": slam.numbers, "reparametrize": reparametrize}
     return out
+
+
+def _models(slam: Any) -> Iterator[Any]:
+    """Yield the models of a filter that may be a user's own."""
+    yield from (slam.landmark_type, slam.association, slam.estimator)
+    for robot in slam.robots.values():
+        yield robot.motion
+        for mount in robot.sensors.values():
+            yield from (mount.sensor, mount.landmark, mount.association, mount.detector, mount.initialization)
 
 
 def _keys(value: Any) -> dict[str, Any]:
@@ -119,14 +79,13 @@ def _robot(robot: Any) -> dict[str, Any]:
         if any(at.values()):
             sensor["mount"] = at
         for part in ("landmark", "association", "detector", "initialization"):
-            if getattr(mount, part, None) is not None:
-                sensor[part] = model(getattr(mount, part))
-        attention = getattr(mount, "attention", None)
-        if attention is not None and attention != type(attention)():
-            sensor["attention"] = _keys(attention)
-        if getattr(mount, "upkeep", None) is not None:
+            if vars(mount)[part] is not None:
+                sensor[part] = model(vars(mount)[part])
+        if mount.attention != type(mount.attention)():
+            sensor["attention"] = _keys(mount.attention)
+        if mount.upkeep is not None:
             sensor["upkeep"] = _keys(mount.upkeep)
-        if getattr(mount, "cov", None) is not None:
+        if mount.cov is not None:
             sensor["mount"] = at | _sigmas(mount.cov)
         out["sensors"][name] = sensor
     return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,24 +14,23 @@ from kalmark.results.advice import advice
 from kalmark.results.align import identity, rigid, rigid_robust, rmse
 from kalmark.results.by_position import by_position, no_ids
 from kalmark.results.calibration import bias_figures, mount_figures
+from kalmark.results.columns import Array, Ints
 from kalmark.results.consistency import diverged, nees, nis, pose_error
-from kalmark.results.history import Array, History, Ints
+from kalmark.results.history import History
 from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.recording import Recording
 from kalmark.results.scoring import association_figures, best_known
 from kalmark.results.shapes import EUCLIDEAN, LINE
 from kalmark.results.truth import Fixes, Truth, fitted
 from kalmark.results.warnings import fix_nis_per_dof, warnings
 from kalmark.results.windows import window_figures
 
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
-
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0
 SETTLED = 0.01  # of the map's extent: the sigma below which a point that is not Euclidean yet is compared
 
 
-def evaluate(run: Run) -> dict[str, Any]:
+def evaluate(run: Recording) -> dict[str, Any]:
     """Return the figures of ``summary.json``; a figure that needs what is not there is absent or None."""
     history = run.history
     robots = {name: robot_figures(run, name) for name in history.robots}
@@ -84,7 +83,12 @@ def evaluate(run: Run) -> dict[str, Any]:
     return summary
 
 
-def robot_figures(run: Run, name: str) -> dict[str, Any]:
+def summary_of(run: Recording) -> dict[str, Any]:
+    """Return the figures of a run as evaluated last, or now if they never were."""
+    return run.summary or evaluate(run)
+
+
+def robot_figures(run: Recording, name: str) -> dict[str, Any]:
     """Return the figures of one robot: against its truth if there is one, else against position fixes."""
     mine = run.history.robot == name
     mean, P = run.history.poses[mine], run.history.pose_covariances[mine]
@@ -120,7 +124,7 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
     }
 
 
-def known_landmarks(run: Run) -> MapLandmarks:
+def known_landmarks(run: Recording) -> MapLandmarks:
     """Return the map at the end with the log's names, where the filter was not told them; without any, by position."""
     names = best_known(run.history, run.landmarks.ids, run.landmarks.observations)
     if no_ids(run):
@@ -211,7 +215,7 @@ def antenna_path(history: History, robot: str, fixes: Fixes) -> tuple[Array, Arr
     return poses[:, :2] + offset, offset
 
 
-def fix_distances(run: Run, robot: str) -> Array:
+def fix_distances(run: Recording, robot: str) -> Array:
     """Return the distances of the fixes from the path that is aligned to them robustly (`rigid_robust`)."""
     fixes = run.truth.fixes[robot]
     antenna, _ = antenna_path(run.history, robot, fixes)

@@ -5,22 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kalmark.errors import RunError
 from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.models.protocols import FullSensor, finds_depth
 from kalmark.results.cameras import mount_now
+from kalmark.results.columns import Array, Ints
 from kalmark.results.decisions import Change
 from kalmark.results.files import seconds
-from kalmark.results.history import Array, History, Ints
+from kalmark.results.history import History
+from kalmark.results.recording import Recording
 from kalmark.results.shapes import LINE
 from kalmark.results.truth import as_rigid
 from kalmark.results.words import count, figure
 
 if TYPE_CHECKING:
-    from kalmark.results.run import Run
     from kalmark.slam.slam import Slam
 
 
@@ -112,7 +114,7 @@ def _short(seconds_: str) -> str:
     return seconds_.rstrip("0").rstrip(".") if "." in seconds_ else seconds_
 
 
-def explain(run: Run, t_s: float, robot: str | None = None) -> Explanation:
+def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation:
     """Return why the scan nearest to a time became what it did.
 
     `t_s` is a time of the log, as in ``associations.csv``; where the log has no scan then, it counts from the first
@@ -135,7 +137,7 @@ def explain(run: Run, t_s: float, robot: str | None = None) -> Explanation:
     return replace(told, asked=f"{t_s:.12g} s {'in the log' if in_log else 'since the first scan'} was asked for")
 
 
-def with_known(run: Run, told: Explanation) -> Explanation:
+def with_known(run: Recording, told: Explanation) -> Explanation:
     """Return an explanation that also says where observations with an id were, and where their landmarks were expected.
 
     Both are seen from the pose after the scan: the way from one to the other is the innovation.  Nothing is added where
@@ -163,9 +165,9 @@ def _seen(slam: Slam, told: Explanation, y: Array) -> Array:
     d = 3 if len(told.pose) == 7 else 2
     out = np.full((len(y), d), np.nan)
     mount = slam.robots[told.robot].sensors[told.sensor]
-    sensor: Any = mount.sensor
+    sensor = mount.sensor
     known = np.flatnonzero(np.isfinite(y[:, : len(sensor.columns)]).all(axis=1))
-    if not len(known) or not hasattr(sensor, "invert") or not getattr(sensor, "finds_depth", True):
+    if not len(known) or not isinstance(sensor, FullSensor) or not finds_depth(sensor):
         return out
     v = sensor.invert(np.ascontiguousarray(y[known, : len(sensor.columns)]))[0]
     if v.shape[1] == LINE:  # both ends of a line: rays
@@ -175,7 +177,7 @@ def _seen(slam: Slam, told: Explanation, y: Array) -> Array:
     return out
 
 
-def explained(run: Run, step: int) -> Explanation:
+def explained(run: Recording, step: int) -> Explanation:
     """Return why the scan of a step became what it did."""
     history = run.history
     rows = np.flatnonzero(history.step == step)
@@ -205,11 +207,9 @@ def fate_of(history: History, row: int) -> Fate:
     return Fate(int(history.index[row]), id_, outcome, landmark, float(history.d2[row]), reason, seen_at, compared)
 
 
-def _gates(run: Run, robot: str, sensor: str, rows: Ints) -> tuple[float, float] | None:
+def _gates(run: Recording, robot: str, sensor: str, rows: Ints) -> tuple[float, float] | None:
     """Return the gates on d2 of a sensor's association, None if it has none."""
-    robots = run.config.get("robots") or {}
-    own = ((robots.get(robot) or robots.get("each") or {}).get("sensors") or {}).get(sensor) or {}
-    section = own.get("association") or run.config.get("association") or {}
+    section = run.section(robot, sensor).get("association") or run.config.get("association") or {}
     near, far = section.get("gate"), section.get("new_gate")
     size = int(np.isfinite(run.history.y[rows]).sum(axis=1).max(initial=0)) if len(rows) else 0
     if not size or not isinstance(near, float) or not isinstance(far, float):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ruamel.yaml import YAML
 from kalmark.errors import RunError
 from kalmark.results.describe import plain
 from kalmark.results.history import History
+from kalmark.results.truth import fitted
 
 ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
 CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
@@ -31,14 +33,10 @@ def tum(history: History, robot: str) -> str:
     """Return a robot's path after each of its scans as TUM lines: t x y z qx qy qz qw."""
     mine = history.robot == robot
     lines = ["# t_s x_m y_m z_m qx qy qz qw"]
-    for t_ns, pose in zip(history.t_ns[mine].tolist(), history.poses[mine].tolist(), strict=True):
-        x, y, z, *q = pose if len(pose) == 7 else _lifted(*pose[:3])
+    poses = fitted(history.poses[mine], 7).tolist()
+    for t_ns, (x, y, z, *q) in zip(history.t_ns[mine].tolist(), poses, strict=True):
         lines.append(f"{seconds(t_ns)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
     return "\n".join(lines) + "\n"
-
-
-def _lifted(x: float, y: float, theta: float) -> tuple[float, ...]:
-    return x, y, 0.0, 0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)
 
 
 def associations_csv(history: History) -> str:
@@ -98,3 +96,23 @@ def _yaml() -> YAML:
         type(None), lambda representer, _: representer.represent_scalar("tag:yaml.org,2002:null", "null")
     )
     return yaml
+
+
+def file_name(robot: str) -> str:
+    """Return a robot's name as part of a file's name."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in robot)
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file so that it is there completely or not at all."""
+    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def replace_file(path: Path, writer: Callable[[Path], Any]) -> None:
+    """Let `writer` write a temporary file beside `path`, then put it in its place."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        writer(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -5,29 +5,39 @@ A *step* is one scan and the controls before it.  Plain arrays, saved as ``histo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from kalmark.events import Id
+from kalmark.results.columns import (
+    Array,
+    Arrays,
+    Flags,
+    Ints,
+    Matrix,
+    Named,
+    Names,
+    Size,
+    Texts,
+    Vector,
+    columns,
+    padded,
+    padded_all,
+    rows_of,
+    texts,
+)
 from kalmark.results.decisions import Decisions
 from kalmark.results.inputs import Inputs
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Texts = npt.NDArray[np.str_]
-Flags = npt.NDArray[np.bool_]
 
 
 class Start(NamedTuple):
     """A robot before the first event: its name, mean and covariance, and the time of its first event."""
 
     robot: str
-    mean: Array
-    covariance: Array
+    mean: Vector
+    covariance: Matrix
     t_ns: int
 
 
@@ -54,10 +64,10 @@ class Camera(NamedTuple):
 
     robot: str
     sensor: str
-    mount: Array
-    size: tuple[float, float]
-    columns: tuple[str, ...]
-    corners: Array
+    mount: Vector
+    size: Size
+    columns: Names
+    corners: Matrix
 
 
 class Mounted(NamedTuple):
@@ -68,18 +78,18 @@ class Mounted(NamedTuple):
     """
 
     name: str
-    mean: Array
-    covariance: Array
-    prior: Array
+    mean: Vector
+    covariance: Matrix
+    prior: Matrix
 
 
 class Biased(NamedTuple):
     """The bias of a robot's controls at the end: `mean` (k,) of the control's `columns`, and its covariance (k, k)."""
 
     robot: str
-    columns: tuple[str, ...]
-    mean: Array
-    covariance: Array
+    columns: Names
+    mean: Vector
+    covariance: Matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,63 +169,41 @@ class History:
         """The robots in the order of their starts, then of their first scans."""
         return tuple(dict.fromkeys([s.robot for s in self.starts] + self.robot.tolist()))
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Return everything as named arrays, those of the contract (t in seconds) first."""
-        named = {"t": self.t_ns * 1e-9} | {key: getattr(self, key) for key in ("robot", "mean", "covariance")}
-        named |= {key: getattr(self, key) for key in ("y", "e", "z", "Z", "landmark")}
-        named |= {key: getattr(self, key) for key in (*_EXTRA, "kind", "left_px", "true_id", "late", "noise")}
-        named |= self.decisions.arrays()
-        return (
-            named | self.inputs.arrays() | _map_arrays(self.maps) | _start_arrays(self.starts) | self._sensor_arrays()
-        )
-
-    def _sensor_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        return {
-            "camera": texts([f"{c.robot}\n{c.sensor}\n{','.join(c.columns)}" for c in self.cameras]),
-            "camera_mount": np.array([c.mount for c in self.cameras]).reshape(-1, 7),
-            "camera_size": np.array([c.size for c in self.cameras], dtype=np.float64).reshape(-1, 2),
-            "camera_corners": np.array([c.corners for c in self.cameras]).reshape(-1, 4, 3),
-            "mount": texts([m.name for m in self.mounts]),
-            "mount_mean": padded_rows([m.mean for m in self.mounts]),
-            "mount_covariance": padded_squares([m.covariance for m in self.mounts]),
-            "mount_prior": padded_squares([m.prior for m in self.mounts]),
-            "bias": texts([f"{b.robot}\n{','.join(b.columns)}" for b in self.biases]),
-            "bias_mean": padded_rows([b.mean for b in self.biases]),
-            "bias_covariance": padded_squares([b.covariance for b in self.biases]),
-        }
+    def arrays(self) -> Arrays:
+        """Return everything as named arrays, those of the contract among them (t in seconds)."""
+        named: Arrays = {"t": self.t_ns * 1e-9}
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        named |= {key: value for key, value in values.items() if isinstance(value, np.ndarray)}
+        named |= self.decisions.arrays() | self.inputs.arrays() | _map_arrays(self.maps)
+        named |= columns("start", Start, self.starts) | columns("camera", Camera, self.cameras, joined=True)
+        named |= columns("mount", Mounted, self.mounts, joined=True)
+        named |= columns("bias", Biased, self.biases, joined=True)
+        return named
 
     @classmethod
-    def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> History:
-        """Return the history that `arrays` gave."""
-        starts = tuple(
-            Start(str(robot), mean[~np.isnan(mean)], _cut(covariance), int(t_ns))
-            for robot, mean, covariance, t_ns in zip(
-                *(named["start_" + key] for key in ("robot", "mean", "covariance", "t_ns")), strict=True
-            )
-        )
-        count = len(named["landmark"])
-        kind, left = named.get("kind", np.full(count, "", dtype=np.str_)), named.get("left_px", np.full(count, np.nan))
-        maps, inputs, cameras = _maps(named), Inputs.from_arrays(named), _cameras(named)
-        keys = ("mount", "mount_mean", "mount_covariance", "mount_prior")
-        rows = zip(*(named.get(key, ()) for key in keys), strict=True)
-        mounts = tuple(Mounted(str(name), mean[~np.isnan(mean)], _cut(P), _cut(C)) for name, mean, P, C in rows)
-        columns: dict[str, Any] = {
-            key: named[key] for key in ("robot", "mean", "covariance", "y", "e", "z", "Z", "landmark", *_EXTRA)
+    def from_arrays(cls, named: Named) -> History:
+        """Return the history that `arrays` gave; the first versions saved fewer arrays."""
+        count, numbers = named["z"].shape[:2]
+        given: dict[str, Any] = {
+            "kind": np.full(count, "", dtype=np.str_),
+            "left_px": np.full(count, np.nan),
+            "true_id": named["id"],
         }
-        columns |= {"kind": kind, "left_px": left, "true_id": named.get("true_id", named["id"])}
-        columns["late"] = named.get("late", np.zeros(count, dtype=np.bool_))
-        columns["noise"] = named.get("noise", np.full((count, named["z"].shape[1]), np.nan))
-        columns |= {"maps": maps, "starts": starts, "mounts": mounts, "biases": _biases(named)}
-        return cls(**columns, inputs=inputs, cameras=cameras, decisions=Decisions.from_arrays(named))
+        given |= {"late": np.zeros(count, dtype=np.bool_), "noise": np.full((count, numbers), np.nan)}
+        given |= {f.name: named[f.name] for f in fields(cls) if f.name in named}
+        return cls(
+            **given,
+            maps=_maps(named),
+            starts=rows_of("start", Start, named),
+            inputs=Inputs.from_arrays(named),
+            decisions=Decisions.from_arrays(named),
+            cameras=rows_of("camera", Camera, named, joined=True),
+            mounts=rows_of("mount", Mounted, named, joined=True),
+            biases=rows_of("bias", Biased, named, joined=True),
+        )
 
 
-def _biases(named: Mapping[str, npt.NDArray[Any]]) -> tuple[Biased, ...]:
-    rows = zip(*(named.get(key, ()) for key in ("bias", "bias_mean", "bias_covariance")), strict=True)
-    told = [(*str(name).split("\n"), mean[~np.isnan(mean)], _cut(P)) for name, mean, P in rows]
-    return tuple(Biased(robot, tuple(columns.split(",")), mean, P) for robot, columns, mean, P in told)
-
-
-def _map_arrays(maps: tuple[MapSnapshot, ...]) -> dict[str, npt.NDArray[Any]]:
+def _map_arrays(maps: tuple[MapSnapshot, ...]) -> Arrays:
     blocks = [m.covariances for m in maps]
     width = max((block.shape[1] for block in blocks), default=2)
     return {
@@ -224,12 +212,12 @@ def _map_arrays(maps: tuple[MapSnapshot, ...]) -> dict[str, npt.NDArray[Any]]:
         "map_size": np.array([len(m.ids) for m in maps], dtype=np.int64),
         "map_landmark": texts([i for m in maps for i in m.ids]),
         "map_kind": texts([kind for m in maps for kind in m.kinds]),
-        "map_mean": padded_rows([mean for m in maps for mean in m.means]),
+        "map_mean": padded_all([mean for m in maps for mean in m.means]),
         "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
     }
 
 
-def _maps(named: Mapping[str, npt.NDArray[Any]]) -> tuple[MapSnapshot, ...]:
+def _maps(named: Named) -> tuple[MapSnapshot, ...]:
     ends = np.cumsum(named["map_size"])
     kinds = named.get("map_kind", np.empty(0, dtype=np.str_))
     return tuple(
@@ -245,44 +233,6 @@ def _maps(named: Mapping[str, npt.NDArray[Any]]) -> tuple[MapSnapshot, ...]:
     )
 
 
-def _start_arrays(starts: tuple[Start, ...]) -> dict[str, npt.NDArray[Any]]:
-    return {
-        "start_robot": texts([s.robot for s in starts]),
-        "start_mean": padded_rows([s.mean for s in starts]),
-        "start_covariance": padded_squares([s.covariance for s in starts]),
-        "start_t_ns": np.array([s.t_ns for s in starts], dtype=np.int64),
-    }
-
-
-def _cameras(named: Mapping[str, npt.NDArray[Any]]) -> tuple[Camera, ...]:
-    if "camera" not in named:
-        return ()
-    rows = zip(*(named[key] for key in ("camera", "camera_mount", "camera_size", "camera_corners")), strict=True)
-    cameras = []
-    for text, mount, (width, height), corners in rows:
-        robot, sensor, columns = str(text).split("\n")
-        cameras.append(Camera(robot, sensor, mount, (float(width), float(height)), tuple(columns.split(",")), corners))
-    return tuple(cameras)
-
-
-_EXTRA = (
-    "t_ns",
-    "step_us",
-    "step",
-    "sensor",
-    "index",
-    "id",
-    "outcome",
-    "d2",
-    "reason",
-)  # and kind and left_px, which runs saved by the first version lack
-
-
-def texts(values: list[Any]) -> Texts:
-    """Return ids or names as an array of texts, "" for None."""
-    return np.array(["" if value is None else str(value) for value in values], dtype=np.str_)
-
-
 def as_id(text: str) -> Id:
     """Return a landmark id from a file: a text that is an integer becomes one."""
     try:
@@ -290,34 +240,3 @@ def as_id(text: str) -> Id:
     except ValueError:
         return text
     return number if str(number) == text else text
-
-
-def padded(blocks: list[Array], counts: list[int], width: int, matrices: bool = False) -> Array:
-    """Stack blocks (K, m) or (K, m, m) of several sizes m, K by `counts`, padded with NaN; an empty one is all NaN."""
-    out = np.full((sum(counts), width, width) if matrices else (sum(counts), width), np.nan)
-    at = 0
-    for block, count in zip(blocks, counts, strict=True):
-        if len(block) == count and block.size:
-            out[(slice(at, at + count), *(slice(m) for m in block.shape[1:]))] = block
-        at += count
-    return out
-
-
-def padded_rows(rows: list[Array]) -> Array:
-    """Stack rows of several lengths, padded with NaN."""
-    out = np.full((len(rows), max((len(row) for row in rows), default=2)), np.nan)
-    for k, row in enumerate(rows):
-        out[k, : len(row)] = row
-    return out
-
-
-def padded_squares(matrices: list[Array]) -> Array:
-    """Stack square matrices of several sizes, padded with NaN."""
-    width = max((len(P) for P in matrices), default=2)
-    return padded([P[None] for P in matrices], [1] * len(matrices), width, matrices=True)
-
-
-def _cut(P: Array) -> Array:
-    """Return a square matrix without the NaN it was padded with."""
-    n = int((~np.isnan(np.diagonal(P))).sum())
-    return P[:n, :n]

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kalmark.results.history import Array, Camera, History, Ints
+from kalmark.results.columns import Array, Ints
+from kalmark.results.history import Camera, History
 from kalmark.results.shapes import EUCLIDEAN
 
 COLUMN = re.compile(r"([uv])([lr]?)(\d*)_px")

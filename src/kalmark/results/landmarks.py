@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from kalmark.errors import RunError
 from kalmark.events import Id
-from kalmark.results.history import as_id, padded_rows, padded_squares
+from kalmark.results.columns import padded_all
+from kalmark.results.history import as_id
 from kalmark.results.shapes import LINE, POINT, TAG, place
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class MapLandmarks:
     """The landmarks of a map: ids, kinds, places with covariances and how often each was observed.
 
     The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
-    in the map is: see `kalmark.results.shapes`.
+    in the map is (`kalmark.results.shapes`); NaN if its model does not say where it is.
     """
 
     ids: list[Id]
@@ -54,14 +55,17 @@ class MapLandmarks:
         """Return the places of the landmarks of a filter's map."""
         table = slam.landmarks()
         rows = zip(table.ids, table.means, table.covariances, strict=True)
-        places = [place(slam.landmark_model(i), mean, cov, slam.segment_ends(i)) for i, mean, cov in rows]
+        in_space = any(robot.motion.space.world == "space" for robot in slam.robots.values())
+        d = 3 if in_space else 2
+        nowhere = np.full(d, np.nan), np.full((d, d), np.nan)
+        places = [place(slam.landmark_model(i), mean, P, slam.segment_ends(i)) or nowhere for i, mean, P in rows]
         return cls(
             list(table.ids),
             list(table.kinds),
             [mean for mean, _ in places],
             [cov for _, cov in places],
             [int(count) for count in table.observations],
-            any(robot.motion.space.world == "space" for robot in slam.robots.values()),
+            in_space,
         )
 
     def positions(self) -> tuple[Array, Array]:
@@ -74,7 +78,7 @@ class MapLandmarks:
         """Return the places (K, n) and covariances (K, q, q), padded with NaN; in the plane the positions alone."""
         if not self.in_space:
             return self.positions()
-        return padded_rows(self.means), padded_squares(self.covariances)
+        return padded_all(self.means), padded_all(self.covariances, 2)
 
     def to_csv(self) -> str:
         """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations."""

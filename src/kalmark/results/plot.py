@@ -1,99 +1,95 @@
-"""``map.png``: paths, landmarks with their 3-sigma ellipses, and the truth behind them."""
+"""``map.png``: paths, landmarks with their 3-sigma contours, the truth behind them; in space a view and a plan."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
-from kalmark.results import plot_space
-from kalmark.results.history import Array, Ints
-from kalmark.results.picture import (
-    FIX_COLOUR,
-    INK,
-    LANDMARK_COLOUR,
-    TRUTH_COLOUR,
-    Picture,
-    broken,
-    ellipses,
-    headline,
-)
-from kalmark.results.plot_sensor import draw_sensor
+from kalmark.results.columns import Array
+from kalmark.results.headline import headline
+from kalmark.results.recording import Recording
+from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, contours, joined, squares
+from kalmark.results.shapes import LINES, TAG
 
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
-
+VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "front": (0.0, 0.0)}
+LANDMARK_COLOUR = "#d2691e"
+EUCLIDEAN_COLOUR, OTHER_COLOUR, LINE_COLOUR = "#1f5fa8", "#c8412f", "#8c1c13"
+GROUPS = {  # of landmarks that are drawn alike, by the dimensions of the scene
+    2: ((LANDMARK_COLOUR, r"estimated landmarks, $3\sigma$"),) * 3,
+    3: (
+        (EUCLIDEAN_COLOUR, r"Euclidean landmarks, $3\sigma$"),
+        (OTHER_COLOUR, r"other landmarks, $3\sigma$"),
+        (LINE_COLOUR, r"lines, $3\sigma$ of their ends"),
+    ),
+}
 LONG = 3000  # a path of more steps than this is drawn thinner
-REACH = 0.2  # an ellipse widens the picture by at most this part of it
 CROWD = 100  # with more landmarks than this, everything about them is drawn thinner
+FEW = 40  # landmarks of space that are labelled
+GROUND, SHADOW, TICK, SOFT = "#d7dbe1", "#c3c8d0", "#7a818c", "#555b66"
+NAMED: dict[str, Any] = {"color": "#1e4d2b", "fontsize": 7, "ha": "center", "va": "bottom", "zorder": 9}
+POSE_COLOUR = "#d62f2f"
+INCHES = {2: 8.3, 3: 13.6}  # what the panels are wide together
+LINE_INCHES, CHARACTERS = 0.17, 13  # the height of a line of text, and how many fit an inch
 
 
-def save_map(run: Run, path: str | PathLike[str]) -> None:
+class Stroke(NamedTuple):
+    """Polylines or marks: points (N, d), NaN between lines, their style, and the label and style in the legend."""
+
+    points: Array
+    style: dict[str, Any]
+    label: str = ""
+    sample: dict[str, Any] | None = None
+
+
+def save_map(run: Recording, path: str | PathLike[str]) -> None:
     """Draw the map of a run and write it as a PNG."""
     figure = draw_map(run)
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=130, format="png", bbox_inches="tight", pad_inches=0.15)
 
 
-def save_sensor(run: Run, robot: str, sensor: str, path: str | PathLike[str], step: int | None = None) -> None:
-    """Draw a camera's last scan, or that at a step, and write it as a PNG."""
-    figure = draw_sensor(run, robot, sensor, step)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=110, format="png")
+def draw_map(run: Recording, step: int | None = None, view: str | tuple[float, float] = "normal") -> Figure:
+    """Return the figure of a run's map after a step, by default the last: axes in metres, in the frame of the map.
 
-
-def draw_map(run: Run) -> Figure:
-    """Return the figure of a run's map: axes in metres, in the frame of the map; in space a view and a plan."""
-    if run.history.in_space:
-        return plot_space.draw_map(run)
-    low, high = extent(run)
-    figure = Figure(figsize=_size(high - low), layout=ConstrainedLayoutEngine(h_pad=0.09), facecolor="white")
-    axes = figure.subplots()
-    draw_plane(axes, run, low, high)
+    In space `view` is where the left half looks from: "normal", "top", "side", "front" or (elevation, azimuth) in
+    degrees.
+    """
+    scene = Scene.of(run, step)
+    spans = [(scene.high - scene.low)[:2]]
+    if scene.d == 3:
+        projection = Projection.of(scene, view)
+        spans.insert(0, np.ptp(projection(corners(scene.low, scene.high)), axis=0))
+    aspects = [float(np.clip(span[0] / span[1], 0.5, 4.0)) for span in spans]
+    tall = float(np.clip(INCHES[scene.d] / sum(aspects), 3.0, 8.5))
+    width = max(sum(aspects) * tall + 0.2 + 0.65 * len(spans), 6.0)
     title, figures = headline(run)
-    _head(axes, title, _lines(figures, width=int(12 * figure.get_figwidth())))
-    entries = _legend(Picture.of(run), len(run.landmarks))
-    figure.legend(handles=entries, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    lines, handles = _lines(figures, int(CHARACTERS * width)), legend(scene)
+    columns = max(1, int(width / 1.9))
+    below, above = 0.6 + 0.25 * -(-len(handles) // columns), 0.55 + LINE_INCHES * len(lines)
+    figure = Figure(figsize=(width, tall + below + above), facecolor="white")
+    height = figure.get_figheight()
+    left = 0.1 if scene.d == 3 else 0.75
+    if scene.d == 3:
+        at = left / width, (below - 0.3) / height, aspects[0] * tall / width, (tall + 0.3) / height
+        draw_space(figure.add_axes(at), scene, projection)
+    wide = aspects[-1] * tall
+    at = (width - 0.15 - wide if scene.d == 3 else left) / width, below / height, wide / width, tall / height
+    draw_plan(figure.add_axes(at, anchor="NW"), scene)
+    figure.text(left / width, 1 - 0.3 / height, title, fontsize=13, fontweight="bold", color=INK)
+    text: dict[str, Any] = {"va": "top", "fontsize": 9, "color": SOFT, "linespacing": 1.35}
+    figure.text(left / width, 1 - 0.4 / height, "\n".join(lines), **text)
+    figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False, fontsize=9)
     return figure
-
-
-def draw_plane(axes: Axes, run: Run, low: Array, high: Array, step: int | None = None) -> None:
-    """Draw the map of a run in the plane after a step, by default the last, between two corners (2,)."""
-    picture, history = Picture.of(run), run.history
-    means, covariances = run.landmarks.positions() if step is None else history.map_at(step)[3:5]
-    until = slice(None) if step is None else slice(step + 1)
-    _style(axes)
-    _draw_truth(axes, picture, crowded=len(means) > CROWD)
-    _draw_landmarks(axes, means, covariances)
-    for robot in picture.paths:
-        mine = history.robot[until] == robot
-        path, P = history.mean[until][mine], history.covariance[until][mine]
-        _draw_robot(axes, picture.colour(robot), path, P, picture.stretches[robot])
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_aspect("equal", adjustable="box")
-
-
-def _head(axes: Axes, title: str, lines: list[str]) -> None:
-    at: dict[str, Any] = {
-        "xy": (0, 1),
-        "xycoords": "axes fraction",
-        "textcoords": "offset points",
-        "annotation_clip": False,
-    }
-    above = 8 + 12.5 * len(lines)
-    axes.annotate("\n".join(lines), xytext=(0, 8), va="bottom", fontsize=9, color="#555b66", linespacing=1.35, **at)
-    axes.annotate(title, xytext=(0, above + 3), va="bottom", fontsize=13, fontweight="bold", color=INK, **at)
 
 
 def _lines(figures: list[str], width: int) -> list[str]:
@@ -107,83 +103,100 @@ def _lines(figures: list[str], width: int) -> list[str]:
     return lines
 
 
-def _style(axes: Axes) -> None:
+def draw_plan(axes: Axes, scene: Scene) -> None:
+    """Draw a scene as seen from above: x to the right, y up."""
     axes.set_xlabel("x (m)", color=INK)
     axes.set_ylabel("y (m)", color=INK)
     axes.grid(True, color="#e6e8ec", linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.tick_params(colors="#555b66", labelsize=9)
+    axes.tick_params(colors=SOFT, labelsize=9)
     for side in axes.spines.values():
         side.set_color("#c4c8cf")
+    for stroke in strokes(scene):
+        axes.plot(stroke.points[:, 0], stroke.points[:, 1], **stroke.style)
+    for name, point in _labels(scene):
+        axes.text(point[0], point[1] + 0.01 * scene.size, name, **NAMED)
+    axes.set_xlim(scene.low[0], scene.high[0])
+    axes.set_ylim(scene.low[1], scene.high[1])
+    axes.set_aspect("equal", adjustable="box")
 
 
-def extent(run: Run) -> tuple[Array, Array]:
-    """Return the corners of what is to be seen of a map; huge ellipses and stray fixes may reach out of it."""
-    picture = Picture.of(run)
-    landmarks, covariances = run.landmarks.positions()
-    parts = [
-        landmarks,
-        *(path[:, :2] for path in picture.paths.values()),
-        *picture.truth.values(),
-        *picture.used.values(),
-    ]
-    points = np.concatenate([*parts, np.array(list(picture.landmarks.values())).reshape(-1, 2)])
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        return np.array([-1.0, -1.0]), np.array([1.0, 1.0])
-    low, high = points.min(axis=0), points.max(axis=0)
-    if len(landmarks):
-        reach = 3.0 * np.sqrt(np.maximum(np.einsum("kii->ki", covariances), 0.0))
-        reach = np.minimum(reach, max(REACH * (high - low).max(), 0.5))
-        low, high = np.minimum(low, (landmarks - reach).min(axis=0)), np.maximum(high, (landmarks + reach).max(axis=0))
-    middle, half = (low + high) / 2, (high - low) / 2
-    half = np.maximum(half * 1.06, max(0.15 * half.max(), 0.5))
-    return middle - half, middle + half
+def strokes(scene: Scene) -> list[Stroke]:
+    """Return all that is drawn of a scene, in the order of the legend."""
+    several, crowded = len(scene.paths) > 1, len(scene.ids) > CROWD
+    gaps = " (gaps: no scans)" if any(s[-1:].any() for s in scene.stretches.values()) else ""
+    out = []
+    for robot, path in scene.paths.items():
+        style = {"color": scene.colour(robot), "linewidth": 0.8 if len(path) > LONG else 1.2, "alpha": 0.9, "zorder": 6}
+        label = robot if several else f"estimated path{gaps}"
+        out.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
+    truth = {"color": TRUTH_COLOUR, "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
+    label = "true paths" if several else "true path"
+    out += [Stroke(scene.true_path(robot), truth, label, truth) for robot in scene.truth]
+    small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
+    aligned = "position fixes (aligned, not used)"
+    out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
+    out += [Stroke(fixes, cross, "fixes used", cross | {"markersize": 5}) for fixes in scene.used.values()]
+    return out + _true_strokes(scene, truth, crowded) + _landmark_strokes(scene, crowded) + _robot_strokes(scene)
 
 
-def _size(span: Array) -> tuple[float, float]:
-    """Return the size of the figure in inches for an area of this width and height."""
-    shape = float(np.clip(span[1] / span[0], 0.35, 1.6))
-    width = 9.0 if shape <= 1 else 9.0 / shape**0.6
-    return width, (width - 0.7) * shape + 1.9
+def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[Stroke]:
+    points, lines = list(scene.true_points().values()), scene.true_lines()
+    out = []
+    if points:
+        colour, zorder = (INK, 6) if scene.d == 2 else (TRUTH_COLOUR, 2)
+        plus = _marks("+", colour, 4 if crowded else 8, zorder) | {"markeredgewidth": 0.6 if crowded else 1.0}
+        out.append(Stroke(np.array(points), plus, "true landmarks", _marks("+", colour, 7, 1)))
+    if lines:
+        out.append(Stroke(joined(lines), style, "true lines", style))
+    tags = np.array([l for l in scene.true_landmarks.values() if len(l) == TAG]).reshape(-1, TAG)
+    return [*out, Stroke(joined(squares(tags, scene.size)), style)] if len(tags) else out
 
 
-def _draw_truth(axes: Axes, picture: Picture, crowded: bool) -> None:
-    for fixes in picture.fixes.values():
-        axes.plot(fixes[:, 0], fixes[:, 1], ".", color=TRUTH_COLOUR, markersize=1.8, zorder=1)
-    for fixes in picture.used.values():
-        axes.plot(fixes[:, 0], fixes[:, 1], "x", color=FIX_COLOUR, markersize=3.5, markeredgewidth=0.7, zorder=3)
-    for robot, path in picture.truth.items():
-        line = broken(path, picture.stretches[robot])
-        axes.plot(line[:, 0], line[:, 1], "-", color=TRUTH_COLOUR, linewidth=2.2, alpha=0.6, zorder=2)
-    if picture.landmarks:
-        points = np.array(list(picture.landmarks.values()))
-        size, width = (4, 0.6) if crowded else (8, 1.0)
-        axes.plot(points[:, 0], points[:, 1], "+", color=INK, markersize=size, markeredgewidth=width, zorder=6)
+def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
+    points, group, out = scene.shapes.points, scene.shapes.group, []
+    for k, (colour, label) in enumerate(GROUPS[scene.d]):
+        mine = group == k
+        if not mine.any():
+            continue
+        rings = contours(points.means[mine], points.covariances[mine])
+        rings = rings.reshape(-1, *rings.shape[-2:])
+        width, alpha = (0.9, 1.0) if scene.d == 2 else (0.7, 0.55)
+        thin = {"linewidth": 0.5 * width, "alpha": 0.75 * alpha} if crowded else {"linewidth": width, "alpha": alpha}
+        sample = {"color": colour, "marker": "."}
+        out.append(Stroke(joined(rings, scene.d), {"color": colour, "zorder": 4, **thin}, label, sample))
+        out.append(Stroke(points.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
+    if scene.d == 3:
+        out.append(Stroke(joined(scene.shapes.lines), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
+        tags = joined(squares(scene.shapes.tags, scene.size))
+        out.append(Stroke(tags, {"color": EUCLIDEAN_COLOUR, "linewidth": 1.4, "zorder": 5}))
+    return out
 
 
-def _draw_landmarks(axes: Axes, means: Array, covariances: Array) -> None:
-    if len(means) == 0:
-        return
-    crowded = len(means) > CROWD
-    contours = LineCollection(
-        list(ellipses(means, covariances)), colors=LANDMARK_COLOUR, linewidths=0.5 if crowded else 0.9, zorder=5
-    )
-    axes.add_collection(contours, autolim=False)
-    axes.plot(means[:, 0], means[:, 1], ".", color=LANDMARK_COLOUR, markersize=1.8 if crowded else 3.5, zorder=5)
+def _robot_strokes(scene: Scene) -> list[Stroke]:
+    """Return starts, ends with their contours, and in space the robots' bodies along the way."""
+    starts, ends, rings, d = [], [], [], scene.d
+    disc = {"markerfacecolor": "white"}
+    for robot, path in scene.paths.items():
+        if not len(path):
+            continue
+        colour = scene.colour(robot)
+        rim = _marks("o", colour, 7 if d == 2 else 6, 7)
+        starts.append(Stroke(path[:1, :d], rim | disc, "start", _marks("o", INK, 6, 1) | disc))
+        marker, size = (_arrow(float(path[-1, 2])), 15) if d == 2 else ("o", 6)
+        mark = _marks(_arrow(0.0) if d == 2 else "o", INK, 11 if d == 2 else 6, 1)
+        ends.append(Stroke(path[-1:, :d], _marks(marker, colour, size, 8) | {"markeredgecolor": "white"}, "end", mark))
+        ring = joined(contours(path[-1:, :d], scene.pose_covariances[robot][-1:, :d, :d])[0], d)
+        style = {"color": colour if d == 2 else POSE_COLOUR, "linewidth": 0.9, "zorder": 7}
+        rings.append(Stroke(ring, style, r"$3\sigma$ of the end", style | {"color": INK if d == 2 else POSE_COLOUR}))
+        if d == 3:
+            thin = {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}
+            rings.append(Stroke(joined(scene.frames(robot)), thin))
+    return starts + ends + rings
 
 
-def _draw_robot(axes: Axes, colour: str, path: Array, P: Array, stretches: Ints) -> None:
-    if len(path) == 0:
-        return
-    width = 0.8 if len(path) > LONG else 1.1
-    line = broken(path[:, :2], stretches)
-    axes.plot(line[:, 0], line[:, 1], "-", color=colour, linewidth=width, alpha=0.9, zorder=4)
-    axes.plot(*path[0, :2], "o", markerfacecolor="white", markeredgecolor=colour, markersize=7, zorder=7)
-    arrow = _arrow(float(path[-1, 2]))
-    axes.plot(*path[-1, :2], marker=arrow, color=colour, markeredgecolor="white", markersize=15, zorder=8)
-    contour = ellipses(path[-1:, :2], P[-1:, :2, :2])[0]
-    axes.plot(contour[:, 0], contour[:, 1], "-", color=colour, linewidth=0.9, zorder=7)
+def _marks(marker: Any, colour: str, size: float, zorder: float) -> dict[str, Any]:
+    return {"linestyle": "", "marker": marker, "color": colour, "markersize": size, "zorder": zorder}
 
 
 def _arrow(heading: float) -> MarkerStyle:
@@ -192,29 +205,118 @@ def _arrow(heading: float) -> MarkerStyle:
     return MarkerStyle(dart, transform=Affine2D().rotate(heading))
 
 
-def _legend(picture: Picture, landmarks: int) -> list[Line2D]:
-    several = len(picture.paths) > 1
-    gaps = " (gaps: no scans)" if any(s[-1:].any() for s in picture.stretches.values()) else ""
-    handles = [
-        Line2D([], [], color=picture.colour(robot), label=robot if several else f"estimated path{gaps}")
-        for robot in picture.paths
-    ]
-    if picture.truth:
-        handles.append(
-            Line2D([], [], color=TRUTH_COLOUR, linewidth=2.2, alpha=0.6, label="true paths" if several else "true path")
-        )
-    if picture.fixes:
-        handles.append(
-            Line2D([], [], color=TRUTH_COLOUR, marker=".", linestyle="", label="position fixes (aligned, not used)")
-        )
-    if picture.used:
-        handles.append(Line2D([], [], color=FIX_COLOUR, marker="x", markersize=5, linestyle="", label="fixes used"))
-    if picture.landmarks:
-        handles.append(Line2D([], [], color=INK, marker="+", linestyle="", label="true landmarks"))
-    if landmarks:
-        handles.append(Line2D([], [], color=LANDMARK_COLOUR, marker=".", label=r"estimated landmarks, $3\sigma$"))
-    if any(len(path) for path in picture.paths.values()):
-        open_dot: dict[str, Any] = {"marker": "o", "markerfacecolor": "white", "linestyle": ""}
-        handles.append(Line2D([], [], color=INK, label="start", **open_dot))
-        handles.append(Line2D([], [], color=INK, marker=_arrow(0.0), linestyle="", label="end", markersize=11))
-    return handles
+def legend(scene: Scene) -> list[Line2D]:
+    """Return the entries of a scene's legend."""
+    samples = {stroke.label: stroke.sample for stroke in reversed(strokes(scene)) if stroke.label}
+    return [Line2D([], [], label=label, **(sample or {})) for label, sample in reversed(samples.items())]
+
+
+def _labels(scene: Scene) -> list[tuple[str, Array]]:
+    """Return the names of the landmarks of space, if they are few, and their places."""
+    if scene.d == 2 or len(scene.ids) > FEW:
+        return []
+    places = scene.shapes.points.means[: len(scene.ids)]
+    inside = ((places >= scene.low) & (places <= scene.high)).all(axis=1)
+    return [(str(scene.ids[k]), places[k]) for k in np.flatnonzero(inside).tolist()]
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A view of space on paper: `axes` (3, 3) are right, up and towards the eye, which is `distance` from `middle`."""
+
+    axes: Array
+    middle: Array
+    distance: float
+
+    @classmethod
+    def of(cls, scene: Scene, view: str | tuple[float, float] = "normal") -> Projection:
+        """Return the view from (elevation, azimuth), degrees: without perspective from the top and the sides."""
+        elevation, azimuth = np.radians(VIEWS[view] if isinstance(view, str) else view)
+        eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        far = np.inf if isinstance(view, str) and view != "normal" else 2.5 * np.linalg.norm(scene.high - scene.low)
+        return cls(np.array([right, np.cross(eye, right), eye]), (scene.low + scene.high) / 2, float(far))
+
+    def __call__(self, points: Array) -> Array:
+        """Return points (..., 3) on paper (..., 2)."""
+        q = (points - self.middle) @ self.axes.T
+        return q[..., :2] / (1.0 - q[..., 2:] / self.distance)
+
+
+def corners(low: Array, high: Array) -> Array:
+    """Return the corners (8, 3) of a box."""
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
+def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
+    """Draw a scene in perspective above a grid on the ground, with the shadows of paths and of few landmarks."""
+    axes.set_axis_off()
+    axes.set_aspect("equal", adjustable="box")
+    floor = ground(scene)
+    shadows = [np.column_stack([line[:, :2], np.full(len(line), floor)]) for line in map(scene.line, scene.paths)]
+    if len(scene.ids) <= CROWD:
+        standing = scene.shapes.points.means[scene.shapes.group != LINES]
+        shadows += [np.array([point, [*point[:2], floor]]) for point in standing]
+    drawn = [Stroke(scene.inside(joined(shadows)), {"color": SHADOW, "linewidth": 0.7, "zorder": 1})]
+    drawn += [Stroke(scene.inside(stroke.points), stroke.style) for stroke in strokes(scene)]
+    for points, style, *_ in _ground(axes, scene, projection) + drawn:
+        axes.plot(*projection(points).T, clip_on=False, **style)
+    for name, point in _labels(scene):
+        u, v = projection(point + np.array([0.0, 0.0, 0.012 * scene.size]))
+        axes.text(u, v, name, **NAMED)
+    edges = projection(corners(scene.low, scene.high))
+    low, high = edges.min(axis=0), edges.max(axis=0)
+    pad = 0.04 * (high - low).max()
+    axes.set_xlim(low[0] - pad, high[0] + pad)
+    axes.set_ylim(low[1] - pad, high[1] + pad)
+
+
+def spacing(size: float) -> float:
+    """Return the distance of the lines of a grid: 2 m, or 1, 2 or 5 times a power of ten that gives some ten lines."""
+    if 8.0 <= size <= 40.0:
+        return 2.0
+    power = 10.0 ** np.floor(np.log10(size / 10.0))
+    return float(power * next(m for m in (1, 2, 5, 10) if size / (m * power) <= 14))
+
+
+def ground(scene: Scene) -> float:
+    """Return the height of the ground: 0, or the lowest there is."""
+    return 0.0 if scene.low[2] <= 0.0 <= scene.high[2] else float(scene.low[2])
+
+
+def _ground(axes: Axes, scene: Scene, projection: Projection) -> list[Stroke]:
+    """Return the grid on the ground and a scale of heights at a corner; draw ticks at the edges that face the eye."""
+    low, high, eye, z = scene.low, scene.high, projection.axes[2], ground(scene)
+    step = spacing(float((high - low)[:2].max()))
+    xs, ys = (np.arange(np.ceil(low[i] / step), np.floor(high[i] / step) + 1) * step for i in (0, 1))
+    lines = [np.array([[x, low[1], z], [x, high[1], z]]) for x in xs]
+    lines += [np.array([[low[0], y, z], [high[0], y, z]]) for y in ys]
+    near = np.where(eye[:2] > 0, high[:2], low[:2])
+    away = 0.035 * scene.size * np.where(eye[:2] > 0, 1.0, -1.0)
+    skip = max(1, -(-max(len(xs), len(ys)) // 8))
+    ticks = [(f"{x + 0.0:g}", [x, near[1] + away[1], z]) for x in xs[::skip]]
+    ticks += [(f"{y + 0.0:g}", [near[0] + away[0], y, z]) for y in ys[::skip]]
+    middle = (low + high) / 2
+    ticks.append(("x (m)", [middle[0], near[1] + 2.6 * away[1], z]))
+    ticks.append(("y (m)", [near[0] + 2.6 * away[0], middle[1], z]))
+    heights, more = _heights(scene, projection)
+    ticks += more
+    for text, point in ticks:
+        u, v = projection(np.array(point))
+        axes.text(u, v, text, color=TICK, fontsize=8, ha="center", va="center", zorder=1)
+    return [Stroke(joined(lines), {"color": GROUND, "linewidth": 0.7, "zorder": 0}), *heights]
+
+
+def _heights(scene: Scene, projection: Projection) -> tuple[list[Stroke], list[tuple[str, Any]]]:
+    """Return the scale of heights at the corner that is leftmost on paper, and its ticks."""
+    low, high = scene.low, scene.high
+    if abs(projection.axes[2, 2]) > 0.99:
+        return [], []
+    edges = corners(low, high)
+    x, y, _ = edges[np.argmin(projection(edges)[:, 0])]
+    step = spacing(float(3.0 * max(high[2] - low[2], 0.2 * scene.size)))
+    scale = Stroke(np.array([[x, y, low[2]], [x, y, high[2]]]), {"color": "#b4bac4", "linewidth": 0.8, "zorder": 0})
+    beside = -0.03 * scene.size * projection.axes[0]
+    zs = np.arange(np.ceil(low[2] / step), np.floor(high[2] / step) + 1) * step
+    ticks = [(f"{z + 0.0:g}", np.array([x, y, z]) + beside) for z in zs]
+    return [scale], [*ticks, ("z (m)", np.array([x, y, high[2] + 0.03 * scene.size]))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,13 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from kalmark.results.columns import Array
 from kalmark.results.explain import Explanation, Fate
-from kalmark.results.history import Array
-from kalmark.results.picture import INK, ellipses
+from kalmark.results.recording import Recording
+from kalmark.results.scene import INK, contours, joined
 from kalmark.results.words import figure as figure_of
-
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
 
 OUTCOME = {
     "associated": "#4a8f7b", "new": "#d2a23c", "rejected": "#c8553d", "ignored": "#8b929c",
@@ -31,14 +29,14 @@ MARK = 6.0  # half a cross or a square, in points
 ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
-def save_scan(run: Run, told: Explanation, path: str | Path) -> None:
+def save_scan(run: Recording, told: Explanation, path: str | Path) -> None:
     """Draw one scan of a run and write it as a PNG."""
     figure = draw_scan(run, told)
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=130, format="png", bbox_inches="tight", pad_inches=0.15)
 
 
-def draw_scan(run: Run, told: Explanation) -> Figure:
+def draw_scan(run: Recording, told: Explanation) -> Figure:
     """Return the figure of one scan, from above: axes in metres, in the frame of the map.
 
     Crosses are the observations where they seem to come from before the scan, squares the landmarks they were compared
@@ -141,24 +139,21 @@ def _label(fate: Fate) -> str:
     return str(fate.index) if d2 is None else f"{fate.index}: {figure_of(d2, 2)}"
 
 
-def _robot(axes: Axes, run: Run, told: Explanation) -> None:
+def _robot(axes: Axes, run: Recording, told: Explanation) -> None:
     history = run.history
     mine = np.flatnonzero(history.robot[: told.step + 1] == told.robot)[-PATH:]
     axes.plot(*history.poses[mine, :2].T, color=ROBOT, lw=1)
-    axes.plot(*ellipses(told.pose[None, :2], told.covariance[None, :2, :2])[0].T, color=ROBOT, lw=1)
+    axes.plot(*contours(told.pose[None, :2], told.covariance[None, :2, :2])[0, 0].T, color=ROBOT, lw=1)
     axes.plot(*told.pose[:2], "o", color=ROBOT, ms=7)
 
 
-def _landmarks(axes: Axes, run: Run, told: Explanation, low: Array, high: Array) -> None:
+def _landmarks(axes: Axes, run: Recording, told: Explanation, low: Array, high: Array) -> None:
     """Draw the map as it was kept last before the scan, and later if it was not kept before."""
     kept = run.history.map_at(told.step)
     inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
-    for i in np.flatnonzero(inside).tolist():
-        axes.plot(*kept.means[i, :2], ".", color=FAINT, ms=4, zorder=1)
-        if np.isfinite(kept.covariances[i, :2, :2]).all():
-            axes.plot(
-                *ellipses(kept.means[i : i + 1, :2], kept.covariances[i : i + 1, :2, :2])[0].T, color=FAINT, lw=0.8
-            )
+    means, covariances = kept.means[inside, :2], kept.covariances[inside, :2, :2]
+    axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
+    axes.plot(*joined(contours(means, covariances)[:, 0], 2).T, color=FAINT, lw=0.8)
 
 
 def _extent(told: Explanation) -> tuple[Array, Array]:

@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from os import PathLike
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from kalmark.errors import RunError
 from kalmark.results.history import Camera
 from kalmark.results.images import Image, Sighting, colour_of, images, steps_of, trimmed
-from kalmark.results.picture import INK, ellipses
-
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
+from kalmark.results.recording import Recording
+from kalmark.results.scene import INK, contours
 
 MEASURED, NAME = "#7d838d", "#1e4d2b"
 
 
-def draw_sensor(run: Run, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> Figure:
+def save_sensor(run: Recording, robot: str, sensor: str, path: str | PathLike[str], step: int | None = None) -> None:
+    """Draw a camera's last scan, or that at a step, and write it as a PNG."""
+    figure = draw_sensor(run, robot, sensor, step)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=110, format="png")
+
+
+def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> Figure:
     """Return the figure of a camera's last scan, or of that at a step, or of the last up to a time.
 
     Pixels, v downwards; measurements are grey crosses or thick lines, expectations 3-sigma ellipses of Z around e or
@@ -45,7 +52,7 @@ def draw_sensor(run: Run, robot: str, sensor: str, step: int | None = None, t_s:
     return figure
 
 
-def find(run: Run, robot: str, sensor: str) -> Camera:
+def find(run: Recording, robot: str, sensor: str) -> Camera:
     """Return a camera of a run by its name.  Raises RunError if there is none of that name."""
     for camera in run.history.cameras:
         if (camera.robot, camera.sensor) == (robot, sensor):
@@ -54,7 +61,7 @@ def find(run: Run, robot: str, sensor: str) -> Camera:
     raise RunError(f"camera {robot}.{sensor} is not in this run, expected one of: {names}")
 
 
-def chosen(run: Run, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> int:
+def chosen(run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> int:
     """Return the step of a camera's scan: the last of all, of those up to a step, or of those up to a time."""
     steps = steps_of(run.history, find(run, robot, sensor))
     if t_s is not None:
@@ -106,7 +113,7 @@ def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: s
     if len(s.expected) == 1:
         axes.plot(*s.expected.T, ".", color=colour, markersize=3, zorder=5)
         if np.isfinite(s.Z).all():
-            axes.plot(*ellipses(s.expected, s.Z[None])[0].T, **style)
+            axes.plot(*contours(s.expected, s.Z[None])[0, 0].T, **style)
         if rejected:
             axes.plot(*np.vstack([s.measured, s.expected]).T, ":", color=INK, linewidth=0.8, zorder=4)
     elif len(s.expected) == 2:

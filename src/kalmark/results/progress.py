@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -16,53 +17,36 @@ def track(
     if not show:
         yield from items
         return
-    bar = None
     start = shown = time.perf_counter()
-    done = 0
-    try:
+    done, advance_to = 0, None
+    with ExitStack() as closing:
         for done, item in enumerate(items):
             now = time.perf_counter()
-            if bar is None and now - start > delay_s:
-                bar = _Bar(what, total)
-            if bar is not None and now - shown > 0.1:
-                bar.advance_to(done)
+            if advance_to is None and now - start > delay_s:
+                advance_to = closing.enter_context(_bar(what, total))
+            if advance_to is not None and now - shown > 0.1:
+                advance_to(done)
                 shown = now
             yield item
-        if bar is not None:
-            bar.advance_to(done + 1)
-    finally:
-        if bar is not None:
-            bar.close()
+        if advance_to is not None:
+            advance_to(done + 1)
 
 
-class _Bar:
-    """One rich progress bar on standard error."""
+@contextmanager
+def _bar(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Show one rich progress bar on standard error; yield what moves it."""
+    from rich.console import Console  # most runs are over before a bar is needed
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
-    def __init__(self, what: str, total: int | None) -> None:
-        from rich.console import Console  # most runs are over before a bar is needed
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            auto_refresh=False,
-        )
-        self._task = self._progress.add_task(what, total=total)
-        self._progress.start()
-
-    def advance_to(self, done: int) -> None:
-        self._progress.update(self._task, completed=done, refresh=True)
-
-    def close(self) -> None:
-        self._progress.stop()
+    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    times = (TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*parts, *times, console=Console(stderr=True), auto_refresh=False) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, completed=done, refresh=True)

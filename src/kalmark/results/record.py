@@ -14,22 +14,24 @@ from numba.core import event as numba_event
 
 from kalmark.errors import DivergedError, EventError
 from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.logs.log import Log
 from kalmark.logs.start import begins_at
 from kalmark.results.advice import stated_noise
 from kalmark.results.cameras import biases, cameras, mounts
+from kalmark.results.columns import Array, Texts, padded, texts
 from kalmark.results.corners import left_px
 from kalmark.results.decisions import Decisions
 from kalmark.results.describe import describe, plain
 from kalmark.results.fitting import refuse_other_columns
-from kalmark.results.history import Array, History, MapSnapshot, Start, Texts, padded, texts
+from kalmark.results.history import History, MapSnapshot, Start
 from kalmark.results.inputs import Controlled, Inputs, UsedFix
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
-from kalmark.results.run import LogReference, Run
+from kalmark.results.recording import LogReference
+from kalmark.results.run import Run
 from kalmark.results.truth import Truth
 
 if TYPE_CHECKING:
-    from kalmark.logs.log import Log
     from kalmark.report import Observation, Report
     from kalmark.slam.slam import Slam
 
@@ -54,18 +56,16 @@ def record(
     """
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
+    log = log if isinstance(log, Log) else Log("", tuple(slam.robots), list(log), format="")
     refuse_other_columns(slam, log)
-    events = log if isinstance(log, list) else list(log)
-    for event in events:
-        if type(event) is Scan and event.ids is not None:
-            known = slam.members
-            known.reserve(i for i in event.ids if i not in known.kinds and i not in known.tentative)
+    events = log.events
+    slam.reserve(name for event in events if type(event) is Scan for name in event.ids or ())
     recorder = _Recorder(slam, np.linspace(0, sum(type(e) is Scan for e in events) - 1, SNAPSHOTS))
     recorder.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in events)
     recorder.starts = _starts(slam, events)
     begin = time.perf_counter()
     with numba_event.install_listener("numba:compiler_lock", recorder.compiler):
-        for event in track(events, getattr(log, "name", "log"), len(events), show=progress):
+        for event in track(events, log.name or "log", len(events), show=progress):
             try:
                 recorder.process(event)
             except EventError as error:
@@ -158,7 +158,7 @@ class _Recorder:
         ids, kinds = tuple(landmarks.ids), tuple(landmarks.kinds)
         return MapSnapshot(len(self.reports) - 1, self.reports[-1].t_ns, ids, *landmarks.places(), kinds)
 
-    def run(self, log: Any, config: Mapping[str, Any] | None, wall_s: float) -> Run:
+    def run(self, log: Log, config: Mapping[str, Any] | None, wall_s: float) -> Run:
         """Return the run made of what was gathered."""
         if self.reports and (not self.maps or self.maps[-1].step < len(self.reports) - 1):
             self.maps.append(self._snapshot())
@@ -168,23 +168,22 @@ class _Recorder:
             config=dict(config) if config is not None else describe(self.slam, log),
             landmarks=MapLandmarks.of(self.slam),
             truth=Truth.of(log, history, self.anchored),
-            log=LogReference.of(log, tuple(self.slam.robots)),
+            log=LogReference(log.name, log.format, None if log.path is None else str(log.path), tuple(log.robots)),
             coordinates=self.slam.estimator.coordinates,
             controls=sum(c.number for c in self.controls.values()),
             fixes=len(self.fixes),
             fixes_rejected=sum(not fix.used for fix in self.fixes),
             wall_s=wall_s,
-            skipped=[*getattr(log, "skipped", ()), *self.skipped],
+            skipped=[*log.skipped, *self.skipped],
             stopped=self.stopped,
             slam=self.slam,
             source=log,
-            reference=plain(getattr(log, "reference", None) or {}),
+            reference=plain(log.reference),
         )
 
-    def _true_ids(self, log: Any) -> Texts:
+    def _true_ids(self, log: Log) -> Texts:
         """Return the id the log has of each observation, whether the filter was told or not; "" where it has none."""
-        hidden = getattr(log, "true_ids", {})
-        told = [hidden.get(scan, scan.ids) for scan in self.scans]
+        told = [log.true_ids.get(scan, scan.ids) for scan in self.scans]
         pairs = zip(told, self.reports, strict=True)
         return texts([None if ids is None else ids[o.index] for ids, report in pairs for o in report.observations])
 
@@ -193,7 +192,7 @@ class _Recorder:
         told = {one for report in self.reports for one in report.late}
         return np.array([(scan.t_ns, scan.robot, scan.sensor, o.index) in told for _, scan, o in seen], dtype=np.bool_)
 
-    def _history(self, log: Any) -> History:
+    def _history(self, log: Log) -> History:
         steps = self.reports
         seen = [
             (s, scan, o)

@@ -5,17 +5,15 @@ from __future__ import annotations
 import html
 import json
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
+from kalmark.results.evaluate import summary_of
 from kalmark.results.files import config_yaml
-from kalmark.results.picture import headline
-from kalmark.results.series import reasons, series
-from kalmark.results.series_association import change_rows
+from kalmark.results.headline import headline
+from kalmark.results.recording import Recording
+from kalmark.results.series import change_rows, reasons, series
 from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words
-
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
 
 _ROBOT = (
     ("scans", "scans", ""),
@@ -33,25 +31,26 @@ _HINTS = {
 }
 
 
-def report_html(run: Run) -> str:
+def report_html(run: Recording) -> str:
     """Return the page: the map over time, errors, NEES and NIS, associations, figures and configuration."""
     title, figures = headline(run)
-    return _TEMPLATE.format(
+    summary = summary_of(run)
+    return _resource("report.html").format(
         title=html.escape(title),
         style=_resource("report.css"),
         figures="".join(f"<span>{html.escape(figure)}</span>" for figure in figures),
-        robots=robot_table(run.summary),
-        summary=summary_table(run.summary),
-        warnings="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("warnings", ())),
-        advice="".join(f"<li>{html.escape(line)}</li>" for line in run.summary.get("advice", ())),
-        mounts=_mounts(run.summary),
+        robots=robot_table(summary),
+        summary=summary_table(summary),
+        warnings="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("warnings", ())),
+        advice="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("advice", ())),
+        mounts=_mounts(summary),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),
         changes=_changes(run),
-        skipped=_skipped(run),
+        skipped=_skipped(run, summary),
         config=html.escape(config_yaml(run.config)),
         plotly=_plotly(),
         data=json.dumps(series(run), allow_nan=False, separators=(",", ":")).replace("</", "<\\/"),
-        space=_resource("space.js"),
+        scene=_resource("scene.js"),
         script=_resource("report.js"),
         hint=_HINTS[run.history.in_space],
     )
@@ -115,18 +114,18 @@ def _mounts(summary: dict[str, Any]) -> str:
     return f"<h2>Mounts that calibrate themselves</h2>{_table(rows, MOUNT_COLUMNS)}" if rows else ""
 
 
-def _changes(run: Run) -> str:
+def _changes(run: Recording) -> str:
     rows = [*change_rows(run)]
     head = ("t (s)", "landmark", "", "why")
     return f"<h2>Landmarks merged and removed</h2>{_table(rows, head)}" if rows else ""
 
 
-def _skipped(run: Run) -> str:
+def _skipped(run: Recording, summary: dict[str, Any]) -> str:
     lines = ([f"stopped: {run.stopped}"] if run.stopped else []) + run.skipped
     if not lines:
         return ""
     shown = "\n".join(html.escape(line) for line in lines[:200])
-    return f"<h2>Left out <small>{run.summary['skipped']}</small></h2><pre>{shown}</pre>"
+    return f"<h2>Left out <small>{summary['skipped']}</small></h2><pre>{shown}</pre>"
 
 
 def _resource(name: str) -> str:
@@ -137,43 +136,3 @@ def _plotly() -> str:
     from plotly.offline import get_plotlyjs  # slow to import
 
     return str(get_plotlyjs())
-
-
-_TEMPLATE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<header><h1>{title}</h1><p class="figures">{figures}</p><ul class="warnings">{warnings}</ul>
-<ul class="warnings advice">{advice}</ul></header>
-<main>
-<section><h2>Map <small>{hint}</small></h2>
-<div id="map"></div>
-<div class="slider"><button id="play">Play</button><input id="time" type="range" min="0" value="0" step="1">
-<output id="now"></output></div>
-<div id="images"></div></section>
-<section id="against-truth"><h2>Errors and their 3-sigma bands <select id="robot"></select></h2>
-<div id="errors"></div>
-<h2>Pose NEES <small id="nees-note"></small></h2><div id="nees"></div></section>
-<section id="nis-section"><h2>NIS per degree of freedom <small id="nis-note"></small></h2><div id="nis"></div></section>
-<section id="fixes-section"><h2>Position fixes <select id="fixed"></select> <small>fix less estimate just before it, and
-3-sigma bands; crosses: rejected</small></h2><div id="fixes"></div></section>
-<section id="association"><h2>Association</h2><div id="outcomes"></div>{reasons}
-<div id="ambiguous"><h2>Ambiguous scans <select id="which"></select>
-<small>crosses: observations; squares: landmarks compared with, and d2; a full line goes to the chosen
-one, whose d2 is at the cross</small></h2>
-<div id="scan"></div><ul id="told"></ul></div>{changes}</section>
-<section><h2>Figures</h2>{robots}{summary}{mounts}{skipped}</section>
-<section><h2>Configuration</h2><pre>{config}</pre></section>
-</main>
-<script>{plotly}</script>
-<script>const DATA = {data};</script>
-<script>{space}</script>
-<script>{script}</script>
-</body>
-</html>
-"""

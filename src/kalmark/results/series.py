@@ -1,81 +1,143 @@
-"""The curves of a report: everything thinned to at most about 2,000 points, as plain lists for JSON."""
+"""The data of a report's page: the scene at each position of the slider, and curves thinned to some 2,000 points."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from itertools import combinations_with_replacement
+from typing import Any
 
 import numpy as np
 
 from kalmark.report import OUTCOMES
+from kalmark.results.columns import Array, Ints
 from kalmark.results.consistency import anees_interval, nees, nis, pose_error
-from kalmark.results.history import Array, Ints, MapSnapshot
-from kalmark.results.picture import Picture, broken, grouped
-from kalmark.results.series_association import association_series
-from kalmark.results.series_fixes import fix_series
-from kalmark.results.series_space import space_series
-from kalmark.results.thinned import POINTS, gaussians, significant, thin, xy
-
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
+from kalmark.results.explain import Explanation, Fate, explained
+from kalmark.results.history import Camera, History, MapSnapshot
+from kalmark.results.images import Image, Sighting, colour_of, images, steps_of
+from kalmark.results.inputs import UsedFix
+from kalmark.results.recording import Recording
+from kalmark.results.scene import Scene, broken, grouped, joined, squares, stretches_of
+from kalmark.results.shapes import shapes
 
 BINS = 120
+POINTS = 2000  # of a curve
+LANDMARKS = 40_000  # in all the maps of a page together
+SCANS = 60  # drawn at most, the most ambiguous ones
+CHANGES = 200  # in the table
+MARKS = 2000  # in the timeline
+TENTATIVE = "tentative: "  # how the reasons of those begin that never were landmarks
+UNSURE = ("between ", "its nearest ", "it does not fit", "cliques as large")  # how reasons of ambiguity begin
 
 
-def series(run: Run) -> dict[str, Any]:
+def series(run: Recording) -> dict[str, Any]:
     """Return all that the pictures of a report need; times in seconds since the first step."""
-    picture = Picture.of(run)
-    t = _since_start(run)
-    dof = 6 if run.history.in_space else 3
-    if run.history.in_space:
-        shown = space_series(run, t)
-    else:
-        shown = {
-            "trueLandmarks": _points(picture.landmarks),
-            "fixes": {robot: xy(points[thin(len(points))]) for robot, points in picture.fixes.items()},
-            "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in picture.used.items()},
-            "maps": [_map(m, float(t[m.step])) for m in run.history.maps],
-        }
-    return shown | {
-        "robots": [_robot(run, picture, robot, t) for robot in picture.paths],
-        "innovations": fix_series(run, picture),
+    scene, t = Scene.of(run), _since_start(run)
+    dof, maps = (3, 6)[scene.d - 2], _fewer(run.history.maps)
+    return {
+        "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
+        "maps": [_map(m, float(t[m.step]), scene) for m in maps],
+        "trueLandmarks": _points(scene),
+        "trueLines": xy(joined(scene.true_lines())),
+        "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
+        "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.used.items()},
+        "bodies": {robot: xy(joined(scene.body(robot))) for robot in scene.paths if scene.d == 3},
+        "cameras": [_camera(run, camera, maps, t) for camera in run.history.cameras],
+        "robots": [_robot(run, scene, robot, t) for robot in scene.paths],
+        "innovations": _innovations(run, scene),
         "nis": _nis(run, t),
         "dof": dof,
         "neesBounds": anees_interval(dof),
         "outcomes": _outcomes(run, t),
-        "association": association_series(run, t),
+        "association": _association(run, t),
     }
 
 
-def _map(snapshot: MapSnapshot, t_s: float) -> dict[str, Any]:
-    ids = [str(i) for i in snapshot.ids]
-    return {"t": round(t_s, 3), "id": ids, **gaussians(snapshot.means, snapshot.covariances)}
-
-
-def _since_start(run: Run) -> Array:
+def _since_start(run: Recording) -> Array:
     t_ns = run.history.t_ns
     return (t_ns - t_ns[0]) * 1e-9 if len(t_ns) else np.empty(0)
 
 
-def _robot(run: Run, picture: Picture, robot: str, t: Array) -> dict[str, Any]:
+def _points(scene: Scene) -> dict[str, Any]:
+    points = scene.true_points()
+    return {"id": [str(i) for i in points], **xy(np.array(list(points.values())).reshape(-1, scene.d))}
+
+
+def _fewer(maps: tuple[MapSnapshot, ...]) -> list[MapSnapshot]:
+    """Return maps evenly spread, the last among them, of so many landmarks that the page stays of a size to open."""
+    total = sum(len(m.ids) for m in maps)
+    stride = max(1, -(-total // LANDMARKS))
+    return [m for k, m in enumerate(reversed(maps)) if k % stride == 0][::-1]
+
+
+def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
+    """Return a map: all points, in space the endpoints of lines last, with the group that each is drawn in."""
+    drawn = shapes(m.means, m.covariances, m.kinds or [""] * len(m.ids), scene.d)
+    points = drawn.points
+    more: dict[str, Any] = {}
+    if scene.d == 3:
+        more = {"lines": xy(joined(drawn.lines)), "tags": xy(joined(squares(drawn.tags, scene.size)))}
+    return {
+        "t": round(t_s, 3),
+        "id": [str(m.ids[row]) for row in points.row],
+        "group": drawn.group.tolist(),
+        "count": len(m.ids),
+        **more,
+        **gaussians(points.means, points.covariances),
+    }
+
+
+def _camera(run: Recording, camera: Camera, maps: list[MapSnapshot], t: Array) -> dict[str, Any]:
+    """Return what a camera saw last at each of the maps: `frames` are indices of its `scans`, None before the first."""
+    steps = steps_of(run.history, camera)
+    last = np.searchsorted(steps, [m.step for m in maps], side="right") - 1
+    used = np.unique(last[last >= 0])
+    return {
+        "name": f"{camera.robot} · {camera.sensor}",
+        "size": [float(side) for side in camera.size],
+        "scans": [_scan(run, camera, int(steps[k]), t) for k in used],
+        "frames": [int(np.searchsorted(used, k)) if k >= 0 else None for k in last],
+    }
+
+
+def _scan(run: Recording, camera: Camera, step: int, t: Array) -> dict[str, Any]:
+    return {"t": round(float(t[step]), 3), "images": [_image(image) for image in images(run.history, camera, step)]}
+
+
+def _image(image: Image) -> dict[str, Any]:
+    return {"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]}
+
+
+def _seen(s: Sighting) -> dict[str, Any]:
+    colour, meaning = colour_of(s)
+    out: dict[str, Any] = {"name": s.name, "outcome": s.outcome, "y": [rounded(p, 2) for p in s.measured]}
+    if np.isfinite(s.expected).all():
+        out |= {"e": [rounded(p, 2) for p in s.expected], "colour": colour, "meaning": meaning}
+    if np.isfinite(s.Z).all():
+        out["Z"] = rounded(np.array([s.Z[0, 0], s.Z[0, 1], s.Z[1, 1]]), 3)
+    return out
+
+
+def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]:
     rows = np.flatnonzero(run.history.robot == robot)
     rows = rows[thin(len(rows))]
     mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
-    out: dict[str, Any] = {"name": robot, "colour": picture.colour(robot), "t": significant(t[rows], 7)}
+    out: dict[str, Any] = {"name": robot, "colour": scene.colour(robot), "t": significant(t[rows], 7)}
     d = 3 if run.history.in_space else 2
     out |= gaussians(mean[:, :d], P[:, :d, :d])
-    stretches = picture.stretches[robot][thin(len(picture.stretches[robot]))]
+    stretches = scene.stretches[robot][thin(len(scene.stretches[robot]))]
     out["gaps"] = (np.flatnonzero(np.diff(stretches)) + 1).tolist()
     out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
-    if robot in picture.truth:
-        true = picture.truth[robot]
+    if robot in scene.truth:
+        true = scene.truth[robot]
         out["truth"] = xy(broken(true[thin(len(true))], stretches))
         out |= _errors(run, rows)
     return out
 
 
-def _errors(run: Run, rows: Ints) -> dict[str, Any]:
+def _errors(run: Recording, rows: Ints) -> dict[str, Any]:
     """Return errors (estimate less truth) and sigmas in m and degrees, and the NEES in the estimator's coordinates."""
     mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
     truth = run.truth.poses_in_map()[rows]
@@ -90,7 +152,7 @@ def _errors(run: Run, rows: Ints) -> dict[str, Any]:
     }
 
 
-def _nis(run: Run, t: Array) -> dict[str, Any]:
+def _nis(run: Recording, t: Array) -> dict[str, Any]:
     """Return NIS per degree of freedom over windows of steps, the 95 % bounds of each, and where gaps in time are."""
     history = run.history
     used = history.outcome == "associated"
@@ -111,7 +173,7 @@ def _nis(run: Run, t: Array) -> dict[str, Any]:
     }
 
 
-def _outcomes(run: Run, t: Array) -> dict[str, Any]:
+def _outcomes(run: Recording, t: Array) -> dict[str, Any]:
     """Return how many observations had which outcome in each of some 120 stretches of time."""
     history = run.history
     edges = np.linspace(0.0, max(float(t[-1]), 1e-9) if len(t) else 1.0, BINS + 1)
@@ -123,7 +185,35 @@ def _outcomes(run: Run, t: Array) -> dict[str, Any]:
     }
 
 
-def reasons(run: Run, most: int = 15) -> list[tuple[str, str, int]]:
+def _innovations(run: Recording, scene: Scene) -> list[dict[str, Any]]:
+    """Return each robot's innovations of fixes and their sigmas in m; times in seconds since the first step."""
+    t_ns = run.history.t_ns
+    begin = int(t_ns[0]) if len(t_ns) else 0
+    by_robot = {robot: [fix for fix in run.history.inputs.fixes if fix.robot == robot] for robot in scene.paths}
+    return [
+        {"name": robot, "colour": scene.colour(robot), **_fix_curves(fixes, begin)}
+        for robot, fixes in by_robot.items()
+        if fixes
+    ]
+
+
+def _fix_curves(fixes: list[UsedFix], begin_ns: int) -> dict[str, Any]:
+    """Return the curves of a robot's fixes, thinned, and those of them that were rejected, by themselves."""
+    t_ns, used = np.array([fix.t_ns for fix in fixes]), np.array([fix.used for fix in fixes])
+    t, z = (t_ns - begin_ns) * 1e-9, np.array([fix.z for fix in fixes])
+    sigma = np.sqrt(np.maximum([np.diagonal(fix.Z) for fix in fixes], 0.0))
+    rows, bad = thin(len(fixes)), np.flatnonzero(~used)
+    bad = bad[thin(len(bad))]
+    return {
+        "t": significant(t[rows], 7),
+        "z": [significant(column) for column in z[rows].T],
+        "sigma": [significant(column) for column in sigma[rows].T],
+        "gaps": (np.flatnonzero(np.diff(stretches_of(t_ns)[rows])) + 1).tolist(),
+        "rejected": {"t": significant(t[bad], 7), "z": [significant(column) for column in z[bad].T]},
+    }
+
+
+def reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
     """Return the commonest (outcome, reason, count); of too many, those that differ in a number only count as one."""
     pairs = zip(run.history.outcome.tolist(), run.history.reason.tolist(), strict=True)
     said = Counter((outcome, reason) for outcome, reason in pairs if reason)
@@ -135,6 +225,91 @@ def reasons(run: Run, most: int = 15) -> list[tuple[str, str, int]]:
     return [(outcome, reason, count) for (outcome, reason), count in said.most_common(most)]
 
 
-def _points(landmarks: dict[Any, Array]) -> dict[str, Any]:
-    points = np.array(list(landmarks.values())).reshape(-1, 2)
-    return {"id": [str(i) for i in landmarks], **xy(points)}
+def _association(run: Recording, t: Array) -> dict[str, Any]:
+    """Return ambiguous scans in the order of time, and when landmarks were merged or removed."""
+    changes = [c for c in run.history.decisions.changes if not c.reason.startswith(TENTATIVE)]
+    return {
+        "scans": [_ambiguous_scan(explained(run, step)) for step in ambiguous(run.history).tolist()],
+        "changes": {
+            what: significant(np.array([t[c.step] for c in changes if c.what == what][:MARKS]), 7)
+            for what in dict.fromkeys(c.what for c in changes)
+        },
+    }
+
+
+def ambiguous(history: History) -> Ints:
+    """Return the steps of the most ambiguous scans, in the order of time: those with most observations in doubt."""
+    told = history.decisions
+    if not len(told.row):
+        return np.zeros(0, dtype=np.int64)
+    reasons = history.reason
+    doubt = (history.outcome == "deferred").astype(np.int64)
+    doubt += np.logical_or.reduce([np.char.startswith(reasons, start) for start in UNSURE])
+    shown = np.zeros(len(history.step), dtype=np.bool_)
+    shown[told.row] = True
+    score = np.bincount(history.step[shown], doubt[shown], len(history.t_ns))
+    best = np.argsort(-score, kind="stable")[:SCANS]
+    return np.sort(best[score[best] > 0])
+
+
+def change_rows(run: Recording) -> Iterator[tuple[str, str, str, str]]:
+    """Return rows of what became of landmarks: when, which, what, why; tentative ones that went are not among them."""
+    history = run.history
+    told = [c for c in history.decisions.changes if not c.reason.startswith(TENTATIVE)]
+    for c in told[:CHANGES]:
+        t_s = (history.t_ns[c.step] - history.t_ns[0]) * 1e-9
+        yield f"{t_s:.1f}", c.landmark, c.what, c.reason
+    if len(told) > CHANGES:
+        yield "", "", "", f"and {len(told) - CHANGES} more: see associations.csv"
+
+
+def _ambiguous_scan(told: Explanation) -> dict[str, Any]:
+    pose = gaussians(told.pose[None, :2], told.covariance[None, :2, :2])
+    return {
+        "t": round(told.t_s, 3),
+        "in_log": told.in_log,
+        "robot": told.robot,
+        "sensor": told.sensor,
+        "pose": pose,
+        "seen": [_fate(fate) for fate in told.fates],
+    }
+
+
+def _fate(fate: Fate) -> dict[str, Any]:
+    x, y = rounded(fate.seen_at[:2], 4)
+    near = [
+        {"name": c.landmark, "d2": float(f"{c.d2:.3g}")} | dict(zip("xy", rounded(c.place[:2], 4), strict=True))
+        for c in fate.near
+    ]
+    text = f"{fate.outcome}{' ' + fate.landmark if fate.landmark else ''}{': ' if fate.reason else ''}{fate.reason}"
+    return {
+        "x": x, "y": y, "k": fate.index, "outcome": fate.outcome, "landmark": fate.landmark, "text": text, "near": near,
+    }  # fmt: skip
+
+
+def xy(points: Array) -> dict[str, Any]:
+    """Return points (N, 2 or 3) to a tenth of a millimetre."""
+    return {axis: rounded(column, 4) for axis, column in zip("xyz", points.T, strict=False)}
+
+
+def gaussians(means: Array, covariances: Array) -> dict[str, Any]:
+    """Return means (N, d) and covariances (N, d, d) column by column: x, y, pxx, pxy, pyy, in space more."""
+    pairs = combinations_with_replacement(range(means.shape[1]), 2)
+    return xy(means) | {f"p{'xyz'[i]}{'xyz'[j]}": significant(covariances[:, i, j]) for i, j in pairs}
+
+
+def thin(count: int) -> Ints:
+    """Return at most about 2,000 evenly spread indices, the last one among them."""
+    stride = max(1, -(-count // POINTS))
+    indices = np.arange(0, count, stride)
+    return np.append(indices, count - 1) if count and indices[-1] != count - 1 else indices
+
+
+def rounded(values: Array, digits: int) -> list[float | None]:
+    """Return values to so many decimals, None for NaN and infinity."""
+    return [value if math.isfinite(value) else None for value in np.round(values, digits).tolist()]
+
+
+def significant(values: Array, digits: int = 4) -> list[float | None]:
+    """Return values to so many significant digits, None for NaN and infinity."""
+    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values.tolist()]

@@ -12,9 +12,11 @@ import numpy.typing as npt
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
+from kalmark.logs.log import Log
 from kalmark.results.align import Rigid
+from kalmark.results.columns import Array, Arrays, Named, padded_all, texts
 from kalmark.results.consistency import pose_error
-from kalmark.results.history import Array, History, Start, as_id, padded_rows, texts
+from kalmark.results.history import History, Start, as_id
 from kalmark.results.shapes import LINE, TAG
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
@@ -48,24 +50,23 @@ class Truth:
     robots: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, log: Any, history: History, anchored: bool = False) -> Truth:
-        """Return the truth of a log at the steps of a history; a log without truth, or a list of events, gives none."""
-        trajectories = getattr(log, "truth", None) or {}
+    def of(cls, log: Log, history: History, anchored: bool = False) -> Truth:
+        """Return the truth of a log at the steps of a history; a log without truth gives none."""
         size = 7 if history.in_space else 3
         poses = np.full((len(history.t_ns), size), np.nan)
-        for robot, trajectory in trajectories.items():
+        for robot, trajectory in log.truth.items():
             mine = history.robot == robot
             if mine.any():
                 poses[mine] = fitted(trajectory.at(history.t_ns[mine]), size)
         fixes = {
             robot: Fixes(track.t_ns, np.asarray(track.xy), np.asarray(track.antenna))
-            for robot, track in (getattr(log, "gps", None) or {}).items()
+            for robot, track in log.gps.items()
         }
-        offset = ORIGIN[size] if anchored else _offset(trajectories, history.starts, size)
-        landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in (getattr(log, "landmarks", None) or {}).items()}
+        offset = ORIGIN[size] if anchored else _offset(log.truth, history.starts, size)
+        landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in log.landmarks.items()}
         if size == 7:
             landmarks = {i: np.append(l, 0.0) if len(l) == 2 else l for i, l in landmarks.items()}
-        return cls(poses, landmarks, fixes, offset, anchored, tuple(trajectories))
+        return cls(poses, landmarks, fixes, offset, anchored, tuple(log.truth))
 
     def __bool__(self) -> bool:
         return bool(self.landmarks) or bool(np.isfinite(self.poses).any())
@@ -87,7 +88,7 @@ class Truth:
         """Return the true landmarks in the frame of the map."""
         return moved(self.to_map(), self.landmarks)
 
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+    def arrays(self) -> Arrays:
         """Return everything as named arrays for ``history.npz``."""
         robots = list(self.fixes)
         return {
@@ -96,7 +97,7 @@ class Truth:
             "truth_anchored": np.array(self.anchored),
             "truth_robot": texts(list(self.robots)),
             "truth_landmark": texts(list(self.landmarks)),
-            "truth_landmark_mean": padded_rows(list(self.landmarks.values())),
+            "truth_landmark_mean": padded_all(list(self.landmarks.values())),
             "fix_robot": texts(robots),
             "fix_size": np.array([len(self.fixes[r].t_ns) for r in robots], dtype=np.int64),
             "fix_t_ns": np.concatenate([self.fixes[r].t_ns for r in robots] or [np.empty(0, dtype=np.int64)]),
@@ -105,7 +106,7 @@ class Truth:
         }
 
     @classmethod
-    def from_arrays(cls, named: Mapping[str, npt.NDArray[Any]]) -> Truth:
+    def from_arrays(cls, named: Named) -> Truth:
         """Return the truth that `arrays` gave."""
         landmarks = {
             as_id(text): mean[~np.isnan(mean)]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -15,24 +15,26 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from kalmark.errors import RunError
+from kalmark.results.files import replace_file
+from kalmark.results.headline import headline
 from kalmark.results.images import images, steps_of
-from kalmark.results.picture import INK, headline
-from kalmark.results.plot import draw_plane, extent
+from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_sensor import draw_image
-from kalmark.results.plot_space import VIEWS, Projection, draw_space, draw_top
 from kalmark.results.progress import track
-from kalmark.results.run import replace_file
-from kalmark.results.space import Scene
-
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
+from kalmark.results.recording import Recording
+from kalmark.results.scene import INK, Scene
 
 INCHES, DPI = (12.8, 7.2), 80
 MOST_IMAGES = 3  # beside the map
 
 
 def write_video(
-    run: Run, path: str | Path, fps: float = 10.0, frames: int = 200, orbit_deg: float = 0.0, progress: bool = True
+    run: Recording,
+    path: str | Path,
+    fps: float = 10.0,
+    frames: int = 200,
+    orbit_deg: float = 0.0,
+    progress: bool = True,
 ) -> Path:
     """Write a run as a video of at most so many frames and return its path.
 
@@ -80,33 +82,32 @@ def _picture(figure: Figure) -> Image.Image:
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(64)
 
 
-def _frames(run: Run, steps: list[int], orbit_deg: float, progress: bool) -> Iterator[Figure]:
+def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool) -> Iterator[Figure]:
     """Yield one figure again and again, drawn anew after each of the steps."""
     figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    first = run.history.t_ns[0]
+    first, title = run.history.t_ns[0], headline(run)[0]
     for k, step in enumerate(track(steps, "video", len(steps), show=progress)):
         figure.clear()
         turned = orbit_deg * k / max(len(steps) - 1, 1)
-        (_draw_space if run.history.in_space else _draw_plane)(figure, run, step, turned)
+        _draw(figure, run, step, turned)
         t = (run.history.t_ns[step] - first) * 1e-9
-        figure.text(0.02, 0.955, headline(run)[0], fontsize=12, fontweight="bold", color=INK)
+        figure.text(0.02, 0.955, title, fontsize=12, fontweight="bold", color=INK)
         figure.text(0.98, 0.955, f"{t:.1f} s", fontsize=12, ha="right", color=INK)
         yield figure
 
 
-def _draw_plane(figure: Figure, run: Run, step: int, _turned: float) -> None:
-    draw_plane(figure.add_axes((0.07, 0.09, 0.9, 0.84)), run, *extent(run), step)
-
-
-def _draw_space(figure: Figure, run: Run, step: int, turned: float) -> None:
+def _draw(figure: Figure, run: Recording, step: int, turned: float) -> None:
     scene = Scene.of(run, step)
+    if scene.d == 2:
+        draw_plan(figure.add_axes((0.07, 0.09, 0.9, 0.84)), scene)
+        return
     elevation, azimuth = VIEWS["normal"]
     projection = Projection.of(scene, (elevation, azimuth + turned))
     draw_space(figure.add_axes((0.0, 0.02, 0.6, 0.92)), scene, projection)
     seen = _last_images(run, step)
     if not seen:
-        draw_top(figure.add_axes((0.65, 0.12, 0.33, 0.76)), scene)
+        draw_plan(figure.add_axes((0.65, 0.12, 0.33, 0.76)), scene)
     height = 0.9 / max(len(seen), 1)
     for k, (title, image, size) in enumerate(seen):
         axes = figure.add_axes((0.64, 0.94 - (k + 1) * height + 0.06, 0.35, height - 0.1))
@@ -114,7 +115,7 @@ def _draw_space(figure: Figure, run: Run, step: int, turned: float) -> None:
         axes.set_title(title, fontsize=9, color="#555b66")
 
 
-def _last_images(run: Run, step: int) -> list[tuple[str, Any, tuple[float, float]]]:
+def _last_images(run: Recording, step: int) -> list[tuple[str, Any, tuple[float, float]]]:
     """Return the images of what each camera saw last up to a step, with titles."""
     out = []
     for camera in run.history.cameras:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +14,9 @@ from scipy.stats import chi2
 from kalmark.results.by_position import LEAST, no_ids
 from kalmark.results.calibration import mount_warnings
 from kalmark.results.inputs import UsedFix
+from kalmark.results.recording import Recording
 from kalmark.results.windows import window_warnings
 from kalmark.results.words import count, figure
-
-if TYPE_CHECKING:
-    from kalmark.results.run import Run
 
 NO_ID = "no id in the log"  # the reason that association by identity gives
 POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
@@ -31,13 +29,13 @@ MARGIN = 0.1  # of an image, by which its measurements may lie outside it
 FEW_FIXES = 5  # fewer say little of the noise
 
 
-def warnings(run: Run, summary: Mapping[str, Any]) -> list[str]:
+def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
     parts = (_lost, _windows, _observations, _robots, _sensors, _truth, _fixes, _noise)
     return [line for part in parts for line in part(run, summary)] + list(mount_warnings(summary))
 
 
-def _lost(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     if run.stopped:
         yield f"the filter stopped: {run.stopped}"
     lost = [name for name, figures in summary["robots"].items() if figures.get("diverged")]
@@ -46,11 +44,11 @@ def _lost(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"DIVERGED: the error of {names} exceeds 10 of its own sigmas and 5 % of the path; do not use this map"
 
 
-def _windows(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _windows(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     yield from window_warnings(run.history)
 
 
-def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history, total = run.history, int(summary["observations"])
     for outcome in ("ignored", "rejected"):
         mine = (history.outcome == outcome) & ~_by_design(run)
@@ -72,13 +70,13 @@ def _observations(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
     yield from _images(run)
 
 
-def _by_design(run: Run) -> npt.NDArray[np.bool_]:
+def _by_design(run: Recording) -> npt.NDArray[np.bool_]:
     """Tell which observations were left alone because a sensor's attention is set so."""
     reasons = run.history.reason
     return np.logical_or.reduce([np.char.startswith(reasons, start) for start in ATTENTION])
 
 
-def _images(run: Run) -> Iterator[str]:
+def _images(run: Recording) -> Iterator[str]:
     """Tell of cameras whose measurements lie outside their images."""
     history = run.history
     robots = history.robot[history.step]
@@ -97,20 +95,14 @@ def _images(run: Run) -> Iterator[str]:
             )
 
 
-def _has_bearing(run: Run) -> npt.NDArray[np.bool_]:
+def _has_bearing(run: Recording) -> npt.NDArray[np.bool_]:
     """Tell of each observation whether all but its first column are bearings, by the type of its sensor."""
-    robots: Mapping[str, Any] = run.config.get("robots") or {}
-    kinds = {
-        (robot, name): str((sensor or {}).get("type", ""))
-        for robot, given in robots.items()
-        for name, sensor in ((given or {}).get("sensors") or {}).items()
-    }
-    pairs = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
-    found = [kinds.get(pair, kinds.get(("each", pair[1]), "")) in BEARINGS for pair in pairs]
-    return np.array(found, dtype=np.bool_)
+    pairs = list(zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True))
+    found = {pair: run.section(*pair).get("type") in BEARINGS for pair in set(pairs)}
+    return np.array([found[pair] for pair in pairs], dtype=np.bool_)
 
 
-def _robots(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history = run.history
     for name in history.robots:
         mine = history.robot == name
@@ -125,7 +117,7 @@ def _robots(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
                 yield f"controls of robot {name} cover {share:.0%} of the time of its scans: are both in seconds?"
 
 
-def _sensors(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _sensors(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     """Tell of what is configured and served nothing: sensors that no observation was by, `each` without a robot."""
     robots: Mapping[str, Any] = run.config.get("robots") or {}
     rows = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
@@ -142,7 +134,7 @@ def _sensors(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
                 yield f"no observation is by the sensor {name} of {', '.join(mine)}, which is configured{hint}"
 
 
-def _truth(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _truth(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     if no_ids(run) and not summary.get("landmarks_matched"):
         yield (
             "the landmarks are not scored: no ids tie them to the true ones, and less than half of them (or less than "
@@ -167,7 +159,7 @@ def _some(names: set[str]) -> str:
     return ", ".join(first) + (", ..." if len(names) > len(first) else "")
 
 
-def _fixes(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     fixes = run.history.inputs.fixes
     starts = {start.robot: start for start in run.history.starts}
     for name in dict.fromkeys(fix.robot for fix in fixes):
@@ -197,7 +189,7 @@ def _d2(fix: UsedFix) -> float:
     return float(fix.z @ np.linalg.solve(fix.Z, fix.z))
 
 
-def _noise(run: Run, summary: Mapping[str, Any]) -> Iterator[str]:
+def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     dof = summary["pose_dof"]
     for name, figures in summary["robots"].items():
         value = figures.get("pose_nees")

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from kalmark.results.columns import Array, Ints
 from kalmark.results.consistency import nis
-from kalmark.results.history import Array, History, Ints
+from kalmark.results.history import History
 from kalmark.results.words import figure
 
 DEGREES = 100  # of freedom in a window, at least
@@ -42,16 +43,11 @@ class Window:
 def window_figures(history: History) -> dict[str, Any]:
     """Return the figures of ``summary.json`` that windows of time have; absent where there is too little."""
     out: dict[str, Any] = {}
-    values = nis_windows(history)
-    if len(values) > 1:
-        worst = max(values, key=lambda w: w.value)
-        out |= {"nis_window_max": worst.value, "nis_window_max_s": [worst.start_s, worst.end_s]}
-        out["nis_window_median"] = float(np.median([w.value for w in values]))
-    shares = left_out_windows(history)
-    if len(shares) > 1:
-        worst = max(shares, key=lambda w: w.value)
-        out |= {"left_out_window_max": worst.value, "left_out_window_max_s": [worst.start_s, worst.end_s]}
-        out["left_out_window_median"] = float(np.median([w.value for w in shares]))
+    for name, windows in (("nis", nis_windows(history)), ("left_out", left_out_windows(history))):
+        if len(windows) > 1:
+            worst = max(windows, key=lambda w: w.value)
+            out |= {f"{name}_window_max": worst.value, f"{name}_window_max_s": [worst.start_s, worst.end_s]}
+            out[f"{name}_window_median"] = float(np.median([w.value for w in windows]))
     correlations = autocorrelations(history)
     if correlations:
         out["innovation_autocorrelation"] = float(np.median([w.value for w in correlations]))

@@ -1,96 +1,28 @@
 """Figures and counts as people write them, and the words for the figures of a run, one source for all who show them.
 
-The words are rows of key in ``summary.json``, label and unit; a label that begins with two blanks is a part of the one
-above it.
+The words are in ``figures.csv``: the part of the summary that a figure is of (`more`: only on the page), its key in
+``summary.json``, its label and unit; a label that begins with two blanks is a part of the one above it.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Iterator, Mapping
+from importlib import resources
 from typing import Any
 
 Words = tuple[tuple[str, str, str], ...]
 
-TOTALS: Words = (
-    ("observations", "observations", ""),
-    ("associated", "  associated", ""),
-    ("new", "  new landmarks", ""),
-    ("rejected", "  rejected by the gate", ""),
-    ("ignored", "  ignored", ""),
-    ("deferred", "  deferred", ""),
-    ("tentative", "  tentative", ""),
-    ("landmarks", "landmarks in the map", ""),
-    ("judged", "fused, where the log hides an id", ""),
-    ("wrong", "  with another's landmark", ""),
-    ("duplicates", "  landmarks beyond one for each id", ""),
-    ("nis_per_dof", "NIS per degree of freedom (1)", ""),
-    ("fixes", "fixes given to the filter", ""),
-    ("fixes_rejected", "  rejected by the gate", ""),
-    ("fix_nis_per_dof", "  NIS per degree of freedom (1)", ""),
-    ("landmarks_matched", "landmarks matched to true ones", ""),
-    ("landmark_rmse_m", "landmark RMSE, aligned", "m"),
-    ("landmark_rmse_raw_m", "landmark RMSE, raw", "m"),
-    ("corner_rms_px", "reprojection of corners, RMS", "px"),
-    ("fix_median_m", "distance to position fixes, median", "m"),
-    ("fix_rms_10m", "distance to position fixes, RMS within 10 m", "m"),
-    ("fix_within_10m", "position fixes within 10 m", "%"),
-    ("step_us_median", "time a step, median", "us"),
-    ("step_us_p99", "time a step, 99 %", "us"),
-)
-MORE: Words = (  # what the page has besides
-    ("landmarks_compared", "landmarks compared with true ones", ""),
-    ("line_rmse_raw_m", "line RMSE, raw", "m"),
-    ("lines_compared", "lines compared with true ones", ""),
-    ("fixes_compared", "position fixes compared with the path", ""),
-    ("nameless", "observations without an id in the log", ""),
-    ("nameless_fused", "  fused all the same", ""),
-    ("nis_window_max", "NIS per degree of freedom, worst window", ""),
-    ("nis_window_max_s", "  from, to", "s"),
-    ("nis_window_median", "  median window", ""),
-    ("left_out_window_max", "observations that fit nothing, worst window", "%"),
-    ("left_out_window_max_s", "  from, to", "s"),
-    ("left_out_window_median", "  median window", "%"),
-    ("innovation_autocorrelation", "correlation of successive innovations (0)", ""),
-    ("events", "events", ""),
-    ("controls", "  controls", ""),
-    ("scans", "  scans", ""),
-    ("skipped", "records left out", ""),
-    ("wall_s", "time of the whole replay", "s"),
-    ("estimator", "estimator", ""),
-    ("coordinates", "coordinates of its errors", ""),
-    ("frame", "frame of the map", ""),
-    ("pose_dof", "numbers of a pose", ""),
-    ("diverged", "diverged", ""),
-    ("stopped", "stopped", ""),
-    ("log.name", "log", ""),
-    ("log.format", "  format", ""),
-    ("log.path", "  path", ""),
-    ("log.robots", "  robots", ""),
-)
-ROBOT: Words = (
-    ("ate_raw_m", "position RMSE", "m"),
-    ("ate_m", "aligned", "m"),
-    ("heading_rmse_deg", "heading RMSE", "deg"),
-    ("pose_nees", "pose NEES", ""),
-)
-BATCH: Words = (
-    ("rms_px", "distance of corners, batch, RMS", "px"),
-    ("median_px", "distance of corners, batch, median", "px"),
-    ("filter_rms_px", "distance of corners, filter, RMS", "px"),
-    ("filter_median_px", "distance of corners, filter, median", "px"),
-    ("sigma_ratio", "landmark sigma, the filter's over the batch's", ""),
-    ("map_difference_m", "distance of landmarks, RMS", "m"),
-    ("map_difference_sigma", "distance of landmarks, largest", "sigmas"),
-    ("map_difference_deg", "angle between tags, RMS", "deg"),
-    ("path_ratio", "position RMSE, the filter's over the batch's", ""),
-    ("path_difference_m", "distance of the paths, RMS", "m"),
-    ("landmarks", "landmarks", ""),
-    ("tags", "tags", ""),
-    ("sightings", "sightings of tags", ""),
-    ("iterations", "iterations", ""),
-    ("chi2_per_dof", "chi2 per degree of freedom (1)", ""),
-)
+
+def _words() -> Iterator[Words]:
+    text = (resources.files("kalmark.results") / "figures.csv").read_text(encoding="utf-8")
+    rows = list(csv.DictReader(text.splitlines()))
+    for part in ("totals", "more", "robot", "batch"):
+        yield tuple((row["key"], row["label"], row["unit"]) for row in rows if row["part"] == part)
+
+
+TOTALS, MORE, ROBOT, BATCH = _words()
 
 
 def in_words(figures: Mapping[str, Any], words: Words) -> Iterator[tuple[str, str, Any, str]]:

@@ -212,6 +212,6 @@ def _frame(corners: list[tuple[float, float]]) -> list[Any]:
 
 
 def facing(place: Any, yaw: float) -> Array:
-    """Return the pose of an upright tag that looks along the heading `yaw` (rad): its z axis is the other way."""
+    """Return the pose (7,) of an upright tag at `place` (3,) that faces along `yaw` (rad), against its z axis."""
     f, _ = from_euler_pose(np.array([*place, -math.pi / 2, 0.0, yaw + math.pi / 2]))
     return f

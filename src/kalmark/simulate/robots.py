@@ -8,7 +8,6 @@ rig is the one configured, and where the sensor sits is drawn around it.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -24,6 +23,7 @@ from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
+from kalmark.models.protocols import coasts, parameter_covariance, range_limit
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import (
     POINTS,
@@ -42,7 +42,7 @@ from kalmark.simulate.sights import (
     things_of,
 )
 from kalmark.simulate.worlds import World
-from kalmark.tracks.robot import Mount, Robot
+from kalmark.slam.robot import Mount, Robot
 
 Array = npt.NDArray[np.float64]
 Key = tuple[int, str, str]
@@ -114,7 +114,7 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
     events: list[Event] = []
     origins: dict[Key, tuple[Id | None, ...]] = {}
     for robot in robots:
-        if getattr(robot.motion, "coasts", False) and robot.sensors:  # it moves from the first event on: the start
+        if coasts(robot.motion) and robot.sensors:  # it moves from the first event on: the start
             events.append(Scan(t_ns=0, robot=robot.name, sensor=next(iter(robot.sensors))))
     for k, (before, now) in enumerate(pairwise(times), 1):
         for robot in robots:
@@ -163,7 +163,10 @@ def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
 
 
 def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
-    """Put a robot at its start and its sensors on their mounts, drawn around what is configured if that has sigmas."""
+    """Put a robot at its start and its sensors on their mounts, drawn around configured values with sigmas.
+
+    `area` (2, D) has the lower and the upper corner of the world.
+    """
     simulated = world.robots[name]
     robot = build_robot(world.models(), name)
     state = drawn_start(robot, chance.route)
@@ -176,14 +179,14 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
 
 
 def drawn_start(robot: Robot, rng: Generator) -> Array:
-    """Return where a robot truly starts: drawn around what the estimator is given, if that has sigmas."""
+    """Return the true start (3,) or (7 or more,) of a robot, drawn around the given one if that has sigmas."""
     space = robot.motion.space
     cov = np.zeros((space.dof, space.dof)) if robot.cov is None else robot.cov
     return space.plus(np.array(robot.start), gaussian(cov, rng))
 
 
 def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
-    """Return a sensor as it truly is, and where: drawn around what the estimator is given, if that has sigmas."""
+    """Return the true sensor and its true mount (3,) or (7,), drawn around the given ones if these have sigmas."""
     at, cov = np.array(mount.at), mount.cov
     if cov is not None:
         at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(cov, rng))
@@ -192,14 +195,14 @@ def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
 
 def true_sensor(sensor: Any, rng: Generator) -> Any:
     """Return a sensor whose own parameters are drawn around those that the estimator is given, if these have sigmas."""
-    if getattr(sensor, "parameter_cov", None) is None:
+    if parameter_covariance(sensor) is None:
         return sensor
     scale, bias_m = rng.normal([sensor.scale, sensor.bias_m], [sensor.sigma_scale, sensor.sigma_bias_m]).tolist()
     return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0)
 
 
 def step(robot: SimRobot, world: World, rng: Generator) -> Array:
-    """Move a robot by one step and return the control that its estimator is given."""
+    """Move a robot by one step and return the control (m,) that its estimator is given."""
     u = robot.driver(robot.state)
     disturbed = u + gaussian(robot.motion.control_noise(u), rng)
     told, done = (disturbed, u) if world.noise_on == "control" else (u, disturbed)
@@ -210,13 +213,13 @@ def step(robot: SimRobot, world: World, rng: Generator) -> Array:
 
 
 def diffused(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -> Array:
-    """Return a state disturbed by what the motion diffuses in `dt_s` of the control u, if it does."""
+    """Return a state (size,) disturbed by the diffusion of the motion, if any, in `dt_s` of the control u (m,)."""
     D = motion.diffusion(u, dt_s)
     return state if D is None else motion.space.plus(state, body_axes(state, len(D)) @ gaussian(D, rng))
 
 
 def body_axes(state: Array, size: int) -> Array:
-    """Return what turns errors (size,) from the robot's frame into the world's; a body's rates stay its own."""
+    """Return the matrix (size, size) from errors in the robot's frame to the world's; rates stay in the body's."""
     G = np.eye(size)
     if len(state) == 3:
         G[:2, :2] = rotation(state[2])
@@ -249,8 +252,8 @@ def scans(
 
 
 def seen_by(sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator) -> Sighted:
-    """Return what a sensor at T sees, other robots last."""
-    near = things.near(T[: world.dimensions], getattr(sensor, "range_max_m", math.inf))
+    """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last."""
+    near = things.near(T[: world.dimensions], range_limit(sensor))
     v = things.seen_from(T, near)
     inside, e = exact(sensor, v, things.sizes[near])
     near, v, e = near[inside], v[inside], e[inside]

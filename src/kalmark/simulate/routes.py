@@ -30,7 +30,7 @@ class Constant(Section):
     """The control, in the motion model's columns."""
 
     def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
-        """Return what gives the control at each true state."""
+        """Return the function from a true state (size,) to the control (m,)."""
         u = np.array(self.u)
         return lambda state: u
 
@@ -44,11 +44,11 @@ class Drive(Section):
     """Tightest turn; a place counts as reached within twice this."""
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
-        """Yield the places to drive to, without end."""
+        """Yield the places (D,) to drive to, without end, within `area` (2, D)."""
         raise NotImplementedError
 
     def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
-        """Return what steers from each true state towards the next place."""
+        """Return the function from a true state (size,) to the control (m,) towards the next place."""
         places = self.places(area, rng)
         target = next(places)
         steer = steer_in_space if motion.space.world == "space" else steer_in_plane
@@ -73,7 +73,7 @@ class Waypoints(Drive):
     """The places (x, y), in space (x, y, z) too."""
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
-        """Yield the places to drive to, without end."""
+        """Yield the places (D,) to drive to, without end, within `area` (2, D)."""
         yield from cycle(np.array(self.points_m, dtype=np.float64))
 
 
@@ -83,7 +83,7 @@ class Wander(Drive):
     type: Literal["wander"] = "wander"
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
-        """Yield the places to drive to, without end."""
+        """Yield the places (D,) to drive to, without end, within `area` (2, D)."""
         while True:
             yield rng.uniform(area[0], area[1])
 
@@ -96,7 +96,7 @@ class Lanes(Drive):
     """Distance between lanes."""
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
-        """Yield the places to drive to, without end."""
+        """Yield the places (D,) to drive to, without end, within `area` (2, D)."""
         (west, south), (east, north) = area[:, :2]
         lanes = np.linspace(west, east, max(2, math.ceil((east - west) / self.spacing_m) + 1))
         ends = [(x, y) for i, x in enumerate(lanes) for y in ((south, north) if i % 2 == 0 else (north, south))]
@@ -123,7 +123,7 @@ def steer_in_plane(motion: Any, pose: Array, target: Array, drive: Drive, dt_s: 
 
 
 def control(motion: Any, v: float, w: float, dt_s: float) -> Array:
-    """Return the control of `motion` that drives at v (m/s) and turns at w (rad/s) for `dt_s`."""
+    """Return the control (m,) of `motion` that drives at v (m/s) and turns at w (rad/s) for `dt_s`."""
     if isinstance(motion, Unicycle):
         return np.array([v, w])
     if isinstance(motion, Odometry2D):
@@ -149,7 +149,7 @@ def steer_in_space(motion: Any, state: Array, target: Array, drive: Drive, dt_s:
 
 
 def control_in_space(motion: Any, state: Array, v: Array, w: Array, dt_s: float) -> Array:
-    """Return the control of `motion` that moves at v (m/s) and turns at w (rad/s), robot's frame, for `dt_s`."""
+    """Return the control (m,) of `motion` for v (3,) m/s and w (3,) rad/s in the robot's frame, for `dt_s`."""
     if motion.columns == Odometry3D.columns:  # the exact screw
         return np.concatenate([left_jacobian(w * dt_s) @ v * dt_s, w * dt_s])
     if len(state) == 7:

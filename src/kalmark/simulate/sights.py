@@ -23,6 +23,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE3
 from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.models.protocols import StartNoise, range_limit, world_of
 from kalmark.models.tags import corners, tag_seen_from
 from kalmark.simulate.layouts import Scenery
 
@@ -71,7 +72,7 @@ class Sensing(Section):
 
     def of(self, section: Any, dt_s: float) -> Sensing:
         """Return it with what it leaves open taken from the `preset` of the sensor's section, if that has one."""
-        preset = presets.ALL.get(getattr(section, "preset", None) or "")
+        preset = presets.ALL.get(section.model_dump().get("preset") or "")
         if preset is None:
             return self
         usual = {"every": max(1, round(1 / (preset.rate_hz * dt_s))), "dropouts": preset.dropouts}
@@ -108,13 +109,13 @@ class Things:
         return centre(self.sort, self.values, self.dimensions)
 
     def near(self, place: Array, reach_m: float) -> Indices:
-        """Return those within reach of a place, in order."""
+        """Return the indices (K,) of those within `reach_m` of a place (D,), in order."""
         if math.isinf(reach_m) or self.tree is None:
             return np.arange(len(self.values))
         return np.array(sorted(self.tree.query_ball_point(place, reach_m)), dtype=np.int64)
 
     def seen_from(self, T: Array, index: Indices) -> Array:
-        """Return them in the frame T."""
+        """Return those of `index` (K,), in the frame T (3,) or (7,): (K, d)."""
         return in_frame(self.sort, T, self.values[index])
 
 
@@ -170,7 +171,8 @@ def noisy(sensor: Any, e: Array, rng: Generator, cov: Array | None = None) -> Ar
     """
     if len(e) == 0:
         return np.empty((0, len(sensor.columns)))
-    noise = getattr(sensor, "start_noise", sensor.noise)  # of what is measured, where innovations are something else
+    # of what is measured, where innovations are something else
+    noise = sensor.start_noise if isinstance(sensor, StartNoise) else sensor.noise
     n = gaussian(noise(e) if cov is None else cov, rng)
     if e.shape[1] == 7 and n.shape[1] == 6:
         return np.array([SE3.plus(pose, d) for pose, d in zip(e, n, strict=True)])
@@ -197,7 +199,7 @@ def gaussian(cov: Array, rng: Generator) -> Array:
 def chosen(
     things: Things, near: Indices, distance: Array, new_per_step: int | None, max_per_scan: int | None, rng: Generator
 ) -> Indices:
-    """Return which of the visible things, rows of `near`, are reported, in order, and note them as seen."""
+    """Return which (R,) of the visible things, rows of `near` (K,), are reported, in order, and note them as seen."""
     rows = np.arange(len(near))
     if new_per_step is not None:
         new = np.flatnonzero(~things.seen[near])
@@ -218,7 +220,7 @@ def faulty(
     v, e, sizes, ids = sighted
     if sensing.outliers:
         wrong = np.flatnonzero(rng.random(len(ids)) < sensing.outliers)
-        found, y = elsewhere(sensor, v[wrong], sizes[wrong], min(sensor_reach(sensor), things.extent()), rng)
+        found, y = elsewhere(sensor, v[wrong], sizes[wrong], min(range_limit(sensor), things.extent()), rng)
         e[wrong[found]] = y[found]
         real = [None if i in wrong[found] else name for i, name in enumerate(real)]
     kept = rng.random(len(ids)) >= (sensing.dropouts or 0.0)
@@ -228,17 +230,12 @@ def faulty(
     return Sighted(v[rows], e[rows], sizes[rows], told), [real[i] for i in rows]
 
 
-def sensor_reach(sensor: Any) -> float:
-    """Return the farthest range of a sensor, inf if it has none."""
-    return float(getattr(sensor, "range_max_m", math.inf))
-
-
 def elsewhere(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generator) -> tuple[Flags, Array]:
     """Return false measurements (K, m): of the same things at places drawn from the field of view, and which succeeded.
 
     Places are uniform in the volume that the sensor sees within reach: in an image, uniform over its pixels.
     """
-    sort, plane = looks_for(sensor), getattr(sensor, "world", "space") == "plane"
+    sort, plane = looks_for(sensor), world_of(sensor) == "plane"
     found, e = np.zeros(len(v), dtype=np.bool_), np.full((len(v), len(sensor.columns)), np.nan)
     for _ in range(_TRIES):
         missing = np.flatnonzero(~found)

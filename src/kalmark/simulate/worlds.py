@@ -13,12 +13,11 @@ import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 from ruamel.yaml import YAML
 
-from kalmark.config.classes import CLASSES
+from kalmark.config.choices import model_of
 from kalmark.config.merging import merged
-from kalmark.config.models import RangeBearingSignatureSensor, world_of
-from kalmark.config.mounting import SpaceStartConfig, StartConfig
-from kalmark.config.reading import resolve_name, validate
-from kalmark.config.schema import Config, RobotConfig, SpaceRobotConfig
+from kalmark.config.mounting import Plugins, SpaceStartConfig, StartConfig
+from kalmark.config.reading import resolve_name, run_plugins, validate
+from kalmark.config.schema import Config, RobotConfig, SpaceRobotConfig, robot_world
 from kalmark.config.sections import Positive, Section, expected
 from kalmark.config.tree import Tree, name_of, read_tree
 from kalmark.simulate.layouts3d import Layout
@@ -60,13 +59,14 @@ class SpaceSimulatedRobot(_Underway, SpaceRobotConfig):
 
 
 AnySimulatedRobot = Annotated[
-    Annotated[SimulatedRobot, Tag("(plane)")] | Annotated[SpaceSimulatedRobot, Tag("(space)")], Discriminator(world_of)
+    Annotated[SimulatedRobot, Tag("(plane)")] | Annotated[SpaceSimulatedRobot, Tag("(space)")],
+    Discriminator(robot_world),
 ]
 
 
 def check_robot(robot: SimulatedRobot | SpaceSimulatedRobot) -> None:
     """Refuse a constant control of another motion, and a rate or faults of a sensor that the robot does not have."""
-    size, route = len(CLASSES[robot.motion.type].columns), robot.route  # type: ignore[attr-defined]
+    size, route = len(model_of(robot.motion).columns), robot.route
     if isinstance(route, Constant) and len(route.u) != size:
         raise expected(f"a route whose u has the {size} numbers of {robot.motion.type}, not {len(route.u)}")
     if isinstance(route, Waypoints) and isinstance(robot, SimulatedRobot) and len(route.points_m[0]) != 2:
@@ -101,6 +101,8 @@ class World(Section):
     """Signatures of landmarks are uniform between 0 and this."""
     filter: dict[str, Any] = Field(default_factory=dict)
     """Configuration keys in which the filter departs from what is simulated."""
+    plugins: Plugins = ()
+    """Python files with models of your own.  This runs the code of those files."""
 
     _file: Path | None = PrivateAttr(None)
     _tree: Tree | None = PrivateAttr(None)
@@ -134,7 +136,7 @@ class World(Section):
     def has_signatures(self) -> bool:
         """Whether any sensor measures signatures."""
         sensors = [sensor for robot in self.robots.values() for sensor in robot.sensors.values()]
-        return any(isinstance(sensor, RangeBearingSignatureSensor) for sensor in sensors)
+        return any("signature" in model_of(sensor).columns for sensor in sensors)
 
     def times(self) -> tuple[int, ...]:
         """Return the times (ns) at which its steps end."""
@@ -154,7 +156,7 @@ class World(Section):
         return validate(Tree(values=self._values()), Config)
 
     def _values(self) -> dict[str, Any]:
-        values: dict[str, Any] = {"robots": {}}
+        values: dict[str, Any] = {"plugins": [*self.plugins], "robots": {}}
         for name, robot in self.robots.items():
             values["robots"][name] = robot.model_dump(exclude={"route", "sensing"}, exclude_none=True)
         if self.has_signatures:
@@ -190,6 +192,7 @@ def load_world(path_or_name: str | Path, overrides: Sequence[str] = ()) -> World
     """
     path = resolve_name(path_or_name, shipped_worlds(), "world")
     tree = read_tree(path, overrides)
+    run_plugins(tree, path)
     world = validate(tree, World)
     world._file, world._tree = path, tree
     world.config()  # a mistake in `filter` shows now, not after the simulation

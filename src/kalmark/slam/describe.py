@@ -1,43 +1,29 @@
-"""Models and robots as JSON: kalmark's own by name and parameters, a user's by its name alone, to be given again."""
+"""Models and robots as JSON: registered ones by name and parameters, others by name alone, to be given again."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
-from kalmark import association, detect
+from kalmark.declare import by_class_name, registered_name
 from kalmark.errors import MapError
-from kalmark.filter import estimators
-from kalmark.management import attention, initialization, upkeep
-from kalmark.models import landmarks, motion, sensors
 from kalmark.models.protocols import Landmark
-from kalmark.tracks.robot import Mount, Robot
+from kalmark.slam.robot import Mount, Robot
 
 State = dict[str, Any]
 
-MODULES = {
-    "motion": (motion, "move"),
-    "sensor": (sensors, "expect"),
-    "landmark": (landmarks, "seen_from"),
-    "estimator": (estimators, "correct"),
-    "association": (association, "associate"),
-    "attention": (attention, "hopeless"),
-    "upkeep": (upkeep, "hopeless"),
-    "detector": (detect, "detect"),
-    "initialization": (initialization, "__post_init__"),
-}
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 
 
 def described(model: Any) -> State:
-    """Return a model as its name and parameters, one of the user's as its name."""
+    """Return a model that has a name in configurations as its class and parameters, another as its class alone."""
     name = type(model).__name__
-    if not is_dataclass(model) or not any(type(model) is getattr(m, name, None) for m, _ in MODULES.values()):
-        return {"python": name, "kind": str(getattr(model, "kind", ""))}
-    return {"type": name, **{f.name: _plain(getattr(model, f.name)) for f in fields(model)}}
+    if registered_name(type(model)) is None:
+        return {"python": name, "kind": model.kind if isinstance(model, Landmark) else ""}
+    return {"type": name, **{f.name: _plain(vars(model)[f.name]) for f in fields(model)}}
 
 
 def _plain(value: Any) -> Any:
@@ -49,13 +35,12 @@ def _plain(value: Any) -> Any:
 
 
 def restored(kind: str, description: State, what: str, argument: str) -> Any:
-    """Make a model of kalmark's again; of the user's own, say which argument of `load` has to give it."""
+    """Make a registered model again; of another, say which argument of `load` has to give it."""
     if "python" in description:
         raise MapError(f"{what} is {_name(description)}, a model of your own: give the {argument} to load() again")
-    module, method = MODULES[kind]
-    model = getattr(module, description["type"], None)
-    if not isinstance(model, type) or not is_dataclass(model) or not hasattr(model, method):
-        raise MapError(f"{what} is {description['type']!r}, expected one of kalmark's")
+    model = by_class_name(kind, description["type"])
+    if model is None:
+        raise MapError(f"{what} is {description['type']!r}, expected one of kalmark's, or of a plugin that is loaded")
     parameters = {k: v for k, v in description.items() if k != "type"}
     return model(**{k: float(v) if v in NOT_FINITE else v for k, v in parameters.items()})
 

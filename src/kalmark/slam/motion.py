@@ -1,12 +1,16 @@
-"""A robot's clock: cuts its controls into the parts by which the robot is moved.
+"""How a robot moves: the control it holds, cut into parts by the scans between, and the prediction of one part.
 
-A rate acts from its time until the robot's next control, so a scan in between splits its interval.  The error of the
-control is common to both parts.  An increment is the motion that ended at its time.  A robot that coasts moves without
-a control, which changes its velocity at its time.
+A rate acts from its time until the robot's next control, so a scan in between splits its interval.  An increment is the
+motion that ended at its time.  A robot that coasts moves without a control, which changes its velocity at its time.
+
+A control's error is white from one control to the next and needs no block of the map.  Two kinds do: the error of a
+control whose interval a scan has split, common to both parts until the next control; and the *bias*, common to all
+controls (`sigma_v_bias_mps` and the like).  Both add to the control, and the scans correct them like all else.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -14,9 +18,13 @@ import numpy.typing as npt
 
 from kalmark.errors import EventError
 from kalmark.events import Control
+from kalmark.filter.estimators import Estimator
+from kalmark.filter.kernels import moved_noise
+from kalmark.filter.map import Map
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
-from kalmark.models.protocols import Motion
+from kalmark.geometry.spaces import Rn, Space
+from kalmark.models.protocols import Motion, bias_covariance, coasts
 
 Array = npt.NDArray[np.float64]
 
@@ -34,15 +42,14 @@ class Part(NamedTuple):
     last: bool
 
 
-class Drive:
+class HeldInput:
     """The control in force of one robot and how far it has been acted upon.
 
-    As a context manager it puts the clock back if what the robot is told turns out to be impossible.
+    As a context manager it puts the clock back if a control turns out to be impossible.
     """
 
     def __init__(self, motion: Motion) -> None:
-        self.motion = motion
-        self.coasts = bool(getattr(motion, "coasts", False))
+        self.motion, self.coasts = motion, coasts(motion)
         self.t_ns: int | None = None
         self.u: Array | None = None
         self.N: Array | None = None
@@ -90,6 +97,76 @@ class Drive:
         part = self.advance(control.t_ns, last=True)
         self.t_ns, self.u, self.N, self.fresh = control.t_ns, control.u, N, True
         return [] if part is None else [part]
+
+
+@dataclass
+class Moving:
+    """A robot in the map: its motion, its slot, the control it holds.
+
+    `bias` and `error` are the slots of the bias of its controls and of a shared error, None where there is none.
+    """
+
+    motion: Motion
+    slot: int
+    bias: int | None
+    held: HeldInput
+    error: int | None = None
+
+    def added(self) -> list[int]:
+        """Return the slots of the blocks that are added to the control."""
+        return [block for block in (self.error, self.bias) if block is not None]
+
+
+class Prediction(NamedTuple):
+    """A robot's state after one part of its motion, with F (n, n) and R_u (n, k).
+
+    Q (n, n) is the noise of the control's error, D that of the diffusion; `valid` if all of it is finite.
+    """
+
+    moved: Array
+    F: Array
+    R_u: Array
+    Q: Array
+    D: Array | None
+    valid: bool
+
+    def joined(self, added: int, shared: bool) -> tuple[Array, Array]:
+        """Return F and Q (n + k added, n + k added) of the robot and `added` constant blocks (k,) added to its control.
+
+        With a `shared` error the control's noise is in one of these blocks.
+        """
+        (n, k), F, Q = self.R_u.shape, self.F, np.zeros_like(self.Q) if shared else self.Q
+        if added:
+            F, Q = np.eye(n + added * k), np.zeros((n + added * k,) * 2)
+            F[:n, :n], F[:n, n:] = self.F, np.tile(self.R_u, added)
+            if not shared:
+                Q[:n, :n] = self.Q
+        if self.D is not None:
+            G = body_axes(self.moved)
+            Q[: len(G), : len(G)] += G @ self.D @ G.T
+        return F, Q
+
+
+def predict(map_: Map, estimator: Estimator, moving: Moving, part: Part) -> Prediction:
+    """Return where one part of its control moves a robot: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
+    r, u = map_.mean(moving.slot), part.u
+    for block in moving.added():
+        u = u + map_.mean(block)
+    moved, F, R_u = moving.motion.move(r, u, part.dt_s)
+    F = estimator.pose_jacobian(map_, moving.slot, F)
+    Q, valid = moved_noise(moved, F, R_u, part.N)
+    return Prediction(moved, F, R_u, Q, moving.motion.diffusion(part.u, part.dt_s), valid)
+
+
+def bias_name(robot: str) -> str:
+    """Return the name of the bias of a robot's controls in the map."""
+    return f"{robot} bias"
+
+
+def bias_block(motion: Motion) -> tuple[Space, Array, Array] | None:
+    """Return the space, the mean (k,) and the covariance (k, k) of the bias of a motion's controls, or None."""
+    cov = bias_covariance(motion)
+    return None if cov is None else (Rn(len(cov)), np.zeros(len(cov)), cov)
 
 
 def body_axes(state: Array) -> Array:

@@ -1,40 +1,44 @@
 """EKF-SLAM: the page to read first.  Events come in by one door, `Slam.process`; [S] 2.4 is the loop it serves.
 
-robot moves             -> predict       prediction          [S] (14)-(17)
-sensor sees known ones  -> _correct      correction          [S] (26)-(30)
-sensor sees new ones    -> _initialize   augmentation        [S] (32)-(38)
-landmark is removed     -> remove        reduction           [S] Table 1
+robot moves               -> _move         prediction          [S] (14)-(17)
+known landmarks observed  -> _correct      correction          [S] (26)-(30)
+new landmarks observed    -> _initialize   augmentation        [S] (32)-(38)
+landmark is removed       -> remove        reduction           [S] Table 1
 
-`association` says which landmark was seen, `members` who is in the map, `lifecycle` what becomes of landmarks later.
+`association` decides which landmark was observed, `management` what becomes of landmarks: both read a `ScanContext` and
+return decisions and actions.  This page alone changes the map, the tracks and the clones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.association import ByIdentity, ambiguity
-from kalmark.association.averaging import average, refuse_postponed
-from kalmark.association.index import Nearby
-from kalmark.association.protocol import ANEW, DEFERRED, NEW, Association, Decision
+from kalmark.association import Association, ByIdentity
+from kalmark.association.averaging import average, outcomes, refuse_averaging
+from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
+from kalmark.association.query import ScanQuery
+from kalmark.association.ratio import accepted
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
-from kalmark.filter.estimators import Estimator, Invariant, Map
-from kalmark.management import budget, delayed, lifecycle, tentative
-from kalmark.management.approach import approach
-from kalmark.management.doubts import MIRRORED
+from kalmark.filter.estimators import Averaging, Correction, Estimator, Invariant, Update
+from kalmark.filter.map import Map
+from kalmark.filter.maps import DENSE, grown, new_map
+from kalmark.geometry.spaces import SE2, SE3, Rn
+from kalmark.management import budget, confirm, delayed, existence, far, merge, mirrored, reparametrize
+from kalmark.management.pending import Initialization, Step
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
-from kalmark.models.protocols import Landmark
+from kalmark.models.protocols import Landmark, Segmented, place_of
 from kalmark.report import LandmarkTable, Observation, Report, judged
-from kalmark.slam.motion import Drive
-from kalmark.slam.prediction import forget_error, place_bias, predict
-from kalmark.tracks.checks import (
+from kalmark.slam.checks import (
     covariance,
     instance,
     measurements,
@@ -43,24 +47,31 @@ from kalmark.tracks.checks import (
     refuse_bad_fix,
     refuse_odd_parts,
 )
-from kalmark.tracks.members import Members
-from kalmark.tracks.robot import Robot, mount_name, robots_given
-from kalmark.tracks.scene import Scene, View
+from kalmark.slam.motion import HeldInput, Moving, Part, bias_block, bias_name, predict
+from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
+from kalmark.slam.robot import Robot, mount_name, robots_given
+from kalmark.tracks.channel import Channel, Parts
+from kalmark.tracks.clones import Clones
+from kalmark.tracks.scan import ScanContext, Start
+from kalmark.tracks.track import ChannelKey, Late, Pending, Status, Track, Tracks
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+UNEXPLAINED = "no landmark explains this measurement"
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
 class Slam:
     """Robots (or one) and landmarks as one joint Gaussian, corrected event by event.
 
-    `association` decides which landmark was seen, `estimator` how the map is corrected, `landmarks` (or a mount's own)
-    what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
-    `reparametrize` (None: never).  `map` is "dense", "postponed" (docs/postponed.md), or "auto": dense while small;
-    `numbers` ("float64", "float32") are those in which a postponed one keeps what is at rest.  `upkeep` says when a
-    sighting without an id becomes a landmark (docs/association.md).  Events must come in the order of their times.
+    `association` decides which landmark was observed, `estimator` how the map is corrected, `landmarks` (or a mount's
+    own) what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
+    `reparametrize` (None: never).  `map` is "dense", "postponed" (the compressed map, docs/compressed.md), or "auto":
+    dense while small; `numbers` ("float64", "float32") are those in which a compressed one keeps what is inactive.
+    `upkeep` says when an observation without an id becomes a landmark (docs/association.md).  Events must come in the
+    order of their times.
     """
 
     def __init__(
@@ -74,40 +85,49 @@ class Slam:
         numbers: str = "float64",
         upkeep: Upkeep = CAREFUL,
     ) -> None:
-        self.robots: dict[str, Robot] = {}
         self.association: Association = ByIdentity() if association is None else association
         self.estimator: Estimator = Invariant() if estimator is None else estimator
         refuse_odd_parts(self.association, self.estimator, landmarks, upkeep, reparametrize)
         self.t_ns: int | None = None
         self.map_type, self.numbers = map, numbers
-        self.map: Map = lifecycle.new_map(map, numbers)
+        self.map: Map = new_map(map, numbers)
         self.landmark_type, self.upkeep = landmarks, upkeep
         self.reparametrize = reparametrize
-        self.members, self.nearby = Members(self.robots), Nearby()
-        self._drives: dict[str, Drive] = {}
-        self._errors: dict[str, int] = {}  # the block of a held control's error, while a scan has split its interval
-        self._views: dict[tuple[str, str], View] = {}
-        self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
+        self.robots: dict[str, Robot] = {}
         for robot in robots_given(robots):
             if robot.name in self.robots:
                 raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
             self.robots[robot.name] = robot
+        self.tracks, self.clones = Tracks(self.robots), Clones()
+        self._moving: dict[str, Moving] = {}
+        self._channels: dict[ChannelKey, Channel] = {}
+        self._policies: dict[ChannelKey, Policy] = {}
+        self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
         for robot in self.robots.values():
-            self._place(robot, landmarks)
+            self._place(robot)
+        self._may_grow = map == "auto" and not any(policy.averages for policy in self._policies.values())
 
-    def _place(self, robot: Robot, landmarks: Landmark | None) -> None:
-        if robot.name in self.members.slots:
+    def _place(self, robot: Robot) -> None:
+        """Enter a robot, the bias of its controls and its mounts into the map."""
+        if robot.name in self.tracks.slots:
             raise ModelError(f"robot {robot.name!r} has the name of another's bias or mount, expected different names")
-        self.refuse_other_world(f"robot {robot.name!r}", robot.motion.space.world)
-        self.members.place_robot(robot.name, self.map.add(robot.motion.space, robot.start, robot.cov))
-        self._drives[robot.name] = Drive(robot.motion)
-        place_bias(self, robot.name)
+        refuse_other_world(self.robots, f"robot {robot.name!r}", robot.motion.space.world)
+        slot = self.map.add(robot.motion.space, robot.start, robot.cov)
+        self.tracks.enter_block(robot.name, slot, robot=True)
+        bias = bias_block(robot.motion)
+        bias_slot = None if bias is None else self.map.add(*bias)
+        if bias_slot is not None:
+            self.tracks.enter_block(bias_name(robot.name), bias_slot)
+        self._moving[robot.name] = Moving(robot.motion, slot, bias_slot, HeldInput(robot.motion))
         for name, mount in robot.sensors.items():
-            slot, block = -1, mount.block(name)
+            mount_slot, block = -1, mount.block(name)
             if block is not None:  # the mount calibrates itself
-                slot = self.map.add(*block)
-                self.members.slots[mount_name(robot.name, name)] = slot
-            self._views[robot.name, name] = View(mount, landmarks, self, slot)
+                mount_slot = self.map.add(*block)
+                self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
+            association = mount.association or self.association
+            channel = channel_of(self.robots, mount, mount_slot, self.landmark_type, association, self.estimator)
+            self._channels[robot.name, name] = channel
+            self._policies[robot.name, name] = policy_of(mount, channel, association, mount.upkeep or self.upkeep)
 
     # ------------------------------------------------------------------ events
     def process(self, event: Event) -> Report:
@@ -131,45 +151,51 @@ class Slam:
             raise
 
     def _control(self, event: Control) -> Report:
-        drive = self._drives[event.robot]
-        refuse_bad_control(event, drive.motion.columns)
+        moving = self._moving[event.robot]
+        refuse_bad_control(event, moving.motion.columns)
         self.t_ns = event.t_ns
-        with drive:
-            for part in drive.accept(event):
-                predict(self, event.robot, part)
-        forget_error(self, event.robot)
+        with moving.held as held:
+            for part in held.accept(event):
+                self._move(event.robot, part)
+        if moving.error is not None:  # of a control that is no longer held
+            self.map.remove(moving.error)
+            moving.error = None
         return Report(event)
 
     def _scan(self, event: Scan) -> Report:
-        view = self._views.get((event.robot, event.sensor))
-        if view is None:
+        key = event.robot, event.sensor
+        if key not in self._channels:
             names = sorted(self.robots[event.robot].sensors)
             raise EventError(f"{when(event)}: sensor is {event.sensor!r}, expected one of {names}")
-        event = event if view.detector is None else view.detector(event)
-        R = measurements(event, view.sensor)
-        if view.averages:
-            refuse_postponed(self.map, event)
+        channel, policy = self._channels[key], self._policies[key]
+        event = event if policy.detector is None else policy.detector(event)
+        R = measurements(event, channel.sensor, channel.check)
+        if policy.averages:
+            refuse_averaging(self.map, self.estimator, event)
         self.t_ns = event.t_ns
         self._advance(event.robot)
-        if len(event.y) == 0:
-            return lifecycle.tidied(self, view, event, Report(event))
         ids = event.ids or (None,) * len(event.y)
         for i in ids if len(self.robots) > 1 else ():
             if i in self.robots:
                 self._advance(i)
-        scene = Scene(self, view, event, ids, R)
-        return self._fuse(event, view, scene, ambiguity.associate(self, view, scene), R)
+        robot, report = self._moving[event.robot].slot, Report(event, event.y)
+        scan = ScanContext(
+            self.map, self.tracks, self.clones, self.estimator, channel, robot, event, ids, R, report
+        )  # fmt: skip
+        if len(event.y):
+            self._fuse(scan, policy)
+        self._maintain(scan, policy)
+        return report
 
     def _fix(self, event: Fix) -> Report:
         pose, size = (3, 2) if self.robots[event.robot].motion.space.axes == 1 else (7, 3)
         refuse_bad_fix(event, size)
         self.t_ns = event.t_ns
         self._advance(event.robot)
-        slot, report = self.members.slots[event.robot], Report(event, event.y.reshape(1, size))
-        gate = self.association.threshold(size, self.estimator.default_gate)
-        view, estimator, R = fix_view(ORIGIN[pose]), self.estimator.for_fixes(), event.cov.reshape(1, size, size)
-        done = estimator.correct(self.map, view, slot, -1, np.array([slot]), 0, report.y, R, gate)
-        self.refuse_sick(done.healthy, event)
+        slot, report = self._moving[event.robot].slot, Report(event, event.y.reshape(1, size))
+        gate, R = self.association.threshold(size, self.estimator.default_gate), event.cov.reshape(1, size, size)
+        update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
+        done = self._corrected(update, event, self.estimator.for_fixes())
         report.e, report.z, report.Z = done.e, done.z, done.Z
         report.observations = tuple(judged([0], [event.robot], [event.robot], done, gate))
         return report
@@ -178,193 +204,586 @@ class Slam:
     def _advance(self, name: str) -> None:
         """Move a robot up to now by the control it holds."""
         assert self.t_ns is not None
-        with self._drives[name] as drive:
-            part = drive.advance(self.t_ns)
+        with self._moving[name].held as held:
+            part = held.advance(self.t_ns)
             if part is not None:
-                predict(self, name, part)
+                self._move(name, part)
+
+    def _move(self, name: str, part: Part) -> None:
+        """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
+        moving = self._moving[name]
+        step, added = predict(self.map, self.estimator, moving, part), moving.added()
+        if not step.valid:
+            what = f"{name!r} at t={seconds(self.t_ns or 0)} s"
+            raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
+        if moving.error is None and not (part.first and part.last) and part.N.any():
+            k = len(part.u)
+            try:
+                moving.error = self.map.add(Rn(k), np.zeros(k), part.N)
+                added.append(moving.error)
+            except MapError:  # it is full: each part has an error of its own
+                pass
+        index = self.map.index(moving.slot)
+        if added:
+            index = np.concatenate([index, *map(self.map.index, added)])
+        F, Q = step.joined(len(added), shared=moving.error is not None)
+        self.estimator.predict(self.map, moving.slot, index, F, Q, step.moved)
+        self.clones.moved(name)
 
     # ------------------------------------------------------------------ scans
-    def _fuse(self, event: Scan, view: View, scene: Scene, decisions: Sequence[Decision], R: Array) -> Report:
+    def _fuse(self, scan: ScanContext, policy: Policy) -> None:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
-        report, ids = scene.report(), scene.ids
-        known = self.members.known_to(view, event.robot, [name for name, _ in decisions])
-        outcomes: list[Observation | None] = [None] * len(decisions)
-        for seen in self._correct(event, report, view, known, ids, decisions, R):
-            outcomes[seen.index] = seen
-        if view.changes:
-            report.removed = lifecycle.review(self, view, event, [o for o in outcomes if o is not None])
-        if len(known) < len(decisions):
-            new = [k for k, outcome in enumerate(outcomes) if outcome is None]
-            for k, seen in self._sight(event, report, view, new, ids, decisions, R):
-                outcomes[k] = seen
-            new = [k for k in new if outcomes[k] is None]
-            reasons = budget.starts(self, view, new, known, event.y, decisions)
-            for k in new:
-                name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
-                outcomes[k] = self._initialize(event, view, k, ids[k], name, reason, R)
-            lifecycle.let_grow(self)
-        report.observations = tuple(outcomes)  # type: ignore[arg-type]
-        return lifecycle.tidied(self, view, event, report)
-
-    def _sight(
-        self, event: Scan, report: Report, view: View, new: list[int], ids: tuple[Id | None, ...],
-        decisions: Sequence[Decision], R: Array,
-    ) -> Iterator[tuple[int, Observation]]:  # fmt: skip
-        """Count the sightings of tentative landmarks; fuse those that confirm one."""
-        seen, confirmed = tentative.sightings(self, view, event, report, new, decisions, R)
-        yield from seen.items()
-        left = [k for k in new if k not in seen and k not in confirmed]
-        yield from delayed.sightings(self, view, event, left, decisions, R)
-        told = [confirmed.get(k, (None, "")) for k in range(len(decisions))]
-        for done in self._correct(event, report, view, list(confirmed), ids, told, R) if confirmed else ():
-            yield done.index, done._replace(outcome="new", reason=told[done.index][1])
+        query = ScanQuery(scan)
+        decisions = policy.association.associate(query)
+        if policy.holds_back:
+            decisions = accepted(query, decisions, policy.upkeep.odds)
+        self.tracks.learn(*query.learned)
+        known = self.tracks.known_to(scan.channel, scan.event.robot, [name for name, _ in decisions])
+        found = self._correct(scan, policy, known, decisions)
+        if policy.reviews:
+            self._review(scan, policy, found)
+        if len(found) < len(decisions):
+            seen = {o.index: o for o in found}
+            self._start(scan, policy, known, decisions, seen)
+            found = list(seen.values())
+        scan.report.observations = tuple(sorted(found))
 
     def _correct(
-        self, event: Scan, report: Report, view: View, known: list[int], ids: tuple[Id | None, ...],
-        decisions: Sequence[Decision], R: Array,
-    ) -> Iterator[Observation]:  # fmt: skip
+        self, scan: ScanContext, policy: Policy, known: list[int], decisions: Sequence[Decision]
+    ) -> list[Observation]:
         """Fuse the observations `known` of landmarks in the map, those of one type at once.  [S] (26)-(30)."""
         names: list[Any] = [decisions[k][0] for k in known]
-        robot = self.members.slots[event.robot]
-        groups = [(look, [known[i] for i in rows]) for look, rows in self.members.by_look(view, names)]
-        if view.attention.updates is not None and len(known) > view.attention.updates:
-            for k in budget.least(self, event, view, groups, decisions, R):
-                reason = f"not among the {view.attention.updates} that tell most"
-                yield Observation(k, ids[k], "ignored", decisions[k][0], None, reason)  # type: ignore[arg-type]
-        if view.attention.sequential:
-            groups = [(look, [k]) for look, rows in groups for k in rows]
-        if not len(report.e) and (len(groups) != 1 or len(groups[0][1]) < len(report.y)):
-            report.blank(view.dof)
-        for look, rows in [group for group in groups if group[1]]:
-            if len(rows) < len(event.y):
-                y, noise, names = event.y[rows], R[rows], [decisions[k][0] for k in rows]
-            else:  # all, in their order
-                y, noise = event.y, R
-            slots = self.members.slots_of(names)
-            approach(self, view, robot, look, slots, y, noise)
-            noise = view.noise(self.map, robot, look, slots, noise, event)
-            done = self.estimator.correct(self.map, look.view, robot, view.mount, slots, look.d, y, noise, view.gate)
-            self.refuse_sick(done.healthy, event)
+        groups = [(m, [known[i] for i in rows]) for m, rows in self.tracks.by_model(scan.channel, names)]
+        report, found, most = scan.report, list[Observation](), policy.attention.updates
+        if most is not None and len(known) > most:
+            groups, out = budget.chosen(scan, policy.attention, groups, decisions)
+            why = f"not among the {most} of most information"
+            found += [Observation(k, scan.ids[k], "ignored", decisions[k][0], None, why) for k in out]  # type: ignore[arg-type]
+        if policy.attention.sequential:
+            groups = [(model, [k]) for model, rows in groups for k in rows]
+        if not len(report.e) and (len(groups) != 1 or len(groups[0][1]) < len(scan.y)):
+            report.blank(scan.channel.dof)
+        for model, rows in groups:
+            if not rows:
+                continue
+            names = [decisions[k][0] for k in rows]
+            slots = self.tracks.slots_of(names)
+            if scan.channel.far is not None and (near := far.approach(scan, model, slots, rows)) is not None:
+                self.estimator.correct(self.map, near)
+            done = self._corrected(scan.update(model, slots, rows), scan.event)
             report.fill(rows, done)
-            outcomes = judged(rows, ids, names, done, view.gate)
-            self.members.count(seen.landmark for seen in outcomes if seen.outcome == "associated")
-            yield from outcomes
-        if view.averages:
-            yield from average(self, event, view, decisions, R)
+            of_these = judged(rows, scan.ids, names, done, scan.channel.gate)
+            self.tracks.count(of_these)
+            found += of_these
+        return found + self._average(scan, decisions) if policy.averages else found
 
-    def _initialize(
-        self, event: Scan, view: View, k: int, id_: Id | None, name: Any, reason: str, R: Array
-    ) -> Observation:
+    def _average(self, scan: ScanContext, decisions: Sequence[Decision]) -> list[Observation]:
+        """Correct by the mean over the matchings among the decisions.  [F]."""
+        found = average(scan, decisions)
+        if found is None:
+            return []
+        assert isinstance(self.estimator, Averaging)
+        d2, valid = self.estimator.average(self.map, found.update, found.pairs, found.weights)
+        self._refuse_diverged(valid, scan.event)
+        of_these = outcomes(found, decisions, d2)
+        self.tracks.count(of_these)
+        return of_these
+
+    def _corrected(self, update: Update, event: Event, estimator: Estimator | None = None) -> Correction:
+        """Correct the map.  Raises DivergedError where the filter cannot go on."""
+        done = (estimator or self.estimator).correct(self.map, update)
+        self._refuse_diverged(done.valid, event)
+        return done
+
+    def _refuse_diverged(self, valid: bool, event: Event) -> None:
+        if not valid:
+            raise DivergedError(f"{when(event)}: the innovation's covariance is not positive definite")
+
+    # ------------------------------------------------------------------ new landmarks
+    def _start(
+        self, scan: ScanContext, policy: Policy, known: list[int], decisions: Sequence[Decision],
+        seen: dict[int, Observation],
+    ) -> None:  # fmt: skip
+        """Decide what becomes of the observations of no landmark: tentative, pending, new, or left alone."""
+        new = [k for k in range(len(decisions)) if k not in seen]
+        confirmed = self._compare_tentative(scan, policy, new, decisions, seen)
+        left = [k for k in new if k not in seen and k not in confirmed]
+        for o in self._start_delayed(scan, policy, left, decisions):
+            seen[o.index] = o
+        if confirmed:
+            by_name = [confirmed.get(k, (None, "")) for k in range(len(decisions))]
+            for o in self._correct(scan, policy, list(confirmed), by_name):
+                seen[o.index] = o._replace(outcome="new", reason=by_name[o.index][1])
+        new = [k for k in new if k not in seen]
+        reasons = budget.left_out(scan, policy.attention, policy.starts, new, known, decisions)
+        for k in new:
+            name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
+            seen[k] = self._initialize(scan, policy, k, name, reason)
+
+    def _initialize(self, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
         """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
-        if name is None or (name in (DEFERRED, ANEW) and name not in view.starts):
-            return Observation(k, id_, "ignored" if name is None else "deferred", None, None, reason)
-        if name == event.robot:
-            return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
-        self.members.reserve([id_])
-        if name in self.members.slots:
-            return Observation(k, id_, "rejected", name, None, f"it is no {view.landmark.kind}")
-        if view.initialization is not None:
-            return view.initialization.observe(self, view, event, k, id_, name, R[k])
-        robot = self.members.slots[event.robot]
-        which = self.members.doubts.which(view, self.map, robot, name, event.y[k], event.t_ns)
-        if which is None:
-            return Observation(k, id_, "deferred", None, None, MIRRORED)
-        l, L_h, Q = view.explain(self.map, robot, event, k, R[k], which)
-        if l.shape != (view.landmark.space.size,):
-            found = f"it finds {len(l)} numbers, a {view.landmark.kind} has {view.landmark.space.size}"
+        channel, id_ = scan.channel, scan.ids[k]
+        refusal = self._refusal(scan, policy, k, name, reason)
+        if refusal is not None:
+            return refusal
+        if policy.deferred is not None and not isinstance(name, Answer):
+            return self._defer(scan, policy.deferred, k, name)
+        start, space = scan.start_of(k), channel.landmark.space
+        if start.mean.shape != (space.size,):
+            found = f"it finds {len(start.mean)} numbers, a {channel.landmark.kind} has {space.size}"
             return Observation(k, id_, "ignored", None, None, found)
-        if not (np.isfinite(l).all() and np.isfinite(L_h).all() and np.isfinite(Q).all()):
-            return Observation(k, id_, "ignored", None, None, "no landmark explains this measurement")
-        held, unproven = name is DEFERRED, name is DEFERRED or (name in (NEW, ANEW) and view.upkeep.confirm > 1)
-        name = self.members.new_name() if name in (NEW, ANEW, DEFERRED) else name
-        G, index = self.estimator.pose_jacobian(self.map, robot, L_h), view.head_index(self.map, robot)
+        if not start.is_finite:
+            return Observation(k, id_, "ignored", None, None, UNEXPLAINED)
+        held = name is DEFERRED
+        tentative = held or (name in (NEW, REMAP) and policy.upkeep.confirm > 1)
+        name = self.tracks.new_name() if isinstance(name, Answer) else name
         try:
-            slot = self.map.augment(view.landmark.space, l, index, G, Q)
+            track = Track(name, channel.landmark, self._add(start))
         except MapError as full:
             return Observation(k, id_, "ignored", None, None, str(full))
-        if unproven:
-            return tentative.started(self, view, event, k, name, slot, reason, held)
-        self.members.start(name, slot, view.landmark)
-        return Observation(k, id_, "new", name, None, reason)
+        if not tentative:
+            self.tracks.confirm(track)
+            return Observation(k, id_, "new", name, None, reason)
+        track.status, self.tracks.tentative[name] = Status.TENTATIVE, track
+        if policy.upkeep.keep_poses:
+            track.first = scan.event.t_ns, *scan.key, k
+        if held:
+            return Observation(k, None, "deferred", name, None, reason)
+        why = f"first sighting: {reason}" if reason else "first sighting"
+        return Observation(k, None, "tentative", name, None, why)
 
-    def refuse_sick(self, healthy: bool, event: Event) -> None:
-        """Raise DivergedError where the filter cannot go on."""
-        if not healthy:
-            raise DivergedError(f"{when(event)}: the innovation's covariance is not positive definite")
+    def _refusal(self, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation | None:
+        """Return what becomes of an observation that can start no landmark, None of one that can."""
+        id_, sensor = scan.ids[k], type(scan.channel.sensor).__name__
+        if name is None or isinstance(name, Mixture):
+            return Observation(k, id_, "ignored", None, None, reason)
+        if name in (DEFERRED, REMAP) and name not in policy.starts:
+            return Observation(k, id_, "deferred", None, None, reason)
+        if name == scan.event.robot:
+            return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
+        self.tracks.reserve([id_])
+        if name in self.tracks.slots:
+            return Observation(k, id_, "rejected", name, None, f"it is no {scan.channel.landmark.kind}")
+        if policy.deferred is None and not scan.channel.starts_landmarks:
+            return Observation(k, id_, "ignored", None, None, f"a {sensor} measurement alone cannot start a landmark")
+        if not isinstance(name, Answer) or policy.deferred is None:
+            return None
+        if not scan.channel.is_ambiguous:
+            why = f"a {sensor} measurement without an id cannot start a landmark"
+            return Observation(k, id_, "ignored", None, None, why)
+        return None if mirrored.is_clear(scan, k) else Observation(k, id_, "deferred", None, None, mirrored.MIRRORED)
+
+    # ------------------------------------------------------------------ pending landmarks
+    def _defer(self, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:
+        """Take a measurement that alone does not determine a landmark; start the landmark if all of them do."""
+        track = self.tracks.pending.get(name)
+        track = track or Track(name, scan.channel.landmark, status=Status.PENDING, pending=Pending(scan.key, name))
+        try:
+            step = way.observe(scan, k, track.pending or Pending(scan.key, name))
+            if step.start is not None and not step.start.is_finite:
+                step = Step("ignored", UNEXPLAINED)
+            self._take(scan, k, track, step)
+            if not step.reason and step.start is None:
+                assert track.pending is not None
+                step = way.solve(scan, track.pending)
+                self._take(scan, k, track, step)
+        except MapError as full:
+            return Observation(k, scan.ids[k], "ignored", None, None, str(full))
+        return Observation(k, scan.ids[k], step.outcome, name if step.start else None, None, step.reason)
+
+    def _take(self, scan: ScanContext, k: int, track: Track, step: Step) -> None:
+        """Do what a step of an initialiser asks for.  Raises MapError where the map is full."""
+        pending = step.pending or track.pending
+        assert pending is not None
+        for correction in step.corrections:
+            self.map.predict(self._rows(correction.parts), correction.F, correction.Q)
+            self.map.set_predicted(correction.slot, correction.mean)
+        if step.added:
+            pending = replace(pending, hypotheses=tuple(self._add_all(step.added)))
+        if step.keep:
+            pending = replace(pending, measurements=(*pending.measurements, scan.measurement(k, self._clone(scan))))
+        if step.start is not None:
+            track.slot = self._add(step.start)
+            track.pending = None
+            self.tracks.pending.pop(track.id, None)
+            self.tracks.confirm(track, step.measurements)
+        elif step.outcome != "ignored":
+            track.pending, self.tracks.pending[track.id] = pending, track
+        for slot in step.removed:
+            self.map.remove(slot)
+        self._release(scan.key)
+
+    def _start_delayed(
+        self, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision]
+    ) -> list[Observation]:
+        """Keep measurements of no landmark as pending; start the landmarks that enough of them determine.  [T] 2."""
+        names = {k: decisions[k][0] for k in new}
+        ids: dict[int, Id | None] = {k: None for k, n in names.items() if n is NEW}
+        ids |= {k: n for k, n in names.items() if isinstance(n, int | str) and n not in self.tracks.slots}
+        ids, way, key = {k: ids[k] for k in new if k in ids}, policy.delayed, scan.key
+        if way is None or not ids:
+            return []
+        held = self.clones.of(key)
+        if not delayed.has_moved(scan, held[-1] if held else None, way):
+            return [Observation(k, i, "deferred", None, None, "until the robot has moved on") for k, i in ids.items()]
+        try:
+            clone = self._clone(scan)
+        except MapError as full:
+            return [Observation(k, i, "ignored", None, None, str(full)) for k, i in ids.items()]
+        made = {k: scan.measurement(k, clone) for k in ids}
+        candidates, best = delayed.joined(scan, way, self.tracks.candidates.get(key, []), made, ids)
+        found = []
+        for k, i in ids.items():
+            outcome, name = delayed.started(scan, way, candidates, best[k]), None
+            candidates, reason = outcome.candidates, outcome.reason
+            if outcome.start is not None and outcome.used is not None:
+                try:
+                    slot = self._add(outcome.start)
+                except MapError as full:
+                    reason = str(full)
+                else:
+                    name = self.tracks.new_name() if best[k].name is None else best[k].name
+                    assert name is not None
+                    self.tracks.confirm(Track(name, scan.channel.landmark, slot), len(outcome.used.measurements))
+                    candidates = delayed.unexplained(scan, candidates, outcome.used, slot)
+            found.append(Observation(k, i, "deferred" if name is None else "new", name, None, reason))
+        for number in self.clones.of(key)[: -way.poses]:
+            candidates = delayed.without_clone(scan, candidates, number)
+        self.tracks.candidates[key] = candidates
+        self._release(key)
+        return found
+
+    # ------------------------------------------------------------------ tentative landmarks
+    def _compare_tentative(
+        self, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision],
+        seen: dict[int, Observation],
+    ) -> dict[int, tuple[Id, str]]:  # fmt: skip
+        """Count the observations of tentative landmarks; return those that confirm one, which is one from here on."""
+        self.tracks.rename_tentative(scan.event.ids or ())
+        rows = [k for k in new if decisions[k][0] in policy.starts]
+        lost = np.array([decisions[k][0] is REMAP for k in rows], dtype=np.bool_)
+        matches, others = confirm.matched(scan, policy.association, rows, lost)
+        seen |= {o.index: o for o in others}
+        confirmed: dict[int, tuple[Id, str]] = {}
+        waiting: dict[int, Track] = {}
+        for match in matches:
+            track, u = self.tracks.tentative[match.name], policy.upkeep
+            track.hits, track.chances, track.unseen = track.hits + 1, track.chances + 1, -1
+            if u.confirms(track.hits):
+                confirmed[match.k] = match.name, f"confirmed: seen in {track.hits} of {track.chances} scans"
+                self._confirm(scan, track)
+                continue
+            why = f"seen in {track.hits} of {track.chances} scans, {u.confirm} of {u.within} make a landmark"
+            seen[match.k] = Observation(match.k, None, "tentative", match.name, match.d2, why)
+            waiting[match.k] = track
+        if waiting and policy.keep_poses:
+            self._keep(scan, policy.keep_poses, waiting)
+        return confirmed
+
+    def _confirm(self, scan: ScanContext, track: Track) -> None:
+        """Make a landmark of a tentative track, and fuse the measurements that were kept of it from their clones.
+
+        What each expects less what it measured, e - y, becomes a block of the map, which is observed to be zero.
+        """
+        del self.tracks.tentative[track.id]
+        self.tracks.confirm(track)
+        late: list[Late] = [] if track.first is None else [track.first]
+        for m in track.measurements:
+            channel, clone = self._channels[m.robot, m.sensor], self.clones[m.clone]
+            start, R = confirm.residual(self.map, self.estimator, channel, clone, track, m)
+            try:
+                slot = self._add(start)
+            except MapError:  # it is full
+                break
+            p, gate = len(R), scan.channel.gate
+            model = merge.ZeroDifference(scan.channel.at, p)
+            update = Update(model, scan.robot, -1, np.array([slot]), p, np.zeros((1, p)), R[None], gate)
+            done = self._corrected(update, scan.event)
+            self.map.remove(slot)
+            if done.fused[0]:
+                track.observations += 1
+                late.append(m.late)
+        track.measurements = []
+        scan.report.late += tuple(late)
+
+    def _keep(self, scan: ScanContext, most: int, waiting: dict[int, Track]) -> None:
+        """Keep observations of tentative tracks with a clone of the pose, of this channel the last `most`."""
+        held = self.clones.of(scan.key)
+        gone = set(held[: max(len(held) - most + 1, 0)])
+        for track in self.tracks.tentative.values() if gone else ():
+            mine = [m for m in track.measurements if m.clone not in gone or (m.robot, m.sensor) != scan.key]
+            track.measurements = mine
+        self._release(scan.key)
+        try:
+            clone = self._clone(scan)
+        except MapError:  # it is full: these measurements are lost
+            return
+        for k, track in waiting.items():
+            track.measurements.append(scan.measurement(k, clone))
+
+    def _drop_tentative(self, scan: ScanContext, policy: Policy) -> None:
+        """Count the tentative landmarks in view that this scan did not show; drop those that cannot be confirmed."""
+        tentative, u = self.tracks.tentative, policy.upkeep
+        mine = [name for name, track in tentative.items() if track.model.kind in scan.channel.models]
+        for name in mine:
+            tentative[name].unseen += 1
+        missed = [name for name in mine if tentative[name].unseen]
+        for name in confirm.in_view(scan, missed):
+            tentative[name].chances += 1
+        for name in missed:
+            track = tentative[name]
+            if u.hopeless(track.hits, track.chances) or track.unseen > confirm.OUT_OF_VIEW * u.within:
+                why = f"tentative: seen in {track.hits} of {track.chances} scans"
+                scan.report.removed += ((name, why),)
+                self.map.remove(track.slot)
+                del tentative[name]
+
+    # ------------------------------------------------------------------ blocks and clones
+    def _rows(self, parts: Parts) -> Index:
+        """Return the rows of some blocks, of each the first so many."""
+        for slot, _ in parts[:-1]:
+            self.map.index(slot)  # to activate a block may move those that are active
+        return np.concatenate([self.map.index(slot)[:count] for slot, count in parts])
+
+    def _add(self, start: Start) -> int:
+        """Add a block computed from others; return its slot.  Raises MapError where the map is full.  [S] (35)-(38)."""
+        return self.map.augment(start.space, start.mean, self._rows(start.parts), start.G, start.Q)
+
+    def _add_all(self, starts: Iterable[Start]) -> list[int]:
+        """Add blocks, all or none of them; return their slots.  Raises MapError where the map is full."""
+        slots: list[int] = []
+        try:
+            for start in starts:
+                slots.append(self._add(start))
+        except MapError:
+            for slot in slots:
+                self.map.remove(slot)
+            raise
+        return slots
+
+    def _clone(self, scan: ScanContext) -> int:
+        """Clone the pose from which a scan was made; return its number.  Raises MapError where the map is full."""
+        event, dof = scan.event, scan.channel.pose_dof
+        number = self.clones.now(event.robot, event.t_ns)
+        if number is None:
+            mean, index = self.map.mean(scan.robot)[: len(scan.channel.at)], self.map.index(scan.robot)[:dof]
+            slot = self.map.augment(SE2 if dof == 3 else SE3, mean, index, np.eye(dof), np.zeros((dof, dof)))
+            number = self.clones.enter(slot, event.robot, event.t_ns)
+        self.clones.clones[number].users.add(scan.key)
+        return number
+
+    def _release(self, key: ChannelKey) -> None:
+        """Remove the clones that no measurement of a channel needs any more; a delayed start needs the last one."""
+        used = {m.clone for track in self.tracks.tentative.values() for m in track.measurements
+                if (m.robot, m.sensor) == key}  # fmt: skip
+        used |= {m.clone for pending in self.tracks.waiting() if pending.channel == key for m in pending.measurements}
+        if self._policies[key].delayed is not None:
+            used.update(self.clones.of(key)[-1:])
+        for slot in self.clones.refer(key, used):
+            self.map.remove(slot)
+
+    # ------------------------------------------------------------------ map management
+    def _review(self, scan: ScanContext, policy: Policy, seen: Sequence[Observation]) -> None:
+        """Simplify and extend the landmarks of a scan, and give up those that are expected and not found.  [TB] 4.4."""
+        fused = [(o, self.tracks.confirmed[o.landmark]) for o in seen
+                 if o.outcome == "associated" and o.landmark in self.tracks.confirmed]  # fmt: skip
+        for _, track in fused if self.reparametrize is not None else ():
+            point = reparametrize.simplified(scan, track, self.reparametrize)  # type: ignore[arg-type]
+            if point is not None:
+                try:
+                    slot = self._add(point.start)
+                except MapError:  # it is full: they stay what they are
+                    break
+                old = track.slot
+                self.tracks.replace(track, slot, point.model)
+                self.map.remove(old)
+        for o, track in fused:
+            if track.extent is not None and isinstance(track.model, Segmented) and track.model.extend:
+                track.extent = reparametrize.extent(scan, track, scan.y[o.index])
+        if policy.attention.delete:
+            self._give_up(scan, policy, {o.landmark: o.outcome for o in seen})
+
+    def _give_up(self, scan: ScanContext, policy: Policy, found: dict[Id | None, str]) -> None:
+        """Count the landmarks in view and those observed; remove the ones too seldom found, each with its reason."""
+        names = self.tracks.observable(scan.channel)
+        for model, rows in self.tracks.by_model(scan.channel, names):
+            tracks = [self.tracks.confirmed[names[i]] for i in rows]
+            slots, extents = [track.slot for track in tracks], [track.extent for track in tracks]
+            for i in scan.channel.in_view(self.map, scan.robot, model, slots, extents).tolist():
+                track = tracks[i]
+                if found.get(track.id) == "ignored":
+                    continue
+                track.searched, track.found = track.searched + 1, track.found + (track.id in found)
+                reason = policy.attention.hopeless(track.searched, track.found, track.observations)
+                if reason:
+                    self.remove(track.id)
+                    scan.report.removed += ((track.id, reason),)
+
+    def _maintain(self, scan: ScanContext, policy: Policy) -> None:
+        """Map management after a scan: landmarks that are gone, that are one, tentative ones without hope."""
+        report, ids = scan.report, scan.event.ids
+        for judgement in existence.judged(scan, policy.upkeep) if policy.upkeep.p_detect is not None else ():
+            track = self.tracks.confirmed[judgement.name]
+            track.log_odds, track.missed = judgement.log_odds, judgement.missed
+            if judgement.gone:
+                self.remove(track.id)
+                why = f"should be in view and was not seen, {judgement.missed} scans in a row"
+                report.removed += ((track.id, why),)
+        if ids is None or None in ids:
+            self._merge(scan, policy)
+        if self.tracks.tentative:
+            self._drop_tentative(scan, policy)
+        for key in self.clones.users() if self.clones.clones else ():
+            self._release(key)
+        self._let_grow()
+
+    def _merge(self, scan: ScanContext, policy: Policy) -> None:
+        """Merge landmarks that are one; report each that is gone, the one it is now, and why."""
+        seen: list[Any] = [o.landmark for o in scan.report.observations if o.outcome in ("associated", "new")]
+        names = [name for name in seen if name in self.tracks.confirmed]
+        self.tracks.note_scan(names)
+        if not policy.upkeep.merge:
+            return
+        unnamed: list[Any] = [o.landmark for o in scan.report.observations if o.id is None]
+        search = merge.Search(self.tracks, [name for name in unnamed if name in names])
+        while (name := search.next()) is not None:
+            track = self.tracks.confirmed[name]
+            if search.is_first_pass:
+                track.compared = track.observations, self.tracks.changes
+            found = merge.proposal(self.map, self.tracks, name, scan.robot, scan.pose(), policy.upkeep.odds)
+            for gone, kept, why in self._merge_pairs(scan, found) if found else ():
+                search.was_merged(kept)
+                scan.report.merged += ((gone, kept, why),)
+
+    def _merge_pairs(self, scan: ScanContext, found: merge.Merge) -> list[tuple[Id, Id, str]]:
+        """Constrain pairs of landmarks to be equal, through the estimator, and remove one of each.
+
+        In a full map nothing is merged.
+        """
+        try:
+            slots = self._add_all([merge.difference(self.map, self.tracks, pair) for pair in found.pairs])
+        except MapError:
+            return []
+        n, count = self.tracks.confirmed[found.pairs[0][0]].model.space.size, len(slots)
+        model, R = merge.ZeroDifference(scan.channel.at, n), np.tile(merge.EQUAL_M**2 * np.eye(n), (count, 1, 1))
+        update = Update(model, scan.robot, scan.channel.mount, np.array(slots), n, np.zeros((count, n)), R)
+        done, merged = self.estimator.correct(self.map, update), []
+        others = f", with {count - 1} others" if count > 1 else ""
+        ordered = merge.order(self.tracks, found.pairs)
+        for slot, (kept, gone), d2 in zip(slots, ordered, done.d2.tolist(), strict=True):
+            self.map.remove(slot)
+            self.tracks.merge(self.tracks.confirmed[kept], self.tracks.confirmed[gone])
+            self.remove(gone)
+            why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
+            merged.append((gone, kept, why))
+        return merged
+
+    def _let_grow(self) -> None:
+        """Compress the map from so many landmarks on that it pays; not where matchings are averaged."""
+        if self._may_grow and len(self.tracks.confirmed) > DENSE:
+            self.map = grown(self.map, (track.model.space for track in self.tracks.confirmed.values()), self.numbers)
 
     # ------------------------------------------------------------------ reading and editing the map
     def mean(self, name: Id) -> Array:
-        """Return the mean of a landmark or of a robot: (x, y, heading) in m and rad, or (x, y, z, qx, qy, qz, qw)."""
+        """Return the mean (size,) of a landmark or robot: x, y, heading in m and rad, or x, y, z, qx, qy, qz, qw."""
         return self.map.mean(self.slot(name))
 
     def covariance(self, *names: Id) -> Array:
-        """Return the joint covariance of robots and landmarks, in the order given, in standard coordinates."""
+        """Return the joint covariance (n, n) of robots and landmarks, in the given order, in standard coordinates."""
         if not names:
             raise MapError("covariance of nothing was asked for, expected names of robots or landmarks")
         return self.map.covariance([self.slot(name) for name in names])
 
     def landmarks(self) -> LandmarkTable:
         """Return ids, kinds, means, covariances and numbers of observations of all landmarks."""
-        return LandmarkTable.of(self)
+        tracks = self.tracks.confirmed.values()
+        kinds, counts = [track.model.kind for track in tracks], [track.observations for track in tracks]
+        means, covs = [self.mean(track.id) for track in tracks], [self.covariance(track.id) for track in tracks]
+        return LandmarkTable([track.id for track in tracks], kinds, means, covs, counts)
 
-    def refuse_other_world(self, what: str, world: str) -> None:
-        """Refuse what lives in the plane among robots that move in space, and the other way round."""
-        here = next(iter(self.robots.values())).motion.space.world
-        if world and world != here:
-            raise ModelError(f"{what} is of the {world}, expected one of the {here}, where the first robot moves")
+    def slot(self, name: Id) -> int:
+        """Return the slot of a robot or landmark in `map`."""
+        return self.tracks.slot(name)
+
+    def reserve(self, ids: Iterable[Id | None]) -> None:
+        """Keep in mind ids that a log will use, so that no landmark without an id is named like one of them."""
+        tracks = self.tracks
+        tracks.reserve(i for i in ids if i not in tracks.confirmed and i not in tracks.tentative)
+
+    def place(self, name: Id) -> tuple[Array, Array]:
+        """Return where a robot or a landmark is: mean (2 or 3,) and covariance, m and m^2, in the map's frame.
+
+        A landmark's model says where it is (`Placed`); of a line it is its point nearest to the anchor or the origin.
+        Raises MapError for a landmark whose model does not say where it is.
+        """
+        mean, P, model = self.mean(name), self.covariance(name), self.landmark_model(name)
+        if model is None:
+            d = 2 if next(iter(self.robots.values())).motion.space.axes == 1 else 3
+            return mean[:d], P[:d, :d]
+        placed = place_of(model, mean[None])
+        if placed is None:
+            raise MapError(f"{name!r} is a {model.kind}, which does not say where it is, expected a model with place()")
+        (p,), (P_l,) = placed
+        return p, P_l @ P @ P_l.T
+
+    def lags(self, robot: str) -> bool:
+        """Return whether a robot is still where it was before the last event: nothing has asked for it yet."""
+        return self._moving[robot].held.lags(self.t_ns or 0)
 
     def landmark_model(self, name: Id) -> Landmark | None:
-        """Return what a landmark is, None for what is no landmark of the map."""
-        return self.members.kinds.get(name)
+        """Return the model of a landmark, None of what is no landmark of the map."""
+        track = self.tracks.confirmed.get(name)
+        return None if track is None else track.model
 
     def segment(self, name: Id) -> tuple[Array, Array]:
-        """Return the ends (2, 3) of the segment seen of a line so far, and their covariances (2, 3, 3)."""
-        kind: Any = self.landmark_model(name)
-        ends = self.segment_ends(name)
-        if ends is None:
+        """Return the ends (2, 3) of the segment observed of a line so far, and their covariances (2, 3, 3)."""
+        model, extent = self.landmark_model(name), self.segment_ends(name)
+        if extent is None or not isinstance(model, Segmented):
             raise MapError(f"{name!r} is no line of the map, expected one with ends")
-        p, P_l = kind.endpoints(self.mean(name)[None], ends[None])
+        p, P_l = model.endpoints(self.mean(name)[None], extent[None])
         return p[0], P_l[0] @ self.covariance(name) @ P_l[0].swapaxes(1, 2)
 
     def segment_ends(self, name: Id) -> Array | None:
-        """Return where on its line the segment seen so far ends, as abscissas (2,); None for what is no line."""
-        return self.members.ends.get(name)
+        """Return the extent of the segment observed so far as abscissas (2,) on its line; None of what is no line."""
+        track = self.tracks.confirmed.get(name)
+        return None if track is None else track.extent
 
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
         name = checked_id(name, "landmark")
         if landmark is not None:
             instance(landmark, Landmark, f"landmark {name!r}", "a landmark model")
-        kind = landmark or lifecycle.surveyed(next((v.landmark for v in self._views.values()), Point2D()), mean)
-        self.refuse_other_world(kind.kind, kind.space.world)
-        if name in self.members.slots:
+        default = next((channel.landmark for channel in self._channels.values()), Point2D())
+        model = landmark or reparametrize.surveyed(default, mean)
+        refuse_other_world(self.robots, model.kind, model.space.world)
+        if name in self.tracks.slots:
             raise MapError(f"landmark {name!r} is in the map already, expected a new id")
-        mean = numbers(mean, kind.space.size, f"landmark {name!r}: mean", MapError)
+        mean = numbers(mean, model.space.size, f"landmark {name!r}: mean", MapError)
         if cov is not None:
-            cov = covariance(cov, kind.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
-        self.members.place(name, self.map.add(kind.space, mean, cov), kind)
-        self.members.reserve([name])
-        lifecycle.let_grow(self)
+            cov = covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
+        self.tracks.enter(Track(name, model, self.map.add(model.space, mean, cov)))
+        self.tracks.reserve([name])
+        self._let_grow()
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
         slot = self.slot(name)
-        if name not in self.members.kinds:
+        if name not in self.tracks.confirmed:
             what = "robot" if name in self.robots else "sensor's mount or a control's bias"
             raise MapError(f"{name!r} is a {what}, expected a landmark")
         self.map.remove(slot)
-        self.members.forget(name)
-
-    def slot(self, name: Id) -> int:
-        """Return the slot of a robot or landmark in `map`."""
-        return self.members.slot(name)
+        self.tracks.remove(name)
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:
         """Write the whole state to a file; `load` resumes bit for bit."""
-        from kalmark.slam.store import save
+        from kalmark.slam import state
 
-        save(self, Path(path))
+        settings = state.settings(
+            self.robots, self.association, self.estimator, self.landmark_type, self.upkeep, self.reparametrize,
+            self.map_type, self.numbers,
+        )  # fmt: skip
+        state.save(Path(path), settings, state.State(self.t_ns, self.map, self.tracks, self.clones, self._moving))
 
     @staticmethod
     def load(
@@ -375,13 +794,19 @@ class Slam:
         landmarks: Landmark | None = None,
     ) -> Slam:
         """Read a state written by `save`; what is not kalmark's own (a user's models) must be given again."""
-        from kalmark.slam.store import load
+        from kalmark.slam import state
 
-        return load(Path(path), robots, association, estimator, landmarks)
+        saved = state.load(Path(path), robots, association, estimator, landmarks)
+        with saved.errors():
+            slam = Slam(**saved.settings)
+            of_channels = [channel.landmark for channel in slam._channels.values()]
+            found = saved.state(slam.robots, slam._moving, of_channels)
+        slam.t_ns, slam.map, slam.tracks, slam.clones = found.t_ns, found.map, found.tracks, found.clones
+        for key, channel in slam._channels.items():
+            channel.mount = slam.tracks.slots.get(mount_name(*key), -1)
+        return slam
 
     @staticmethod
     def from_config(path: str | Path) -> Slam:
         """Build the Slam that a configuration (a path or a shipped name) describes."""
-        from kalmark.config import slam_from_config
-
-        return slam_from_config(path)
+        return import_module("kalmark.config").slam_from_config(path)  # by name: configuration stands above

@@ -1,5 +1,5 @@
 "use strict";
-const TRUTH = "rgba(139,146,156,0.6)", LANDMARK = "#d2691e", FIX = "#7a3fa0", INK = "#2b2f36", BAND = "rgba(31,95,168,0.13)";
+const INK = "#2b2f36", BAND = "rgba(31,95,168,0.13)";
 const OUTCOME = {associated: "#4a8f7b", new: "#d2a23c", rejected: "#c8553d", ignored: "#aab0ba",
                  deferred: "#7c86b8", tentative: "#b48ac0"};
 const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d"]};
@@ -20,43 +20,6 @@ function logAxis(title, values) {
   const steps = top - bottom > 2.5 ? [1] : [1, 2, 5], tickvals = [];
   for (let k = Math.floor(bottom); k <= top; k++) for (const m of steps) tickvals.push(Number(m + "e" + k));
   return {...axis(title), type: "log", range: [bottom - pad, top + pad], tickvals, ticktext: tickvals.map(v => `${v}`)};
-}
-
-/* The 3-sigma contours of many Gaussians as one broken line. */
-function ellipses(g, from, to, points = 24) {
-  const x = [], y = [];
-  for (let i = from; i < to; i++) {
-    const half = (g.pxx[i] - g.pyy[i]) / 2, mid = (g.pxx[i] + g.pyy[i]) / 2, root = Math.hypot(half, g.pxy[i]);
-    const a = 3 * Math.sqrt(Math.max(mid + root, 0)), b = 3 * Math.sqrt(Math.max(mid - root, 0));
-    const turn = Math.atan2(g.pxy[i], half) / 2, c = Math.cos(turn), s = Math.sin(turn);
-    for (let k = 0; k <= points; k++) {
-      const u = a * Math.cos(2 * Math.PI * k / points), v = b * Math.sin(2 * Math.PI * k / points);
-      x.push(g.x[i] + c * u - s * v);
-      y.push(g.y[i] + s * u + c * v);
-    }
-    x.push(null);
-    y.push(null);
-  }
-  return {x, y};
-}
-
-function extent() {
-  const all = {x: [], y: []};
-  const last = DATA.maps.length ? [DATA.maps[DATA.maps.length - 1]] : [];
-  for (const g of [...DATA.robots, ...DATA.robots.map(r => r.truth || {x: [], y: []}), DATA.trueLandmarks,
-                   ...Object.values(DATA.usedFixes), ...last])
-    for (const k of ["x", "y"]) for (const value of g[k]) if (value !== null) all[k].push(value);
-  const span = v => v.reduce(([a, b], w) => [Math.min(a, w), Math.max(b, w)], [Infinity, -Infinity]);
-  const most = Math.max(0.2 * Math.max(...[all.x, all.y].map(span).map(r => r[1] - r[0])), 0.5);
-  for (const g of last)  /* the ellipses too, but a huge one widens the picture only so far */
-    for (const [k, p] of [["x", "pxx"], ["y", "pyy"]])
-      g[k].forEach((value, i) => {
-        const reach = Math.min(3 * Math.sqrt(Math.max(g[p][i], 0)), most);
-        all[k].push(value - reach, value + reach);
-      });
-  let [x, y] = [span(all.x), span(all.y)].map(r => r[0] > r[1] ? [-1, 1] : r);
-  const pad = 0.05 * Math.max(x[1] - x[0], y[1] - y[0], 1);
-  return [x, y].map(r => [r[0] - pad, r[1] + pad]);
 }
 
 /* The number of steps of a robot up to a time. */
@@ -105,65 +68,12 @@ function band(t, low, high, gaps) {
   return {x, y, mode: "lines", line: {width: 0}, fill: "toself", fillcolor: BAND, hoverinfo: "skip"};
 }
 
-function still() {
-  const traces = [];
-  for (const [robot, f] of Object.entries(DATA.fixes))
-    traces.push({...f, mode: "markers", marker: {color: TRUTH, size: 3}, name: "position fixes (aligned, not used)",
-                 hoverinfo: "skip"});
-  Object.values(DATA.usedFixes).forEach((f, i) =>
-    traces.push({...f, mode: "markers", marker: {color: FIX, size: 5, symbol: "x-thin", line: {color: FIX, width: 1}},
-                 name: "fixes used", legendgroup: "fixes", showlegend: i === 0, hoverinfo: "skip"}));
-  DATA.robots.filter(r => r.truth).forEach((r, i) =>
-    traces.push({...r.truth, mode: "lines", line: {color: TRUTH, width: 3}, name: "true path", legendgroup: "truth",
-                 showlegend: i === 0, hoverinfo: "skip"}));
-  if (DATA.trueLandmarks.x.length)
-    traces.push({x: DATA.trueLandmarks.x, y: DATA.trueLandmarks.y, text: DATA.trueLandmarks.id, mode: "markers",
-                 marker: {symbol: "cross-thin", size: 8, line: {color: INK, width: 1}}, name: "true landmarks",
-                 hovertemplate: "true %{text}: %{x:.3f}, %{y:.3f}<extra></extra>"});
-  return traces;
-}
-
-function moving(frame) {
-  const map = DATA.maps[frame], traces = [];
-  const many = map.x.length > 100;
-  traces.push({...ellipses(map, 0, map.x.length), mode: "lines", line: {color: LANDMARK, width: many ? 0.7 : 1.1},
-               name: "landmarks, 3 sigma", legendgroup: "landmarks", hoverinfo: "skip"});
-  const sigma = map.x.map((_, i) => Math.sqrt(Math.max(map.pxx[i] + map.pyy[i], 0)));
-  traces.push({x: map.x, y: map.y, text: map.id, customdata: sigma, mode: "markers", marker: {color: LANDMARK, size: many ? 3 : 5},
-               legendgroup: "landmarks", showlegend: false,
-               hovertemplate: "%{text}: %{x:.3f}, %{y:.3f}<br>sigma %{customdata:.3g} m<extra></extra>"});
-  for (const r of DATA.robots) {
-    const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path";
-    traces.push({...pathOf(r, n, ["x", "y"]), mode: "lines", line: {color: r.colour, width: 1.6}, name,
-                 legendgroup: r.name, hoverinfo: "skip"});
-    const at = n ? [n - 1] : [];
-    traces.push({...ellipses(r, Math.max(n - 1, 0), n, 48), mode: "lines", line: {color: r.colour, width: 1.4},
-                 legendgroup: r.name, showlegend: false, hoverinfo: "skip"});
-    traces.push({x: at.map(i => r.x[i]), y: at.map(i => r.y[i]), mode: "markers", legendgroup: r.name, showlegend: false,
-                 marker: {symbol: "triangle-up", size: 13, color: r.colour, line: {color: "white", width: 1},
-                          angle: at.map(i => 90 - r.theta[i] * 180 / Math.PI)},
-                 hovertemplate: r.name + ": %{x:.3f}, %{y:.3f}<extra></extra>"});
-  }
-  return traces;
-}
-
-/* The picture of a map in the plane: a function that draws the map at a position of the slider. */
-function planarMap() {
-  const [x, y] = extent(), background = still();
-  const width = el("map").clientWidth || 1080;
-  const height = Math.min(820, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 120));
-  const page = layout({height, uirevision: "map", xaxis: {...axis("x (m)"), range: x},
-                       yaxis: {...axis("y (m)"), range: y, scaleanchor: "x"}, margin: {l: 64, r: 16, t: 32, b: 44},
-                       legend: {orientation: "h", y: -48 / (height - 100), yanchor: "top"}});
-  return frame => Plotly.react("map", [...background, ...moving(frame)], page, CONFIG);
-}
-
 function drawMap() {
   if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
-  const slider = el("time"), draw = DATA.space ? spatialMap() : planarMap();
+  const slider = el("time"), draw = mapPicture();
   const show = () => {
     const map = DATA.maps[+slider.value];
-    el("now").textContent = `${map.t.toFixed(1)} s · ${map.count ?? map.x.length} landmarks`;
+    el("now").textContent = `${map.t.toFixed(1)} s · ${map.count} landmarks`;
     draw(+slider.value);
   };
   slider.max = DATA.maps.length - 1;
@@ -250,7 +160,7 @@ const CHANGE = {merged: ["#1f5fa8", "triangle-down"], removed: ["#c8553d", "x-th
 
 /* One ambiguous scan: observations, the landmarks each was compared with, and the decision. */
 function drawScan(scan) {
-  const traces = [], ring = ellipses(scan.pose, 0, 1);
+  const traces = [], ring = contours(scan.pose, [0], 24, "xy");
   traces.push({...ring, mode: "lines", line: {color: "#1f5fa8", width: 1}, name: "robot, 3 sigma", hoverinfo: "skip"},
     {x: scan.pose.x, y: scan.pose.y, mode: "markers", marker: {color: "#1f5fa8", size: 9}, showlegend: false,
      hovertemplate: `${scan.robot}<extra></extra>`});

@@ -1,0 +1,456 @@
+"""The figures of docs/figures.md: what each should be, the command that measures it, and how its output is read.
+
+    python benchmarks/figures.py --table                 # docs/figures.md from docs/figures.json
+    python benchmarks/figures.py --measure WORD ...      # run the commands of the figures whose names have these words
+    python benchmarks/figures.py --list WORD ...         # print the names and the commands
+
+A command runs in a shell at the root of the repository, once for all of its figures.  `KALMARK_DATA` and
+`KALMARK_ORACLE` name the real logs and the recordings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parent.parent
+SAVED, PAGE = ROOT / "docs" / "figures.json", ROOT / "docs" / "figures.md"
+Read = Callable[[str], str]  # from the output of a command to the measured value
+
+
+class Figure(NamedTuple):
+    """One row of the table."""
+
+    section: str
+    name: str
+    wanted: str
+    command: str
+    read: Read
+
+
+def passes(output: str) -> str:
+    """Return that a test, which asserts what is wanted, has passed; a failure ends the command."""
+    return "within"
+
+
+def row(start: str, text: str) -> Read:
+    """Return a reader of the last line that begins with these words; `text` is filled with the words after them."""
+
+    def read(output: str) -> str:
+        begin = start.split()
+        for line in reversed(output.splitlines()):
+            words = line.replace("|", " ").split()
+            if words[: len(begin)] == begin:
+                return text.format(*(word.rstrip(",;") for word in words[len(begin) :]))
+        raise SystemExit(f"no line begins with {start!r} in the output:\n{output}")
+
+    return read
+
+
+def spread(starts: list[str], columns: list[int]) -> Read:
+    """Return a reader of several lines: the least and the greatest of each of these columns."""
+
+    def read(output: str) -> str:
+        shown = [[float(row(start, f"{{{c}}}")(output)) for start in starts] for c in columns]
+        return " / ".join(f"{min(values):g} to {max(values):g}" for values in shown)
+
+    return read
+
+
+def saved(path: str, text: str) -> Read:
+    """Return a reader of a JSON file that the command writes; `text` is filled with its values, `robot` with the first."""
+
+    def read(output: str) -> str:
+        values = json.loads((ROOT / path).read_text())
+        return text.format_map(values | {"robot": next(iter(values.get("robots", {"": {}}).values()))})
+
+    return read
+
+
+def exactness() -> Iterator[Figure]:
+    """Yield the figures that a test asserts."""
+    for name, wanted, words in (
+        ("`Ekf` on the recorded course run, every x and P", "1e-9", "recorded_course"),
+        ("functions of the course in the plane, values and Jacobians", "1e-12", "courses_own_functions"),
+        ("heading sigma of a standing robot after 500 scans, `Invariant` and `Fej`", "1e-6°", "learns_nothing_of_its_heading"),
+        ("orientation sigmas of a robot that stands in space, 100 scans", "1e-6°", "learns_nothing_of_its_orientation"),
+        ("relative map with an uncertain start against an exact one", "1e-9 m", "uncertain_start_leaves"),
+        ("augmentation against a prior C: difference", "falls as 1/C", "huge_prior"),
+        ("fast `Ekf` against the textbook filter", "1e-10", "textbook_to"),
+        ("alignment and ATE against evo", "1e-9", "evo"),
+        ("runs in a rotated world, every sensor with every landmark", "1e-6 m; charts 1e-2", "test_invariance"),
+        ("functions of space against the toolbox's recordings, 74 of 84", "1e-9", "test_oracle_functions"),
+        ("lines of three recorded runs: initialisation, innovation, visibility", "1e-9", "test_oracle_lines"),
+        ("Jacobians of every sensor of space with every landmark, 200 draws", "1e-6", "test_seam_in_space"),
+        ("fitted lens correction, round trip over the image", ".01 px", "test_lenses"),
+        ("compressed map against dense, 3,000 steps, 120 landmarks", "1e-8", "compressed_map_equals_the_dense"),
+        ("inactive blocks of every space against the dense filter", "1e-9", "test_compressed_space"),
+    ):  # fmt: skip
+        yield Figure("Exactness", name, wanted, f"python -m pytest tests -k {words}", passes)
+
+
+def campaigns() -> Iterator[Figure]:
+    """Yield the consistency of the filters in simulation."""
+    shown = "{{estimators[{0}][pose_anees]:.2f}} / {{estimators[{0}][pose_inside]:.1%}} / {{estimators[{0}][joint_anees]:.3f}} / {{estimators[{0}][position_rmse_m]:.3f}} m / {{estimators[{0}][diverged]}}"
+    both = "--estimator invariant --estimator ekf"
+    cases = [
+        *((world, f"kalmark campaign {world} --runs 50 {both}", f"campaign-{world}") for world in ("cloister", "loop_b", "loop_b2", "loop_c")),
+        *((name, f"kalmark campaign {name} --runs {runs} {both}", f"campaign-{name}")
+          for name, runs in (("lost_in_the_woods", 10), ("mrclam", 20), ("victoria_park_known", 2))),
+    ]  # fmt: skip
+    for (name, command, out), estimator in itertools.product(cases, ("invariant", "ekf")):
+        text = shown.format(estimator)
+        wanted = "joint .95 to 1.05" if (name, estimator) == ("cloister", "invariant") else ""
+        yield Figure("Consistency", f"`{name}`, `{estimator}`", wanted, command, saved(f"out/{out}/summary.json", text))
+    for world, kind in itertools.product(("loop_b2", "loop_c"), ("postponed", "dense")):
+        out = f"out/{world}_{kind}"
+        command = f"kalmark campaign {world} --runs 100 --estimator invariant --set filter.map.type={kind} --out {out}"
+        wanted = "as dense" if kind == "postponed" else ""
+        yield Figure("Consistency", f"`{world}`, `invariant`, `map.type={kind}`", wanted, command,
+                     saved(f"{out}/summary.json", shown.format("invariant")))  # fmt: skip
+
+
+def space() -> Iterator[Figure]:
+    """Yield the consistency in space."""
+    for name, options, wanted, estimator in (
+        ("thick_cloister", "", "90 % in the band", "invariant"),
+        ("thick_cloister", "", "", "ekf"),
+        ("thick_cloister_stereo", "", "90 % in the band", "invariant"),
+        ("thick_cloister_stereo", "", "", "ekf"),
+        ("thick_cloister_pinhole", "", "at most 7.0", "invariant"),
+        ("thick_cloister_pinhole", "", "", "ekf"),
+        ("thick_cloister_pinhole", " --set filter.landmarks.type=anchored_homogeneous", "at most 7.0", "invariant"),
+        ("thick_cloister_pinhole", " --set filter.landmarks.type=anchored_homogeneous", "", "ekf"),
+    ):
+        kind = ", anchored homogeneous points" if options else ""
+        out = f"out/campaign-{name}{'-anchored' if options else ''}"
+        command = (
+            f"kalmark campaign {name} --runs 50 --skip 30 --estimator invariant --estimator ekf{options} --out {out}"
+        )
+        text = f"{{estimators[{estimator}][pose_anees]:.2f}} / {{estimators[{estimator}][pose_inside]:.1%}}"
+        yield Figure("Space", f"`{name}`{kind}, `{estimator}`: pose ANEES (6) / in band", wanted, command,
+                     saved(f"{out}/summary.json", text))  # fmt: skip
+    house = "kalmark campaign house --runs 20 --skip 30 --estimator invariant --estimator ekf --out out/campaign-house"
+    for estimator in ("invariant", "ekf"):
+        text = f"{{estimators[{estimator}][pose_anees]:.2f}} / {{estimators[{estimator}][joint_anees]:.2f}}"
+        yield Figure("Space", f"`house`, lines, `{estimator}`: pose ANEES (6) / joint (1)", "", house,
+                     saved("out/campaign-house/summary.json", text))  # fmt: skip
+    yield Figure("Space", "`self_calibration`: mount 5 cm and 1.5° wrong an axis; error / below 3 sigma",
+                 ".1°, 5 mm / 96 %", "kalmark campaign self_calibration --runs 50 --skip 30 --estimator invariant",
+                 saved("out/campaign-self_calibration/summary.json",
+                       "{estimators[invariant][mount_deg]:.3f}°, {estimators[invariant][mount_m]:.4f} m / {estimators[invariant][mount_sure]:.1%}"))  # fmt: skip
+    for name, theirs in TOOLBOX.items():
+        yield Figure("Space", f"toolbox recording `{name}`: position RMSE, m / pose NEES", f"{theirs} (toolbox)",
+                     f"kalmark run slamtb --log {name}.json.gz --out out/{name}",
+                     saved(f"out/{name}/summary.json", "{robot[ate_raw_m]:.4f} / {robot[pose_nees]:.1f}"))  # fmt: skip
+    for test in (1, 2, 8, 13, 21, 22):
+        yield Figure("Space", f"TagSLAM test {test}, RMS of the corners, px: filter / bundle adjustment", "below 1",
+                     "python benchmarks/tags.py", row(str(test), "{3} / {5}"))  # fmt: skip
+    yield Figure("Space", "`starry_night`: position raw / landmark sigma ratio / pose NEES", "1.5 times the batch / .9 to 1.1 / 3",
+                 "python benchmarks/filter_vs_batch.py starry_night", row("starry_night invariant", "{0} m / {2} / {1}"))  # fmt: skip
+
+
+TOOLBOX = {
+    "a_idpPnt_odo": ".0365 / 6.5", "a_idpPnt_odo_small": ".0405 / 7.8", "a3_hmgPnt_odo": ".0217 / 25.7",
+    "b2_idpPnt_constVel_small": ".095 / 5.3", "c_idpLin_small": ".0113 / 7.6", "c_plkLin_small": ".0117 / 7.6",
+    "c_hmgLin_small": ".0117 / 7.9", "e_omni_ahmPnt": ".0371 / 7.6", "g_outliers_small": ".0411 / 6.7",
+}  # fmt: skip
+
+
+def real_logs() -> Iterator[Figure]:
+    """Yield the figures of real logs with known association."""
+    command = "python benchmarks/real_logs.py"
+    for label, start, wanted, text in (
+        ("Lost in the Woods: position raw / landmarks raw", "lost_in_the_woods", ".078 / .042 m", "{0} / {2} m"),
+        ("Lost in the Woods, ranges to 1 m: position raw / landmarks aligned", "lost_in_the_woods 1 m", "1.42 / .165 m", "{0} / {3} m"),
+        ("MRCLAM 6, mean of five robots alone: position raw / landmarks aligned / pose NEES", "mrclam, mean of five", ".41 m / .10 m / 4", "{0} m / {3} m / {4}"),
+        ("MRCLAM 6, all in one map: position raw", "mrclam all in one", ".14 m", "{0} m"),
+        ("Victoria Park, known trees: aligned median / share within 10 m", "victoria_park_known", "1.4 m / .96", "{6} m / {7}"),
+    ):  # fmt: skip
+        for estimator in ("invariant", "ekf"):
+            yield Figure("Real logs, known association", f"{label}, `{estimator}`", wanted, command,
+                         row(f"{start} {estimator}", text))  # fmt: skip
+    command = "python benchmarks/filter_vs_batch.py"
+    for label, start in (
+        ("Lost in the Woods", "lost_in_the_woods"), ("Lost in the Woods, ranges to 3 m", "lost_in_the_woods_3m"),
+        ("Lost in the Woods, ranges to 1 m", "lost_in_the_woods_1m"), ("MRCLAM 6, all in one", "mrclam_all"),
+        ("Victoria Park, known trees", "victoria_park_known"), ("DLR", "dlr"), ("Freiburg course", "freiburg_course"),
+    ):  # fmt: skip
+        for estimator in ("invariant", "ekf"):
+            wanted = ".95 to 1.05 / .35" if estimator == "invariant" else ""
+            yield Figure("Filter against batch",
+                         f"{label}, `{estimator}`", wanted, command,
+                         row(f"{start} {estimator}", "{2} / {4} / {3}"))  # fmt: skip
+    for estimator in ("invariant", "ekf"):
+        wanted = ".95 to 1.05 / .35" if estimator == "invariant" else ""
+        yield Figure("Filter against batch", f"MRCLAM 6, each of five robots, `{estimator}`", wanted, command,
+                     spread([f"mrclam_{k} {estimator}" for k in range(1, 6)], [2, 4, 3]))  # fmt: skip
+
+
+def unknown_ids() -> Iterator[Figure]:
+    """Yield the figures without ids."""
+    park, section = "python benchmarks/victoria_park.py", "Victoria Park from its raw laser"
+    for label, start in (("raw laser, unknown ids", "laser"), ("RFS detections, unknown ids", "rfs")):
+        for steering in ("ascii", "mat"):
+            yield Figure(section, f"{label}, steering `{steering}`: median / RMS within 10 m / share within 10 m / duplicates by scan, by map, %",
+                         "2.0 m / 3 m / 95 % / 10", park, row(f"{start} {steering}", "{0} m / {1} m / {2} / {6}, {7}"))  # fmt: skip
+            yield Figure(section, f"{label}, steering `{steering}`: landmarks / of 299 trees / times real time",
+                         "- / - / 10", park, row(f"{start} {steering}", "{4} / {5} / {8}"))  # fmt: skip
+    section = "Association"
+    for sigmas, prototype in ((".2 m, 3°", "0 / 0"), (".4 m, 5°", ".6 / 2"), ("1 m, 15°", "2.7 / 7")):
+        for k, name in enumerate(("nearest", "global", "jcbb", "clique", "sample", "auto")):
+            start = {".2 m, 3°": "0.2 m, 3 deg", ".4 m, 5°": "0.4 m, 5 deg", "1 m, 15°": "1.0 m, 15 deg"}[sigmas]
+            yield Figure(section, f"pose sigma {sigmas}, `{name}`: wrong pairs / scans with one, %",
+                         prototype if name == "auto" else "", "python benchmarks/association.py", cell(start, k))  # fmt: skip
+    for name in ("auto", "clique", "jcbb", "nearest"):
+        yield Figure(section, f"loop of 6 m and 15°, 200 runs, `{name}`: closed / open / wrong, %",
+                     "98 / - / 0" if name == "auto" else "", "python benchmarks/loop_closing.py", row(name, "{0} / {2} / {4}"))  # fmt: skip
+    section, dlr = "Logs with hidden ids", "python benchmarks/unknown_ids.py dlr dlr_unknown"
+    yield Figure(section, "DLR: wrong pairs", "1 %", dlr, row("wrong:", "{0} of {2} {3}"))
+    yield Figure(
+        section, "DLR: observations of clutter that are not fused", "90 %", dlr, row("without an id in the log:", "{5}")
+    )
+    yield Figure(section, "DLR: map against that with ids, RMS, raw / aligned", ".3 m", dlr,
+                 row("difference of the maps, RMS:", "{0} m / {2} m"))  # fmt: skip
+    yield Figure(section, "DLR: landmarks with ids / without", "", dlr, row("landmarks:", "{0} / {3}"))
+    for robot in range(1, 6):
+        each = f'python benchmarks/unknown_ids.py mrclam mrclam --set log.ids=hidden --set association.type=auto --set "log.robots=[{robot}]"'
+        yield Figure(section, f"MRCLAM 6, robot {robot}: wrong pairs", "2 in 1,000", each, row("wrong:", "{0} of {2}"))
+        yield Figure(section, f"MRCLAM 6, robot {robot}: of these, of landmarks over .5 m apart", "", each,
+                     row("of these, of landmarks more than 0.5 m apart:", "{0}"))  # fmt: skip
+        yield Figure(section, f"MRCLAM 6, robot {robot}: aligned path RMSE / with ids", "1.3 times", each,
+                     row(f"{robot}: aligned path RMSE", "{0} m / {4} m"))  # fmt: skip
+        ideal = f'python benchmarks/unknown_ids.py mrclam --set "log.robots=[{robot}]"'
+        yield Figure(section, f"MRCLAM 6, robot {robot}, all earlier ids known: another landmark is the nearest / takes the best assignment",
+                     "", ideal, row("another is the nearest:", "{0} / {9}"))  # fmt: skip
+
+
+def cell(start: str, index: int) -> Read:
+    """Return a reader of the column of a method in the table of associations."""
+
+    def read(output: str) -> str:
+        for line in output.splitlines():
+            cells = [c.strip() for c in line.strip("| ").split("|")]
+            if cells[0] == start:
+                return cells[1 + index]
+        raise SystemExit(f"no row {start!r} in the output:\n{output}")
+
+    return read
+
+
+def partial_measurements() -> Iterator[Figure]:
+    """Yield the figures of ranges alone and bearings alone."""
+    section, command = "Ranges alone", "python benchmarks/range_only.py"
+    for label, start in (
+        ("beacons at 5 to 20 m", "5 to 20 m"), ("beacons at 20 to 80 m", "20 to 80 m"),
+        ("four at 10 to 40 m, scale and bias unknown", "four at 10 to 40 m, scale 7 % and bias .2 m unknown"),
+        ("straight line", "5 to 20 m, straight line"),
+    ):  # fmt: skip
+        for way in ("trilateration", "hypotheses"):
+            wanted = "none started" if "straight" in label else "98 to 100 %" if "beacons" in label else ""
+            yield Figure(section, f"{label}, {way}: started / squared error within 99 %", wanted, command,
+                         row(f"{start} {way}", "{0} / {1}"))  # fmt: skip
+    for label, start, wanted in (
+        ("Plaza1, scale and bias unknown", "all unknown", ".45 m / .15 m / 1 % of 1.069"),
+        ("Plaza1, scale given", "scale given", ".354 / .099 m"),
+        ("Plaza1, scale unknown, no bias", "no bias", ""),
+        ("Plaza1, hypotheses", "hypotheses", ""),
+    ):
+        yield Figure(
+            section, f"{label}: path / beacons aligned / scale", wanted, command, row(start, "{0} / {1} m / {2}")
+        )
+    section, command = "Bearings alone, in the plane", "python benchmarks/bearing_only.py"
+    wanted = {"inverse depth": ("99 %", "95 %"), "delayed": ("97 %", "90 %"), "naive": ("", "")}
+    for reach, way in itertools.product(("5 to 20", "20 to 80"), wanted):
+        yield Figure(section, f"{reach} m, {way}: started / consistent / within 20 % / NEES mean, median (2, 1.39)",
+                     wanted[way][0 if reach == "5 to 20" else 1], command, row(f"{reach} {way}", "{0} % / {1} % / {2} % / {3}, {4}"))  # fmt: skip
+    woods = "kalmark run lost_in_the_woods_bearing --out out/woods_bearing"
+    yield Figure(section, "Lost in the Woods without ranges: aligned position / landmarks", ".132 m", woods,
+                 saved("out/woods_bearing/summary.json", "{robot[ate_m]:.3f} m / {landmark_rmse_m:.3f} m"))  # fmt: skip
+    for sensor in ("laser", "sonar", "camera", "rgbd", "arva", "rfid"):
+        yield Figure("Presets of [S] Table 2", f"`{sensor}`, 50 runs: pose ANEES", "3",
+                     "python examples/05_table2.py 50", row(sensor, "{0}"))  # fmt: skip
+
+
+def speed() -> Iterator[Figure]:
+    """Yield the ratios of times within one run, and microseconds for orientation."""
+    section, command = "Speed", "python benchmarks/step.py"
+    for name, start, wanted in (
+        ("`Slam.process`", "Slam.process", "at most 5 times"), ("its compiled kernels", "compiled kernels", ""),
+        ("textbook filter, NumPy", "textbook NumPy", ""), ("iSAM2, update and pose marginal", "GTSAM iSAM2", ""),
+    ):  # fmt: skip
+        yield Figure(section, f"a step with 50 landmarks, 6 observed, {name}: median / times kernels", wanted, command,
+                     row(start, "{0} us / {3}"))  # fmt: skip
+    yield Figure(section, "1,024 landmarks, 10 observed: control / scan / of which compiled correction", "60 us together", command,
+                 row("the map that Slam chooses, 10 seen a step:", "{1} us / {4} us / {11} us"))  # fmt: skip
+    yield Figure(section, "dense step, 1,024 landmarks, 6 observed, over the dsyrk of its covariance", "1.6", command,
+                 row("1,024 landmarks, dense, 6 seen a step:", "{6}"))  # fmt: skip
+    peers = "python benchmarks/peers.py"
+    yield Figure(section, "a step at 50 / 100 / 200 / 1,000 / 10,000 landmarks, 10 observed: `Slam.process`", "", peers,
+                 row("kalmark, Slam.process", "{0} / {2} / {4} / {6} / {8} us"))  # fmt: skip
+    yield Figure(section, "iSAM2 with joint marginals over `Slam.process`, same maps", "- / 10 / - / 20 / 3", peers,
+                 row("GTSAM iSAM2, update and marginals", "{0} / {1} / {2} / {3} / {4}"))  # fmt: skip
+    for name in ("textbook as printed, NumPy", "MRPT kf-slam, number by number"):
+        yield Figure(
+            section,
+            f"{name} over `Slam.process`, 50 / 100 / 200 / 1,000",
+            "",
+            peers,
+            row(name, "{0} / {1} / {2} / {3}"),
+        )
+    for kind in ("homogeneous", "anchored_homogeneous", "inverse_depth"):
+        yield Figure(section, f"one camera, 40 points, `{kind}`: a step / times faster than the toolbox", "5 ms / 20",
+                     "python benchmarks/camera.py", row(kind, "{0} ms / {1}"))  # fmt: skip
+    for world in ("plane", "space, one camera"):
+        yield Figure(section, f"first step of a new process, {world}, `Invariant`, processor time: cold / warm", "- / 1 s",
+                     "python benchmarks/start.py", row(f"{world}, `Invariant`", "{2} s / {5} s"))  # fmt: skip
+    for name in ("Trunks", "Walls", "Corners"):
+        yield Figure(
+            section,
+            f"detector `{name}`, a scan of 361 beams",
+            "",
+            "python benchmarks/detectors.py",
+            row(name, "{1} us"),
+        )
+    section, command = "Large maps", "python benchmarks/map_growth.py"
+    for count in ("49", "1,024", "10,000"):
+        yield Figure(section, f"mission with {count} landmarks: total / a step / ordinary step, after a full update / worst steps", "15 ms worst" if count == "10,000" else "",
+                     command, row(f"{count} ", "{1} s / {3} ms / {5} us, {7} us / {9}, {11}, {13} ms"))  # fmt: skip
+    yield Figure(
+        section,
+        "mission with 10,000 landmarks: dense filter over compressed map",
+        "60",
+        command,
+        row("10,000 ", "{20}"),
+    )
+    yield Figure(
+        section,
+        "ordinary step after a full update, 10,000 over 49 landmarks",
+        "1.5",
+        command,
+        row("ordinary, largest over smallest map:", "{5}"),
+    )
+    for numbers, wanted in (("float64", "38,000 in 24 GiB"), ("float32", "50,000 in 24 GiB")):
+        yield Figure(
+            section,
+            f"memory of a covariance in `{numbers}`",
+            wanted,
+            command,
+            row(f"{numbers}:", "{9} landmarks in {12} GiB"),
+        )
+    nearby = "python benchmarks/nearby.py"
+    for count in ("1,024", "10,000"):
+        yield Figure(section, f"nearest neighbour over known association, {count} landmarks: mission / known place",
+                     "2" if count == "10,000" else "", nearby, row(f"{count} ", "{2} / {5}"))  # fmt: skip
+
+
+def structure() -> Iterator[Figure]:
+    """Yield the counts of the sources."""
+    for name, wanted, start, text in (
+        (
+            "modules in the largest import cycle, imports for types included",
+            "0",
+            "modules in the largest import cycle:",
+            "{0}",
+        ),
+        (
+            "functions that take the whole `Slam`, outside `slam/slam.py`",
+            "0",
+            "functions that take the whole Slam:",
+            "{0}",
+        ),
+        ("lines of Python under `src`", "26,500", "lines", "{0}"),
+        ("public functions of arrays that state the shapes", "100 %", "public functions with shapes:", "{3}"),
+    ):
+        yield Figure("Structure", name, wanted, "python benchmarks/structure.py", row(start, text))
+    for kind, wanted in (
+        ("a sensor in the plane", "1"),
+        ("a landmark in space", "2"),
+        ("an association", "1"),
+        ("an estimator", "1"),
+    ):
+        yield Figure("Structure", f"files to touch for {kind}, without test and regenerated page", wanted,
+                     "python benchmarks/structure.py", row(f"files to touch, {kind}:", "{0}"))  # fmt: skip
+    for name, wanted in (("known ids", "14"), ("unknown ids", "20")):
+        yield Figure("Structure", f"files that the calls of one scan enter, {name}", wanted, "python benchmarks/structure.py --scan",
+                     row(f"files of one scan, {name}:", "{0}"))  # fmt: skip
+
+
+def figures() -> list[Figure]:
+    """Return all figures, in the order of the page."""
+    parts = (exactness, campaigns, real_logs, unknown_ids, partial_measurements, space, speed, structure)
+    return [figure for part in parts for figure in part()]
+
+
+HEAD = """# Measured figures
+
+`python benchmarks/figures.py --table` writes this page from [figures.json](figures.json); `--measure WORD ...` runs the
+commands of the figures whose names have these words and saves their values. `KALMARK_DATA` and `KALMARK_ORACLE` name the
+folders of the real logs and of the recordings. A test has "within" where it asserts the wanted bound. "raw": start pose
+given, no alignment. Consistency: pose ANEES (3 in the plane is consistent) / steps inside its 95 % band / joint NEES per
+dimension (1) / position RMSE / diverged runs, seed 0. Filter against batch: landmark sigma ratio / worst landmark in
+sigmas / map difference, m. Ratios hold between machines; microseconds are for orientation.
+"""
+
+
+def page() -> str:
+    """Return docs/figures.md."""
+    known, lines, section = json.loads(SAVED.read_text()), [HEAD.rstrip()], ""
+    for figure in figures():
+        if figure.section != section:
+            section = figure.section
+            lines += [
+                f"\n\n## {section}\n\n| figure | wanted | measured | command | commit | date |",
+                "\n|---|---|---|---|---|---|",
+            ]
+        one = known.get(f"{section}: {figure.name}", {"measured": "", "commit": "", "date": ""})
+        lines.append(
+            f"\n| {figure.name} | {figure.wanted} | {one['measured']} | `{figure.command}` | {one['commit']} | {one['date']} |"
+        )
+    return "".join(lines) + "\n"
+
+
+def measure(words: list[str]) -> None:
+    """Run the commands of the figures whose names have these words, and save what they measure."""
+    known = json.loads(SAVED.read_text())
+    commit = subprocess.check_output(["git", "rev-parse", "--short=7", "HEAD"], cwd=ROOT, text=True).strip()
+    chosen = [one for one in figures() if all(word in f"{one.section}: {one.name}" for word in words)]
+    for command, group in itertools.groupby(sorted(chosen, key=lambda one: one.command), lambda one: one.command):
+        print(command, flush=True)
+        done = subprocess.run(command, shell=True, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
+        for one in group:
+            value = {"measured": one.read(done.stdout), "commit": commit, "date": str(datetime.date.today())}
+            known[f"{one.section}: {one.name}"] = value
+            print(f"  {one.name}: {value['measured']}")
+        SAVED.write_text(json.dumps(known, indent=1, ensure_ascii=False) + "\n")
+
+
+def main() -> None:
+    """Measure, list, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("words", nargs="*", metavar="WORD")
+    parser.add_argument("--measure", action="store_true")
+    parser.add_argument("--list", action="store_true")
+    parser.add_argument("--table", action="store_true")
+    given = parser.parse_args()
+    if given.list:
+        for one in figures():
+            if all(word in f"{one.section}: {one.name}" for word in given.words):
+                print(f"{one.section}: {one.name}\n    {one.command}")
+    if given.measure:
+        if not given.words:
+            sys.exit("--measure: expected words of the figures to measure")
+        measure(given.words)
+    if given.measure or given.table:
+        PAGE.write_text(page())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""What an association may ask about a scan, answered from the map and the tracks."""
+
+from __future__ import annotations
+
+from zlib import crc32
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.association.matchings import Places
+from kalmark.association.posterior import log_volume_ratio
+from kalmark.events import Id
+from kalmark.filter import corrections, kernels
+from kalmark.filter.layout import P_AT
+from kalmark.filter.map import Marginal, Pairs
+from kalmark.filter.observed import add_blocks, observed_block
+from kalmark.models.observe import linearize
+from kalmark.report import Compared
+from kalmark.tracks.channel import ObservationModel
+from kalmark.tracks.scan import ScanContext
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+LIMITS = 30, 1e-2  # linearisations of a matching, and the sigmas by which the last one moves anything
+
+
+class ScanQuery:
+    """One scan before it is fused: the association's window on the map.
+
+    `learned` are the numbers of observations without ids that are likely of landmarks of the map, and that are not.
+    """
+
+    def __init__(self, scan: ScanContext) -> None:
+        self.scan, self.ids, self.y = scan, scan.ids, scan.y
+        self.learned = 0.0, 0.0
+        self._pairs: Pairs | None = None  # near each other when candidates were asked for,
+        self._names: list[Id] = []  # and the landmarks of these
+
+    def dof(self) -> int:
+        """Return the size p of one innovation."""
+        return self.scan.channel.dof
+
+    def experience(self) -> tuple[float, float]:
+        """Return how many of the last observations without ids were of landmarks of the map, and how many were not."""
+        return self.scan.tracks.experience
+
+    def learn(self, known: float, unknown: float) -> None:
+        """Say how many observations without ids are likely of landmarks of the map, and how many are not."""
+        self.learned = known, unknown
+
+    def key(self) -> tuple[int, ...]:
+        """Return numbers, at least 0, that differ from those of all other scans."""
+        event = self.scan.event
+        return event.t_ns % 2**63, crc32(event.robot.encode()), crc32(event.sensor.encode())
+
+    # ------------------------------------------------------------------ one by one
+    def candidates(self, nearest: int = 4, farther: float = 10.0) -> list[Id]:
+        """Return the ids of the landmarks that this sensor could have observed where these observations seem to be.
+
+        These are the `nearest` ones to each place within `farther` times the nearest distance.  A sensor whose
+        measurements do not determine a place could have observed any.
+        """
+        scan, channel, tracks = self.scan, self.scan.channel, self.scan.tracks
+        places = channel.places(scan.map, scan.robot, scan.y)
+        if places is None:
+            return tracks.observable(channel)
+        sorts = tracks.sorts_of(channel.kinds, len(scan.map.blocks))
+        self._pairs = scan.map.pairs(sorts, scan.robot, channel.mount, places, nearest, farther)
+        self._names = [tracks.names[slot] for slot in self._pairs.slots.tolist()]
+        scan.report.seen_at = places
+        return self._names.copy()
+
+    def distances(self, candidates: list[Id]) -> Array:
+        """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83).
+
+        inf where a candidate is not near an observation.
+        """
+        d2 = np.full((len(self.y), len(candidates)), np.inf)
+        if self._pairs is None:
+            slots = self.scan.tracks.slots_of(candidates)
+            rows, numbers = (a.ravel() for a in np.indices(d2.shape))
+            d2[rows, numbers] = self._squared(Pairs(rows, numbers, slots, np.zeros((len(slots), 0)), None), candidates)
+            return d2
+        pairs, columns = self._pairs, self._pairs.numbers
+        if candidates != self._names:
+            at = {name: i for i, name in enumerate(candidates)}
+            columns = np.array([at.get(name, -1) for name in self._names], dtype=np.int64)[columns]
+            asked = columns >= 0
+            columns, pairs = columns[asked], pairs._replace(rows=pairs.rows[asked], numbers=pairs.numbers[asked])
+        d2[pairs.rows, columns] = squared = self._squared(pairs, self._names)
+        self.scan.report.compared = Compared(pairs.rows, pairs.numbers, self._names, squared, pairs.places)
+        return d2
+
+    def _squared(self, pairs: Pairs, names: list[Id]) -> Array:
+        """Return the squared distances (M,) of pairs of an observation and a landmark."""
+        out = np.empty(len(pairs.rows))
+        for model, which in self.scan.tracks.by_model(self.scan.channel, names):
+            some = slice(None) if len(which) == len(names) else np.isin(pairs.numbers, which)
+            k, l = pairs.rows[some], pairs.numbers[some]
+            if pairs.marginal is None:
+                out[some] = self.scan.predict(model, pairs.slots[l], k)[1]
+            else:
+                m, robot, mount, here = pairs.marginal
+                R = self.scan.noise(model, pairs.slots[l], k)
+                out[some] = model.predict(m, robot, mount, here[l], self.y[k], R)[1]
+        return out
+
+    # ------------------------------------------------------------------ jointly
+    def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
+        """Return the innovations z (M, p) of M pairs of an observation and a landmark, and their Z (M p, M p).
+
+        The noise of an observation is in the blocks of its pairs, not between them: only one of them can be right.
+        """
+        scan, p = self.scan, self.scan.channel.dof
+        slots = scan.tracks.slots_of(names)
+        m, robot, mount, here = scan.map.marginal(scan.robot, scan.channel.mount, slots)
+        z, R, H, at = np.empty((len(rows), p)), np.empty((len(rows), p, p)), [], []
+        for model, which in scan.tracks.by_model(scan.channel, names):
+            index, _, mean = observed_block(m.x, m.blocks, m.atoms, robot, mount, here[which], model.d)
+            head = len(mean) - model.d * len(which)
+            l = mean[head:].reshape(len(which), model.d)
+            _, z[which], E_h, E_l = linearize(model.model, mean[:head], l, scan.y[rows[which]])
+            R[which] = scan.noise(model, slots[which], rows[which])
+            H += [(i, E_h[k], E_l[k]) for k, i in enumerate(which)]
+            h, d = E_h.shape[2], E_l.shape[2]
+            at += [np.concatenate([index[:h], index[h + k * d : h + (k + 1) * d]]) for k in range(len(which))]
+        index = np.concatenate(at)
+        S, starts = kernels.submatrix(m.P, index), np.cumsum([0, *(len(a) for a in at)])
+        J = np.zeros((z.size, len(index)))
+        for (i, E_h, E_l), start, end in zip(H, starts[:-1], starts[1:], strict=True):
+            J[i * p : (i + 1) * p, start:end] = np.hstack([E_h, E_l])
+        Z = J @ S @ J.T
+        add_blocks(Z, R)
+        return z, Z
+
+    def together(self, names: list[Id]) -> JointCandidates | None:
+        """Return landmarks to be asked about jointly; None if of several kinds, or if this sensor gives no places."""
+        scan = self.scan
+        if not scan.channel.gives_places or len({scan.tracks.sorts[name] for name in names}) > 1:
+            return None
+        read = None if self._pairs is None else self._pairs.marginal
+        if read is not None and names != self._names:
+            at = {name: i for i, name in enumerate(self._names)}
+            read = read._replace(slots=read.slots[[at[n] for n in names]]) if at.keys() >= set(names) else None
+        slots, model = scan.tracks.slots_of(names), scan.channel.models[scan.tracks.sorts[names[0]]]
+        if read is None:
+            read = scan.map.marginal(scan.robot, scan.channel.mount, slots)
+        return JointCandidates(scan, model, slots, read)
+
+
+class JointCandidates:
+    """Landmarks of one kind that a scan may show, asked about jointly; `read` is a joint marginal that has them."""
+
+    def __init__(self, scan: ScanContext, model: ObservationModel, slots: Index, read: Marginal) -> None:
+        self._scan, self._model, self._slots, self._read = scan, model, slots, read
+
+    def places(self) -> Places:
+        """Return where all observations seem to be from the sensor (K, n), where the landmarks are, and covariances."""
+        n = self._scan.dimensions
+        v, V_y = self._scan.channel.sensor.invert(self._scan.y)
+        V = V_y[:, :n] @ self._scan.R @ V_y[:, :n].swapaxes(1, 2)
+        m, _, _, here = self._read
+        rows = (m.blocks[here, P_AT][:, None] + np.arange(n)).ravel()
+        return np.ascontiguousarray(v[:, :n]), V, m.means(here, n), kernels.submatrix(m.P, rows)
+
+    def fit(self, rows: Index, columns: Index) -> tuple[float, float]:
+        """Return the joint d2 and log |Z| of pairs of an observation `rows` (M,) and a landmark `columns` (M,)."""
+        m, robot, mount, here = self._read
+        model, y = self._model, self._scan.y[rows]
+        R = self._scan.noise(model, self._slots[columns], rows)
+        run = corrections.compiled_fit if isinstance(model.model, tuple) else corrections.fit
+        scan = robot, mount, here[columns], model.d, y, np.ascontiguousarray(R), np.inf
+        d2, log_det = run(model.model, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, LIMITS)
+        return float(d2), float(log_det)
+
+    def log_volume_ratio(self, rows: Index, columns: Index) -> Array:
+        """Return log |Z| / |R| (M,) of each pair: twice the information that the measurement gives."""
+        if not len(rows):
+            return np.zeros(0)
+        m, robot, mount, here = self._read
+        R = self._scan.noise(self._model, self._slots[columns], rows)
+        Z, _ = self._model.predict(m, robot, mount, here[columns], self._scan.y[rows], R)
+        return log_volume_ratio(Z, R)

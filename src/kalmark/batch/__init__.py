@@ -1,0 +1,1 @@
+"""The maximum likelihood of the same events: one sparse solver for poses, points, tags and mounts."""

@@ -1,0 +1,247 @@
+"""Turn a log and the associations that a filter made in it into the least-squares problem of the same data.
+
+The log is replayed through the same clock as in the filter (`kalmark.slam.motion`).  Derivation and figures:
+docs/batch.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from kalmark.batch.chain import Chain, Starts
+from kalmark.batch.factors import Block, Factor, positions, sightings
+from kalmark.batch.problem import Problem, motions
+from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, Array, Flags, Ints, State
+from kalmark.errors import KalmarkError
+from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.geometry.spaces import mount_space
+from kalmark.models.observe import inverse_expectation, view_of
+from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor
+from kalmark.slam.checks import measurements
+
+if TYPE_CHECKING:
+    from kalmark.slam.robot import Robot
+
+Texts = npt.NDArray[np.str_]
+Known = Mapping[Id, tuple[Any, Any]]
+Seen = tuple[int, Id, Array, Array]  # node, landmark or node of a robot, y and R
+NONE = np.zeros(0, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Associations:
+    """The observations (O,) that count: number `index` of scan `scan` by `sensor`, of the landmark or robot `landmark`.
+
+    `e` (O, m) is what was expected of it, NaN for nothing.
+    """
+
+    scan: Ints
+    sensor: Texts
+    index: Ints
+    landmark: list[Id]
+    e: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What a batch solution needs beside the events: robots and their starts, associations, initial values.
+
+    The S scans have the times `t_ns` (S,) and are of the `robot` (S,), `poses` (S, 3) or (S, 7) are the initial poses
+    there.  `landmarks` has the initial means, of the type `landmark`, and covariances of those in the map.  Of the
+    fixes the first `fixes` count.  `known` has what was in the map beforehand: (mean, covariance or None for exactly).
+
+    Without `motion` each pose is on its own, but for those that share landmarks: of each such part without a landmark
+    that is known exactly the first pose is held.  `mounts`, by robot and sensor, are the means of those that are not
+    known: solved for where another sensor sees something at the same pose, else held.  Sightings with whitened
+    residuals beyond `huber` count less.
+    """
+
+    robots: Mapping[str, Robot]
+    landmark: Landmark
+    t_ns: Ints
+    robot: Texts
+    poses: Array
+    associations: Associations
+    landmarks: Mapping[Id, tuple[Array, Array]]
+    known: Known = field(default_factory=dict)
+    starts: Starts = field(default_factory=dict)
+    fixes: int = 0
+    motion: bool = True
+    mounts: Mapping[tuple[str, str], Array] = field(default_factory=dict)
+    huber: float = np.inf
+
+
+def replayed(given: Given, events: Iterable[Event]) -> Problem:
+    """Return the problem of the motion and fixes of `events` and the observations that are associated.
+
+    Raises KalmarkError for what cannot be solved for, or if the events are not those of the associations.
+    """
+    replay = _Replay(given)
+    for event in events:
+        replay.take(event)
+    if len(replay.nodes) < len(given.t_ns):
+        t_s = given.t_ns[len(replay.nodes)] * 1e-9
+        raise KalmarkError(f"batch solution: the log has no scan at t={t_s:.9g} s, expected the log of the run")
+    return replay.problem()
+
+
+class _Replay:
+    """Replays the events and gathers nodes, motions and sightings."""
+
+    def __init__(self, given: Given) -> None:
+        self.given, self.known = given, given.known
+        self.chain = Chain(given.robots if given.motion else {}, given.starts)
+        self.apart: dict[tuple[str, int], int] = {}  # nodes without motion, by robot and time
+        self.sighted: dict[tuple[str, str, int], list[Seen]] = {}  # by robot, sensor and group
+        self.fixes: list[tuple[int, Array, Array]] = []
+        self.nodes: list[int] = []
+        self.rows: dict[int, list[int]] = {}
+        for row, scan in enumerate(given.associations.scan.tolist()):
+            self.rows.setdefault(scan, []).append(row)
+
+    def take(self, event: Event) -> None:
+        """Replay one event; scans that are none of the given ones change nothing."""
+        step, given = len(self.nodes), self.given
+        if event.robot not in given.robots:
+            return
+        if isinstance(event, Control):
+            self.chain.take(event)
+        elif isinstance(event, Fix):
+            if len(self.fixes) < given.fixes:
+                self.fixes.append((self._node(event.robot, event.t_ns), event.y, event.cov))
+        elif step < len(given.t_ns) and (event.t_ns, event.robot) == (given.t_ns[step], given.robot[step]):
+            self.nodes.append(self._node(event.robot, event.t_ns))
+            if step in self.rows:
+                self._scan(event, self.rows[step])
+
+    def _node(self, robot: str, t_ns: int) -> int:
+        if self.given.motion:
+            return self.chain.node_at(robot, t_ns)
+        return self.apart.setdefault((robot, t_ns), len(self.apart))
+
+    def _scan(self, scan: Scan, rows: list[int]) -> None:
+        used, node = self.given.associations, self.nodes[-1]
+        index = used.index[rows]
+        if (used.sensor[rows] != scan.sensor).any() or (index >= len(scan.y)).any():
+            raise KalmarkError(
+                f"batch solution: scan at t={scan.t_s:.9g} s is not the one of the run, expected its log"
+            )
+        R = self._noise(scan, self.given.robots[scan.robot].sensors[scan.sensor].sensor, rows)
+        for row, y, R_row in zip(rows, scan.y[index], R, strict=True):
+            target, group = used.landmark[row], LANDMARKS
+            if isinstance(target, str) and target in self.given.robots:
+                target, group = self._node(target, scan.t_ns), POSES
+            self.sighted.setdefault((scan.robot, scan.sensor, group), []).append((node, target, y, R_row))
+
+    def _noise(self, scan: Scan, sensor: Sensor, rows: list[int]) -> Array:
+        """Return the noise R of a scan's rows as in the filter: where it varies, that of what was expected."""
+        used = self.given.associations
+        R, y = measurements(scan, sensor)[used.index[rows]], scan.y[used.index[rows]]
+        if scan.cov is not None or not isinstance(sensor, NonAdditiveSensor) or sensor.additive:
+            return R
+        e = used.e[rows][:, : len(sensor.columns)]
+        e = np.where(np.isnan(e), y, e)  # a new landmark is expected where it is seen
+        if isinstance(sensor, FullSensor):
+            return sensor.noise_at(sensor.invert(e)[0])
+        if isinstance(sensor, Ranging):
+            return sensor.noise(e)
+        what = f"the noise of {type(sensor).__name__} is not additive"
+        raise KalmarkError(f"batch solution: {what}, expected one that is")
+
+    # ------------------------------------------------------------------ the problem
+    def problem(self) -> Problem:
+        """Return the problem of all that was replayed."""
+        given, nodes = self.given, np.array(self.nodes, dtype=np.int64)
+        size, space, names = given.poses.shape[1], given.landmark.space, self._names()
+        if given.motion:
+            poses, motion = self.chain.poses(nodes, given.poses), self.chain.motions()
+        else:
+            poses, motion = np.empty((len(self.apart), size)), motions(NONE, np.zeros((0, size)), sp.csr_array((0, 0)))
+            poses[nodes] = given.poses
+        values = np.array([self._value(name, poses) for name in names]).reshape(-1, space.size)
+        seen, mounts = self._sightings({name: k for k, name in enumerate(names)})
+        spaces = (POSE_SPACES[size], space, *(mount_space(size) for _ in mounts))
+        state = State(spaces, (poses, values, *(mean[None] for mean in mounts)))
+        exactly = np.array([name in self.known and self.known[name][1] is None for name in names], dtype=np.bool_)
+        held = NONE if given.motion else _first_poses(seen, len(poses), exactly)
+        free = np.ones(state.ends[-1], dtype=np.bool_)
+        for group, rows in ((POSES, held), (LANDMARKS, np.flatnonzero(exactly))):
+            free[state.columns(group, rows)[:, None] + np.arange(state.spaces[group].dof)] = False
+        kind = "tag" if given.landmark.kind == "tag" else "landmark"
+        return Problem(motion, (*seen, *self._positions(names)), free, state, names, nodes, kind)
+
+    def _names(self) -> list[Id]:
+        """Return the landmarks.  One that was measured by fewer numbers than it has says nothing and is left out."""
+        numbers: dict[Id, int] = {}
+        for (_, _, group), seen in self.sighted.items():
+            for _, name, _, R in seen if group == LANDMARKS else ():
+                numbers[name] = numbers.get(name, 0) + len(R)
+        return [name for name, k in numbers.items() if k >= self.given.landmark.space.dof or name in self.known]
+
+    def _sightings(self, at: Mapping[Id, int]) -> tuple[list[Factor], list[Array]]:
+        """Return what each sensor saw and the means of the mounts to be solved for, in the order of their groups."""
+        given, kept = self.given, {}
+        for (robot, sensor, group), seen in self.sighted.items():
+            if given.robots[robot].sensors[sensor].cov is not None and (robot, sensor) not in given.mounts:
+                what = f"mount '{robot}.{sensor}' is in the map"
+                raise KalmarkError(f"batch solution: {what}, expected mounts that are known")
+            rows = [(node, at.get(target, -1) if group == LANDMARKS else target, y, R) for node, target, y, R in seen]
+            columns = [np.array(column) for column in zip(*(row for row in rows if row[1] != -1), strict=True)]
+            if columns:
+                kept[robot, sensor, group] = columns
+        at_once = np.bincount(np.concatenate([NONE, *(np.unique(node) for node, *_ in kept.values())]))
+        free = [key[:2] for key, (node, *_) in kept.items() if key[:2] in given.mounts and (at_once[node] > 1).any()]
+        groups = {name: FIRST_MOUNT + k for k, name in enumerate(dict.fromkeys(free))}
+        factors, size = [], given.poses.shape[1]
+        for (robot, sensor, group), (node, target, y, R) in kept.items():
+            mount = given.robots[robot].sensors[sensor]
+            mean = np.array(given.mounts.get((robot, sensor), mount.at), dtype=np.float64)
+            blocks = [Block(POSES, node, POSE_SPACES[size]), Block(group, target, given.landmark.space)]
+            if (robot, sensor) in groups:
+                blocks.insert(1, Block(groups[robot, sensor], np.zeros_like(node), mount_space(size)))
+            view = view_of(mount.sensor, given.landmark, mean)
+            factors.append(sightings(view, tuple(blocks), y, R, given.huber, sensor))
+        return factors, [np.array(given.mounts[name], dtype=np.float64) for name in groups]
+
+    def _positions(self, names: list[Id]) -> list[Factor]:
+        """Return the factors of the fixes and of the landmarks known with a covariance."""
+        known = [(k, *self.known[name]) for k, name in enumerate(names) if name in self.known]
+        given = ((POSES, self.fixes), (LANDMARKS, [row for row in known if row[2] is not None]))
+        return [positions(group, *(np.array(c) for c in zip(*rows, strict=True))) for group, rows in given if rows]
+
+    def _value(self, name: Id, poses: Array) -> Array:
+        """Return where the map, or else its first sighting, puts a landmark."""
+        if name in self.known:
+            return np.asarray(self.known[name][0], dtype=np.float64)
+        if name in self.given.landmarks:
+            mean, size = self.given.landmarks[name][0], self.given.landmark.space.size
+            if mean.shape != (size,) or not np.isfinite(mean).all():
+                what = f"landmark {str(name)!r} is at {mean.tolist()}"
+                raise KalmarkError(f"batch solution: {what}, expected a point of {size} finite numbers")
+            return mean
+        for (robot, sensor, _), seen in self.sighted.items():
+            mount = self.given.robots[robot].sensors[sensor]
+            for node, landmark, y, _ in seen:
+                if landmark == name and isinstance(mount.sensor, FullSensor):
+                    at = np.array(mount.at)
+                    return inverse_expectation(poses[node], at, mount.sensor, self.given.landmark, y[None])[0][0]
+        raise KalmarkError(f"batch solution: landmark {str(name)!r} is not in the map, expected a place to start from")
+
+
+def _first_poses(seen: list[Factor], n: int, exactly: Flags) -> Ints:
+    """Return the first pose of each part of the sightings that no landmark connects with the others, or with the world.
+
+    Landmarks known `exactly` (m,) are of the world.
+    """
+    node, target = (np.concatenate([f.term.blocks[k].rows for f in seen]) for k in (0, -1))
+    links = sp.coo_array((np.ones(len(node)), (node, n + target)), shape=(n + len(exactly),) * 2)
+    part = connected_components(links, directed=False)[1]
+    found, first = np.unique(part[:n], return_index=True)
+    return np.asarray(first[~np.isin(found, part[n:][exactly])], dtype=np.int64)

@@ -1,0 +1,152 @@
+"""The optimum of a problem by Gauss-Newton, by Newton's method once near, or by Levenberg's method.
+
+A step is taken along the exponential: a stretch of the path that turns takes the landmarks it sees along.  With motion
+it is halved until the merit falls, which is the cost plus an exact penalty on the constraints (Nocedal & Wright,
+Numerical Optimization, 18.3).  Outliers make Gauss-Newton crawl, so the last steps count the curvature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from threadpoolctl import threadpool_limits
+
+from kalmark.batch.linear import Reduced, UndeterminedError
+from kalmark.batch.problem import Linearized, Problem
+from kalmark.batch.state import LANDMARKS, POSES, Array, Ints, State
+from kalmark.errors import KalmarkError
+from kalmark.events import Id
+
+NEAR = 1e-2  # relative step below which Newton's method is tried
+ROUNDING = 1e-6  # relative step below which the cost cannot tell any more which of two states is better
+DAMPING = 1e-4  # the first of Levenberg's method
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """The optimum of a log's data: its state, with a pose `nodes` (S,) for each scan and the landmarks `ids`.
+
+    `covariances` (m, dof, dof) are those of the landmarks, `chi2` is the sum of squared whitened residuals (motion
+    included), `dof` their number less what they determine, `relative_step` the last one over the map's size.
+    """
+
+    ids: list[Id]
+    nodes: Ints
+    state: State
+    covariances: Array
+    chi2: float
+    dof: int
+    iterations: int
+    relative_step: float
+
+    @property
+    def poses(self) -> Array:
+        """The poses (S, 3) or (S, 7) at the scans."""
+        return self.state.groups[POSES][self.nodes]
+
+    @property
+    def means(self) -> Array:
+        """The landmarks (m, size)."""
+        return self.state.groups[LANDMARKS]
+
+    def sigma(self) -> Array:
+        """Return the sigma (m,) of each landmark's position: the root of its covariance's trace, in metres."""
+        d = self.state.d
+        return np.sqrt(np.trace(self.covariances[:, :d, :d], axis1=1, axis2=2))
+
+
+def optimum(
+    problem: Problem, start: State | None = None, *, iterations: Iterable[int] = range(1, 101), tolerance: float = 1e-9
+) -> Batch:
+    """Find the maximum-likelihood path and map: O(steps) and O(landmarks^3) each of the `iterations`.
+
+    Ends when a step is below `tolerance` of the map's size, and in radians.  Raises KalmarkError if the start does not
+    show what was seen, if something is not determined, or if the iterations do not suffice.
+    """
+    search = _Search(problem, problem.start if start is None else start)
+    with threadpool_limits(1):
+        for iteration in iterations:
+            search.advance()
+            if search.size < tolerance or search.flat:
+                at, P = search.at, Reduced(problem, search.at).covariances()
+                chi2, dof = 2 * search.cost(at, search.multipliers), len(at.z) + len(at.w) - int(problem.free.sum())
+                return Batch(problem.ids, problem.nodes, at.state, P, chi2, dof, iteration, search.size)
+    what = f"the last of {iteration} steps is {search.size:.3g} of the map"
+    raise KalmarkError(f"batch solution: {what}, expected {tolerance:g}")
+
+
+class _Search:
+    """Where the search stands: the problem there, the multipliers of the motion, the penalty (q,) on its violation."""
+
+    def __init__(self, problem: Problem, start: State) -> None:
+        _refuse_hidden(problem, start)
+        self.problem, self.at, self.size = problem, problem.at(start), np.inf
+        self.damping, self.flat = 0.0 if len(self.at.w) else DAMPING, False
+        self.multipliers, self.penalty = np.zeros(len(self.at.w)), np.zeros(start.spaces[POSES].dof)
+        self.followers = _followers(self.at)
+
+    def advance(self) -> None:
+        """Take one step, of Newton's method if near and if that lowers the merit; without motion of Levenberg's."""
+        if self.damping:
+            lower = self._take(Reduced(self.problem, self.at, damping=self.damping), shortest=1.0)
+            self.damping = 0.1 * self.damping if lower else max(10 * self.damping, 1e-9)
+            self.flat = self.size < ROUNDING and not lower
+            return
+        if self.size < NEAR:
+            try:
+                if self._take(Reduced(self.problem, self.at, self.multipliers)):
+                    return
+            except UndeterminedError:
+                pass
+        if not self._take(Reduced(self.problem, self.at)):
+            raise KalmarkError("batch solution: no step lowers the cost, expected a better start or fewer outliers")
+
+    def cost(self, at: Linearized, multipliers: Array) -> float:
+        """Return half the sum of squared residuals: of the factors, and of the motion's errors w = Q m."""
+        return 0.5 * at.chi2 + 0.5 * float(multipliers @ (self.problem.motions.Q @ multipliers))
+
+    def _take(self, reduced: Reduced, shortest: float = 1e-6) -> bool:
+        """Go the longest of 1, 1/2, 1/4, ... `shortest` of a step that lowers the merit; return whether there is."""
+        step, multipliers = reduced.step()
+        change, q = multipliers - self.multipliers, len(self.penalty)
+        self.size = self.at.state.relative(step)
+        self.penalty = np.maximum(self.penalty, 1.5 * np.abs(multipliers).reshape(-1, q).max(axis=0, initial=0.0))
+        now, fraction = self._merit(self.at, self.multipliers), 1.0
+        while fraction >= shortest:
+            at = self.problem.at(self.at.state.moved(fraction * step, self.followers))
+            there = self.multipliers + fraction * change
+            if self._merit(at, there) < now or (self.size < ROUNDING and not self.damping):  # NaN is not lower
+                self.at, self.multipliers = at, there
+                return True
+            fraction /= 2
+        return False
+
+    def _merit(self, at: Linearized, multipliers: Array) -> float:
+        defect = np.abs(at.w - self.problem.motions.Q @ multipliers).reshape(-1, len(self.penalty)).sum(axis=0)
+        return self.cost(at, multipliers) + float(self.penalty @ defect)
+
+
+def _refuse_hidden(problem: Problem, start: State) -> None:
+    """Raise KalmarkError if a state does not show a sensor what it saw."""
+    for factor in problem.factors:
+        hidden = np.flatnonzero(np.isnan(factor.term.at(start)[0]).any(axis=1))
+        if len(hidden):
+            node, *_, target = (int(block.rows[hidden[0]]) for block in factor.term.blocks)
+            known = factor.term.blocks[-1].group == LANDMARKS
+            what = f"{problem.kind if known else 'pose'} {problem.ids[target] if known else target}"
+            what += f" to {factor.sensor} at pose {node}"
+            raise KalmarkError(f"batch solution: the start does not show {what}, which saw it")
+
+
+def _followers(at: Linearized) -> sp.csr_array:
+    """Return (m, n): for each landmark the weights, summing to 1, of the poses that see it."""
+    (path, end), (pose, landmark) = at.state.ends[:2], at.state.spaces[:2]
+    shape = len(at.state.groups[LANDMARKS]), len(at.state.groups[POSES])
+    seen = sp.csr_array((np.ones(at.H.nnz), at.H.indices, at.H.indptr), shape=at.H.shape)
+    together = sp.coo_array(seen[:, path:end].T @ seen[:, :path])
+    weights = sp.coo_array((together.data, (together.row // landmark.dof, together.col // pose.dof)), shape=shape)
+    total: Array = np.asarray(weights.sum(axis=1)).ravel()
+    return sp.csr_array(sp.diags_array(1.0 / np.maximum(total, 1.0)) @ weights)

@@ -1,0 +1,129 @@
+"""The state of the batch problem, groups of blocks on spaces of the map, and its geometry, many rows at once, compiled.
+
+Poses are (n, 3) in the plane or (n, 7) in space; their errors are position and orientation of the world.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from kalmark.compiled import compiled
+from kalmark.geometry import frames, frames3d
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import left_jacobian_inverse
+from kalmark.geometry.spaces import SE2, SE3, Space, Table, retract
+from kalmark.models.observe import linearize
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+POSES, LANDMARKS, FIRST_MOUNT = range(3)  # the first two groups; from the third on each group is one mount
+POSE_SPACES: dict[int, Space] = {3: SE2, 7: SE3}  # by their numbers
+ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+
+
+class State(NamedTuple):
+    """The values of all blocks: rows (k, size) of a space for each group; the first are poses, the second landmarks.
+
+    A step of the whole state is one error for each row of each group, in this order.
+    """
+
+    spaces: tuple[Space, ...]
+    groups: tuple[Array, ...]
+
+    @property
+    def d(self) -> int:
+        """Numbers in a position: 2 in the plane, 3 in space."""
+        return 2 if self.spaces[POSES] is SE2 else 3
+
+    @property
+    def ends(self) -> list[int]:
+        """Where the errors of each group end in a step; those of the poses come first."""
+        sizes = [space.dof * len(rows) for space, rows in zip(self.spaces, self.groups, strict=True)]
+        return [int(end) for end in np.cumsum(sizes)]
+
+    def columns(self, group: int, row: Ints) -> Ints:
+        """Return where (K,) in a step the errors of the rows `row` (K,) of a group begin."""
+        return (self.ends[group - 1] if group else 0) + self.spaces[group].dof * row
+
+    def parts(self, step: Array) -> list[Array]:
+        """Return the errors (k, dof) of each group in a step."""
+        split = np.split(step, self.ends[:-1])
+        return [part.reshape(-1, space.dof) for space, part in zip(self.spaces, split, strict=True)]
+
+    def moved(self, step: Array, followers: sp.csr_array) -> State:
+        """Return the state after a step along the exponential, x + V(dtheta) dx.
+
+        A pose turns by its own dtheta, a landmark with the poses that see it, by the weights `followers` (m, n).
+        """
+        parts = self.parts(step)
+        turns = [parts[POSES][:, self.d :], followers @ parts[POSES][:, self.d :]]
+        turns += [np.zeros((1, 0))] * len(parts[FIRST_MOUNT:])
+        return State(self.spaces, tuple(map(plus, self.spaces, self.groups, parts, turns)))
+
+    def relative(self, step: Array) -> float:
+        """Return the largest rotation in a step (n,) (rad), or translation over half the map extent (at least 1 m)."""
+        d, parts = self.d, self.parts(np.abs(step))
+        places = np.concatenate([rows[:, :d] for rows in self.groups[:FIRST_MOUNT]])
+        extent = max(1.0, 0.5 * float(np.ptp(places, axis=0).max()))
+        return float(max(max(p[:, :d].max(initial=0.0) / extent, p[:, d:].max(initial=0.0)) for p in parts))
+
+
+def plus(space: Space, x: Array, d: Array, turns: Array) -> Array:
+    """Return rows x of a space moved by the errors d (k, dof), along the exponential for turns (k, axes) if any."""
+    return _plus(space.atoms, *(np.ascontiguousarray(a) for a in (x, d, turns)))
+
+
+def looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
+    """Return the innovations z (K, p) of y (K, m) and E (K, p, h + n) by the errors of head and landmark.  [S] (63).
+
+    Row for row a `head` (K, .), pose and mount as of `kalmark.models.observe`, sees a landmark l (K, .).
+    """
+    look = _looked if isinstance(view, tuple) else _looked.py_func  # type: ignore[attr-defined]
+    return look(view, *(np.ascontiguousarray(a) for a in (head, l, y)))
+
+
+@compiled
+def _plus(atoms: Table, x: Array, d: Array, turns: Array) -> Array:
+    moved = x.copy()
+    for i in range(len(x)):
+        retract(atoms, moved[i], d[i], turns[i])
+    return moved
+
+
+@compiled
+def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
+    _, z_0, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
+    k, h = len(y), H_0.shape[2]
+    z, E = np.empty((k, z_0.shape[1])), np.empty((k, z_0.shape[1], h + L_0.shape[2]))
+    for i in range(k):
+        _, z_i, H_i, L_i = linearize(view, head[i], l[i : i + 1], y[i : i + 1])
+        z[i], E[i, :, :h], E[i, :, h:] = z_i[0], H_i[0], L_i[0]
+    return z, E
+
+
+@compiled
+def beyond(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
+    """Return what the poses b after a imply beyond the steps: w (n, q) in the frames a, W (n, q, 2 q) by a and b."""
+    n, size = a.shape
+    q = 3 if size == 3 else 6
+    w, W = np.empty((n, q)), np.empty((n, q, 2 * q))
+    for i in range(n):
+        if size == 3:
+            back, B_a = frames.inverse(a[i])
+            d, D_back, D_b = frames.compose(back, b[i])
+            w[i] = d - step[i]
+            w[i, 2] = wrap(w[i, 2])
+        else:
+            back, B_a = frames3d.inverse(a[i])
+            d, D_back, D_b = frames3d.compose(back, b[i])
+            w[i] = frames3d.minus(d, step[i])
+        W[i, :, :q], W[i, :, q:] = D_back @ B_a, D_b
+        if size == 7:
+            W[i, 3:] = left_jacobian_inverse(w[i, 3:]) @ W[i, 3:].copy()
+    return w, W

@@ -1,0 +1,345 @@
+"""A model is declared once: a frozen dataclass whose fields carry bounds and a line of documentation, under a name.
+
+    @register("sensor", "sonar")
+    class Sonar:
+        sigma_range_m: Annotated[float, Within(gt=0), "Noise of the range."] = 0.1
+
+From that follow the checks when one is made, the section of a configuration and its documentation, and what is saved.
+A parameter's unit is the end of its name.  The first paragraph of the class's docstring is its documentation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib import util
+from numbers import Integral, Real
+from pathlib import Path
+from types import ModuleType, NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from kalmark.errors import KalmarkError, ModelError
+from kalmark.geometry.spaces import Space
+
+Class = TypeVar("Class", bound=type)
+
+UNITS = {
+    "_mps_per_sqrt_s": "m/s/sqrt(s)",
+    "_radps_per_sqrt_s": "rad/s/sqrt(s)",
+    "_m_per_sqrt_s": "m/sqrt(s)",
+    "_rad_per_sqrt_s": "rad/sqrt(s)",
+    "_per_m": "1/m",
+    "_mps": "m/s",
+    "_radps": "rad/s",
+    "_rad": "rad",
+    "_deg": "deg",
+    "_px": "px",
+    "_m": "m",
+    "_s": "s",
+    "r_max": "m",
+}
+
+
+@dataclass(frozen=True)
+class Within:
+    """The bounds of a number, or of each number of a list; without `infinite` it is finite."""
+
+    ge: float | None = None
+    gt: float | None = None
+    le: float | None = None
+    lt: float | None = None
+    infinite: bool = False
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """The bounds that there are, by name."""
+        named = {"ge": self.ge, "gt": self.gt, "le": self.le, "lt": self.lt}
+        return {name: value for name, value in named.items() if value is not None}
+
+    def holds(self, value: float) -> bool:
+        """Return whether a number is within."""
+        if math.isnan(value) or (math.isinf(value) and not self.infinite):
+            return False
+        return not (
+            (self.ge is not None and value < self.ge)
+            or (self.gt is not None and value <= self.gt)
+            or (self.le is not None and value > self.le)
+            or (self.lt is not None and value >= self.lt)
+        )
+
+    def words(self, kind: str) -> str:
+        """Return what is expected: `kind` is "number" or "whole number"."""
+        if self.lt is not None and self.gt is not None:
+            what = "probability" if (self.gt, self.lt) == (0, 1) else kind
+            return f"a {what} between {self.gt:g} and {self.lt:g}"
+        if not self.limits:
+            return f"a {kind}" if self.infinite else f"a finite {kind}"
+        above = f"a positive {kind}" if self.gt == 0 else f"a {kind}" if self.gt is None else f"a {kind} > {self.gt:g}"
+        above += "" if self.ge is None else f" of at least {self.ge:g}"
+        below = "" if self.le is None else f" up to {self.le:g}"
+        return above + below + ("" if self.lt is None else f" below {self.lt:g}")
+
+
+Number = Annotated[float, Within()]
+NotNegative = Annotated[float, Within(ge=0)]
+Positive = Annotated[float, Within(gt=0)]
+Limit = Annotated[float, Within(gt=0, infinite=True)]
+Probability = Annotated[float, Within(gt=0, lt=1)]
+Count = Annotated[int, Within(ge=1)]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A field of a model: `type` is without None and without the `words` that it may be instead."""
+
+    name: str
+    type: Any
+    default: Any
+    optional: bool
+    words: tuple[str, ...]
+    within: Within
+    text: str
+
+    @property
+    def unit(self) -> str:
+        """The unit, by the end of the name."""
+        return unit_of(self.name)
+
+    @property
+    def wanted(self) -> str:
+        """What a value is to be, in words."""
+        if self.type is None:
+            return f"one of {', '.join(self.words)}"
+        number = self.within.words("whole number" if self.type is int else "number")
+        kinds = [{bool: "True or False", str: "a text"}.get(self.type, number), *self.words]
+        return " or ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
+
+    def refused(self, value: Any) -> str:
+        """Return what a value is to be instead, nothing if it is that."""
+        if (value is None and self.optional) or (isinstance(value, str) and value in self.words):
+            return ""
+        truth = isinstance(value, bool | np.bool_)
+        if self.type in (bool, str):
+            return "" if truth == (self.type is bool) and (truth or isinstance(value, str)) else self.wanted
+        if self.type in (int, float):
+            if truth or not isinstance(value, Integral if self.type is int else Real):
+                return self.wanted if self.type is int or self.words else "a number"
+            if self.within.holds(float(value)):
+                return ""
+            return self.wanted if math.isfinite(value) or self.within.infinite else "a finite number"
+        if get_origin(self.type) is tuple:
+            kind, *more = get_args(self.type)
+            size = None if more == [...] else 1 + len(more)
+            one = Parameter("", kind, None, False, (), self.within, "")
+            if isinstance(value, list | tuple) and size in (None, len(value)) and not any(map(one.refused, value)):
+                return ""
+            return "a list of finite numbers" if size is None else f"{size} numbers, each {one.wanted}"
+        return "" if self.type is Any else self.wanted
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that a name ends in, "" for none."""
+    return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
+
+
+def parameters(model: type) -> tuple[Parameter, ...]:
+    """Return the parameters of a model's class, () if it is no dataclass."""
+    return _parameters(model)
+
+
+@cache
+def _parameters(model: Any) -> tuple[Parameter, ...]:
+    if not dataclasses.is_dataclass(model):
+        return ()
+    try:
+        hints = get_type_hints(model, include_extras=True)
+    except NameError:  # a user's own, whose types only a checker knows
+        hints = {}
+    fields = [field for field in dataclasses.fields(model) if field.init]
+    return tuple(_parameter(field, hints.get(field.name, Any)) for field in fields)
+
+
+def _parameter(field: dataclasses.Field[Any], hint: Any) -> Parameter:
+    extras: tuple[Any, ...] = ()
+    if get_origin(hint) is Annotated:
+        hint, *rest = get_args(hint)
+        extras = tuple(rest)
+    parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    words = tuple(word for part in parts if get_origin(part) is Literal for word in get_args(part))
+    kinds = [part for part in parts if part is not NoneType and get_origin(part) is not Literal]
+    bounds = next((extra for extra in extras if isinstance(extra, Within)), Within(infinite=True))
+    return Parameter(
+        field.name,
+        kinds[0] if len(kinds) == 1 else Any if kinds else None,
+        None if field.default is dataclasses.MISSING else field.default,
+        NoneType in parts,
+        words,
+        bounds,
+        next((extra for extra in extras if isinstance(extra, str)), ""),
+    )
+
+
+def refuse(model: Any, key: str, wanted: str) -> ModelError:
+    """Return the error of a model's parameter that is not what is `wanted`, which has `key` and `wanted`, too."""
+    error = ModelError(f"{type(model).__name__}: {key} is {vars(model)[key]!r}, expected {wanted}")
+    error.key, error.wanted = key, wanted
+    return error
+
+
+def check_parameters(model: Any) -> None:
+    """Refuse a model with a parameter that is not as declared.  Raises ModelError."""
+    for parameter in parameters(type(model)):
+        wanted = parameter.refused(vars(model)[parameter.name])
+        if wanted:
+            raise refuse(model, parameter.name, wanted)
+
+
+def summary(model: type) -> str:
+    """Return the first paragraph of a class's docstring, on one line."""
+    return " ".join((inspect.getdoc(model) or "").partition("\n\n")[0].split())
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def declared(model: Class) -> Class:
+    """Make a class a frozen dataclass whose parameters are checked when one is made."""
+    if "__dataclass_params__" in vars(model):  # a user's, made one in another way
+        return model
+    after = next((vars(each)["__post_init__"] for each in model.__mro__ if "__post_init__" in vars(each)), None)
+    if after not in _CHECKS:
+
+        def __post_init__(self: Any) -> None:
+            check_parameters(self)
+            if after is not None:
+                after(self)
+
+        _CHECKS.add(__post_init__)
+        model.__post_init__ = __post_init__  # type: ignore[attr-defined]
+    return dataclass(frozen=True)(model)  # type: ignore[return-value]
+
+
+# ------------------------------------------------------------------ names
+_CHECKS: set[Any] = set()
+_CLASSES: dict[str, dict[str, list[type]]] = {}
+_PLUGINS: dict[Path, ModuleType] = {}
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
+def register(role: str, name: str) -> Callable[[Class], Class]:
+    """Make a class a frozen dataclass, checked when one is made, under its name in configurations.
+
+    `role` is "motion", "sensor", "landmark", "association", "estimator", "detector" or "initialization".  A name may
+    stand for two classes, one of the plane and one of space.  Raises ModelError if kalmark has that name already.
+    """
+
+    def registered(model: Class) -> Class:
+        model = declared(model)
+        others = _CLASSES.setdefault(role, {}).setdefault(name, [])
+        if not is_own(model) and any(map(is_own, others)):
+            raise ModelError(f"{model.__name__}: {name!r} is a {role} of kalmark, expected another name")
+        others[:] = [other for other in others if is_own(other) or world_of_class(other) != world_of_class(model)]
+        others.append(model)
+        return model
+
+    return registered
+
+
+def is_own(model: type) -> bool:
+    """Return whether a class is of kalmark itself."""
+    return model.__module__.split(".")[0] == "kalmark"
+
+
+def world_of_class(model: Any) -> str:
+    """Return "plane" or "space", where a model's class lives, "" for either."""
+    named = {name: value for each in reversed(model.__mro__) for name, value in vars(each).items()}
+    world = named["space"].world if isinstance(named.get("space"), Space) else named.get("world", "")
+    return world if isinstance(world, str) else ""
+
+
+def classes(role: str, world: str = "") -> dict[str, list[type]]:
+    """Return the classes of a role by name, of a world or, for "", of all: those of space last."""
+    fitting = {
+        name: [model for model in models if world in ("", world_of_class(model)) or not world_of_class(model)]
+        for name, models in _CLASSES.get(role, {}).items()
+    }
+    found = [(name, models) for name, models in fitting.items() if models]
+    return dict(sorted(found, key=lambda each: world_of_class(each[1][0]) == "space"))
+
+
+def built_in(role: str) -> tuple[Any, ...]:
+    """Return the classes of a role that are kalmark's own."""
+    return tuple(model for models in _CLASSES.get(role, {}).values() for model in models if is_own(model))
+
+
+def class_of(role: str, name: str, world: str = "") -> type:
+    """Return the class of a name, of a world where the name stands for two.  Raises KeyError."""
+    models = _CLASSES[role][name]
+    return next((model for model in models if world in ("", world_of_class(model))), models[0])
+
+
+def registered_name(model: type) -> str | None:
+    """Return the name of a class in configurations, None if it has none."""
+    named = (name for by_name in _CLASSES.values() for name, models in by_name.items() if model in models)
+    return next(named, None)
+
+
+def own_name(model: type) -> str:
+    """Return how a user's class that has no name is called: file.py:Class, or module:Class without a file."""
+    file = vars(sys.modules.get(model.__module__, sys)).get("__file__")
+    return f"{Path(file).name if file and model.__module__ != 'builtins' else model.__module__}:{model.__qualname__}"
+
+
+def by_class_name(role: str, name: str) -> type | None:
+    """Return the registered class of that name of its own."""
+    return next((each for models in _CLASSES.get(role, {}).values() for each in models if each.__name__ == name), None)
+
+
+# ------------------------------------------------------------------ a user's own files
+def load_plugin(file: Path) -> ModuleType:
+    """Run a Python file of the user's, once, and return it; what it registers is known from then on.
+
+    Raises KalmarkError if it cannot be run.
+    """
+    file = file.resolve()
+    if file not in _PLUGINS:
+        name = f"plugin_{file.stem}"
+        spec = util.spec_from_file_location(name, file)
+        if spec is None or spec.loader is None or not file.is_file():
+            raise KalmarkError(f"{file}: no such file, expected Python code")
+        module = util.module_from_spec(spec)
+        sys.modules[name] = module
+        try:
+            spec.loader.exec_module(module)
+        except Exception as error:
+            raise KalmarkError(f"{file} cannot be run: {type(error).__name__}: {error}{line_of(error)}") from None
+        _PLUGINS[file] = module
+    return _PLUGINS[file]
+
+
+def plugin_of(model: type) -> Path | None:
+    """Return the file that has a user's class, None if it was not run as a plugin."""
+    return next((file for file, module in _PLUGINS.items() if module.__name__ == model.__module__), None)
+
+
+def register_by_file(role: str, name: str) -> bool:
+    """Register file.py:Class under this name if a plugin has it, and return whether one has."""
+    place, _, attribute = name.rpartition(":")
+    for file, module in _PLUGINS.items():
+        if place in (file.stem, file.name, str(file)) and isinstance(model := vars(module).get(attribute), type):
+            register(role, name)(model)
+            return True
+    return False
+
+
+def line_of(error: BaseException) -> str:
+    """Return where in the user's file an error came from."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    return f" ({trace.tb_frame.f_code.co_filename}:{trace.tb_lineno})" if trace is not None else ""

@@ -1,0 +1,230 @@
+"""The full update of a compressed map: inactive blocks get all corrections of an interval.  docs/compressed.md.
+
+It is a job that can be done in slices, panel by panel from the first.  Until a panel is done, a read of its elements is
+corrected by what is still to come; so a slice may have any length.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from kalmark.compiled import compiled
+from kalmark.filter.compressed.immediate import Displacements, carried
+from kalmark.filter.compressed.storage import PANEL, Stored, Triangle, subtract
+from kalmark.filter.kernels import Array, Flags, Index
+from kalmark.filter.layout import P_AT, P_SIZE, X_SIZE, Layout, laid_out
+from kalmark.filter.prefault import Prefault
+
+ROWS = 8  # of the active blocks, to write at once
+WRITING = 60  # multiplications that take as long as to write a number there
+GATHERING = 1500  # and as to gather a number from the storage
+MORE = 1.5  # times the memory that a full update has needed: the next one may
+
+
+@compiled
+def fill(panel: Stored, begin: int, end: int, A: Index, where: Index, V: Array, P_AA: Array) -> None:
+    """Write the covariances of the active blocks into the rows begin..end of the matrix, all of one panel."""
+    first = begin // PANEL * PANEL
+    for i in range(begin, end):
+        row, own = panel[i - first], where[i]
+        if own >= 0:
+            for k in range(i // PANEL + 1):
+                for j in range(k * PANEL, min(i + 1, (k + 1) * PANEL)):
+                    row[j] = V[k, own, j - k * PANEL]
+        for c in range(len(A)):
+            if A[c] <= i:
+                row[A[c]] = V[i // PANEL, c, i % PANEL] if own < 0 else P_AA[own, c]
+
+
+@compiled
+def corrected(
+    C: Array, rows: Index, columns: Index, done: tuple[int, int], where: Index, R: Array, V: Array, P_AA: Array, q: int
+) -> None:  # fmt: skip
+    """Bring elements [rows][:, columns] that were read before their panel was done up to date."""
+    panel, column = done
+    m = (R.shape[1] - q) // 2
+    for a in range(len(rows)):
+        for b in range(len(columns)):
+            i, j = max(rows[a], columns[b]), min(rows[a], columns[b])
+            if i // PANEL < panel:
+                continue
+            if where[i] >= 0:
+                C[a, b] = P_AA[where[i], where[j]] if where[j] >= 0 else V[j // PANEL, where[i], j % PANEL]
+            elif where[j] >= 0:
+                C[a, b] = V[i // PANEL, where[j], i % PANEL]
+            elif i // PANEL > panel or j >= column:
+                s = 0.0
+                for c in range(q):
+                    s += R[i, c] * R[j, c]
+                for c in range(m):
+                    s -= R[i, q + m + c] * R[j, q + c] + R[i, q + c] * R[j, q + m + c]
+                C[a, b] -= s
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The result of a compression interval: its rows A0 of the storage and those, A, of its active blocks at the end.
+
+    `Psi` (A0, A0), `Phi` (A, A0) and P_AA as in docs/compressed.md; likewise of the robots' turns, cloned and of now,
+    `Phi_T` (T, A0), P_TA and P_TT; and what displaced inactive blocks.
+    """
+
+    A0: Index
+    A: Index
+    Psi: Array
+    Phi: Array
+    P_AA: Array
+    Phi_T: Array
+    P_TA: Array
+    P_TT: Array
+    displacements: Displacements
+
+
+class Workspace:
+    """Memory that one full update leaves to the next: its page faults take longer than all else."""
+
+    def __init__(self, prefault: Prefault) -> None:
+        self.prefault = prefault
+        self._numbers: dict[str, Array] = {}
+        self._used: dict[str, int] = {}  # of these, or soon
+
+    def array(self, name: str, shape: tuple[int, ...]) -> Array:
+        """Return an array of that shape, holding anything."""
+        size, kept = math.prod(shape), self._numbers.get(name)
+        if kept is None or len(kept) < size:
+            kept = self._numbers[name] = np.empty(4 * size)  # what is not used takes no memory
+            self._used[name] = 0
+        used, more = max(size, self._used[name]), min(int(MORE * size), len(kept))
+        if more > used:
+            self.prefault.add(kept, used, more)
+            self._used[name] = more
+        return kept[:size].reshape(shape)
+
+
+class FullUpdate:
+    """P_BB <- P_BB - W W', P_AB, P_AA and the means, in slices."""
+
+    def __init__(self, map_: Layout, storage: Triangle, interval: Interval, workspace: Workspace) -> None:
+        self.map, self.storage, self.interval = map_, storage, interval
+        self.x_before, self.n = map_.x[: map_.x_n].copy(), map_.n
+        self.where: Index = np.full(self.n, -1)
+        self.where[interval.A] = np.arange(len(interval.A))
+        self.L = _root(interval.Psi, storage.diagonal(interval.A0))
+        self.q = self.L.shape[1]
+        self.R = workspace.array("R", (self.n, self.q + 2 * len(interval.P_TT)))
+        self.V = workspace.array(
+            "V", (len(range(0, self.n, PANEL)), len(interval.A), PANEL)
+        )  # one panel's after the other
+        self.known = self.where >= 0
+        self.inactive = _in_use(map_, self.n) & (self.where < 0)
+        gaps = np.flatnonzero(~self.inactive & (self.where < 0))
+        self.R[gaps] = 0.0
+        self.V[gaps // PANEL, :, gaps % PANEL] = 0.0
+        self.panel = self.column = self.row = 0
+        self.cost = PANEL * max(1, self.R.shape[1])  # of a column of a panel, in multiplications
+        self.aside = PANEL * len(interval.A0) * (len(interval.A) + self.q + GATHERING)  # to know a panel
+        panels = range(0, self.n, PANEL)
+        self.work = float(sum(self.cost * min(k + PANEL, self.n) + self.aside for k in panels))
+        self.work += WRITING * int(interval.A.sum())
+        self.spent = 0.0
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.panel * PANEL >= self.n
+
+    def advance(self, work: float) -> None:
+        """Do so much work, in multiplications, at least one step; to know a panel is left for later if it is more."""
+        if work <= 0:
+            return
+        begun, until = self.spent, self.spent + work
+        while self.spent < until and not self.done:
+            if self.column == 0 and self.spent > begun and self.spent + self.aside > until:
+                return
+            self.spent += self._step(int((until - self.spent) // (self.cost * PANEL)))
+
+    def _step(self, tiles: int) -> int:
+        """Update some tiles of a panel or, when it is done, write some rows of the active blocks; return the work."""
+        first = self.panel * PANEL
+        last = min(first + PANEL, self.n)
+        panel = self.storage.panels[self.panel]
+        if self.column == last or not self.inactive[first:last].any():
+            begin, self.row = self.row, min(self.row + ROWS, last)
+            fill(panel, begin, self.row, self.interval.A, self.where, self.V, self.interval.P_AA)
+            if self.row == last:
+                self.panel, self.column = self.panel + 1, 0
+            return WRITING * last * int((self.where[begin : self.row] >= 0).sum())
+        if self.column == 0 and self._know_more(first, last):
+            return self.aside
+        start, self.column = self.column, min(last, self.column + PANEL * max(1, tiles))
+        if self.R.shape[1]:
+            W, m = self.R[first:last, : self.q], len(self.interval.P_TT)
+            L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
+            subtract(panel[: last - first], L, self.R, start, self.column)
+        return self.cost * (self.column - start)
+
+    def read(self, rows: Index, columns: Index) -> Array:
+        """Return elements as they will be when all is done; all rows must be known."""
+        C = self.storage.get(rows, columns)
+        if not self.done:
+            done = self.panel, self.column
+            corrected(C, rows, columns, done, self.where, self.R, self.V, self.interval.P_AA, self.q)
+        return C
+
+    def know(self, slots: Index) -> None:
+        """Bring the means of blocks (K,) up to date and make their elements readable."""
+        rows = self.map.blocks[slots, P_AT]
+        here = rows < self.n
+        unknown = slots[here][~self.known[rows[here]]]
+        if len(unknown):
+            self._know(unknown)
+
+    def _know_more(self, first: int, last: int) -> bool:
+        """Know the inactive blocks among the rows first..last; return whether any were unknown."""
+        unknown = np.flatnonzero(self.inactive[first:last] & ~self.known[first:last])
+        if len(unknown):
+            self._know(np.arange(*np.searchsorted(self.map.blocks[:, P_AT], [first + unknown[0], last])))
+        return len(unknown) > 0
+
+    def _know(self, slots: Index) -> None:
+        """Work out the means of some blocks, their rows of R = [W, w, a], and their covariances V' with A."""
+        p = self.interval
+        blocks, atoms, numbers, rows = laid_out(self.map.blocks[slots], self.map.atoms)
+        G = self.storage.get(rows, p.A0)
+        x, _, a = carried(atoms, self.x_before[numbers], G, *p.displacements)
+        V = G @ p.Phi.T + a @ p.P_TA
+        w = G @ p.Phi_T.T + a @ (0.5 * p.P_TT)
+        R = np.concatenate([G @ self.L, w, a], axis=1)
+        new = ~self.known[rows]
+        here = rows[new]
+        self.R[here] = R[new]
+        self.V[here // PANEL, :, here % PANEL] = V[new]
+        self.known[rows] = True
+        stored = np.repeat(self.where[self.map.blocks[slots, P_AT]] < 0, blocks[:, X_SIZE])
+        self.map.x[numbers[stored]] = x[stored]
+
+
+def _in_use(map_: Layout, n: int) -> Flags:
+    """Return which of the rows belong to blocks: none lies in two panels, which leaves some over."""
+    first, sizes = map_.blocks[:, P_AT], map_.blocks[:, P_SIZE]
+    edges = np.bincount(first, minlength=n + 1) - np.bincount(first + sizes, minlength=n + 1)
+    return np.cumsum(edges[:n]) > 0
+
+
+def _root(Psi: Array, variances: Array) -> Array:
+    """Return L (n, rank) with L L' = Psi, by pivoted Cholesky of Psi in units of the blocks' sigmas."""
+    from scipy.linalg.lapack import dpstrf
+
+    sigma = np.sqrt(np.maximum(variances, 0.0))
+    scaled = Psi * sigma[:, None] * sigma
+    if not len(Psi) or not scaled.any():
+        return np.zeros((len(Psi), 0))
+    c, pivots, rank, _ = dpstrf(scaled, lower=1, tol=1e-15 * scaled.diagonal().max())
+    L = np.zeros((len(Psi), rank))
+    L[pivots - 1] = np.tril(c)[:, :rank]
+    known = sigma > 0
+    L[known] /= sigma[known, None]
+    return L

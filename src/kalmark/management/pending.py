@@ -1,0 +1,62 @@
+"""Deferred initialisation: what a way to start landmarks late may ask for, step by step.
+
+All ways are one idea: measurements made from cloned poses, pending until a test passes.  They differ in the solver:
+where bearings intersect (`delayed`), where ranges meet (`trilateration`), which of several directions a range has
+(`hypotheses`), which of two poses a tag has (`mirrored`).  A way reads and returns steps; `Slam` applies them.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.tracks.channel import Parts
+from kalmark.tracks.scan import ScanContext, Start
+from kalmark.tracks.track import Pending
+
+Array = npt.NDArray[np.float64]
+
+OTHERS = "another sensor's ranges of it are being kept"
+
+
+class Correction(NamedTuple):
+    """The correction of one hypothesis alone (Schmidt's filter): P <- F P F' + Q on the rows of the parts."""
+
+    slot: int
+    parts: Parts
+    F: Array
+    Q: Array
+    mean: Array
+
+
+class Step(NamedTuple):
+    """What becomes of an observation of a pending landmark, and what is to be done, in this order.
+
+    `pending` is what is known of it after the step, None where that stays as it is.  `corrections` of hypotheses,
+    hypotheses to be `added`; with `keep`, the measurement is kept with a clone of the pose.  `removed` are slots of
+    hypotheses.  With `start`, the landmark enters the map, from so many `measurements`.  A step without a reason and
+    without a start is followed by `solve`.
+    """
+
+    outcome: str
+    reason: str
+    pending: Pending | None = None
+    corrections: tuple[Correction, ...] = ()
+    added: tuple[Start, ...] = ()
+    keep: bool = False
+    removed: tuple[int, ...] = ()
+    start: Start | None = None
+    measurements: int = 1
+
+
+@runtime_checkable
+class Initialization(Protocol):
+    """A way to start a landmark with an id from measurements of which one alone does not determine it."""
+
+    def observe(self, scan: ScanContext, k: int, pending: Pending) -> Step:
+        """Return what the k-th observation of a scan does to what is pending of its landmark."""
+
+    def solve(self, scan: ScanContext, pending: Pending) -> Step:
+        """Return whether the landmark can start now, after the first step has been done."""

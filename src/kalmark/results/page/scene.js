@@ -1,0 +1,214 @@
+"use strict";
+/* The map of a run, in the plane or in space, where it turns under the mouse, and the images of cameras at the slider. */
+const AXES = DATA.dof === 3 ? ["x", "y"] : ["x", "y", "z"], SPACE = AXES.length === 3;
+const TRUTH = SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)", FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = "#8c1c13";
+const MEASURED = "#7d838d", SEGMENT = "rgba(58,104,200,0.55)";
+const GROUPS = !SPACE ? [["#d2691e", "landmarks, 3 sigma"]] :
+  [["#1f5fa8", "landmarks, 3 sigma"], ["#c8412f", "landmarks that are not Euclidean, 3 sigma"], [LINE, "lines, 3 sigma of their ends"]];
+
+/* Points with what `value` (axis) gives of each axis. */
+const along = (value, axes = AXES) => Object.fromEntries([...axes].map(k => [k, value(k)]));
+
+/* Nothing where a point of space lies outside the box: points at great depth would shrink all the rest to a dot. */
+function boxed(p) {
+  if (!SPACE) return p;
+  const {low, high} = DATA.box, keep = p.x.map((_, i) => AXES.every((k, a) => p[k][i] >= low[a] && p[k][i] <= high[a]));
+  return {...p, ...along(k => p[k].map((v, i) => keep[i] ? v : null))};
+}
+
+/* The 3-sigma contours of the Gaussians `rows` as one broken line, mean + 3 L c with P = L L': ellipses, in space three
+   great circles of each ellipsoid. */
+function contours(g, rows, points = 24, axes = AXES) {
+  const out = along(() => [], axes), circles = axes.length === 2 ? [[0, 1]] : [[0, 1], [1, 2], [0, 2]];
+  for (const i of rows) {
+    if (g.pxx[i] === null || g.x[i] === null) continue;
+    const L = [];
+    for (let a = 0; a < axes.length; a++) {
+      L.push([0, 0, 0]);
+      for (let b = 0; b <= a; b++) {
+        let rest = g["p" + axes[b] + axes[a]][i];
+        for (let c = 0; c < b; c++) rest -= L[a][c] * L[b][c];
+        L[a][b] = a === b ? Math.sqrt(Math.max(rest, 0)) : L[b][b] ? rest / L[b][b] : 0;
+      }
+    }
+    for (const [u, v] of circles) {
+      for (let k = 0; k <= points; k++) {
+        const c = 3 * Math.cos(2 * Math.PI * k / points), s = 3 * Math.sin(2 * Math.PI * k / points);
+        L.forEach((row, a) => out[axes[a]].push(g[axes[a]][i] + row[u] * c + row[v] * s));
+      }
+      for (const k of axes) out[k].push(null);
+    }
+  }
+  return axes.length === 3 ? boxed(out) : out;
+}
+
+/* A polyline of a robot's frame placed at its pose at step i. */
+function placed(body, r, i) {
+  const [x, y, z, w] = r.q.map(q => q[i]);
+  const Q = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]];
+  const turned = a => body.x.map((v, k) => v === null ? null : r[AXES[a]][i] + Q[a][0] * v + Q[a][1] * body.y[k] + Q[a][2] * body.z[k]);
+  return {x: turned(0), y: turned(1), z: turned(2)};
+}
+
+const KIND = SPACE ? {type: "scatter3d", connectgaps: false} : {}, quiet = {showlegend: false};
+const WHERE = AXES.map(k => `%{${k}:.3f}`).join(", ");
+
+/* A line of the map; widths are those of the plane, in space lines are thinner than they are said to be. */
+const stroke = (points, color, width, extra) =>
+  ({...KIND, ...points, mode: "lines", line: {color, width: SPACE ? 2.5 * width : width}, hoverinfo: "skip", ...extra});
+
+/* Marks of the map, which are of a size of their own in space. */
+const marks = (points, marker, sizes, extra) =>
+  ({...KIND, ...points, mode: "markers", marker: {...marker, size: sizes[+SPACE]}, ...extra});
+
+/* A thin cross: a line in the plane, in space a symbol of its own. */
+const thin = (symbol, color) => SPACE ? {symbol, color} : {symbol: `${symbol}-thin`, color, line: {color, width: 1}};
+
+function ground() {
+  const {low, high} = DATA.box, size = Math.max(high[0] - low[0], high[1] - low[1]), z = low[2] <= 0 && high[2] >= 0 ? 0 : low[2];
+  let step = 2;
+  if (size < 8 || size > 40) {
+    const power = 10 ** Math.floor(Math.log10(size / 10));
+    step = power * [1, 2, 5, 10].find(m => size / (m * power) <= 14);
+  }
+  const grid = {x: [], y: [], z: []}, line = (a, b) => {
+    grid.x.push(a[0], b[0], null); grid.y.push(a[1], b[1], null); grid.z.push(z, z, null);
+  };
+  for (let x = Math.ceil(low[0] / step) * step; x <= high[0]; x += step) line([x, low[1]], [x, high[1]]);
+  for (let y = Math.ceil(low[1] / step) * step; y <= high[1]; y += step) line([low[0], y], [high[0], y]);
+  return stroke(grid, GROUND, 0.4, quiet);
+}
+
+/* What does not move with the slider: ground, fixes, truth. */
+function still() {
+  const traces = SPACE ? [ground()] : [], l = DATA.trueLandmarks;
+  const each = (things, name, draw) => things.forEach((f, i) => traces.push({...draw(f), name, legendgroup: name, showlegend: i === 0}));
+  const skip = {hoverinfo: "skip"};
+  each(Object.values(DATA.fixes), "position fixes (aligned, not used)", f => marks(f, {color: TRUTH}, [3, 2], skip));
+  each(Object.values(DATA.usedFixes), "fixes used", f => marks(f, thin("x", FIX), [5, 2], skip));
+  each(DATA.robots.filter(r => r.truth), "true path", r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
+  if (DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: "true lines"}));
+  if (l.x.length)
+    traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],
+                      {name: "true landmarks", hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
+  return traces;
+}
+
+/* The map and the robots at a position of the slider. */
+function moving(frame) {
+  const map = DATA.maps[frame], traces = [], many = map.count > 100;
+  GROUPS.forEach(([color, name], group) => {
+    const rows = map.group.flatMap((g, i) => SPACE && g !== group ? [] : [i]), pick = k => rows.map(i => map[k][i]);
+    const sigma = rows.map(i => map.pxx[i] === null ? null : Math.sqrt(Math.max(AXES.reduce((sum, k) => sum + map["p" + k + k][i], 0), 0)));
+    const shown = rows.length > 0 || DATA.maps.some(m => m.group.includes(group)), width = SPACE ? (many ? 0.4 : 0.8) : many ? 0.7 : 1.1;
+    traces.push(stroke(contours(map, rows, many && SPACE ? 12 : 24), color, width,
+                       {name, legendgroup: name, showlegend: shown, opacity: SPACE ? 0.6 : 1}));
+    traces.push(marks({...boxed(along(pick)), text: pick("id"), customdata: sigma}, {color}, many ? [3, 1.8] : [5, 3],
+                      {legendgroup: name, ...quiet, hovertemplate: `%{text}: ${WHERE}<br>sigma %{customdata:.3g} m<extra></extra>`}));
+  });
+  if (SPACE) traces.push(stroke(boxed(map.lines), LINE, 1.6, quiet), stroke(map.tags, TAG, 1.2, quiet));
+  DATA.robots.forEach((r, i) => {
+    const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path", at = n ? [n - 1] : [];
+    const own = {legendgroup: r.name, ...quiet};
+    traces.push(stroke(pathOf(r, n, AXES), r.colour, 1.6, {name, legendgroup: r.name}));
+    if (SPACE) traces.push(stroke(n ? placed(DATA.bodies[r.name], r, n - 1) : along(() => []), r.colour, 1.2, own));
+    else traces.push({...along(k => at.map(i => r[k][i])), mode: "markers", ...own,
+                      marker: {symbol: "triangle-up", size: 13, color: r.colour, line: {color: "white", width: 1},
+                               angle: at.map(i => 90 - r.theta[i] * 180 / Math.PI)},
+                      hovertemplate: `${r.name}: ${WHERE}<extra></extra>`});
+    traces.push(stroke(contours(r, at, 48), SPACE ? POSE : r.colour, SPACE ? 0.8 : 1.4,
+                       {name: "robot, 3 sigma", legendgroup: "pose", showlegend: SPACE && i === 0}));
+  });
+  return traces;
+}
+
+function planarPage() {
+  const [x, y] = [0, 1].map(a => [DATA.box.low[a], DATA.box.high[a]]), width = el("map").clientWidth || 1080;
+  const height = Math.min(820, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 120));
+  return layout({height, uirevision: "map", xaxis: {...axis("x (m)"), range: x},
+                 yaxis: {...axis("y (m)"), range: y, scaleanchor: "x"}, margin: {l: 64, r: 16, t: 32, b: 44},
+                 legend: {orientation: "h", y: -48 / (height - 100), yanchor: "top"}});
+}
+
+function spatialPage() {
+  const {low, high} = DATA.box, spans = high.map((v, a) => v - low[a]), unit = Math.max(...spans) / 1.05;
+  const side = (title, a) => ({title: {text: title}, range: [low[a], high[a]], backgroundcolor: "white", gridcolor: "#e6e8ec",
+                               zerolinecolor: "#e6e8ec", showspikes: false});
+  return layout({height: 640, uirevision: "map", margin: {l: 0, r: 0, t: 0, b: 0}, legend: {orientation: "h", y: 0.02, x: 0.02},
+    scene: {aspectmode: "manual", aspectratio: {x: spans[0] / unit, y: spans[1] / unit, z: spans[2] / unit}, uirevision: "map",
+            xaxis: side("x (m)", 0), yaxis: side("y (m)", 1), zaxis: side("z (m)", 2),
+            camera: {center: {x: 0, y: 0, z: -0.18}, eye: {x: 0.95, y: -1.4, z: 0.9}, up: {x: 0, y: 0, z: 1}}, dragmode: "turntable"}});
+}
+
+/* The picture of a map: a function that draws it, and the images, at a position of the slider. */
+function mapPicture() {
+  const background = still(), page = SPACE ? spatialPage() : planarPage();
+  return frame => {
+    const shown = el("map")._fullLayout?.scene?._scene;  /* the slider must not turn the view back */
+    if (shown) page.scene.camera = shown.getCamera();
+    Plotly.react("map", [...background, ...moving(frame)], page, CONFIG);
+    DATA.cameras.forEach((camera, i) => drawImages(camera, i, frame));
+  };
+}
+
+/* The part of the straight line through two pixels that lies in the image, or nothing. */
+function trimmed([a, b], size) {
+  const d = [b[0] - a[0], b[1] - a[1]];
+  let first = -Infinity, last = Infinity;
+  for (const k of [0, 1]) {
+    if (d[k] === 0) { if (a[k] < 0 || a[k] > size[k]) return []; continue; }
+    const ends = [-a[k] / d[k], (size[k] - a[k]) / d[k]].sort((p, q) => p - q);
+    first = Math.max(first, ends[0]);
+    last = Math.min(last, ends[1]);
+  }
+  return first < last ? [first, last].map(t => [a[0] + t * d[0], a[1] + t * d[1]]) : [];
+}
+
+function drawImages(camera, i, frame) {
+  const scan = camera.frames[frame] === null ? null : camera.scans[camera.frames[frame]];
+  const sides = camera.scans.length ? camera.scans[0].images.length : 0;
+  for (let k = 0; k < sides; k++) {
+    const id = `image-${i}-${k}`;
+    if (!el(id)) el("images").insertAdjacentHTML("beforeend", `<div id="${id}"></div>`);
+    drawImage(id, camera, scan, scan ? scan.images[k] : {side: "", seen: []});
+  }
+}
+
+function drawImage(id, camera, scan, image) {
+  const {size} = camera, lines = new Map(), marks = {new: [], rejected: [], measured: []}, names = {x: [], y: [], text: []};
+  const add = (colour, name, dash, width, points) => {
+    const key = colour + dash;
+    if (!lines.has(key)) lines.set(key, {x: [], y: [], mode: "lines", line: {color: colour, width, dash}, name, hoverinfo: "skip"});
+    for (const p of points) { lines.get(key).x.push(p[0]); lines.get(key).y.push(p[1]); }
+    lines.get(key).x.push(null);
+    lines.get(key).y.push(null);
+  };
+  for (const s of image.seen) {
+    const single = s.y.length === 1, close = p => p.length > 2 ? [...p, p[0]] : p, dash = s.outcome === "rejected" ? "dot" : "solid";
+    if (single) marks.measured.push([...s.y[0], s.name]); else add(SEGMENT, "measured", "solid", 4, close(s.y));
+    if (s.outcome in marks) marks[s.outcome].push(...s.y.map(p => [...p, s.name]));
+    if (s.e && single && s.Z) {
+      const e = contours({x: [s.e[0][0]], y: [s.e[0][1]], pxx: [s.Z[0]], pxy: [s.Z[1]], pyy: [s.Z[2]]}, [0], 32, "xy");
+      add(s.colour, s.meaning, dash, 1.4, e.x.slice(0, -1).map((x, k) => [x, e.y[k]]));
+    } else if (s.e) add(s.colour, s.meaning, dash, 1.4, s.e.length === 2 ? trimmed(s.e, size) : close(s.e));
+    if (s.name && s.outcome !== "ignored") {
+      const at = s.e && single ? s.e : s.y, mean = a => at.reduce((sum, p) => sum + p[a], 0) / at.length;
+      names.x.push(mean(0)); names.y.push(mean(1) - 15); names.text.push(s.name);
+    }
+  }
+  const dots = (points, name, marker) => ({x: points.map(p => p[0]), y: points.map(p => p[1]), text: points.map(p => p[2]), name,
+    mode: "markers", marker, hovertemplate: `%{text} ${name}: %{x:.1f}, %{y:.1f}<extra></extra>`, showlegend: points.length > 0});
+  const high = (el(id).clientWidth || 500) * size[1] / size[0];  /* below the image its ticks, then a legend of two rows at most */
+  const title = `${camera.name}${image.side ? " · " + image.side : ""}${scan ? ` · ${scan.t.toFixed(2)} s` : ""}`;
+  Plotly.react(id, [
+    dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: MEASURED, width: 1.3}}), ...lines.values(),
+    dots(marks.new, "new", {symbol: "square-open", size: 10, color: "#1e4d2b"}),
+    dots(marks.rejected, "rejected", {symbol: "x-thin", size: 9, line: {color: INK, width: 1.6}}),
+    {...names, mode: "text", textfont: {size: 10, color: "#1e4d2b"}, hoverinfo: "skip", showlegend: false}],
+    layout({height: high + 100, title: {text: title, x: 0.01, font: {size: 13}}, margin: {l: 44, r: 10, t: 30, b: 70},
+            xaxis: {...axis(""), range: [0, size[0]], constrain: "domain", mirror: true, showline: true},
+            yaxis: {...axis(""), range: [size[1], 0], scaleanchor: "x", constrain: "domain", mirror: true, showline: true},
+            showlegend: true, legend: {orientation: "h", y: -24 / high, yanchor: "top", x: 0, font: {size: 11}}}), {...CONFIG, displayModeBar: false});
+}

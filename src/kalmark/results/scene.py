@@ -1,0 +1,258 @@
+"""What the pictures of a run show at one step, in the frame of the map: paths, landmarks, truth, fixes, cameras.
+
+One description for robots in the plane (d = 2) and in space (d = 3); `kalmark.results.plot` draws it for ``map.png``,
+`kalmark.results.series` writes it into the page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from kalmark.events import Id
+from kalmark.geometry.rotations import matrix
+from kalmark.results.align import Rigid, rigid, rigid_robust
+from kalmark.results.columns import Array, Ints
+from kalmark.results.evaluate import FIX_GAP_S, antenna_path
+from kalmark.results.history import Camera
+from kalmark.results.recording import Recording
+from kalmark.results.shapes import EUCLIDEANS, LINE, Shapes, shapes
+from kalmark.results.truth import moved
+
+COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b0457a", "#6b6f2a")
+SPACE_COLOURS = ("#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#6b6f2a", "#b0457a")  # landmarks are blue or red
+TRUTH_COLOUR, FIX_COLOUR, INK = "#8b929c", "#7a3fa0", "#2b2f36"
+GAP_STEPS = 10.0
+CLEAR = 0.3  # a point whose sigma is a larger part of its distance does not widen the picture
+REACH, REACH_M = 0.15, 0.5  # a contour widens the picture by at most this part of it, or so much
+PAD, PAD_M = 0.04, 0.2  # around it, a part of its longest side, or so much
+NARROW = 0.15  # the least width of a plan, as a part of its length
+FRAMES = 6  # cameras are drawn at so many poses of a path
+BODY = np.array([[1.0, 0, 0], [-0.6, 0.5, 0], [-0.6, -0.5, 0], [1.0, 0, 0], [-0.6, 0, 0.45], [-0.3, 0, 0]])  # a dart
+SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.5, -0.5, 0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A run up to one of its steps, in the plane (d = 2) or in space (d = 3).
+
+    By robot: poses (N, 3|7) and their covariances up to the step, `stretches` (S,), the gaps in time up to each of all
+    its steps, true positions (S, d; NaN: unknown), fixes (F, 2) to score with and those `used` by the filter (F, d).
+    `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places.  `low` and `high` (d,) are the
+    corners of the box to draw, the same for all steps.
+    """
+
+    d: int
+    paths: dict[str, Array]
+    pose_covariances: dict[str, Array]
+    stretches: dict[str, Ints]
+    truth: dict[str, Array]
+    fixes: dict[str, Array]
+    used: dict[str, Array]
+    true_landmarks: dict[Id, Array]
+    ids: tuple[Id, ...]
+    shapes: Shapes
+    cameras: tuple[Camera, ...]
+    low: Array
+    high: Array
+
+    @classmethod
+    def of(cls, run: Recording, step: int | None = None) -> Scene:
+        """Return what to draw of a run after a step, by default the last; the box is that of the whole run."""
+        history, d = run.history, 3 if run.history.in_space else 2
+        to_map = _truth_to_map(run, d)
+        mine = {robot: history.robot == robot for robot in history.robots}
+        truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
+        scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
+        moved_truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
+        landmarks = {i: l if d == 3 else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()}
+        used, last = _used_fixes(run, d), run.landmarks
+        whole = shapes(*last.places(), last.kinds, d)
+        now, ids = whole, tuple(last.ids)
+        if step is not None:
+            _, _, ids, means, covariances, kinds = history.map_at(step)
+            now = shapes(means, covariances, kinds or [""] * len(ids), d)
+        until = slice(None) if step is None else slice(step + 1)
+        poses, P = history.poses, history.pose_covariances
+        ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
+        true = [l.reshape(-1, d) if len(l) == LINE else l[None, :d] for l in landmarks.values()]
+        low, high = _box(poses[:, :d], ends, whole, [*moved_truth.values(), *used.values(), *true])
+        return cls(
+            d,
+            {robot: poses[until][rows[until]] for robot, rows in mine.items()},
+            {robot: P[until][rows[until]] for robot, rows in mine.items()},
+            {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()},
+            moved_truth,
+            {robot: _fixes_in_map(run, robot) for robot in scored},
+            used,
+            landmarks,
+            ids,
+            now,
+            history.cameras,
+            low,
+            high,
+        )
+
+    @property
+    def size(self) -> float:
+        """The longest side of the box."""
+        return float((self.high - self.low).max())
+
+    def colour(self, robot: str) -> str:
+        """Return the robot's colour."""
+        colours = SPACE_COLOURS if self.d == 3 else COLOURS
+        return colours[list(self.paths).index(robot) % len(colours)]
+
+    def line(self, robot: str) -> Array:
+        """Return a robot's path (N, d), NaN in gaps of time."""
+        return broken(self.paths[robot][:, : self.d], self.stretches[robot])
+
+    def true_path(self, robot: str) -> Array:
+        """Return a robot's true path (N, d), NaN in gaps of time."""
+        return broken(self.truth[robot], self.stretches[robot])
+
+    def inside(self, lines: Array) -> Array:
+        """Return polylines (..., d) with NaN where they leave the box."""
+        out = (lines < self.low) | (lines > self.high)
+        return np.where(out.any(axis=-1, keepdims=True), np.nan, lines)
+
+    def frames(self, robot: str) -> list[Array]:
+        """Return what is drawn of a robot along its path: the pyramids of its cameras, or a dart if it has none."""
+        path, body = self.paths[robot], self.body(robot)
+        at = np.unique(np.linspace(0, max(len(path) - 1, 0), FRAMES).round().astype(int))
+        return [_placed(pose, line) for pose in path[at[: len(path)]] for line in body]
+
+    def body(self, robot: str) -> list[Array]:
+        """Return what is drawn of a robot in space as polylines (P, 3) in its own frame."""
+        size = 0.03 * self.size
+        mine = [_pyramid(camera, size) for camera in self.cameras if camera.robot == robot]
+        return mine or [0.6 * size * BODY]
+
+    def true_lines(self) -> list[Array]:
+        """Return the true lines (2, 3)."""
+        return [l.reshape(2, 3) for l in self.true_landmarks.values() if len(l) == LINE]
+
+    def true_points(self) -> dict[Id, Array]:
+        """Return where the true landmarks are (d,), but for lines."""
+        return {i: l[: self.d] for i, l in self.true_landmarks.items() if len(l) != LINE}
+
+
+def squares(tags: Array, size: float) -> list[Array]:
+    """Return tags (T, 7) as squares (5, 3) that can be seen in a scene of this size."""
+    return [_placed(tag, 0.03 * size * SQUARE) for tag in tags]
+
+
+def contours(means: Array, covariances: Array, sigmas: float = 3.0) -> Array:
+    """Return the contours (K, C, N, d) of many Gaussians at once, closed: ellipses, in space three great circles each.
+
+    [S] (85)-(87).  NaN where a Gaussian is not finite.
+    """
+    d = means.shape[1]
+    alpha = np.linspace(0.0, 2.0 * np.pi, 41 if d == 2 else 25)
+    circles = np.zeros((d * (d - 1) // 2, d, len(alpha)))
+    for circle, (i, j) in zip(circles, combinations(range(d), 2), strict=True):
+        circle[i], circle[j] = np.cos(alpha), np.sin(alpha)
+    known = np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    values, axes = np.linalg.eigh(np.where(known[:, None, None], covariances, 0.0))
+    half = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    out = means[:, None, None, :] + sigmas * np.einsum("kij,cjp->kcpi", half, circles)
+    return np.where(known[:, None, None, None], out, np.nan)
+
+
+def joined(lines: Sequence[Array] | Array, d: int = 3) -> Array:
+    """Return polylines (P, d) as one (N, d) that is broken by NaN between them."""
+    parts = [part for line in lines for part in (line, np.full((1, d), np.nan))]
+    return np.concatenate(parts) if parts else np.empty((0, d))
+
+
+def stretches_of(t_ns: Ints) -> Ints:
+    """Return how many gaps are before each of a robot's steps (N,): 3 s, and ten times the median, without a scan."""
+    steps = np.diff(t_ns) * 1e-9
+    if not len(steps):
+        return np.zeros(len(t_ns), dtype=np.int64)
+    return np.append(0, np.cumsum(steps > max(FIX_GAP_S, GAP_STEPS * float(np.median(steps)))))
+
+
+def broken(points: Array, stretches: Ints) -> Array:
+    """Return a path (N, d) with a row of NaN before each new stretch, so that no line is drawn across the gap."""
+    at = np.flatnonzero(np.diff(stretches[: len(points)])) + 1
+    return np.insert(points, at, np.nan, axis=0)
+
+
+def grouped(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
+    """Return the group (N,) of each of these steps, and before which groups a gap in time is.
+
+    A group is drawn as one: what is of so many consecutive steps, and on one side of a gap.
+    """
+    stretches = stretches_of(t_ns)
+    new = (np.diff(steps // each, prepend=-1) != 0) | (np.diff(stretches, prepend=0) != 0)
+    return np.cumsum(new) - 1, np.flatnonzero(np.diff(stretches[new])) + 1
+
+
+def _used_fixes(run: Recording, d: int) -> dict[str, Array]:
+    """Return the fixes (N, d) of each robot that the filter used; they are in the frame of the map."""
+    used = [fix for fix in run.history.inputs.fixes if fix.used]
+    rows = {name: np.array([fix.y for fix in used if fix.robot == name]) for name in sorted({f.robot for f in used})}
+    return {name: np.pad(y, ((0, 0), (0, d - y.shape[1]))) for name, y in rows.items()}
+
+
+def _truth_to_map(run: Recording, d: int) -> Rigid:
+    """Return what brings the truth into the map: nothing if they share a frame, else the best rigid alignment."""
+    truth = run.truth
+    if truth.frame == "truth":
+        return truth.to_map()
+    known = np.isfinite(truth.poses).all(axis=1)
+    return rigid(truth.poses[known][:, :d], run.history.mean[known][:, :d])
+
+
+def _fixes_in_map(run: Recording, robot: str) -> Array:
+    """Return where the robot was (N, 2) by each fix: aligned robustly, the antenna's offset taken off."""
+    fixes = run.truth.fixes[robot]
+    antenna, offset = antenna_path(run.history, robot, fixes)
+    known = np.isfinite(antenna).all(axis=1)
+    if known.sum() < 2:
+        return np.empty((0, 2))
+    return rigid_robust(antenna[known], fixes.xy[known]).inverse()(fixes.xy[known]) - offset[known]
+
+
+def _placed(pose: Array, points: Array) -> Array:
+    return points @ matrix(np.ascontiguousarray(pose[3:7])).T + pose[:3]
+
+
+def _pyramid(camera: Camera, depth: float) -> Array:
+    """Return a camera's pyramid, `depth` long, as one polyline in its robot's frame that passes all its edges."""
+    a, b, c, d = depth * camera.corners
+    top = np.zeros(3)
+    return _placed(camera.mount, np.array([a, b, top, a, d, top, c, d, c, b]))
+
+
+def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:
+    """Return the corners (d,) of what is to be seen: a path, contours at its ends, landmarks whose place is clear.
+
+    Contours reach out of it where they are huge.
+    """
+    d = path.shape[1]
+    means, covariances = drawn.points.means, drawn.points.covariances
+    known = np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", np.where(known[:, None, None], covariances, 0.0)), 0.0))
+    middle = path.mean(axis=0) if len(path) else np.zeros(d)
+    distance = np.linalg.norm(np.where(known[:, None], means, np.inf) - middle, axis=1)
+    near = np.logical_or(drawn.group == EUCLIDEANS, sigma.max(axis=1, initial=0.0) < CLEAR * distance)
+    clear = np.logical_and(known, near)
+    last = np.array([pose[:d] for pose, _ in ends.values()]).reshape(-1, d)
+    spread = np.array([np.sqrt(np.maximum(np.diagonal(P)[:d], 0.0)) for _, P in ends.values()]).reshape(-1, d)
+    points = np.concatenate([path, means[clear], *more])
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        return -np.ones(d), np.ones(d)
+    limit = max(REACH * float(np.ptp(points, axis=0).max()), REACH_M)
+    centres, reach = np.concatenate([means[clear], last]), np.fmin(3 * np.concatenate([sigma[clear], spread]), limit)
+    points = np.concatenate([points, centres - reach, centres + reach])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = (low + high) / 2, (high - low) / 2
+    half += max(2 * PAD * float(half.max()), PAD_M)
+    half[:2] = np.maximum(half[:2], NARROW * half.max())
+    return middle - half, middle + half

@@ -1,0 +1,123 @@
+"""The boundary: what models, covariances and events must be before they are let in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import EventError, KalmarkError, ModelError
+from kalmark.events import Control, Fix, Scan, finite, shown, when
+from kalmark.management.upkeep import Upkeep
+from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
+
+Array = npt.NDArray[np.float64]
+
+
+def covariance(value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError) -> Array:
+    """Return a copy of a (size, size) covariance; raise `error` if it is asymmetric or not positive (semi)definite."""
+    cov = finite(value, what, error)
+    if cov.shape != (size, size):
+        raise error(f"{what} has shape {cov.shape}, expected ({size}, {size})")
+    _refuse_indefinite(cov[None], what, definite, error)
+    return cov
+
+
+def instance(value: Any, protocol: type, what: str, expected: str) -> None:
+    """Raise ModelError if `value` is not of that protocol or class, or is a class itself instead of one of its kind."""
+    if isinstance(value, type):
+        raise ModelError(f"{what} is the class {value.__name__}, expected an instance: {value.__name__}(...)")
+    if not isinstance(value, protocol):
+        raise ModelError(f"{what} is {shown(value)}, expected {expected}")
+
+
+def able(value: Any, methods: tuple[str, ...], what: str, expected: str) -> None:
+    """Raise ModelError if `value` lacks one of these methods, or is a class itself instead of one of its kind."""
+    instance(value, object, what, expected)
+    if not all(callable(getattr(value, method, None)) for method in methods):
+        raise ModelError(f"{what} is {shown(value)}, expected {expected}")
+
+
+def refuse_odd_association(value: Any, what: str) -> None:
+    """Refuse what does not decide which landmark was seen."""
+    expected = "an object like km.association.Automatic(), with threshold and associate"
+    able(value, ("threshold", "associate"), what, expected)
+
+
+def refuse_odd_parts(association: Any, estimator: Any, landmarks: Any, upkeep: Any, reparametrize: Any) -> None:
+    """Refuse what a Slam cannot be made of."""
+    refuse_odd_association(association, "association")
+    like = "an object like km.estimators.Ekf(), with predict, correct, for_fixes and pose_jacobian"
+    able(estimator, ("predict", "correct", "for_fixes", "pose_jacobian"), "estimator", like)
+    if landmarks is not None:
+        instance(landmarks, Landmark, "landmarks", "a landmark model")
+    instance(upkeep, Upkeep, "upkeep", "an Upkeep")
+    if reparametrize is not None and not (isinstance(reparametrize, int | float) and reparametrize >= 0):
+        raise ModelError(f"reparametrize is {shown(reparametrize)}, expected a number of at least 0, or None: never")
+
+
+def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[KalmarkError] = EventError) -> None:
+    """Refuse finite matrices (K, m, m) that are not covariances."""
+    scale = np.abs(covs).max(axis=(1, 2), initial=0.0)
+    with np.errstate(over="ignore"):
+        skewed = np.abs(covs - covs.swapaxes(1, 2)).max(axis=(1, 2), initial=0.0) > 1e-9 * scale
+    if skewed.any():
+        raise error(f"{what} is {shown(covs[np.argmax(skewed)].tolist())}, expected a symmetric matrix")
+    lowest = np.linalg.eigvalsh(covs).min(axis=1)
+    bad = ~(lowest > 0) if definite else ~(lowest >= -1e-9 * scale)
+    if bad.any():
+        kind = "positive definite" if definite else "positive semidefinite"
+        raise error(f"{what} has the eigenvalue {lowest[np.argmax(bad)]:.3g}, expected a {kind} matrix")
+
+
+def numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -> Array:
+    """Return a copy of (size,) finite numbers; raise `error` if it is anything else."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise error(f"{what} is {value!r}, expected {size} finite numbers") from None
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise error(f"{what} is {array.tolist()}, expected {size} finite numbers")
+    return array
+
+
+def refuse_bad_control(event: Control, columns: tuple[str, ...]) -> None:
+    """Refuse a control that is not of these components, or whose own noise is no covariance."""
+    if event.u.shape != (len(columns),):
+        raise EventError(f"{when(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
+    if event.cov is not None:
+        covariance(event.cov, len(columns), f"{when(event)}: cov", definite=False)
+
+
+def refuse_bad_fix(event: Fix, size: int) -> None:
+    """Refuse a fix that is not a position (size,) with its covariance."""
+    if event.y.shape != (size,):
+        expected = "x and y in m" if size == 2 else "x, y and z in m"
+        raise EventError(f"{when(event)}: y has shape {event.y.shape}, expected ({size},): {expected}")
+    covariance(event.cov, size, f"{when(event)}: cov", definite=True)
+
+
+def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | None = None) -> Array:
+    """Return the noise R (K, p, p) of a scan's innovations, refusing measurements its sensor cannot have made.
+
+    `check` is the sensor's own, if it has one.
+    """
+    m, count = len(sensor.columns), len(event.y)
+    if event.width != m and (count or event.width):
+        expected = f"expected {m}: {', '.join(sensor.columns)}"
+        raise EventError(f"{when(event)}: y has {event.width} columns, {expected}")
+    if check is not None and count:
+        try:
+            check(event.y)
+        except EventError as error:
+            raise EventError(f"{when(event)}: {error}") from None
+    if event.cov is None:
+        return sensor.noise(event.y) if count else np.zeros((0, m, m))
+    what, p = f"{when(event)}: cov", innovation_size(sensor)
+    if event.cov.shape not in ((p, p), (count, p, p)):
+        raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
+    _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)
+    covs = np.ascontiguousarray(np.broadcast_to(event.cov, (count, p, p)))
+    return sensor.noise_from(event.y, covs) if isinstance(sensor, OwnNoise) else covs

@@ -1,0 +1,115 @@
+"""Made once at construction: the channel of each mounted sensor, and the policy for its scans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Association, averages, weighs
+from kalmark.errors import ModelError
+from kalmark.events import Scan
+from kalmark.filter.estimators import Estimator
+from kalmark.management.attention import Attention
+from kalmark.management.delayed import Delayed
+from kalmark.management.mirrored import Mirrored
+from kalmark.management.pending import Initialization
+from kalmark.management.trilateration import Trilateration
+from kalmark.management.upkeep import Upkeep
+from kalmark.models.protocols import Ambiguous, Intersecting, Landmark, Ranging, Reparametrizable, Segmented, world_of
+from kalmark.slam.robot import Mount, Robot
+from kalmark.tracks.channel import Channel, default_landmark
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """What is decided about the scans of a channel.
+
+    `deferred` starts landmarks with ids from several measurements, `delayed` any landmark from cloned poses (None: at
+    first sight).  `starts` are the answers to an observation without an id that start one.  `averages`: the association
+    may answer with mixtures; `holds_back`: its pairs are tested against chance; `reviews`: landmarks may change after a
+    scan; the last `keep_poses` clones are kept for tentative landmarks.
+    """
+
+    association: Association
+    upkeep: Upkeep
+    attention: Attention
+    detector: Callable[[Scan], Scan] | None
+    deferred: Initialization | None
+    delayed: Delayed | None
+    starts: tuple[Answer, ...]
+    averages: bool
+    holds_back: bool
+    reviews: bool
+    keep_poses: int
+
+
+def policy_of(mount: Mount, channel: Channel, association: Association, upkeep: Upkeep) -> Policy:
+    """Return the policy for the scans of a mount.
+
+    Raises ModelError if its initialisation does not fit its sensor.
+    """
+    delayed = mount.initialization if isinstance(mount.initialization, Delayed) else None
+    if delayed is not None and not (isinstance(mount.sensor, Intersecting) and channel.landmark.kind == "point"):
+        what = f"a {type(mount.sensor).__name__} does not start a {channel.landmark.kind} late"
+        raise ModelError(f"{what}: expected one that has meet(), and points of the plane")
+    kinds = [model.landmark for model in channel.models.values()]
+    reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
+    return Policy(
+        association, upkeep, mount.attention, mount.detector, _deferred(mount), delayed, _starts(association, upkeep),
+        averages(association), upkeep.hold_back and not weighs(association), reviews,
+        upkeep.keep_poses if delayed is None else 0,
+    )  # fmt: skip
+
+
+def _deferred(mount: Mount) -> Initialization | None:
+    """Return how a mounted sensor starts landmarks from several measurements, None if one is enough for it."""
+    ranging, way = tuple(mount.sensor.columns) == ("range_m",) and isinstance(mount.sensor, Ranging), None
+    if mount.initialization is not None and not isinstance(mount.initialization, Delayed):
+        way = mount.initialization
+        if not ranging:
+            what = f"{type(mount.sensor).__name__} does not measure ranges alone"
+            raise ModelError(f"Mount: initialization is {way!r}, but its {what}")
+    if ranging and not isinstance(mount.initialization, Delayed):
+        return way or Trilateration()
+    return Mirrored() if isinstance(mount.sensor, Ambiguous) else None
+
+
+def _starts(association: Association, upkeep: Upkeep) -> tuple[Answer, ...]:
+    """Return the answers to an observation without an id that start a landmark.
+
+    An association that weighs matchings defers what may be one of several landmarks: that is none to be mapped again.
+    """
+    if not upkeep.hold_back:
+        return (NEW,)
+    return (NEW, REMAP) if weighs(association) else (NEW, REMAP, DEFERRED)
+
+
+def channel_of(
+    robots: Mapping[str, Robot], mount: Mount, slot: int, landmarks: Landmark | None, association: Association,
+    estimator: Estimator,
+) -> Channel:  # fmt: skip
+    """Return the channel of a mount whose block is on a slot (-1: none).
+
+    Raises ModelError if sensor or landmark are of another world than the robots, or do not fit each other.
+    """
+
+    def landmark_of(m: Mount) -> Landmark:
+        late = m.initialization is not None
+        return m.landmark or landmarks or default_landmark(m.sensor, m.at, m.cov is not None, late)
+
+    landmark = landmark_of(mount)
+    refuse_other_world(robots, type(mount.sensor).__name__, world_of(mount.sensor))
+    refuse_other_world(robots, landmark.kind, landmark.space.world)
+    polar = any(landmark_of(m).kind == "polar" for robot in robots.values() for m in robot.sensors.values())
+
+    def threshold(dof: int) -> float:
+        return association.threshold(dof, estimator.default_gate)
+
+    return Channel(mount.sensor, mount.at, slot, landmark, threshold, polar)
+
+
+def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:
+    """Refuse what lives in the plane among robots that move in space, and the other way round."""
+    here = next(iter(robots.values())).motion.space.world
+    if world and world != here:
+        raise ModelError(f"{what} is of the {world}, expected one of the {here}, where the first robot moves")

@@ -1,0 +1,199 @@
+"""Robots and the mounts of their sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag
+
+from kalmark.association.protocol import Association
+from kalmark.errors import ModelError
+from kalmark.events import Scan, finite, shown
+from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
+from kalmark.management.attention import EVERYTHING, Attention
+from kalmark.management.delayed import Delayed
+from kalmark.management.hypotheses import Hypotheses
+from kalmark.management.trilateration import Trilateration
+from kalmark.management.upkeep import Upkeep
+from kalmark.models.protocols import Landmark, Motion, Sensor, parameter_covariance, refuse_misspelt
+from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
+
+Array = npt.NDArray[np.float64]
+
+
+IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
+WANTED = {
+    3: "three finite numbers: x and y in m, heading in rad",
+    7: "seven finite numbers: x, y, z in m and a unit quaternion qx, qy, qz, qw",
+}
+
+
+def _pose(value: Any, what: str, sizes: tuple[int, ...]) -> Array:
+    """Return a pose of one of the sizes 3 (plane) and 7 (space), its quaternion normalised."""
+    try:
+        pose = finite(value, what, ModelError)
+    except ModelError:
+        pose = np.empty(0)
+    unit = pose.shape == (7,) and abs(np.linalg.norm(pose[3:]) - 1) < 1e-6
+    if pose.ndim != 1 or len(pose) not in sizes or (len(pose) == 7 and not unit):
+        raise ModelError(f"{what} is {shown(value)}, expected {' or '.join(WANTED[n] for n in sizes)}")
+    if unit:
+        pose[3:] /= np.linalg.norm(pose[3:])
+    pose.flags.writeable = False
+    return pose
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """A sensor and where it sits in the robot's frame: `at` = (x, y, heading), m and rad, or (x, y, z, qx, qy, qz, qw).
+
+    `landmark` is the type of landmark this sensor starts and `association` its own, if not the slam's.  `detector`
+    turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
+    and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
+    by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
+    called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas.
+    """
+
+    sensor: Sensor
+    at: Any = (0.0, 0.0, 0.0)
+    landmark: Landmark | None = None
+    association: Association | None = None
+    detector: Callable[[Scan], Scan] | None = None
+    attention: Attention = EVERYTHING
+    cov: Any = None
+    upkeep: Upkeep | None = None
+    initialization: Delayed | Trilateration | Hypotheses | None = None
+
+    def __post_init__(self) -> None:
+        instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
+        refuse_misspelt(self.sensor, "Mount: sensor")
+        if self.landmark is not None:
+            instance(self.landmark, Landmark, "Mount: landmark", "a landmark model")
+            refuse_misspelt(self.landmark, "Mount: landmark")
+        if self.association is not None:
+            refuse_odd_association(self.association, "Mount: association")
+        if self.detector is not None:
+            able(self.detector, ("__call__",), "Mount: detector", "an object like km.detect.Trunks(), or a function")
+        instance(self.attention, Attention, "Mount: attention", "an Attention")
+        if self.upkeep is not None:
+            instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")
+        if self.initialization is not None:
+            ways = "a Delayed, a Trilateration or Hypotheses"
+            one_of: Any = (Delayed, Trilateration, Hypotheses)
+            instance(self.initialization, one_of, "Mount: initialization", ways)
+        object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
+
+    def covariance(self, dof: int, what: str) -> Array | None:
+        """Return the covariance (dof, dof) of the mount in a robot's frame, or None if it is known exactly."""
+        return None if self.cov is None else covariance(self.cov, dof, what, definite=False, error=ModelError)
+
+    def block(self, what: str) -> tuple[Space, Array, Array] | None:
+        """Return the space, the mean (size,) and the covariance (dof, dof) of this sensor's block, None if it has none.
+
+        That is the mount, if it is uncertain, with the sensor's own parameters behind it, if they are.
+        """
+        pose, dof = len(self.at), 3 if len(self.at) == 3 else 6
+        cov, own = self.covariance(dof, what), parameter_covariance(self.sensor)
+        if own is None:
+            return None if cov is None else (mount_space(pose), self.at, cov)
+        whole = block_diag(np.zeros((dof, dof)) if cov is None else cov, own)
+        return mount_space(pose, len(own)), np.concatenate([self.at, self.sensor.parameters]), whole  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A robot: its motion model, its start with covariance `cov` (None: known exactly), its sensors.
+
+    `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.
+    """
+
+    name: str
+    motion: Motion
+    start: Any = None
+    sensors: Mapping[str, Mount] = field(default_factory=dict)
+    cov: Any = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise ModelError(f"Robot: name is {shown(self.name)}, expected a text that is not empty")
+        what = f"robot {self.name!r}"
+        instance(self.motion, Motion, f"{what}: motion", "a motion model")
+        refuse_misspelt(self.motion, f"{what}: motion")
+        space = self.motion.space
+        pose = 3 if space.kinds[:2] == SE2.kinds else 7 if space.kinds[:2] == SE3.kinds else 0
+        if not pose:
+            raise ModelError(f"{what}: motion is in {getattr(space, 'name', shown(space))}, expected SE2, SE3 or more")
+        start = IDENTITY[pose] if self.start is None else self.start
+        object.__setattr__(self, "start", _state(start, pose, space, f"{what}: start"))
+        object.__setattr__(self, "sensors", _mounts(self.sensors, what, pose))
+        for name, mount in self.sensors.items():
+            mount.covariance(3 if pose == 3 else 6, f"{what}: sensor {name!r}: cov")
+        if self.cov is not None:
+            object.__setattr__(self, "cov", _cov(self.cov, pose, space, f"{what}: cov"))
+
+
+def robots_given(value: Any) -> list[Robot]:
+    """Return the robots of a Slam: any number of them, or one alone.  Raises ModelError."""
+    if isinstance(value, Robot):
+        return [value]
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise ModelError(f"robots is {shown(value)}, expected a list of Robots")
+    robots = list(value)
+    for robot in robots:
+        instance(robot, Robot, "robots: one", "a Robot")
+    if not robots:
+        raise ModelError("a Slam needs at least one robot, got none")
+    return robots
+
+
+def mount_name(robot: str, sensor: str) -> str:
+    """Return the name of a sensor's mount in the map."""
+    return f"{robot}.{sensor}"
+
+
+def _state(value: Any, pose: int, space: Space, what: str) -> Array:
+    """Return a start of a motion's space: the whole state, or a pose, the rest of it zero."""
+    try:
+        given = finite(value, what, ModelError)
+    except ModelError:
+        given = np.empty(0)
+    whole = given.shape == (space.size,)
+    rest = given[pose:] if whole else np.zeros(space.size - pose)
+    state = np.concatenate([_pose(given[:pose] if whole else value, what, (pose,)), rest])
+    state.flags.writeable = False
+    return state
+
+
+def _cov(value: Any, pose: int, space: Space, what: str) -> Array:
+    """Return the covariance of a start, of the whole state or of the pose alone, the rest of it known."""
+    given, dof = finite(value, what, ModelError), 3 if pose == 3 else 6
+    size = dof if given.shape == (dof, dof) else space.dof
+    cov = np.zeros((space.dof, space.dof))
+    cov[:size, :size] = covariance(given, size, what, definite=False, error=ModelError)
+    return cov
+
+
+def _mounts(sensors: Any, what: str, size: int) -> dict[str, Mount]:
+    """Return a copy of a robot's sensors, by name; one at the robot's own origin is there in space too."""
+    if not isinstance(sensors, Mapping):
+        raise ModelError(f"{what}: sensors is {shown(sensors)}, expected a mapping of names to Mounts")
+    for name, mount in sensors.items():
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"{what}: the name of a sensor is {shown(name)}, expected a text that is not empty")
+        if not isinstance(mount, Mount):
+            raise ModelError(
+                f"{what}: sensor {name!r} is {shown(mount)}, expected a Mount: Mount(sensor, at=(x, y, heading))"
+            )
+    mounts = {}
+    for name, mount in sensors.items():
+        if len(mount.at) != size and not mount.at.any():
+            mount = replace(mount, at=IDENTITY[size])  # noqa: PLW2901
+        if len(mount.at) != size:
+            at = f"{what}: sensor {name!r} sits at {mount.at.tolist()}"
+            raise ModelError(f"{at}, expected {WANTED[size]}")
+        mounts[name] = mount
+    return mounts

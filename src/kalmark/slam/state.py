@@ -1,0 +1,401 @@
+"""A Slam on disk: one zip of arrays, a JSON description and their checksums, never pickle: loading runs nothing of it.
+
+The settings are what a Slam is constructed with, the state is what events have made of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.association import Association
+from kalmark.errors import KalmarkError, MapError
+from kalmark.events import Id
+from kalmark.filter.estimators import Estimator
+from kalmark.filter.map import Map
+from kalmark.filter.maps import restored as restored_map
+from kalmark.geometry.spaces import SE2, SE3, Rn, Space
+from kalmark.management.hypotheses import POLAR
+from kalmark.management.upkeep import Upkeep
+from kalmark.models.protocols import Landmark
+from kalmark.slam.describe import described, landmark_type, restored, robot_described, robots_restored, same
+from kalmark.slam.motion import Moving, bias_name
+from kalmark.slam.robot import Robot, mount_name
+from kalmark.tracks.clones import Clone, Clones, Measurement
+from kalmark.tracks.track import Pending, Status, Track, Tracks
+
+Array = npt.NDArray[np.float64]
+Description = dict[str, Any]
+
+VERSION = 7
+DESCRIPTION, SUMS = "slam.json", "sha256"
+OF_TRACKS = ("recent", "last_scan", "changes", "unnamed", "experience")  # what `Tracks` knows beside the tracks
+OF_MOVING = ("t_ns", "fresh")
+
+
+class State(NamedTuple):
+    """What events have made of a Slam."""
+
+    t_ns: int | None
+    map: Map
+    tracks: Tracks
+    clones: Clones
+    moving: dict[str, Moving]
+
+
+def settings(
+    robots: Mapping[str, Robot], association: Association, estimator: Estimator, landmarks: Landmark | None,
+    upkeep: Upkeep, reparametrize: float | None, map_type: str, numbers: str,
+) -> Description:  # fmt: skip
+    """Return a description of what a Slam was constructed with."""
+    return {
+        "robots": [robot_described(robot) for robot in robots.values()],
+        "association": described(association),
+        "estimator": described(estimator),
+        "landmarks": None if landmarks is None else described(landmarks),
+        "upkeep": described(upkeep),
+        "reparametrize": reparametrize,
+        "map": map_type,
+        "numbers": numbers,
+    }
+
+
+# ---------------------------------------------------------------------- saving
+def save(path: Path, settings: Description, state: State) -> None:
+    """Write settings and state; the file appears whole or not at all.  A model's own memory is not written.
+
+    Raises MapError if the file cannot be written, or an id is neither an integer nor a text.
+    """
+    description = {"kalmark": VERSION, "settings": settings, "state": _state(state)}
+    members = {DESCRIPTION: json.dumps(description, default=_plain, allow_nan=False).encode()}
+    members |= {f"{name}.npy": _npy(array) for name, array in _arrays(state)}
+    sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in members.items()).encode()
+    temporary = path.with_name(path.name + ".part")
+    try:
+        try:
+            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+                for name, data in (members | {SUMS: sums}).items():
+                    archive.writestr(name, data)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise MapError(f"{path}: {error.strerror}, expected a file that can be written") from error
+
+
+def _state(state: State) -> Description:
+    tracks = state.tracks
+    all_ = [track for each in (tracks.confirmed, tracks.tentative, tracks.pending) for track in each.values()]
+    blocks = {name: slot for name, slot in tracks.slots.items() if name not in tracks.confirmed}
+    return {
+        "t_ns": state.t_ns,
+        "map": state.map.state(),
+        "blocks": [[_id(name), slot] for name, slot in blocks.items()],
+        "tracks": [_record(track) | {"id": _id(track.id)} for track in all_],
+        "candidates": [[*key, [_record(c) for c in candidates]] for key, candidates in tracks.candidates.items()],
+        "reserved": sorted(map(_id, tracks.reserved)),
+        **{name: getattr(tracks, name) for name in OF_TRACKS},
+        "clones": [[number, _record(clone)] for number, clone in state.clones.clones.items()],
+        "latest": state.clones.latest,
+        "numbered": state.clones.numbered,
+        "moving": {name: [m.error, *(getattr(m.held, key) for key in OF_MOVING)] for name, m in state.moving.items()},
+    }
+
+
+def _record(value: Any) -> Description:
+    """Return a record as its fields."""
+    return {field.name: getattr(value, field.name) for field in fields(value)}
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON has no word for: arrays as lists, records as their fields, models as they are described."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, set | frozenset):
+        return sorted(map(_id, value), key=str) if not all(isinstance(v, tuple) for v in value) else sorted(value)
+    if isinstance(value, Status):
+        return value.value
+    if isinstance(value, Measurement | Pending):
+        return _record(value)
+    if isinstance(value, Landmark):
+        return described(value)
+    raise MapError(f"{value!r} cannot be saved, expected a number or a text")
+
+
+def _id(name: Any) -> Any:
+    name = name.item() if isinstance(name, np.generic) else name
+    if not isinstance(name, int | str):
+        raise MapError(f"landmark {name!r} cannot be saved, expected an id that is an integer or a text")
+    return name
+
+
+def _arrays(state: State) -> Iterator[tuple[str, Array]]:
+    yield from state.map.arrays()
+    for i, moving in enumerate(state.moving.values()):
+        if moving.held.u is not None and moving.held.N is not None:
+            yield f"u{i}", moving.held.u
+            yield f"N{i}", moving.held.N
+
+
+def _npy(array: Array) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.ascontiguousarray(array, dtype="<f8"), (1, 0), allow_pickle=False)
+    return file.getvalue()
+
+
+# ---------------------------------------------------------------------- loading
+@dataclass(frozen=True)
+class Saved:
+    """A file that was written by `save`: the settings to construct a Slam with, and the state it then takes over."""
+
+    path: Path
+    settings: Description
+    _state: Description
+    _members: dict[str, bytes]
+    _landmarks: Landmark | None = None  # the user's own, given again
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """Turn whatever a damaged file leads to into a MapError that names the file."""
+        try:
+            yield
+        except KalmarkError as error:
+            raise MapError(f"{self.path}: {error}") from error
+        except OSError as error:
+            said = error.strerror or error
+            raise MapError(f"{self.path}: {said}, expected a map written by save()") from error
+        except Exception as error:  # a damaged file fails in any way: in zlib, json, numpy or a model
+            said = " ".join(str(error).split())
+            raise MapError(f"{self.path}: {type(error).__name__}: {said}, expected a map written by save()") from error
+
+    def state(self, robots: Mapping[str, Robot], moving: dict[str, Moving], own: Sequence[Landmark]) -> State:
+        """Return the state, `own` being the landmark models of the user's that it may have.
+
+        `moving` are the robots as they are after construction.  Raises MapError if the parts do not fit together.
+        """
+        s, given = self._state, [*own]
+        if self._landmarks is not None:
+            given.append(self._landmarks)
+        map_ = restored_map(s["map"], partial(_array, self._members))
+        state = State(_time(s["t_ns"]), map_, Tracks(robots), Clones(), moving)
+        tracks, clones = state.tracks, state.clones
+        for name, slot in s["blocks"]:
+            tracks.enter_block(name, slot, robot=name in robots)
+        for record in s["tracks"]:
+            _enter(tracks, _track(record, given), len(map_.spaces))
+        for robot, sensor, candidates in s["candidates"]:
+            tracks.candidates[robot, sensor] = [_pending(c) for c in candidates]
+        tracks.reserve(s["reserved"])
+        for name in OF_TRACKS:
+            setattr(tracks, name, s[name])
+        tracks.experience = float(s["experience"][0]), float(s["experience"][1])
+        tracks.changes, tracks.unnamed = _count(s["changes"], "changes"), _count(s["unnamed"], "unnamed")
+        for number, c in s["clones"]:
+            users = {(str(robot), str(sensor)) for robot, sensor in c["users"]}
+            clones.clones[_count(number, "number of a clone")] = Clone(c["slot"], c["robot"], c["t_ns"], users)
+        clones.latest = {robot: _count(number, "number of a clone") for robot, number in s["latest"].items()}
+        clones.numbered = _count(s["numbered"], "number of clones")
+        for i, (name, m) in enumerate(moving.items()):
+            error, t_ns, fresh = s["moving"][name]
+            k, m.slot, m.error = len(m.motion.columns), tracks.slots[name], error
+            m.bias = tracks.slots.get(bias_name(name))
+            m.held.t_ns, m.held.fresh = _time(t_ns), bool(fresh)
+            if f"u{i}.npy" in self._members:
+                m.held.u, m.held.N = _array(self._members, f"u{i}", (k,)), _array(self._members, f"N{i}", (k, k))
+        _check_owners(robots, state)
+        _check_measurements(robots, state)
+        return state
+
+
+def load(
+    path: Path, robots: Iterable[Robot] | None, association: Association | None, estimator: Estimator | None,
+    landmarks: Landmark | None,
+) -> Saved:  # fmt: skip
+    """Read a file written by `save`; models of the user's own are given again.
+
+    Raises MapError if the file is damaged, lacks a model, or was saved with other robots or landmarks.
+    """
+    given = None if robots is None else list(robots)
+    saved = Saved(path, {}, {}, {})
+    with saved.errors():
+        description, members = _read(path)
+        s, state = description["settings"], description["state"]
+        kinds = {"landmarks": s["landmarks"], "kinds": [[t["id"], t["model"]] for t in state["tracks"]]}
+        found = {
+            "robots": robots_restored(s["robots"], given),
+            "association": association or restored("association", s["association"], "association", "association"),
+            "estimator": estimator or restored("estimator", s["estimator"], "estimator", "estimator"),
+            "landmarks": landmark_type(kinds, landmarks),
+            "map": s["map"],
+            "numbers": s["numbers"],
+            "reparametrize": _threshold(s["reparametrize"]),
+            "upkeep": restored("upkeep", s["upkeep"], "upkeep", "upkeep"),
+        }
+        return Saved(path, found, state, members, landmarks)
+    raise AssertionError  # `errors` has raised
+
+
+def _read(path: Path) -> tuple[Description, dict[str, bytes]]:
+    """Return the description and the arrays' files, their checksums compared."""
+    with zipfile.ZipFile(path) as archive:
+        state = json.loads(archive.read(DESCRIPTION))
+        if state.get("kalmark") != VERSION:
+            raise MapError(f"version is {state.get('kalmark')!r}, expected {VERSION}")
+        sums = {name: sum_ for sum_, name in map(str.split, archive.read(SUMS).decode().splitlines())}
+        members = {name: archive.read(name) for name in {DESCRIPTION, *sums}}
+    for name, data in members.items():
+        if hashlib.sha256(data).hexdigest() != sums.get(name):
+            raise MapError(f"{name} is damaged: its checksum is not {sums.get(name)}")
+    return state, members
+
+
+def _array(members: dict[str, bytes], name: str, shape: tuple[int, ...]) -> Array:
+    """Return an array, its header compared with what is expected before anything is made of it."""
+    file = io.BytesIO(members[f"{name}.npy"])
+    version = np.lib.format.read_magic(file)
+    got, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    if (version, got, fortran, dtype) != ((1, 0), shape, False, np.dtype("<f8")):
+        raise MapError(f"{name} is an array {got} of {dtype}, expected {shape} of float64")
+    return np.frombuffer(file.read(), "<f8").reshape(shape).astype(np.float64)
+
+
+def _enter(tracks: Tracks, track: Track, slots: int) -> None:
+    if track.slot >= slots:
+        raise MapError(f"slot of {track.id!r} is {track.slot}, expected one of {slots}")
+    if track.status is Status.CONFIRMED:
+        tracks.enter(track)
+    else:
+        of = tracks.tentative if track.status is Status.TENTATIVE else tracks.pending
+        of[track.id] = track
+
+
+def _track(record: Description, own: Sequence[Landmark]) -> Track:
+    name = record["id"]
+    model = next((landmark for landmark in own if same(landmark, record["model"])), None)
+    model = model or restored("landmark", record["model"], f"landmark {name!r}", "landmarks")
+    pending = record["pending"]
+    changed = {
+        "model": model,
+        "status": Status(record["status"]),
+        "observations": _count(record["observations"], f"observations of {name!r}"),
+        "covisible": set(record["covisible"]),
+        "compared": tuple(record["compared"]),
+        "extent": None if record["extent"] is None else np.array(record["extent"], dtype=np.float64).reshape(2),
+        "first": None if record["first"] is None else tuple(record["first"]),
+        "pending": None if pending is None else _pending(pending),
+        "measurements": [_measurement(m) for m in record["measurements"]],
+    }
+    track = Track(**(record | changed))
+    for what in ("searched", "found", "hits", "chances", "missed"):
+        _count(getattr(track, what), f"{what} of {name!r}")
+    return track
+
+
+def _pending(record: Description) -> Pending:
+    arrays = {key: None if record[key] is None else _numbers(record[key]) for key in ("mean", "cov", "poses")}
+    if arrays["poses"] is not None and arrays["poses"].shape != (2, 7):
+        raise MapError(f"what is pending of {record['name']!r} has poses {record['poses']!r}, expected two")
+    changed = {
+        "channel": tuple(record["channel"]),
+        "measurements": tuple(_measurement(m) for m in record["measurements"]),
+        "hypotheses": tuple(record["hypotheses"]),
+        "log_weights": tuple(_numbers(record["log_weights"]).tolist()),
+    }
+    pending = Pending(**(record | arrays | changed))
+    if len(pending.log_weights) != len(pending.hypotheses):
+        raise MapError(f"what is pending of {pending.name!r} has {len(pending.log_weights)} weights of its hypotheses")
+    return pending
+
+
+def _measurement(record: Description) -> Measurement:
+    m = Measurement(**(record | {"y": _numbers(record["y"]), "R": _numbers(record["R"])}))
+    if m.y.ndim != 1 or m.R.ndim != 2 or m.R.shape[0] != m.R.shape[1]:
+        raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} has the noise {m.R.tolist()}")
+    return m
+
+
+def _numbers(value: Any) -> Array:
+    found = np.array(value, dtype=np.float64)
+    if not np.isfinite(found).all():
+        raise MapError(f"{value!r} is no array of finite numbers")
+    return found
+
+
+def _check_owners(robots: Mapping[str, Robot], state: State) -> None:
+    """Refuse a map whose blocks are not each one robot, one landmark or one other known thing, of their shapes."""
+    owners = _owners(robots, state)
+    used = [i for i, space in enumerate(state.map.spaces) if space is not None]
+    if sorted(_count(slot, f"slot of {what}") for what, slot, _ in owners) != used:
+        raise MapError(f"the slots of the map are not used once each: {len(owners)} names, {len(used)} blocks")
+    for what, slot, space in owners:
+        block = state.map.spaces[slot]
+        if block is None or block.kinds != space.kinds:
+            raise MapError(f"{what} is a {space.name} of {space.size} numbers, its block in the map is {block}")
+
+
+def _owners(robots: Mapping[str, Robot], state: State) -> list[tuple[str, int, Space]]:
+    """Return what each block is, its slot and its space.  Raises MapError for names without a block."""
+    tracks = state.tracks
+    spaces: dict[Id, Space] = {name: robot.motion.space for name, robot in robots.items()}
+    mounts = {mount_name(name, key): mount.block(key) for name, r in robots.items() for key, mount in r.sensors.items()}
+    spaces |= {name: block[0] for name, block in mounts.items() if block is not None}
+    biased = [name for name in robots if bias_name(name) in tracks.slots]
+    spaces |= {bias_name(name): Rn(len(robots[name].motion.columns)) for name in biased}
+    spaces |= {name: track.model.space for name, track in tracks.confirmed.items()}
+    if robots.keys() & tracks.confirmed.keys() or spaces.keys() != tracks.slots.keys():
+        raise MapError("the slots' names are not those of the robots and landmarks")
+    owners = [(f"{name!r}", slot, spaces[name]) for name, slot in tracks.slots.items()]
+    owners += [(f"tentative {name!r}", t.slot, t.model.space) for name, t in tracks.tentative.items()]
+    owners += [(f"a hypothesis of {p.name!r}", slot, POLAR) for p in tracks.waiting() for slot in p.hypotheses]
+    for number, clone in state.clones.clones.items():
+        pose = SE2 if robots[clone.robot].motion.space.axes == 1 else SE3
+        owners.append((f"clone {number}", clone.slot, pose))
+    errors = [(name, m) for name, m in state.moving.items() if m.error is not None]
+    owners += [(f"the error of {name!r}", m.error, Rn(len(m.motion.columns))) for name, m in errors]  # type: ignore[misc]
+    return owners
+
+
+def _check_measurements(robots: Mapping[str, Robot], state: State) -> None:
+    """Refuse measurements that were not made from a clone of the map by a sensor of its robots."""
+    tracks, clones = state.tracks, state.clones
+    measured = [m for t in tracks.tentative.values() for m in t.measurements]
+    for m in (*measured, *(m for p in tracks.waiting() for m in p.measurements)):
+        if m.clone not in clones.clones or (m.robot, m.sensor) not in clones.clones[m.clone].users:
+            raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} does not fit the clones of the map")
+        if m.y.shape != (len(robots[m.robot].sensors[m.sensor].sensor.columns),):
+            raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} is {m.y.tolist()}")
+    channels = {(name, sensor) for name, robot in robots.items() for sensor in robot.sensors}
+    if not {*clones.users(), *(p.channel for p in tracks.waiting()), *tracks.candidates} <= channels:
+        raise MapError("clones or pending measurements are of sensors that there are not")
+
+
+def _count(value: Any, what: str) -> int:
+    if type(value) is not int or value < 0:
+        raise MapError(f"{what} is {value!r}, expected an integer of at least 0")
+    return value
+
+
+def _threshold(value: Any) -> float | None:
+    if value is not None and not isinstance(value, float | int):
+        raise MapError(f"reparametrize is {value!r}, expected a number or none")
+    return value
+
+
+def _time(value: Any) -> int | None:
+    if value is not None and type(value) is not int:
+        raise MapError(f"t_ns is {value!r}, expected an integer or none")
+    return value

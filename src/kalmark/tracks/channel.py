@@ -1,0 +1,271 @@
+"""A channel: a mounted sensor as the filter sees it, with an observation model for each kind of block."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import ModelError
+from kalmark.filter import corrections
+from kalmark.filter.map import AT_ONCE, Map, StochasticMap
+from kalmark.filter.neighbours import has_place
+from kalmark.models import landmarks as kinds
+from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag
+from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
+from kalmark.models.protocols import (
+    Ambiguous,
+    Checked,
+    FarCorrected,
+    FullSensor,
+    Landmark,
+    NonAdditiveSensor,
+    Segmented,
+    Sensor,
+    StartNoise,
+    UnknownDepth,
+    finds_depth,
+    range_limit,
+    sees_kinds,
+)
+from kalmark.models.sensors import RangeBearing, TagPose
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
+
+ROBOT = "robot"
+ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one model applies to
+EUCLIDEAN = ("point", "point3")
+TINY_RHO = 1e-9  # 1 / m: as good as infinitely far
+BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationModel:
+    """How a sensor on a mount `at` observes landmarks of one type."""
+
+    landmark: Landmark
+    sensor: Any
+    at: Array
+
+    @cached_property
+    def model(self) -> Any:
+        """What `linearize` takes.  Made when it is first needed: models that are built in are compiled then."""
+        return view_of(self.sensor, self.landmark, self.at)
+
+    @cached_property
+    def built_in(self) -> bool:
+        """Whether sensor and landmark are kalmark's own."""
+        return is_built_in(self.sensor, self.landmark)
+
+    @cached_property
+    def d(self) -> int:
+        """How many of the landmark's numbers are observed."""
+        return self.landmark.space.size
+
+    def predict(
+        self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
+        run = corrections.compiled_compared if isinstance(self.model, tuple) else corrections.compared
+        scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), math.inf
+        return run(self.model, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but the compiled model, whose addresses mean nothing to another process."""
+        return {name: value for name, value in self.__dict__.items() if name != "model"}
+
+
+class Channel:
+    """A sensor of a robot on its mount `at`, whose slot is `mount` (-1: not in the map), starting `landmark`s.
+
+    `threshold` gives the gate on d2 from the size of an innovation.  `polar`: another sensor starts polar points.
+    """
+
+    def __init__(
+        self, sensor: Sensor, at: Array, mount: int, landmark: Landmark, threshold: Callable[[int], float], polar: bool
+    ) -> None:
+        self.sensor: Any = sensor
+        self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
+        self.mount, self.landmark = mount, landmark
+        self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
+        self.models = self._models(polar)
+        self.kinds = frozenset(self.models)
+        self._refuse_misfit()
+        self.dof = self._dof()
+        self.gate = threshold(self.dof)
+        full, self.finds_depth = isinstance(sensor, FullSensor), finds_depth(sensor)
+        any_depth = self.finds_depth or isinstance(landmark, UnknownDepth) or landmark.kind not in EUCLIDEAN
+        self.starts_landmarks = full and any_depth
+        placed = all(has_place(model.landmark.space) for model in self.models.values())
+        self.gives_places = full and self.finds_depth and placed
+        self.is_ambiguous = isinstance(sensor, Ambiguous)
+        self.check = sensor.check if isinstance(sensor, Checked) else None
+        self.start_noise = sensor.start_noise if isinstance(sensor, StartNoise) else None
+        varies = isinstance(sensor, NonAdditiveSensor) and not sensor.additive
+        self.noise_at: Any = sensor.noise_at if varies else None  # type: ignore[attr-defined]
+        self.far: ObservationModel | None = None  # of poses, for measurements far from what is expected
+        if isinstance(sensor, FarCorrected):
+            self.far = ObservationModel(landmark, TagPose(), self.at)
+
+    def _models(self, polar: bool) -> dict[str, ObservationModel]:
+        """Return the models of all kinds of blocks that this sensor can observe: its landmarks and those like them."""
+        seen = [*(sees_kinds(self.sensor) or ())]
+        if self.landmark.kind == "polar" or (self.landmark.kind == "point" and polar):  # whichever a sensor starts
+            seen = list(dict.fromkeys([*seen, "point", "polar"]))
+        types = [BY_KIND[kind]() for kind in seen if kind != self.landmark.kind]
+        models: dict[str, ObservationModel] = {}
+        for landmark in (*types, self.landmark):
+            model = ObservationModel(landmark, self.sensor, self.at)
+            models |= {kind: model for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
+        return models
+
+    def _refuse_misfit(self) -> None:
+        """Refuse a kind of landmark that one of kalmark's own sensors does not observe."""
+        sensor, kind = type(self.sensor).__name__, self.landmark.kind
+        if isinstance(self.landmark, InverseDepth2D) and finds_depth(self.sensor):
+            raise ModelError(f"a {sensor} does not see the rays to landmarks of unknown depth, {kind}, expected point")
+        if not self.models[kind].built_in:
+            return
+        seen = sees_kinds(self.sensor)
+        if seen is not None and kind not in seen:
+            raise ModelError(f"a {sensor} does not see a landmark of the type {kind}, expected {' or '.join(seen)}")
+        if kind == "polar" and tuple(self.sensor.columns) != ("range_m", "bearing_rad"):
+            raise ModelError(f"a {sensor} does not start polar points, expected a sensor of ranges and bearings")
+        numbers = 3 if "signature" in self.sensor.columns else 4 if kind == "polar" else 2
+        if seen is None and numbers != self.landmark.space.size:
+            raise ModelError(f"a {sensor} finds {numbers} numbers, a {kind} has {self.landmark.space.size}")
+
+    def _dof(self) -> int:
+        """Return the size p of one innovation."""
+        if self.models[self.landmark.kind].built_in:
+            return int(self.sensor.noise(np.zeros((1, len(self.sensor.columns)))).shape[1])
+        return len(self.sensor.angular)
+
+    # ------------------------------------------------------------------ where it is
+    def observer(self, map_: Map, robot: int) -> Array:
+        """Return the observer block (size,): the robot's pose, then mount and parameters if they are in the map."""
+        pose = map_.mean(robot)[: len(self.at)]
+        return pose if self.mount < 0 else np.concatenate([pose, map_.mean(self.mount)])
+
+    def parts(self, map_: Map, robot: int) -> Parts:
+        """Return the blocks that the observer block is made of."""
+        pose = (robot, self.pose_dof)
+        return (pose,) if self.mount < 0 else (pose, (self.mount, len(map_.rows(self.mount))))
+
+    def split(self, observer: Array) -> tuple[Array, Array, Array]:
+        """Return pose, mount, both (3,) or (7,), and the sensor's own parameters (k,) of an observer block."""
+        size = len(self.at)
+        mount = observer[size : 2 * size] if len(observer) > size else self.at
+        return observer[:size], mount, observer[2 * size :]
+
+    def composed(self, map_: Map, robot: int) -> tuple[Array, Array, Array]:
+        """Return the sensor's pose T (3,) or (7,) in the map's frame, T_r and T_s (dof, dof)."""
+        return composed(*self.split(self.observer(map_, robot))[:2])
+
+    def pose(self, map_: Map, robot: int) -> Array:
+        """Return the sensor's pose T, (3,) or (7,), in the map's frame."""
+        return self.composed(map_, robot)[0]
+
+    def calibrated(self, map_: Map) -> Any:
+        """Return the sensor with its parameters as they are estimated."""
+        if self.mount < 0 or len(own := map_.mean(self.mount)[len(self.at) :]) == 0:
+            return self.sensor
+        return self.sensor.with_parameters(own)
+
+    # ------------------------------------------------------------------ what it observes
+    def places(self, map_: Map, robot: int, y: Array) -> Array | None:
+        """Return where measurements y (K, m) seem to come from (K, 2 or 3); None if they do not determine it."""
+        if not self.gives_places:
+            return None
+        v = self.calibrated(map_).invert(y)[0]
+        return self.landmark.from_view(self.pose(map_, robot), v)[0][:, : self.dimensions]
+
+    def in_view(
+        self, map_: Map, robot: int, model: ObservationModel, slots: list[int], extents: list[Array | None]
+    ) -> Index:
+        """Return the indices (K,) of the `slots` in view; `extents` are the segments (2, 3) of lines, or None."""
+        T, l = self.pose(map_, robot), map_.means(np.array(slots), model.d)
+        if not isinstance(model.landmark, Segmented):
+            v = model.landmark.seen_from(T, l)[0]
+            if isinstance(model.landmark, InverseDepth2D):  # a ray, as long as rho times the distance
+                v = v / np.maximum(l[:, -1:], TINY_RHO)
+            return np.flatnonzero(self.sensor.sees(v))
+        p, _ = model.landmark.endpoints(l, np.array(extents))
+        return np.flatnonzero(self.sensor.sees_segments(T, p[:, 0], p[:, 1])[0])
+
+    def noise(self, map_: Map, robot: int, model: ObservationModel, slots: Index, R: Array, own_noise: bool) -> Array:
+        """Return the noise (K, p, p) of observations of blocks: R, unless it varies with their places  [F]."""
+        if self.noise_at is None or own_noise:
+            return R
+        return self.noise_at(model.landmark.seen_from(self.pose(map_, robot), map_.means(slots, model.d))[0])
+
+    def innovations(self, map_: Map, robot: int, model: ObservationModel, slots: Index, y: Array) -> Array:
+        """Return the innovations z (K, p) of y (K, m) from the blocks `slots`."""
+        return linearize(model.model, self.observer(map_, robot), map_.means(slots, model.d), y)[1]
+
+    def predict(
+        self, map_: Map, robot: int, model: ObservationModel, slots: Index, y: Array, R: Array
+    ) -> tuple[Array, Array]:
+        """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
+        if len(slots) > AT_ONCE and len(set(slots.tolist())) > AT_ONCE:  # a joint marginal is dense
+            cuts = [slice(i, i + AT_ONCE) for i in range(0, len(slots), AT_ONCE)]
+            parts = [self.predict(map_, robot, model, slots[cut], y[cut], R[cut]) for cut in cuts]
+            return np.concatenate([Z for Z, _ in parts]), np.concatenate([d2 for _, d2 in parts])
+        return model.predict(*map_.marginal(robot, self.mount, slots), y, R)
+
+    def landmark_of(
+        self, map_: Map, robot: int, y: Array, R: Array, own_noise: bool, which: int = 0
+    ) -> tuple[Array, Array, Array]:
+        """Return the landmark l (n,) that explains a measurement y (1, m) with the noise R, L_h and Q.  [S] (32)-(35).
+
+        L_h (., 3 or more) is with respect to the observer block, Q = L_y R L_y' + prior.  Of two landmarks that explain
+        it, `which` is taken.
+        """
+        observer = self.observer(map_, robot)
+        r, mount, own = self.split(observer)
+        sensor = self.calibrated(map_)
+        v, V_y = (a[:, which] for a in sensor.both(y)[:2]) if self.is_ambiguous else sensor.invert(y)
+        l, L_r, L_s, L_y, prior = landmark_at(r, mount, self.landmark, v, V_y, self.finds_depth)
+        if self.noise_at is not None and not own_noise:
+            R = self.noise_at(self.sensor.invert(y)[0])[0]
+        if self.start_noise is not None and not own_noise:
+            R = self.start_noise(y)[0]
+        L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
+        if len(own):  # y = h(v, p) stays what it is: V_p = -V_y E_p
+            L_h = np.concatenate([L_h, -L_y[0] @ sensor.parameters_jacobian(v)[0]], axis=1)
+        return l[0], L_h, L_y[0] @ R @ L_y[0].T + prior[0]
+
+
+def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool) -> Landmark:
+    """Return the type of landmark that a sensor at `at` (3,) or (7,) starts by default.
+
+    Homogeneous points move with steps of the robot (`generator`), not with those of a mount: a mount's place that
+    cannot be observed would seem to be.
+    """
+    if "size_m" in sensor.columns or "qw" in sensor.columns:
+        return Tag()
+    if len(at) == 3:
+        if not finds_depth(sensor) and not delayed:
+            return InverseDepth2D()
+        if "signature" in sensor.columns:
+            return PointSignature2D()
+        return Polar2D() if _arcs_matter(sensor) else Point2D()
+    if "point3" not in (sees_kinds(sensor) or ("point3",)):
+        return kinds.AnchoredHomogeneousLine()
+    if finds_depth(sensor):
+        return Point3D()
+    return kinds.AnchoredHomogeneous() if calibrated else kinds.Homogeneous()
+
+
+def _arcs_matter(sensor: Sensor) -> bool:
+    """Return whether the arc of a bearing's sigma leaves its tangent by half a sigma of the range, far away."""
+    if not isinstance(sensor, RangeBearing) or np.isinf(d := range_limit(sensor)):
+        return False
+    return bool(d * sensor.sigma_bearing_rad**2 > np.sqrt(sensor.range_variance(np.array([[d]]))[0]))

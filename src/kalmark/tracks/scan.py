@@ -1,0 +1,110 @@
+"""One scan with all that it is read against.  Who is handed it reads; only `Slam` changes the map and the tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.events import Id, Scan
+from kalmark.filter.estimators import Estimator, Update
+from kalmark.filter.map import Map
+from kalmark.geometry.spaces import Space
+from kalmark.report import Report
+from kalmark.tracks.channel import Channel, ObservationModel, Parts
+from kalmark.tracks.clones import Clones, Measurement
+from kalmark.tracks.track import ChannelKey, Tracks
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+
+class Start(NamedTuple):
+    """A block to be added to the map, computed from blocks that are in it: mean, covariance G P G' + Q.  [S] (35)-(38).
+
+    The columns of G are the rows of the `parts`, one after the other.
+    """
+
+    space: Space
+    mean: Array
+    parts: Parts
+    G: Array
+    Q: Array
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all its numbers are finite."""
+        return all(bool(np.isfinite(a).all()) for a in (self.mean, self.G, self.Q))
+
+
+@dataclass(slots=True, eq=False)
+class ScanContext:
+    """A scan of K observations with their ids and noise R (K, p, p), and the state it is read against.
+
+    `robot` is the slot of the robot that observes, `report` the answer that is being made.
+    """
+
+    map: Map
+    tracks: Tracks
+    clones: Clones
+    estimator: Estimator
+    channel: Channel
+    robot: int
+    event: Scan
+    ids: tuple[Id | None, ...]
+    R: Array
+    report: Report = field(repr=False)
+
+    @property
+    def y(self) -> Array:
+        """The measurements (K, m)."""
+        return self.event.y
+
+    @property
+    def key(self) -> ChannelKey:
+        """Robot and sensor."""
+        return self.event.robot, self.event.sensor
+
+    @property
+    def own_noise(self) -> bool:
+        """Whether the scan came with its own noise."""
+        return self.event.cov is not None
+
+    @property
+    def dimensions(self) -> int:
+        """2 in the plane, 3 in space."""
+        return self.channel.dimensions
+
+    def pose(self) -> Array:
+        """Return the pose of the sensor as it is estimated now, (3,) or (7,)."""
+        return self.channel.pose(self.map, self.robot)
+
+    def noise(self, model: ObservationModel, slots: Index, rows: Index | list[int]) -> Array:
+        """Return the noise (M, p, p) of the observations `rows` if they are of the blocks `slots` (M,)."""
+        return self.channel.noise(self.map, self.robot, model, slots, self.R[rows], self.own_noise)
+
+    def predict(self, model: ObservationModel, slots: Index, rows: Index | list[int]) -> tuple[Array, Array, Array]:
+        """Return Z (M, p, p), d2 (M,) and the noise (M, p, p) of the observations `rows` of the blocks `slots` (M,)."""
+        R = self.noise(model, slots, rows)
+        return *self.channel.predict(self.map, self.robot, model, slots, self.y[rows], R), R
+
+    def update(self, model: ObservationModel, slots: Index, rows: list[int]) -> Update:
+        """Return the correction by the observations `rows` of the blocks `slots` (K,)."""
+        y, R = (self.y, self.R) if len(rows) == len(self.y) else (self.y[rows], self.R[rows])
+        R = self.channel.noise(self.map, self.robot, model, slots, R, self.own_noise)
+        return Update(model.model, self.robot, self.channel.mount, slots, model.d, y, R, self.channel.gate)
+
+    def start_of(self, k: int, which: int = 0) -> Start:
+        """Return the landmark that explains the k-th observation; of two that do, `which`."""
+        R = self.R[k]
+        if self.event.cov is not None and self.channel.start_noise is not None:
+            R = np.broadcast_to(self.event.cov, (len(self.y), *self.event.cov.shape[-2:]))[k]
+        l, L_h, Q = self.channel.landmark_of(self.map, self.robot, self.y[k : k + 1], R, self.own_noise, which)
+        G = self.estimator.pose_jacobian(self.map, self.robot, L_h)
+        return Start(self.channel.landmark.space, l, self.channel.parts(self.map, self.robot), G, Q)
+
+    def measurement(self, k: int, clone: int) -> Measurement:
+        """Return the k-th observation as made from a cloned pose."""
+        return Measurement(clone, self.event.t_ns, *self.key, k, self.y[k], self.R[k], self.own_noise)

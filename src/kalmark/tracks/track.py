@@ -1,0 +1,277 @@
+"""One record a landmark: everything that is known of it beside its Gaussian, and the names of all blocks of the map."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kalmark.errors import MapError
+from kalmark.events import Id
+from kalmark.models.protocols import Landmark, Segmented
+from kalmark.report import Observation
+from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
+from kalmark.tracks.clones import Measurement
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan
+ChannelKey = tuple[str, str]  # robot, sensor
+
+FORGETTING = 0.9  # factor by which what was learnt counts less from one scan to the next
+RECENT = 12  # landmarks observed most recently, beside those of the last scan
+
+
+class Status(Enum):
+    """How far a landmark has come: no block yet, a block that corrects nothing, or a landmark of the map."""
+
+    PENDING = "pending"
+    TENTATIVE = "tentative"
+    CONFIRMED = "confirmed"
+
+
+@dataclass(frozen=True, eq=False)
+class Pending:
+    """Measurements from cloned poses that may be of one landmark, until a test of an initialiser passes.
+
+    `mean` and `cov` are its Gaussian in the frame of the sensor of the first measurement, `missed` counts the cloned
+    poses in a row from which it was in view and not observed ([T] 2).  Of ranges, none is kept nearer to the one before
+    than `spacing_m`.  `hypotheses` are slots of blocks, with the logarithms of their weights after `used` measurements.
+    `poses` (2, 7) are those that a tag may have, the first better by the chi-square `evidence`, as of the time `t_ns`.
+    """
+
+    channel: ChannelKey
+    name: Id | None = None
+    measurements: tuple[Measurement, ...] = ()
+    mean: Array | None = None
+    cov: Array | None = None
+    missed: int = 0
+    spacing_m: float = 0.0
+    hypotheses: tuple[int, ...] = ()
+    log_weights: tuple[float, ...] = ()
+    used: int = 0
+    poses: Array | None = None
+    evidence: float = 0.0
+    t_ns: int = 0
+
+
+@dataclass
+class Track:
+    """What is known of one landmark.
+
+    `slot` is its block, -1 while it has none.  `observations` counts those that were used.  `searched` and `found`
+    count the scans in which it was expected and observed; `hits` of `chances` are these of a tentative one, `unseen`
+    the scans since it was last observed.  `log_odds` of its existence (None: never judged), `missed` scans in a row
+    without it where it should be in view.  `covisible` landmarks were observed in one scan with it.  `compared` says
+    after how many observations, and after how many changes of the map, it was last compared with others.  `extent`
+    (2,) are the abscissas of the segment observed of a line.  `first` is the observation that started it, and
+    `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
+    """
+
+    id: Id
+    model: Landmark
+    slot: int = -1
+    status: Status = Status.CONFIRMED
+    observations: int = 0
+    searched: int = 1
+    found: int = 1
+    hits: int = 1
+    chances: int = 1
+    unseen: int = -1
+    log_odds: float | None = None
+    missed: int = 0
+    covisible: set[Id] = field(default_factory=set)
+    compared: tuple[int, int] = (0, -1)
+    extent: Array | None = None
+    first: Late | None = None
+    pending: Pending | None = None
+    measurements: list[Measurement] = field(default_factory=list)
+
+
+def _looks_invented(name: Id) -> bool:
+    return type(name) is str and name[:1] == "u" and name[1:].isdecimal()
+
+
+class Tracks:
+    """The tracks by status, and the names, slots and kinds of all blocks of the map.
+
+    `slots` has robots, mounts and biases, too; `names` are the landmarks by slot.  `sorts` has the words by which a
+    `Channel` finds its observation models: a landmark's kind, or ROBOT.  `recent` are the landmarks observed last,
+    `last_scan` those of the last scan; `changes` counts landmarks that have come or gone.  `candidates` are pending
+    measurements without a landmark, by channel.  `reserved` are ids of the log or of a survey that look like invented
+    names: u1, u2, ...  `experience` counts observations without ids that were of landmarks of the map, and were not.
+    """
+
+    def __init__(self, robots: Iterable[str]) -> None:
+        self.robots = tuple(robots)
+        self.confirmed: dict[Id, Track] = {}
+        self.tentative: dict[Id, Track] = {}
+        self.pending: dict[Id, Track] = {}
+        self.candidates: dict[ChannelKey, list[Pending]] = {}
+        self.slots: dict[Id, int] = {}
+        self.names: dict[int, Id] = {}
+        self.sorts: dict[Id, str] = {}
+        self.recent: list[Id] = []
+        self.last_scan: list[Id] = []
+        self.changes = 0
+        self.unnamed = 0
+        self.reserved: set[Id] = set()
+        self.experience = (0.0, 0.0)
+        self._sort_at: Index = np.full(64, -1)  # by slot: the number of a landmark's kind in `_numbers`, -1 for none
+        self._numbers: dict[str, int] = {}
+        self._wanted: dict[frozenset[str], Flags] = {}
+
+    # ------------------------------------------------------------------ blocks
+    def enter_block(self, name: str, slot: int, *, robot: bool = False) -> None:
+        """Enter a robot, a mount or a bias."""
+        self.slots[name] = slot
+        if robot:
+            self.sorts[name] = ROBOT
+
+    def slot(self, name: Id) -> int:
+        """Return the slot of a block.  Raises MapError if there is none of that name."""
+        slot = self.slots.get(name) if isinstance(name, Hashable) else None
+        if slot is None:
+            robots, count = ", ".join(map(repr, self.robots)), len(self.confirmed)
+            raise MapError(f"{name!r} is not in the map, expected {robots} or one of its {count} landmarks")
+        return slot
+
+    def slots_of(self, names: Sequence[Any]) -> Index:
+        """Return the slots (K,) of blocks that are in the map."""
+        return np.fromiter(map(self.slots.__getitem__, names), np.int64, len(names))
+
+    # ------------------------------------------------------------------ landmarks
+    def confirm(self, track: Track, observations: int = 1) -> None:
+        """Make a landmark of the map of a track that has a block."""
+        track.status, track.observations = Status.CONFIRMED, observations
+        if isinstance(track.model, Segmented) and track.extent is None:
+            track.extent = np.array(track.model.first_ends)
+        self.enter(track)
+
+    def enter(self, track: Track) -> None:
+        """Enter a landmark of the map under its slot and its kind."""
+        name, slot, kind = track.id, track.slot, track.model.kind
+        self.confirmed[name], self.slots[name], self.names[slot], self.sorts[name] = track, slot, name, kind
+        self._reach(slot)
+        self.changes += 1
+        self._sort_at[slot] = self._numbers.setdefault(kind, len(self._numbers))
+
+    def replace(self, track: Track, slot: int, model: Landmark) -> None:
+        """Give a landmark another block and another model."""
+        self._leave(track)
+        track.slot, track.model = slot, model
+        self.enter(track)
+
+    def remove(self, name: Id) -> None:
+        """Strike out a landmark."""
+        track = self.confirmed.pop(name)
+        self._leave(track)
+        del self.slots[name], self.sorts[name]
+        self.changes += 1
+        self.last_scan = []
+        for other in track.covisible:
+            if other in self.confirmed:
+                self.confirmed[other].covisible.discard(name)
+
+    def merge(self, kept: Track, gone: Track) -> None:
+        """Let one track have what is known of another, which is to be removed: they are one landmark."""
+        kept.observations += gone.observations
+        for name in list(gone.covisible):
+            if name in self.confirmed:
+                self.confirmed[name].covisible.add(kept.id)
+        kept.covisible |= gone.covisible
+
+    def count(self, observations: Iterable[Observation]) -> None:
+        """Count the observations that were used, each at its landmark; those of robots are not counted."""
+        for seen in observations:
+            if seen.outcome == "associated" and (track := self.confirmed.get(seen.landmark)):  # type: ignore[arg-type]
+                track.observations += 1
+
+    def note_scan(self, names: list[Id]) -> None:
+        """Note the landmarks that were observed in one scan: they are covisible, and so different ones."""
+        if names != self.last_scan:
+            for name in names:
+                self.confirmed[name].covisible.update(names)
+            self.recent = [name for name in self.recent if name not in names][-RECENT:] + names
+            self.last_scan = names
+
+    def learn(self, known: float, unknown: float) -> None:
+        """Remember how much of a scan was in the map, the less so the longer ago."""
+        if known + unknown > 0:
+            self.experience = FORGETTING * self.experience[0] + known, FORGETTING * self.experience[1] + unknown
+
+    def waiting(self) -> Iterator[Pending]:
+        """Return all that is pending: of landmarks with ids, and candidates."""
+        yield from (track.pending for track in self.pending.values() if track.pending is not None)
+        for candidates in self.candidates.values():
+            yield from candidates
+
+    def _leave(self, track: Track) -> None:
+        if self.names.pop(track.slot, None) is not None:
+            self._sort_at[track.slot] = -1
+
+    # ------------------------------------------------------------------ names
+    def new_name(self) -> str:
+        """Return a name for a landmark that has none: u1, u2, ..."""
+        while True:
+            self.unnamed += 1
+            name = f"u{self.unnamed}"
+            if name not in self.slots and name not in self.tentative and name not in self.reserved:
+                return name
+
+    def reserve(self, ids: Iterable[Id | None]) -> None:
+        """Keep in mind that names were given by the log or a survey, so that they are not invented."""
+        self.reserved.update(name for name in ids if name is not None and _looks_invented(name))
+
+    def rename_tentative(self, ids: Iterable[Id | None]) -> None:
+        """Give other names to tentative landmarks whose name the log, or a survey, gives to another one."""
+        for name in [name for name in self.tentative if name in self.slots or name in ids]:
+            track = self.tentative.pop(name)
+            track.id = self.new_name()
+            self.tentative[track.id] = track
+
+    def is_invented(self, name: Id) -> bool:
+        """Return whether a landmark's name was invented, for want of an id."""
+        return _looks_invented(name) and name not in self.reserved
+
+    # ------------------------------------------------------------------ by channel
+    def sorts_of(self, kinds: frozenset[str], count: int) -> tuple[Index, Flags]:
+        """Return the sort (count or more,) of the landmark on each slot, and which sorts (S + 1,) are of some kinds.
+
+        The last of both are of no landmark, so that a slot or a sort of -1 is none.
+        """
+        self._reach(count)
+        wanted = self._wanted.get(kinds)
+        if wanted is None or len(wanted) <= len(self._numbers):
+            wanted = self._wanted[kinds] = np.array([*(sort in kinds for sort in self._numbers), False])
+        return self._sort_at, wanted
+
+    def _reach(self, slot: int) -> None:
+        while slot + 1 >= len(self._sort_at):
+            self._sort_at = np.concatenate([self._sort_at, np.full(len(self._sort_at), -1)])
+
+    def observable(self, channel: Channel) -> list[Id]:
+        """Return the landmarks of the kinds that a sensor can observe."""
+        return [name for name, track in self.confirmed.items() if track.model.kind in channel.models]
+
+    def known_to(self, channel: Channel, robot: str, names: Sequence[Any]) -> list[int]:
+        """Return the indices of those names that a sensor of this robot can observe in the map."""
+        sorts = list(map(self.sorts.get, names))
+        if channel.models.keys() >= set(sorts) and robot not in names:
+            return list(range(len(names)))
+        return [i for i, sort in enumerate(sorts) if sort in channel.models and names[i] != robot]
+
+    def by_model(self, channel: Channel, names: Sequence[Id]) -> list[tuple[ObservationModel, list[int]]]:
+        """Return the indices of names grouped by observation model, points of known depth first."""
+        sorts = list(map(self.sorts.__getitem__, names))
+        if len(set(sorts)) == 1:
+            return [(channel.models[sorts[0]], list(range(len(names))))]
+        groups: dict[int, tuple[ObservationModel, list[int]]] = {}
+        for i, model in enumerate(channel.models[sort] for sort in sorts):
+            groups.setdefault(id(model), (model, []))[1].append(i)
+        return sorted(groups.values(), key=lambda group: group[0].landmark.kind not in EUCLIDEAN)

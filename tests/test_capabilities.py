@@ -1,0 +1,75 @@
+"""Where landmarks are, and names of capabilities that are misspelt."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kalmark.errors import ModelError
+from kalmark.geometry.spaces import HEADING, RHO, VECTOR, Space
+from kalmark.models import landmarks
+from kalmark.models.pointwise import jacobian
+from kalmark.models.protocols import place_of
+from kalmark.models.sensors import RangeBearing
+from kalmark.slam.robot import Mount
+
+
+@pytest.mark.parametrize("kind", landmarks.BUILT_IN, ids=lambda kind: kind.__name__)
+def test_the_jacobian_of_a_place_is_that_of_differences(kind: Any) -> None:
+    rng = np.random.default_rng(3)
+    model = kind()
+    space = model.space
+    for _ in range(20):
+        l = space.plus(
+            np.zeros(space.size) + (np.arange(space.size) == 6) * (kind is landmarks.Tag), rng.normal(size=space.dof)
+        )
+        p, P_l = model.place(l[None])
+        assert p.shape == (1, 2 if space.world == "plane" else 3)
+        expected = jacobian(lambda d: model.place(space.plus(l, d)[None])[0][0], np.zeros(space.dof))
+        np.testing.assert_allclose(P_l[0], expected, rtol=1e-4, atol=1e-4 * (1 + np.abs(expected).max()))
+
+
+def test_a_line_is_at_its_point_nearest_to_the_anchor() -> None:
+    rng = np.random.default_rng(4)
+    for kind in landmarks.LINES:
+        line = kind()
+        l = rng.normal(size=(5, line.space.size))
+        p, _ = line.place(l)
+        ends, _ = line.endpoints(l, np.tile([0.0, 1.0], (5, 1)))
+        along = ends[:, 1] - ends[:, 0]
+        off = p - (l[:, :3] if line.anchored else 0.0)
+        np.testing.assert_allclose(np.sum(along * off, axis=1), 0.0, atol=1e-7 * np.abs(along).max() ** 2)
+
+
+class _Post:
+    kind, space = "post", Space("post", (VECTOR, HEADING))
+
+    def seen_from(self, T: Any, l: Any) -> Any: ...
+    def from_view(self, T: Any, v: Any) -> Any: ...
+
+
+def test_a_users_landmark_is_at_the_vector_it_begins_with() -> None:
+    placed = place_of(_Post(), np.array([[1.0, 2.0, 0.5]]))
+    assert placed is not None
+    assert placed[0].tolist() == [[1.0, 2.0]]
+    assert placed[1].tolist() == [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]
+    anchored = _Post()
+    anchored.space = Space("anchored", (VECTOR, HEADING, RHO))
+    assert place_of(anchored, np.ones((1, 4))) is None
+
+
+def test_a_misspelt_capability_is_refused_with_both_names() -> None:
+    class Short(RangeBearing):
+        def see(self, v: Any) -> Any: ...
+
+    class Deaf:
+        columns, angular, find_depth = ("y",), (False,), False
+
+        def expect(self, v: Any) -> Any: ...
+        def noise(self, y: Any) -> Any: ...
+
+    Mount(Short())  # it has `sees`, by inheritance
+    with pytest.raises(ModelError, match="Deaf has 'find_depth', expected 'finds_depth'"):
+        Mount(Deaf())
