@@ -214,7 +214,7 @@ class StochasticMap(Layout):
             size = next_capacity(len(self.P))
             self._next = np.zeros((size, size))
             self.prefault.add(self._next, 0, size * size)
-        return self.prefault.some()
+        return self.prefault.some() if self.prefault.waiting else 0
 
     # ------------------------------------------------------------------ moving
     def predict(self, index: Index, F: Array, Q: Array) -> None:

@@ -14,24 +14,24 @@ BIT, PAGE = 1 << 21, 4096  # bytes to touch at once, a large page of memory, and
 
 
 class Prefault:
-    """Parts of arrays to touch in the order in which they will be needed, as long as their owner keeps them."""
+    """Parts of arrays, `waiting` to be touched in the order in which they will be needed, as long as they are kept."""
 
     def __init__(self) -> None:
-        self._waiting: deque[tuple[ref[Numbers], int, int]] = deque()
+        self.waiting: deque[tuple[ref[Numbers], int, int]] = deque()
 
     def add(self, array: Numbers, first: int, last: int) -> None:
         """Add the numbers first..last of a contiguous array (N,); their values stay."""
-        self._waiting.append((ref(array), first, last))
+        self.waiting.append((ref(array), first, last))
 
     def clear(self) -> None:
         """Drop all that is left to touch."""
-        self._waiting.clear()
+        self.waiting.clear()
 
     def some(self) -> int:
         """Touch the next bit of memory; return its size in bytes."""
-        if not self._waiting:
+        if not self.waiting:
             return 0
-        kept, first, last = self._waiting.popleft()
+        kept, first, last = self.waiting.popleft()
         array = kept()
         if array is None:
             return 0
@@ -39,5 +39,5 @@ class Prefault:
         here = array.reshape(-1)[first : end : PAGE // array.itemsize]
         here[:] = here.copy()
         if end < last:
-            self._waiting.appendleft((kept, end, last))
+            self.waiting.appendleft((kept, end, last))
         return (end - first) * int(array.itemsize)
