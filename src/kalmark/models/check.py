@@ -1,7 +1,7 @@
 """Check a model of one's own: its shapes, and its Jacobians against central differences.
 
-Differences are taken in the error coordinates of the spaces: of a robot's state, a landmark, a pose.  Those of angles
-are wrapped: a difference near a multiple of 2 pi over so small a step is a wrap.
+Differences are in the error coordinates of the spaces: of a robot's state, a landmark, a pose, a measurement.  Two
+steps must agree on one; where they do not (the border of a domain, a wrap, a pole), it is not compared.
 """
 
 from __future__ import annotations
@@ -10,44 +10,35 @@ import inspect
 import itertools
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+import kalmark.models.landmarks  # noqa: F401 - registers the kinds that sensors see
 from kalmark.declare import classes
 from kalmark.errors import ModelError
-from kalmark.geometry.spaces import HOMOGENEOUS, RHO, ROTATION, SE2, SE3, TURNED, Rn, Space
-from kalmark.models.protocols import (
-    Calibrated,
-    Completing,
-    Landmark,
-    Motion,
-    Placed,
-    Reparametrizable,
-    Segmented,
-    SegmentVisible,
-    Sensor,
-    UnknownDepth,
-    bias_covariance,
-    finds_depth,
-    sees_kinds,
-)
+from kalmark.geometry.spaces import ANGLE, HOMOGENEOUS, RHO, ROTATION, SCALAR, SE2, SE3, TURNED, Rn, Space
+from kalmark.models import protocols
 from kalmark.models.sensors3d import Spatial
 
 Array = npt.NDArray[np.float64]
 Rng = np.random.Generator
+Batch = Callable[[Array], Any]
 
 TOLERANCE = 1e-5
+STEP = np.cbrt(np.finfo(float).eps)
 DRAWS = 200
 BATCH = 10
 LARGEST = 13  # numbers of an argument of a plain function
+FACING = np.array([0.0, 0.0, 1.0, np.cos(0.3), 0.0, 0.0, -np.sin(0.3)])  # tilted: no tag like its mirror image
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found: the largest difference, relative to 1 + the value, and where it was."""
+    """The result of one check: the largest difference, relative to 1 + the value, and where it was."""
 
     what: str
     error: float
@@ -59,336 +50,240 @@ class Finding:
         return self.error <= TOLERANCE
 
 
-@runtime_checkable
-class _Moves(Protocol):
-    def move(self, r: Array, u: Array, dt_s: float) -> Any: ...
-
-
-@runtime_checkable
-class _Expects(Protocol):
-    def expect(self, v: Array) -> Any: ...
-
-
-@runtime_checkable
-class _Seen(Protocol):
-    def seen_from(self, T: Array, l: Array) -> Any: ...
-
-
-@runtime_checkable
-class _Inverts(Protocol):
-    def invert(self, y: Array) -> Any: ...
-
-
-@runtime_checkable
-class _Starts(Protocol):
-    def from_view(self, T: Array, v: Array) -> Any: ...
-
-
 def check_model(model: Any, rng: Rng) -> list[Finding]:
-    """Return one finding for each thing that a motion, sensor or landmark model, or a function, promises.
+    """Return one finding for each promise of a motion, sensor or landmark model, or of a function.
 
     A function f(x, ...) returns a value and its Jacobians in its arguments, in their order.  Raises ModelError if it is
     none of these, or returns the wrong shapes.
     """
-    roles: Any = ((_Moves, Motion, _motion), (_Expects, Sensor, _sensor), (_Seen, Landmark, _landmark))
+    found, offered, name = _Findings(), dir(model), type(model).__name__
+    roles: Any = (
+        ("move", protocols.Motion, _motion),
+        ("expect", protocols.Sensor, _sensor),
+        ("seen_from", protocols.Landmark, _landmark),
+    )
+    protocol, check = next((rest for method, *rest in roles if method in offered), (None, _function))
+    if protocol is None and not callable(model):
+        raise ModelError(f"{name}: expected a function, or a model with one of the methods move, expect and seen_from")
+    needed = {each for each in vars(protocol or object) if not each.startswith("_")} - {"from_view"}
+    if missing := sorted(needed - {*offered}):
+        raise ModelError(f"{name} has no {', '.join(missing)}")
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        for method, protocol, check in roles:
-            if isinstance(model, method):
-                missing = sorted(name for name in _required(protocol, check) if name not in dir(model))
-                if missing:
-                    raise ModelError(f"{type(model).__name__} has no {', '.join(missing)}")
-                return check(model, rng)
-        if callable(model):
-            return _function(model, rng)
-    name = type(model).__name__
-    raise ModelError(f"{name}: expected a function, or a model with one of the methods move, expect and seen_from")
-
-
-def _required(protocol: Any, check: Any) -> list[str]:
-    """Return what a model must have to be looked at; a landmark need not start."""
-    return [name for name in vars(protocol) if not name.startswith("_") and (check, name) != (_landmark, "from_view")]
+        check(model, rng, found)
+    return [*found.worst.values()]
 
 
 # ------------------------------------------------------------------ motions
-def _motion(model: Any, rng: Rng) -> list[Finding]:
-    k, space, worst = len(model.columns), model.space, _Worst()
-    for draw in range(DRAWS):
-        r = _drawn(space, rng)
-        u = rng.normal(0, 1, k) * 10.0 ** rng.uniform(-6, 0.3) * (draw > 0)
-        u[rng.uniform(size=k) < 0.2] = 0.0
-        dt_s = float(rng.uniform(0.01, 2))
-        where = f"r = {_show(r)}, u = {_show(u)}, dt_s = {dt_s:.3g}"
-        moved, R_r, R_u = model.move(r, u, dt_s)
-        _shape("move", "state", moved, (space.size,))
-        _shape("move", "R_r", R_r, (space.dof, space.dof))
-        _shape("move", "R_u", R_u, (space.dof, k))
-        worst.add("R_r", R_r, _differences(lambda x: model.move(x, u, dt_s)[0], r, space, space), where)  # noqa: B023
-        worst.add("R_u", R_u, _differences(lambda x: model.move(r, x, dt_s)[0], u, Rn(k), space), where)  # noqa: B023
-        worst.covariance("control_noise", model.control_noise(u), k, where)
-        diffusion = model.diffusion(u, dt_s)
-        if diffusion is not None:
-            worst.covariance("diffusion", diffusion, space.dof, where)
-    bias = bias_covariance(model)
-    if bias is not None:
-        worst.covariance("bias_cov", bias, k, "the model")
-    return worst.findings()
+def _motion(model: Any, rng: Rng, found: _Findings) -> None:
+    k, space = len(model.columns), model.space
+    r = np.array([_drawn(space, rng) for _ in range(DRAWS)])
+    u = rng.normal(0, 1, (DRAWS, k)) * 10.0 ** rng.uniform(-6, 0.3, (DRAWS, 1))
+    u[rng.uniform(size=u.shape) < 0.2] = 0.0
+    u[0] = 0.0
+    dt_s = rng.uniform(0.01, 2, DRAWS).tolist()
+    at = {"r": r, "u": u, "dt_s": dt_s}
+
+    def move(r: Array, u: Array) -> list[Array]:
+        return [np.array(each) for each in zip(*map(model.move, r, u, dt_s), strict=True)]
+
+    state, R_r, R_u = move(r, u)
+    _shape("state of move", state, (DRAWS, space.size))
+    R_r[~np.isfinite(state).all(axis=1)] = np.nan
+    found.jacobian("R_r", R_r, lambda x: move(x, u)[0], r, space, space, at)
+    found.jacobian("R_u", R_u, lambda x: move(r, x)[0], u, Rn(k), space, at)
+    found.covariance("control_noise", [*map(model.control_noise, u)], k, at)
+    diffusion = [D for D in map(model.diffusion, u, dt_s) if D is not None]
+    if diffusion:
+        found.covariance("diffusion", diffusion, space.dof if space.world == "space" else SE2.dof, at)
+    if (bias := protocols.bias_covariance(model)) is not None:
+        found.covariance("bias_cov", [bias], k, {})
 
 
 # ------------------------------------------------------------------ sensors
-def _sensor(model: Any, rng: Rng) -> list[Finding]:
-    m = len(model.columns)
+def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
+    m, spatial = len(model.columns), isinstance(model, Spatial)
     if len(model.angular) != m:
         raise ModelError(f"angular has {len(model.angular)} entries for {m} columns, expected one each")
+    plain = Space("y", tuple(ANGLE if angle else SCALAR for angle in model.angular))
+    measured = SE3 if "qw" in model.columns else plain
     v, view = _views(model, rng)
-    worst, p = _Worst(), m
-    if isinstance(model, Spatial):  # its innovation is not always y - e
-        y, p = _innovations(model, v, view, rng, worst)
-    else:
-        y, E_v = model.expect(v)
-        _shape("expect", "e", y, (len(v), m))
-        _shape("expect", "E_v", E_v, (len(v), m, view.dof))
-        for one, at in zip(E_v, v, strict=True):
-            worst.add("E_v", one, _differences(lambda x: model.expect(x[None])[0][0], at, view, Rn(m)), _at("v", at))
-    if isinstance(model, _Inverts):
-        y = _inverse(model, y, view, p, worst)
-    R = model.noise(y)
-    _shape("noise", "R", R, (len(y), p, p))
-    for one, at in zip(R, y, strict=True):
-        worst.covariance("noise", one, p, _at("y", at))
-    if isinstance(model, Calibrated):
-        E_p = model.parameters_jacobian(v)
-        for one, at in zip(E_p, v, strict=True):
-            changed = _differences(
-                lambda x: model.with_parameters(x).expect(at[None])[0][0],  # noqa: B023
-                model.parameters, Rn(len(model.parameters)), Rn(m),
-            )  # fmt: skip
-            worst.add("E_p", one, changed, _at("v", at))
-    return worst.findings()
+    y = np.tile([0.3 * (name == "size_m") for name in model.columns], (len(v), 1))
+    e, E_v = _expect(model, v, y)
+    _shape("e of expect", e, (len(v), m))
+    lines = isinstance(model, protocols.SegmentVisible)  # what is measured of a line lies anywhere on it
+    y = rng.uniform(0, [*model.image, *model.image], (len(v), m)) if lines else e
+    E_v = _expect(model, v, y)[1] if spatial else E_v
+    kept = _finite("e of expect", y, v)
+    v, y, E_v = v[kept], y[kept], E_v[kept]
+    p = E_v.shape[1] if spatial else m
+    found.jacobian("E_v", E_v, lambda x: _changing(model, x, y), v, view, Rn(p) if spatial else measured, {"v": v})
+    found.covariance("noise", model.noise(y), p, {"y": y})
+    if isinstance(model, protocols.NonAdditiveSensor) and not model.additive:
+        found.covariance("noise_at", model.noise_at(v), p, {"v": v})
+    if "invert" in dir(model):
+        _inverse(model, y, view, measured, found)
+    if isinstance(model, protocols.Calibrated):
+        a = np.tile(model.parameters, (len(v), 1))
+        own = Rn(a.shape[1])
+        E_p, of = model.parameters_jacobian(v), lambda x: _expect(model.with_parameters(x[0]), v, y)[0]
+        found.jacobian("E_p", E_p, of, a, own, measured, {"v": v})
 
 
-def _innovations(model: Any, v: Array, view: Space, rng: Rng, worst: _Worst) -> tuple[Array, int]:
-    """Check how the innovations of kalmark's own sensors of space change with the views; return measurements."""
-    y = np.zeros((len(v), len(model.columns)))
-    if model.columns[-1] == "size_m":
-        y[:, -1] = 0.3
-    lines = isinstance(model, SegmentVisible)  # what is measured of a line lies anywhere on it
-    y = rng.uniform(0, [*model.image, *model.image], (DRAWS, 4)) if lines else model.expect(v, y)[0]
-    E_v = model.expect(v, y)[1]
-    angular, par = np.array(model.angular, dtype=np.bool_), np.array(model.parameters)
-    for one, at, given in zip(E_v, v, y, strict=True):
-
-        def innovation(x: Array, given: Array = given) -> Array:
-            z = type(model).expected(model.code, par, angular, np.ascontiguousarray(x)[None], given[None])[1]
-            return np.asarray(z[0])
-
-        worst.add("E_v", one, -_differences(innovation, at, view, Rn(E_v.shape[1])), _at("v", at))
-    return y, E_v.shape[1]
+def _expect(model: Any, v: Array, y: Array) -> tuple[Array, Array]:
+    e, E_v = model.expect(v, y) if isinstance(model, Spatial) else model.expect(v)
+    return np.asarray(e, dtype=np.float64), np.asarray(E_v, dtype=np.float64)
 
 
-def _inverse(model: Any, y: Array, view: Space, p: int, worst: _Worst) -> Array:
-    """Check what a sensor starts landmarks by; return the measurements that can be inverted."""
-    measured = SE3 if "qw" in model.columns else Rn(y.shape[1])
-    y = _inside(model.invert, y[:BATCH] if model.columns[-1] == "size_m" else y, measured)  # tags are iterated
+def _changing(model: Any, v: Array, y: Array) -> Any:
+    """Return what E_v is the Jacobian of: e, or -z of kalmark's sensors of space, whose z is not always y - e."""
+    if not isinstance(model, Spatial):
+        return model.expect(v)[0]
+    angular = np.array(model.angular, dtype=np.bool_)
+    return -type(model).expected(model.code, np.array(model.parameters), angular, np.ascontiguousarray(v), y)[1]
+
+
+def _inverse(model: Any, y: Array, view: Space, measured: Space, found: _Findings) -> None:
+    """Check what a sensor starts landmarks from: a view, a ray or the two rays of a line."""
+    sized = model.columns[-1] == "size_m"  # a tag, found by iterations; its size has no error
     back, V_y = model.invert(y)
-    d, k = view.size, back.shape[1]
-    if k not in ((d,) if finds_depth(model) else (d, d - 1, 2 * d)):
-        raise ModelError(f"invert: v has shape {back.shape}, expected {(len(y), d)}")
-    started, errors = view if k == d else Rn(k), p if model.columns[-1] == "size_m" else measured.dof
-    _shape("invert", "V_y", V_y, (len(y), started.dof, errors))
-    for one, at in zip(V_y, y, strict=True):
-        differences = _differences(lambda x: model.invert(x[None])[0][0], at, measured, started)
-        worst.add("V_y", one, differences[:, :errors], _at("y", at))
-    if k == 2 * d:
-        return y
-    if k == d - 1:  # a ray, at any distance
-        back = np.column_stack([back, np.ones(len(back))])
-    again = model.expect(back, y)[0] if isinstance(model, Spatial) else model.expect(back)[0]
-    error = np.array([measured.minus(one, other) for one, other in zip(again, y, strict=True)])
-    worst.add("expect(invert(y)) = y", _unwrapped(error), np.zeros_like(error), "all draws")
-    return y
+    d, k, n = view.size, np.shape(back)[1], y.shape[1] - sized
+    if k not in ((d,) if protocols.finds_depth(model) else (d, d - 1, 2 * d)):
+        raise ModelError(f"v of invert has shape {np.shape(back)}, expected {(len(y), d)}")
+    kept = np.flatnonzero(_finite("v of invert", back, y))[: BATCH if sized else None]
+    y, back, V_y = y[kept], back[kept], V_y[kept]
 
+    def inverted(x: Array) -> Array:
+        rows = np.full((len(x), k), np.nan)
+        for row, one, whole in zip(rows, x, y, strict=True):
+            with suppress(ValueError, ArithmeticError):  # refused, beyond the border of what can be measured
+                row[:] = model.invert(np.append(one, whole[n:])[None])[0][0]
+        return rows
 
-def _inside(invert: Callable[[Array], tuple[Array, Array]], y: Array, space: Space) -> Array:
-    """Return the measurements that can be inverted all around, too; all of them if there are none.
-
-    On the border of what a sensor can measure (a sine of 1) the differences would leave it.
-    """
-    steps = 1e-4 * np.vstack([np.eye(space.dof), -np.eye(space.dof)])
-    around = [np.array([space.plus(one, step * (1 + np.abs(one[: space.dof]))) for step in steps]) for one in y]
-    kept = [one for one, near in zip(y, around, strict=True) if _finite(invert, np.vstack([one[None], near]))]
-    return np.array(kept) if kept else y
-
-
-def _finite(invert: Callable[[Array], tuple[Array, Array]], y: Array) -> bool:
-    try:
-        return bool(np.isfinite(invert(y)[0]).all())
-    except (ValueError, ArithmeticError):
-        return False
+    of, to = Rn(n) if sized else measured, view if k == d else Rn(k)
+    found.jacobian("V_y", V_y, inverted, y[:, :n], of, to, {"y": y})
+    if k != 2 * d:
+        whole = np.column_stack([back, np.ones(len(back))]) if k == d - 1 else back  # a ray, at any distance
+        found.same("expect(invert(y)) = y", _expect(model, whole, y)[0], y, measured, {"y": y})
 
 
 def _views(model: Any, rng: Rng) -> tuple[Array, Space]:
-    """Return views (DRAWS, d) that a sensor can have, and their space."""
-    d, in_image = _size_of_view(model, rng), model.columns[0].endswith("_px")
-    v = rng.normal(0, 1, (DRAWS, d)) * 10.0 ** rng.uniform(-1, 1, (DRAWS, 1))
+    """Return views (K, d) that a sensor can have, and their space."""
+    d = _size_of_view(model, rng)
     if d == SE3.size:
-        v = np.array([SE3.plus(FACING, rng.normal(0, 0.1, 6)) for _ in range(DRAWS)])
-        v[:, 2] += 1.0  # a tag that faces a camera
-    elif in_image and not isinstance(model, SegmentVisible):
-        depth = 10.0 ** rng.uniform(-0.5, 1, (DRAWS, 1))
-        rho = rng.uniform(0.01, 1, (DRAWS, d - 3))
-        v = np.column_stack([depth * rng.uniform(-0.4, 0.4, (DRAWS, 2)), depth, rho])
-    return v, SE3 if d == SE3.size else Rn(d)
+        return np.array([SE3.plus(FACING, rng.normal(0, 0.1, 6)) for _ in range(DRAWS)]), SE3
+    v = rng.normal(0, 1, (20 * DRAWS, d)) * 10.0 ** rng.uniform(-1, 1, (20 * DRAWS, 1))
+    if protocols.image_size(model) is not None or model.columns[0].endswith("_px"):  # about the middle of the image
+        v[:, :2], v[:, 2] = rng.uniform(-0.4, 0.4, (len(v), 2)), 1.0
+        v[:, :3] *= 10.0 ** rng.uniform(-0.5, 1, (len(v), 1))
+    if d == 4:
+        v[:, 3] = rng.uniform(0.01, 1, len(v))  # an inverse distance
+    seen = v[model.sees(v)] if isinstance(model, protocols.Visible) and "sees_segments" not in dir(model) else v
+    return (seen if len(seen) else v)[:DRAWS], Rn(d)
 
 
 def _size_of_view(model: Any, rng: Rng) -> int:
     """Return how many numbers a view has: those of a landmark the sensor names, else what it takes and gives back."""
-    kinds = sees_kinds(model) or ()
-    seen = [own() for models in classes("landmark").values() for own in models if own().kind in kinds]
-    if seen:
-        T = SE3_ORIGIN if seen[-1].space.world == "space" else np.zeros(3)
-        return int(seen[-1].seen_from(T, _drawn(seen[-1].space, rng)[None])[0].shape[1])
+    kinds = protocols.sees_kinds(model) or ()
+    named = [own for models in classes("landmark").values() for own in models if vars(own).get("kind") in kinds]
+    if named:
+        landmark: Any = named[-1]()
+        T = _drawn(SE3 if landmark.space.world == "space" else SE2, rng)
+        return int(landmark.seen_from(T, _drawn(landmark.space, rng)[None])[0].shape[1])
     taken = []
     for d in (3, 2, 4):
-        try:
+        with suppress(Exception):  # this only tries; a mistake shows when the model is called in earnest
             e, E_v = model.expect(rng.uniform(0.5, 1, (BATCH, d)))
             if np.shape(E_v) == (BATCH, len(model.columns), d):
                 taken.append(d)
-                if not isinstance(model, _Inverts) or np.shape(model.invert(e)[0]) == (BATCH, d):
+                if "invert" not in dir(model) or np.shape(model.invert(e)[0]) == (BATCH, d):
                     return d
-        except Exception:  # this only tries; what is wrong shows when the model is called in earnest
-            continue
     return taken[0] if taken else 2
 
 
 # ------------------------------------------------------------------ landmarks
-def _landmark(model: Any, rng: Rng) -> list[Finding]:
-    space, worst = model.space, _Worst()
-    pose = SE3 if space.world == "space" else SE2
+def _landmark(model: Any, rng: Rng, found: _Findings) -> None:
     for _ in range(DRAWS // BATCH):
-        T, l = _drawn(pose, rng), np.array([_drawn(space, rng) for _ in range(BATCH)])
-        where = f"T = {_show(T)}"
-        v, V_T, V_l = model.seen_from(T, l)
-        if np.ndim(v) != 2:
-            raise ModelError(f"seen_from: v has shape {np.shape(v)}, expected ({BATCH}, d)")
-        view = SE3 if v.shape[1] == SE3.size and np.shape(V_l)[1] == SE3.dof else Rn(v.shape[1])
-        _shape("seen_from", "V_T", V_T, (BATCH, view.dof, pose.dof))
-        _shape("seen_from", "V_l", V_l, (BATCH, view.dof, space.dof))
-        for i, at in enumerate(l):
-            one = at[None]
-            worst.add("V_T", V_T[i], _differences(lambda x: model.seen_from(x, one)[0][0], T, pose, view), where)  # noqa: B023
-            worst.add("V_l", V_l[i], _differences(lambda x: model.seen_from(T, x[None])[0][0], at, space, view), where)  # noqa: B023
-        for name, points in _points(model).items():
-            p, P_l = points(l)
-            _shape(name, "P_l", P_l, (BATCH, p.shape[1], space.dof))
-            for one, at in zip(P_l, l, strict=True):
-                differences = _differences(lambda x: points(x[None])[0][0], at, space, Rn(p.shape[1]))  # noqa: B023
-                worst.add(f"P_l of {name}", one, differences, _at("l", at))
-        if isinstance(model, _Starts):
-            _started(model, T, pose, _startable(model, space.world, v, view, rng), view, worst)
-    return worst.findings()
+        _from_pose(model, rng, found)
 
 
-def _points(model: Any) -> dict[str, Callable[[Array], tuple[Array, Array]]]:
-    """Return what gives points of landmarks, by name."""
-    named: dict[str, Callable[[Array], tuple[Array, Array]]] = {}
-    if isinstance(model, Reparametrizable):
-        named["to_point"] = model.to_point
-    if isinstance(model, Placed):
-        named["place"] = model.place
-    return named
-
-
-def _startable(model: Any, world: str, v: Array, view: Space, rng: Rng) -> tuple[Array, Space]:
-    """Return what `from_view` takes, and its space: a view, or a view completed by a prior."""
-    if not isinstance(model, Completing):
-        return v, view
-    d = 6 if isinstance(model, Segmented) else 2 if world == "plane" else 3
-    if isinstance(model, UnknownDepth) or d == 6:  # rays of length 1
-        v = rng.normal(0, 1, (BATCH, d)).reshape(BATCH, -1, d if d == 2 else 3)
-        v = (v / np.linalg.norm(v, axis=2, keepdims=True)).reshape(BATCH, d)
-        v = model.complete(v, np.tile(np.eye(d), (BATCH, 1, 1)), False)[0]
-    return v, Rn(v.shape[1]) if view.size != SE3.size else view
-
-
-def _started(model: Any, T: Array, pose: Space, given: tuple[Array, Space], view: Space, worst: _Worst) -> None:
-    """Check the landmarks that start from what is seen of them."""
-    w, of = given
-    l, L_T, L_w = model.from_view(T, w)
-    space, where = model.space, f"T = {_show(T)}"
-    _shape("from_view", "l", l, (BATCH, space.size))
-    _shape("from_view", "L_T", L_T, (BATCH, space.dof, pose.dof))
-    _shape("from_view", "L_v", L_w, (BATCH, space.dof, of.dof))
-    for i, at in enumerate(w):
-        one = at[None]
-        worst.add("L_T", L_T[i], _differences(lambda x: model.from_view(x, one)[0][0], T, pose, space), where)  # noqa: B023
-        worst.add("L_v", L_w[i], _differences(lambda x: model.from_view(T, x[None])[0][0], at, of, space), where)
-    again = model.seen_from(T, l)[0]
-    if isinstance(model, Segmented):  # the plane through both rays
-        normal = np.cross(w[:, :3], w[:, 3:6])
-        again, w = (n / np.linalg.norm(n, axis=1, keepdims=True) for n in (again, normal))
-        view = Rn(3)
-    error = np.array([view.minus(a, b[: view.size]) for a, b in zip(again, w, strict=True)])
-    worst.add("seen_from(from_view(v)) = v", _unwrapped(error), np.zeros_like(error), where)
+def _from_pose(model: Any, rng: Rng, found: _Findings) -> None:
+    """Check landmarks seen from one pose."""
+    space, pose = model.space, SE3 if model.space.world == "space" else SE2
+    T, l = _drawn(pose, rng), np.array([_drawn(space, rng) for _ in range(BATCH)])
+    Ts, where = np.tile(T, (BATCH, 1)), Rn(3 if space.world == "space" else 2)
+    v, V_T, V_l = model.seen_from(T, l)
+    if np.ndim(v) != 2 or len(v) != BATCH:
+        raise ModelError(f"v of seen_from has shape {np.shape(v)}, expected ({BATCH}, d)")
+    view = SE3 if v.shape[1] == SE3.size and np.shape(V_l)[1] == SE3.dof else Rn(v.shape[1])
+    at: dict[str, Any] = {"T": Ts, "l": l}
+    found.jacobian("V_T", V_T, lambda x: model.seen_from(x[0], l)[0], Ts, pose, view, at)
+    found.jacobian("V_l", V_l, lambda x: model.seen_from(T, x)[0], l, space, view, at)
+    if isinstance(model, protocols.Reparametrizable):
+        found.jacobian("P_l of to_point", model.to_point(l)[1], lambda x: model.to_point(x)[0], l, space, where, at)
+    if isinstance(model, protocols.Placed):
+        found.jacobian("P_l of place", model.place(l)[1], lambda x: model.place(x)[0], l, space, where, at)
+    if "from_view" not in dir(model):
+        return
+    if isinstance(model, protocols.UnknownDepth | protocols.Segmented):  # rays of length 1, completed by a prior
+        rays, d = 1 + isinstance(model, protocols.Segmented), 2 if space.world == "plane" else 3
+        v = rng.normal(0, 1, (BATCH, rays, d))
+        v = (v / np.linalg.norm(v, axis=2, keepdims=True)).reshape(BATCH, -1)
+        if isinstance(model, protocols.Completing):
+            v = model.complete(v, np.tile(np.eye(rays * d), (BATCH, 1, 1)), False)[0]
+    given = view if v.shape[1] == view.size else Rn(v.shape[1])
+    l, L_T, L_v = model.from_view(T, v)
+    _shape("l of from_view", l, (BATCH, space.size))
+    at = {"T": Ts, "v": v}
+    found.jacobian("L_T", L_T, lambda x: model.from_view(x[0], v)[0], Ts, pose, space, at)
+    found.jacobian("L_v", L_v, lambda x: model.from_view(T, x)[0], v, given, space, at)
+    again, looked = model.seen_from(T, l)[0], v[:, : view.size]
+    if isinstance(model, protocols.Segmented):  # the plane through both rays
+        again, looked = (n / np.linalg.norm(n, axis=1)[:, None] for n in (again, np.cross(v[:, :3], v[:, 3:6])))
+    found.same("seen_from(from_view(v)) = v", again, looked, view, at)
 
 
 # ------------------------------------------------------------------ functions
-def _function(f: Callable[..., Any], rng: Rng) -> list[Finding]:
+def _function(f: Callable[..., Any], rng: Rng, found: _Findings) -> None:
     """Check a function f(x, ...) -> value, Jacobians in its arguments, in their order."""
     sizes, count = _sizes(f, rng)
-    worst = _Worst()
-    for _ in range(DRAWS):
-        x = [float(rng.uniform(0.1, 2)) if size == 0 else rng.normal(0, 1, size) for size in sizes]
-        where = ", ".join(f"{_show(np.array(one))}" for one in x)
-        _, *jacobians = f(*x)
-        for i, J in enumerate(jacobians[:count]):
+    draws = [[float(rng.uniform(0.1, 2)) if n == 0 else rng.normal(0, 1, n) for n in sizes] for _ in range(DRAWS)]
+    results = [f(*x) for x in draws]
+    m = np.size(results[0][0])
+    for i, n in enumerate(sizes[:count]):
 
-            def value(one: Array, i: int = i, x: list[Any] = x) -> Array:
-                return np.atleast_1d(f(*x[:i], one if sizes[i] else float(one[0]), *x[i + 1 :])[0])
+        def value(x: Array, i: int = i, n: int = n) -> Array:
+            given = [(*old[:i], one if n else float(one[0]), *old[i + 1 :]) for old, one in zip(draws, x, strict=True)]
+            return np.array([np.ravel(f(*each)[0]) for each in given])
 
-            at = np.atleast_1d(x[i])
-            expected = _differences(value, at, Rn(len(at)), Rn(len(value(at))))
-            worst.add(f"Jacobian {i + 1}", np.reshape(J, expected.shape), expected, where)
-    return worst.findings()
+        J = np.array([np.reshape(each[1 + i], (m, max(n, 1))) for each in results])
+        x = np.array([np.atleast_1d(each[i]) for each in draws])
+        at = {f"argument {j + 1}": [each[j] for each in draws] for j in range(len(sizes))}
+        found.jacobian(f"Jacobian {i + 1}", J, value, x, Rn(max(n, 1)), Rn(m), at)
 
 
 def _sizes(f: Callable[..., Any], rng: Rng) -> tuple[tuple[int, ...], int]:
     """Return the sizes of a function's arguments, 0 for a number, and how many have Jacobians."""
     try:
-        own = inspect.signature(f).parameters.values()
+        own = [one for one in inspect.signature(f).parameters.values() if one.kind < inspect.Parameter.VAR_POSITIONAL]
     except (TypeError, ValueError):
         raise ModelError("got no Python function, expected f(x, ...) -> value, Jacobians") from None
-    choices = [_choices(one) for one in own if one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD)]
-    for sizes in sorted(itertools.product(*choices), key=sum) if 1 <= len(choices) <= 3 else ():
-        try:
+    choices: list[Any] = [(0,) if one.annotation in (float, "float") else range(1, LARGEST + 1) for one in own]
+    for i, one in enumerate(own):
+        if one.default is not one.empty:
+            choices[i] = (np.size(one.default) if np.ndim(one.default) else 0,)
+    for sizes in sorted(itertools.product(*choices), key=sum) if 1 <= len(own) <= 3 else ():
+        with suppress(Exception):  # this only tries
             value, *jacobians = f(*(1.0 if n == 0 else rng.normal(0, 1, n) for n in sizes))
             shapes = [(np.size(value), max(n, 1)) for n in sizes[: len(jacobians)]]
-            fits = np.ndim(value) < 2 and np.isfinite(value).all()
-            if jacobians and fits and all(_fits(J, at) for J, at in zip(jacobians, shapes, strict=True)):
+            allowed = [{at, (max(at),)} if 1 in at else {at} for at in shapes]
+            fit = [np.shape(J) in at for J, at in zip(jacobians, allowed, strict=True)]
+            if np.ndim(value) < 2 and np.isfinite(value).all() and fit and all(fit):
                 return sizes, len(jacobians)
-        except Exception:  # this only tries
-            continue
-    raise ModelError(
-        "no sizes of up to three arguments give a value (m,) and Jacobians (m, n), expected such a function"
-    )
-
-
-def _choices(parameter: inspect.Parameter) -> Any:
-    """Return the sizes that an argument may have: that of its default, a number's 0, or any."""
-    if parameter.default is not parameter.empty:
-        return (np.size(parameter.default) if np.ndim(parameter.default) else 0,)
-    return (0,) if parameter.annotation in (float, "float") else range(1, LARGEST + 1)
-
-
-def _fits(J: Any, shape: tuple[int, int]) -> bool:
-    return np.shape(J) == shape or (1 in shape and np.shape(J) == (max(shape),) and np.ndim(J) == 1)
+    raise ModelError("no sizes of 1 to 3 arguments give a value (m,) and Jacobians (m, n), expected such a function")
 
 
 # ------------------------------------------------------------------ differences
-SE3_ORIGIN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-FACING = np.array([0.0, 0.0, 0.0, np.cos(0.3), 0.0, 0.0, -np.sin(0.3)])  # tilted: no tag like its mirror image
-
-
 def _drawn(space: Space, rng: Rng) -> Array:
     """Return a random value of a space: some metres, any direction, no inverse distance near 0."""
     x = np.zeros(space.size)
@@ -403,57 +298,69 @@ def _drawn(space: Space, rng: Rng) -> Array:
     return x
 
 
-def _differences(f: Callable[[Array], Any], x: Array, of: Space, to: Space) -> Array:
-    """Return d f / d x (to.dof, of.dof) by central differences in the errors of both spaces."""
+def _differences(f: Batch, x: Array, of: Space, to: Space, h: float) -> Array:
+    """Return d f / d x (K, to.dof, of.dof) by central differences in the errors of both spaces."""
     columns = []
     for i in range(of.dof):
-        step = np.zeros(of.dof)
-        step[i] = np.cbrt(np.finfo(float).eps) * max(1.0, abs(x[i]) if of.dof == of.size else 1.0)
-        rise = to.minus(np.asarray(f(of.plus(x, step))), np.asarray(f(of.plus(x, -step))))
-        columns.append(_unwrapped(rise) / (2 * step[i]))
+        step = np.zeros((len(x), of.dof))
+        step[:, i] = h * np.maximum(1.0, np.abs(x[:, i]) if of.dof == of.size else 1.0)
+        ends = [f(np.array([of.plus(*each) for each in zip(x, d, strict=True)])) for d in (step, -step)]
+        rise = np.array([to.minus(*each) for each in zip(*ends, strict=True)])
+        columns.append(rise / (2 * step[:, i, None]))
     return np.stack(columns, axis=-1)
 
 
-def _unwrapped(rise: Array) -> Array:
-    return np.asarray(rise - 2 * np.pi * np.round(rise / (2 * np.pi)))
+@dataclass
+class _Findings:
+    """The worst finding of each kind so far."""
+
+    worst: dict[str, Finding] = field(default_factory=dict)
+
+    def jacobian(self, what: str, J: Any, f: Batch, x: Array, of: Space, to: Space, at: dict[str, Any]) -> None:
+        """Compare J (K, to.dof, of.dof) with the differences of f at x (K, of.size)."""
+        J = np.asarray(J, dtype=np.float64)
+        _shape(what, J, (len(x), to.dof, of.dof))
+        fine, coarse = (_differences(f, x, of, to, h) for h in (STEP, 2 * STEP))
+        smooth = np.abs(coarse - fine) <= TOLERANCE / 2 * (1 + np.abs(fine))
+        error = np.where(smooth, np.abs(J - fine) / (1 + np.abs(fine)), 0.0)
+        error[~np.isfinite(J) | ~smooth.any()] = np.inf
+        self._keep(what, error, at)
+
+    def same(self, what: str, x: Array, expected: Array, space: Space, at: dict[str, Any]) -> None:
+        """Compare values (K, space.size); what differs by turns is the same."""
+        d = np.array([space.minus(*each) for each in zip(x, expected, strict=True)])
+        d -= 2 * np.pi * np.round(d / (2 * np.pi))
+        self._keep(what, np.abs(d) / (1 + np.abs(expected).max(axis=1, keepdims=True)), at)
+
+    def covariance(self, what: str, P: Any, size: int, at: dict[str, Any]) -> None:
+        """Check shape, symmetry and sign of covariances (K, size, size)."""
+        P = np.array(P, dtype=np.float64)
+        _shape(what, P, (len(P), size, size))
+        finite = np.isfinite(P).all(axis=(1, 2))
+        negative = -np.linalg.eigvalsh(np.where(finite[:, None, None], P, 0.0))[:, :1]
+        error = np.maximum(np.abs(P - P.swapaxes(1, 2)).max(axis=2), np.maximum(negative, 0.0))
+        self._keep(f"{what} is a covariance", error, at)
+
+    def _keep(self, what: str, error: Array, at: dict[str, Any]) -> None:
+        error = np.where(np.isnan(error), np.inf, error).reshape(len(error), -1).max(axis=1)
+        i = int(np.argmax(error))
+        if what not in self.worst or error[i] > self.worst[what].error:
+            where = ", ".join(f"{name} = {_show(x[i])}" for name, x in at.items())
+            self.worst[what] = Finding(what, float(error[i]), where or "the model")
 
 
-class _Worst:
-    """The worst difference of each kind so far."""
-
-    def __init__(self) -> None:
-        self._found: dict[str, Finding] = {}
-
-    def add(self, what: str, value: Array, expected: Array, where: str) -> None:
-        """Compare a value with what was expected."""
-        error = np.max(np.abs(value - expected) / (1.0 + np.abs(expected)), initial=0.0)
-        self._keep(what, float("inf") if np.isnan(error) else float(error), where)
-
-    def covariance(self, what: str, P: Any, size: int, where: str) -> None:
-        """Check shape, symmetry and sign of a covariance."""
-        P = np.asarray(P, dtype=np.float64)
-        _shape(what, "covariance", P, (size, size))
-        asymmetry = float(np.max(np.abs(P - P.T), initial=0.0))
-        negative = max(0.0, -float(np.linalg.eigvalsh(P).min())) if np.isfinite(P).all() else float("inf")
-        self._keep(f"{what} is a covariance", max(asymmetry, negative), where)
-
-    def findings(self) -> list[Finding]:
-        """Return one finding for each kind."""
-        return list(self._found.values())
-
-    def _keep(self, what: str, error: float, where: str) -> None:
-        if what not in self._found or error > self._found[what].error:
-            self._found[what] = Finding(what, error, where)
+def _finite(what: str, y: Array, x: Array) -> Any:
+    """Return which rows of y (K, m), found at x (K, n), are finite.  Raises ModelError if none is."""
+    kept = np.isfinite(y).all(axis=1)
+    if not kept.any():
+        raise ModelError(f"{what} is {_show(y[0])} at {_show(x[0])}, expected finite numbers")
+    return kept
 
 
-def _shape(method: str, what: str, value: Any, expected: tuple[int, ...]) -> None:
+def _shape(what: str, value: Any, expected: tuple[int, ...]) -> None:
     if np.shape(value) != expected:
-        raise ModelError(f"{method}: {what} has shape {np.shape(value)}, expected {expected}")
+        raise ModelError(f"{what} has shape {np.shape(value)}, expected {expected}")
 
 
-def _at(name: str, x: Array) -> str:
-    return f"{name} = {_show(x)}"
-
-
-def _show(x: Array) -> str:
+def _show(x: Any) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in np.ravel(x)) + ")"
