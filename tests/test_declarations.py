@@ -14,7 +14,9 @@ import pytest
 import kalmark as km
 from kalmark.campaign.running import run_campaign
 from kalmark.config import build_slam, config_dict, load_config
+from kalmark.config.opening import open_run
 from kalmark.errors import ConfigError, KalmarkError, ModelError
+from kalmark.logs import FORMATS, formats
 from kalmark.results.describe import describe
 from kalmark.results.files import config_yaml
 from kalmark.simulate.robots import simulate
@@ -72,6 +74,24 @@ class Post(km.landmarks.Point2D):
 class Unnamed(Ball):
     """A sensor without a name in configurations."""
 '''
+FORMAT = """
+from kalmark.events import Control
+from kalmark.logs import FORMATS, Log
+from kalmark.logs.source import Format
+
+
+def find(path):
+    return path if path.suffix == ".mine" else None
+
+
+def read(path, request):
+    rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
+    events = [Control(t_s, "r", (v, w)) for t_s, v, w in rows]
+    return Log(name=path.stem, format="mine", path=path, robots=("r",), events=events, skipped=request.skipped)
+
+
+FORMATS["mine"] = Format("mine", "a file that ends in .mine", find, read)
+"""
 WORLD = """
 plugins: [my_models.py]
 world: {type: random_field, count: 40, size_m: 30.0}
@@ -134,6 +154,26 @@ def test_a_model_of_a_plugin_works_from_the_world_to_the_reloaded_map(plugin: Pa
     restored = km.Slam.load(tmp_path / "map.zip")
     assert restored.robots["r"].sensors["eye"].sensor == slam.robots["r"].sensors["eye"].sensor
     np.testing.assert_array_equal(restored.mean("r"), slam.mean("r"))
+
+
+def test_a_plugin_adds_a_log_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("kalmark.logs.formats.FORMATS", FORMATS.copy())
+    monkeypatch.setattr("kalmark.logs.FORMATS", formats.FORMATS)
+    (tmp_path / "format.py").write_text(FORMAT)
+    (tmp_path / "log.mine").write_text("0.0 1.0 0.1\n1.0 1.0 0.2\n")
+    (tmp_path / "mine.yaml").write_text("plugins: [format.py]\nlog: {path: log.mine}\nrobots: {r: {sensors: {}}}\n")
+    config, log = open_run(tmp_path / "mine.yaml")
+    assert (log.format, len(log.events), tuple(config.robots)) == ("mine", 2, ("r",))
+
+
+def test_a_package_adds_a_verb(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("def hello(name: str) -> None:\n    print('hello', name)\n")
+    (tmp_path / "own-1.dist-info").mkdir()
+    (tmp_path / "own-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 1\n")
+    (tmp_path / "own-1.dist-info" / "entry_points.txt").write_text("[kalmark.verbs]\nhello = own:hello\n")
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from kalmark.cli import main; sys.exit(main())"
+    done = subprocess.run([sys.executable, "-c", code, "hello", "you"], capture_output=True, text=True, check=True)
+    assert done.stdout == "hello you\n"
 
 
 def test_a_campaign_s_workers_run_the_plugin(plugin: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import entry_points, version
 from typing import Annotated
 
 import typer
@@ -38,12 +39,12 @@ for verb in (demo, run, simulate, evaluate, report, explain, campaign, config, c
 app.add_typer(data, name="data")
 for name, what in COMING.items():
     app.command(name, hidden=True, context_settings={"ignore_unknown_options": True})(coming(name, what))
+for other in entry_points(group="kalmark.verbs"):
+    app.command(other.name)(other.load())
 
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
-
         typer.echo(f"kalmark {version('kalmark')}")
         raise typer.Exit
 

@@ -25,7 +25,7 @@ def open_run(
     """
     path = resolve_config(path_or_name)
     tree = read_tree(path, overrides)
-    values = {key: value for key, value in tree.values.items() if key == "log"}
+    values = {key: value for key, value in tree.values.items() if key in ("log", "plugins")}
     alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
     log = open_config_log(alone)
     refuse_idle(tree, log)
