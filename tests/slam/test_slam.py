@@ -399,3 +399,22 @@ def test_a_robot_that_is_not_connected_learns_nothing_from_the_other(estimator: 
         y = np.array([[3.0, 0.4], [4.0, -1.0], [2.0, 2.0]]) + rng.normal(size=(3, 2)) * [0.1, 0.02]
         slam.process(km.Scan(t, "a", "lidar", y, [1, 2, 3]))
     assert (slam.mean("b").tobytes(), slam.covariance("b").tobytes()) == before
+
+
+def test_a_landmark_is_where_its_model_says() -> None:
+    slam = started()
+    for name in ("rover", 1):
+        where, P = slam.place(name)
+        np.testing.assert_array_equal(where, slam.mean(name)[:2])
+        np.testing.assert_array_equal(P, slam.covariance(name)[:2, :2])
+
+    camera = km.Mount(km.sensors.Bearing(), landmark=km.landmarks.InverseDepth2D(prior_rho_per_m=0.5))
+    slam = km.Slam([rover(eye=camera)])
+    slam.process(km.Control(0.0, "rover", (0.5, 0.1)))
+    slam.process(km.Scan(1.0, "rover", "eye", [[0.3]], [1]))
+    x, y, bearing, rho = slam.mean(1)
+    c, s = np.cos(bearing) / rho, np.sin(bearing) / rho
+    P_l = np.array([[1, 0, -s, -c / rho], [0, 1, c, -s / rho]])
+    where, P = slam.place(1)
+    np.testing.assert_allclose(where, (x + c, y + s), atol=1e-12)
+    np.testing.assert_allclose(P, P_l @ slam.covariance(1) @ P_l.T, atol=1e-12)
