@@ -10,6 +10,8 @@ import pytest
 
 import kalmark as km
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
+from kalmark.geometry.spaces import HEADING, SCALAR, Space
+from kalmark.results.landmarks import MapLandmarks
 
 NAN, INF = float("nan"), float("inf")
 
@@ -418,3 +420,46 @@ def test_a_landmark_is_where_its_model_says() -> None:
     where, P = slam.place(1)
     np.testing.assert_allclose(where, (x + c, y + s), atol=1e-12)
     np.testing.assert_allclose(P, P_l @ slam.covariance(1) @ P_l.T, atol=1e-12)
+
+
+class Around:
+    """A point of the plane by its direction from the origin and its distance, which does not say where it is."""
+
+    kind = "around"
+    space = Space("around", (HEADING, SCALAR))
+
+    def seen_from(self, T: Any, l: Any) -> Any:
+        p, P_l = around(l)
+        v, V_T, V_p = km.landmarks.Point2D().seen_from(T, p)
+        return v, V_T, V_p @ P_l
+
+    def from_view(self, T: Any, v: Any) -> Any:
+        p, P_T, P_v = km.landmarks.Point2D().from_view(T, v)
+        l = np.column_stack([np.arctan2(p[:, 1], p[:, 0]), np.hypot(p[:, 0], p[:, 1])])
+        L_p = np.linalg.inv(around(l)[1])
+        return l, L_p @ P_T, L_p @ P_v
+
+
+class AroundPlaced(Around):
+    """The same, which does."""
+
+    def place(self, l: Any) -> Any:
+        return around(l)
+
+
+def around(l: Any) -> tuple[Any, Any]:
+    c, s, d = np.cos(l[:, 0]), np.sin(l[:, 0]), l[:, 1]
+    return np.stack([d * c, d * s], axis=1), np.stack([np.stack([-d * s, d * c], 1), np.stack([c, s], 1)], axis=2)
+
+
+def test_a_user_s_landmark_is_where_its_place_says_and_so_in_the_tables() -> None:
+    slam = started(landmarks=AroundPlaced())
+    where, P = slam.place(1)
+    (angle, distance), P_l = slam.mean(1), around(slam.mean(1)[None])[1][0]
+    np.testing.assert_allclose(where, (distance * np.cos(angle), distance * np.sin(angle)))
+    np.testing.assert_allclose(P, P_l @ slam.covariance(1) @ P_l.T)
+    header, row, *_ = MapLandmarks.of(slam).to_csv().splitlines()
+    assert header.split(",")[2:4] == ["x_m", "y_m"]
+    np.testing.assert_allclose([float(x) for x in row.split(",")[2:4]], where)
+    with pytest.raises(MapError, match="1 is a around, which does not say where it is"):
+        started(landmarks=Around()).place(1)
