@@ -8,11 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+import kalmark as km
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
 from kalmark.models.check import Finding, check_model
 from kalmark.models.landmarks import Point2D
 from kalmark.models.motion import Unicycle
+from kalmark.simulate.robots import diffused
 
 Array = npt.NDArray[np.float64]
 
@@ -201,3 +203,14 @@ def test_wrong_shapes_and_missing_methods_are_refused() -> None:
         check(Half())
     with pytest.raises(ModelError, match="expected a function, or a model"):
         check(3)
+
+
+def test_a_robot_of_the_plane_with_a_speed_in_its_state_diffuses_in_its_pose() -> None:
+    slam = km.Slam([km.Robot("r", Speed(), start=(0, 0, 1.0, 0.5), sensors={"l": km.Mount(km.sensors.RangeBearing())})])
+    for t_s in (0.0, 1.0):
+        slam.process(km.Control(t_s, "r", (0.1, 0.1)))
+    slam.process(km.Scan(2.0, "r", "l", [[2.0, 0.3]], [1]))
+    np.testing.assert_allclose(slam.mean("r")[2:], (1.2, 0.7))
+    np.testing.assert_allclose(np.diag(slam.covariance("r"))[2:], (2 * 0.02 + 2 * 0.02**2, 2 * 0.1**2))
+    moved = diffused(Speed(), np.array([0, 0, 1.0, 0.5]), np.zeros(2), 1.0, np.random.default_rng(0))
+    assert moved[3] == 0.5

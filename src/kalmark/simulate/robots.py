@@ -215,13 +215,17 @@ def step(robot: SimRobot, world: World, rng: Generator) -> Array:
 def diffused(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -> Array:
     """Return a state (size,) disturbed by the diffusion of the motion, if any, in `dt_s` of the control u (m,)."""
     D = motion.diffusion(u, dt_s)
-    return state if D is None else motion.space.plus(state, body_axes(state, len(D)) @ gaussian(D, rng))
+    if D is None:
+        return state
+    d = np.zeros(motion.space.dof)
+    d[: len(D)] = body_axes(state, len(D)) @ gaussian(D, rng)
+    return motion.space.plus(state, d)
 
 
 def body_axes(state: Array, size: int) -> Array:
     """Return the matrix (size, size) from errors in the robot's frame to the world's; rates stay in the body's."""
     G = np.eye(size)
-    if len(state) == 3:
+    if len(state) < 7:
         G[:2, :2] = rotation(state[2])
         return G
     Q = matrix(state[3:7].copy())

@@ -171,7 +171,7 @@ def bias_block(motion: Motion) -> tuple[Space, Array, Array] | None:
 
 def body_axes(state: Array) -> Array:
     """Return what turns an error from the robot's frame into the world's: (3, 3) in the plane, (6 or more) in space."""
-    if len(state) == 3:
+    if len(state) < 7:
         G = np.eye(3)
         G[:2, :2] = rotation(state[2])
         return G
