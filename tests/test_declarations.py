@@ -174,6 +174,10 @@ def test_a_package_adds_a_verb(tmp_path: Path) -> None:
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from kalmark.cli import main; sys.exit(main())"
     done = subprocess.run([sys.executable, "-c", code, "hello", "you"], capture_output=True, text=True, check=True)
     assert done.stdout == "hello you\n"
+    (tmp_path / "own.py").unlink()
+    done = subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("kalmark ")
+    assert "the verb 'hello' of own:hello cannot be loaded" in done.stderr
 
 
 def test_a_campaign_s_workers_run_the_plugin(plugin: Path, tmp_path: Path) -> None:

@@ -39,8 +39,11 @@ for verb in (demo, run, simulate, evaluate, report, explain, campaign, config, c
 app.add_typer(data, name="data")
 for name, what in COMING.items():
     app.command(name, hidden=True, context_settings={"ignore_unknown_options": True})(coming(name, what))
-for other in entry_points(group="kalmark.verbs"):
-    app.command(other.name)(other.load())
+for other in entry_points(group="kalmark.verbs"):  # of other packages; one that cannot be loaded stops no other verb
+    try:
+        app.command(other.name)(other.load())
+    except Exception as error:
+        sys.stderr.write(f"kalmark: the verb {other.name!r} of {other.value} cannot be loaded: {error}\n")
 
 
 def _show_version(wanted: bool) -> None:
