@@ -92,6 +92,15 @@ def read(path, request):
 
 FORMATS["mine"] = Format("mine", "a file that ends in .mine", find, read)
 """
+DETECTOR = '''
+
+@km.register("detector", "every_other")
+class EveryOther:
+    """Every other observation of a scan."""
+
+    def __call__(self, scan):
+        return km.Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=scan.y[::2], ids=scan.ids[::2])
+'''
 WORLD = """
 plugins: [my_models.py]
 world: {type: random_field, count: 40, size_m: 30.0}
@@ -189,6 +198,16 @@ def test_a_campaign_s_workers_run_the_plugin(plugin: Path, tmp_path: Path) -> No
     code = f"import pickle, sys; print(pickle.loads(bytes.fromhex('{pickle.dumps(config).hex()}')).robots['r'].sensors)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "sigma_range_m=0.05" in done.stdout
+
+
+def test_a_detector_of_a_plugin_needs_no_parameter_of_kalmark_s(plugin: Path, tmp_path: Path) -> None:
+    plugin.write_text(plugin.read_text() + DETECTOR)
+    sensor = "{type: range_bearing, detector: {type: every_other}}"
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"plugins: [{plugin}]\nrobots: {{each: {{sensors: {{eye: {sensor}}}}}}}")
+    slam = build_slam(load_config(path))
+    report = slam.process(km.Scan(0.0, "robot", "eye", [[1.0, 0.0], [2.0, 0.1], [3.0, 0.2]], [1, 2, 3]))
+    assert [seen.id for seen in report.observations] == [1, 3]
 
 
 def test_a_class_without_a_name_is_read_again_by_its_file(plugin: Path, tmp_path: Path) -> None:

@@ -116,8 +116,9 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
         "cov": covariance_of(sensor.mount, 3 if world == "plane" else 6),
     }
     if sensor.detector is not None:
-        signed, theirs = "signature" in sensor.type, sensor.detector.signature
-        found = sensor.detector.model_copy(update={"signature": signed if theirs is None else theirs})
+        found, chooses = sensor.detector, "signature" in type(sensor.detector).model_fields
+        if chooses and found.signature is None:
+            found = found.model_copy(update={"signature": "signature" in sensor.type})
         own["detector"] = _build(config, (*path, "detector"), found)
     if sensor.attention is not None:
         own["attention"] = model_of(sensor.attention)
