@@ -143,7 +143,9 @@ def not_polar(x: Array, y: Array) -> tuple[Array, Array, Array]:
     return value, D_x, -D_y
 
 
-@pytest.mark.parametrize("model", [Speed(), Bearing(), Camera(), Sign(), polar], ids=["speed", "bearing", "camera", "sign", "polar"])
+@pytest.mark.parametrize(
+    "model", [Speed(), Bearing(), Camera(), Sign(), polar], ids=["speed", "bearing", "camera", "sign", "polar"]
+)
 def test_a_right_model_passes(model: Any) -> None:
     assert wrong(model) == set()
 
