@@ -381,7 +381,7 @@ def structure() -> Iterator[Figure]:
     for name, wanted in (("known ids", "14"), ("unknown ids", "20")):
         yield Figure("Structure", f"files that the calls of one scan enter, {name}", wanted, "python benchmarks/structure.py --scan",
                      row(f"files of one scan, {name}:", "{0}"))  # fmt: skip
-    before = "git worktree add -f out/before be0e13e; python benchmarks/{} out/before"
+    before = "python benchmarks/{} be0e13e"
     for count in (50, 1000):
         yield Figure("Structure", f"a step with {count} landmarks, as a part of that of be0e13e", ".8",
                      before.format("paired.py"), row(f"{count} landmarks:", "{6}"))  # fmt: skip

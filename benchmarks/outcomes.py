@@ -1,6 +1,6 @@
 """Every shipped real log through this checkout and another one: are the outcomes the same, observation by observation?
 
-    git worktree add out/before be0e13e && KALMARK_DATA=... KALMARK_ORACLE=... python benchmarks/outcomes.py out/before
+    KALMARK_DATA=... KALMARK_ORACLE=... python benchmarks/outcomes.py be0e13e      # a commit, or a folder
 
 A line a log: observations, how many have another outcome or another landmark, the largest relative difference of d2,
 and the figure of the summary that differs most.  `--only WORD` takes the logs whose names have the word.  Runs that
@@ -18,6 +18,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from paired import checkout
 
 HERE = Path(__file__).resolve().parents[1]
 RECORDINGS = ("a3_hmgPnt_odo", "a_idpPnt_odo_small", "b2_idpPnt_constVel_small", "c_hmgLin_small", "c_idpLin_small",
@@ -40,10 +42,10 @@ RUNS: dict[str, tuple[str, ...]] = {
 TIMES = ("_us", "us_", "wall", "compile", "real_time")  # parts of the names of figures that are times
 
 
-def run(checkout: Path, name: str, out: Path) -> Path:
+def run(place: Path, name: str, out: Path) -> Path:
     """Run a log through a checkout unless that is done; return the run folder."""
     if not (out / "summary.json").exists():
-        environment = os.environ | {"PYTHONPATH": str(checkout / "src"), "OPENBLAS_NUM_THREADS": "1"}
+        environment = os.environ | {"PYTHONPATH": str(place / "src"), "OPENBLAS_NUM_THREADS": "1"}
         command = [sys.executable, "-m", "kalmark", "run", *RUNS[name], "--out", str(out)]
         subprocess.run(command, env=environment, capture_output=True, check=False)
     return out
@@ -80,11 +82,11 @@ def compared(mine: Path, other: Path) -> tuple[int, int, str]:
 def main() -> None:
     """Print the lines."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("other", type=Path, help="another checkout of kalmark")
+    parser.add_argument("other", help="a commit, or the folder of another checkout")
     parser.add_argument("--only", default="", metavar="WORD")
     parser.add_argument("--out", type=Path, default=Path("out/outcomes"))
     options = parser.parse_args()
-    checkouts, total, different = {"mine": HERE, "other": options.other.resolve()}, 0, 0
+    checkouts, total, different = {"mine": HERE, "other": checkout(options.other)}, 0, 0
     for name in (name for name in RUNS if options.only in name):
         mine, other = (run(place, name, options.out / which / name) for which, place in checkouts.items())
         if all((each / "summary.json").exists() for each in (mine, other)):

@@ -1,6 +1,6 @@
 """A step of this checkout against another one's, in turn within one run: a control and a scan through `Slam.process`.
 
-    git worktree add /tmp/before be0e13e && python benchmarks/paired.py /tmp/before
+    python benchmarks/paired.py be0e13e                 # a commit, checked out below out/, or a folder
 
 Ten landmarks in view, known ids, of 50 and of 1,000 in the map.  A line each: the ratio of the medians (this one over
 the other), pair by pair, then their median.  Each checkout compiles on its first run, which does not count.
@@ -44,26 +44,37 @@ def step_us(count: int) -> float:
     return float(np.median(spent[STEPS // 10 :])) / 1e3
 
 
-def measured(checkout: Path, count: int) -> float:
+def measured(place: Path, count: int) -> float:
     """Return `step_us` of a checkout, in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(checkout / "src"), "OPENBLAS_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(place / "src"), "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, str(Path(__file__).resolve()), "--step", str(count)]
     return float(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+
+
+def checkout(name: str) -> Path:
+    """Return a folder with another checkout: that folder, or a commit checked out below out/."""
+    folder = Path(name)
+    if not folder.is_dir():
+        folder = HERE / "out" / "checkouts" / name
+        if not folder.is_dir():
+            subprocess.run(["git", "worktree", "add", "--force", "--detach", str(folder), name], cwd=HERE, check=True)
+    return folder.resolve()
 
 
 def main() -> None:
     """Print the ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("other", nargs="?", type=Path, help="another checkout of kalmark")
+    parser.add_argument("other", nargs="?", help="a commit, or the folder of another checkout")
     parser.add_argument("--step", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.step:
         print(step_us(options.step))
         return
+    other = checkout(options.other)
     for count in SIZES:
-        for checkout in (HERE, options.other):
-            measured(checkout, count)
-        ratios = [measured(HERE, count) / measured(options.other, count) for _ in range(PAIRS)]
+        for place in (HERE, other):
+            measured(place, count)
+        ratios = [measured(HERE, count) / measured(other, count) for _ in range(PAIRS)]
         pairs = " ".join(f"{ratio:.2f}" for ratio in ratios)
         print(f"{count:>6} landmarks: {pairs}  median {np.median(ratios):.2f}", flush=True)
 
