@@ -70,7 +70,7 @@ class Kernels(Way):
         kernels.predict(m.P, m.n, self.index, F, G @ self.N @ G.T)
         slots = np.array([self.slam.slot(i) for i in scan.ids or ()])
         seen = (0, -1, slots, 2, scan.y, self.noise, np.inf)
-        corrections.compiled_invariant(self.model, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), seen, (6, 1e-3))
+        corrections.compiled_invariant(self.model, m.whole, seen, (6, 1e-3))
 
 
 class Isam2Pose(Isam2):

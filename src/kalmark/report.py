@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,7 +67,8 @@ def judged(
     `ids` are those of the whole scan.
     """
     d2, fused = done.d2.tolist(), done.fused.tolist()
-    outcomes = [Observation(k, ids[k], "associated", name, d, "") for k, name, d in zip(rows, names, d2, strict=True)]
+    fates = zip(rows, [ids[k] for k in rows], repeat("associated"), names, d2, repeat(""), repeat(()), strict=False)
+    outcomes = list(map(tuple.__new__, repeat(Observation), fates))  # several times as fast as by their constructor
     if all(fused):
         return outcomes
     return [seen if used else _rejected(seen, gate) for seen, used in zip(outcomes, fused, strict=True)]

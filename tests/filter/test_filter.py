@@ -14,7 +14,7 @@ import pytest
 import kalmark as km
 from kalmark.errors import EventError
 from kalmark.filter import corrections, kernels
-from kalmark.filter.estimators import Update
+from kalmark.filter.estimators import Movement, Update
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.textbook import TextbookSlam
 from kalmark.geometry import POINT2, SE2, Rn
@@ -269,7 +269,7 @@ def test_the_plain_python_source_of_a_correction_equals_the_compiled_one() -> No
                 slam.process(event)
             m, slots, y = slam.map, np.array([slam.slot(i) for i in (1, 2, 3)]), np.full((3, 2), 2.0)
             view, R3 = slam._channels["r", "lidar"].models["point"].model, np.tile(R, (3, 1, 1))
-            function(view, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), (0, -1, slots, 2, y, R3, np.inf), last)
+            function(view, m.whole, (0, -1, slots, 2, y, R3, np.inf), last)
             maps.append((m.x[: m.n].copy(), full(m)))
         np.testing.assert_allclose(maps[0][0], maps[1][0], atol=1e-9)
         np.testing.assert_allclose(maps[0][1], maps[1][1], atol=1e-9)
@@ -347,9 +347,8 @@ class Own:
     coordinates, default_gate = "world", 9.0
     inner = km.estimators.Ekf()
 
-    def predict(self, map_: Any, robot: int, index: Any, F: Any, Q: Any, moved: Any) -> None:
-        map_.predict(index, F, Q)
-        map_.set_predicted(robot, moved)
+    def predict(self, map_: Any, movement: Movement) -> bool:
+        return self.inner.predict(map_, movement)
 
     def correct(self, map_: Any, update: Update) -> Any:
         return self.inner.correct(map_, update._replace(R=4 * update.R))

@@ -11,7 +11,7 @@ from kalmark.models.observe import (
     expectation,
     inverse_expectation,
     linearize,
-    linearize_built_in,
+    linearize_in_plane,
     view_of,
 )
 from kalmark.models.pointwise import jacobian
@@ -106,7 +106,7 @@ def test_the_compiled_seam_equals_the_written_out_one(sensor: km.sensors.RangeBe
     ours_e, _, *Jacobians = linearize(view, r, l, e)
     for ours, written in zip((ours_e, *Jacobians), (e, E_r, E_l), strict=True):
         np.testing.assert_allclose(ours, written, atol=1e-13)
-    for ours, plain in zip(linearize(view, r, l, e), linearize_built_in.py_func(view, r, l, e), strict=True):
+    for ours, plain in zip(linearize(view, r, l, e), linearize_in_plane.py_func(view, r, l, e), strict=True):
         np.testing.assert_allclose(ours, plain, atol=1e-13)
 
 

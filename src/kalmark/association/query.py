@@ -171,7 +171,7 @@ class JointCandidates:
         R = self._scan.noise(model, self._slots[columns], rows)
         run = corrections.compiled_fit if isinstance(model.model, tuple) else corrections.fit
         scan = robot, mount, here[columns], model.d, y, np.ascontiguousarray(R), np.inf
-        d2, log_det = run(model.model, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan, LIMITS)
+        d2, log_det = run(model.model, m.whole, scan, LIMITS)
         return float(d2), float(log_det)
 
     def log_volume_ratio(self, rows: Index, columns: Index) -> Array:

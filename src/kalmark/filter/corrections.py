@@ -1,21 +1,27 @@
 """The corrections: textbook, invariant and first-estimates, each one function from innovation to corrected map.
 
 The same source runs twice: compiled for the built-in models, as plain Python for a user's (`linearize` is the only
-place that differs).  A map is its mean x, covariance P with n rows in use, tables of `blocks` and `atoms`, and the axes
-of its gauge.  A scan is the slots of its robot and of its sensor's mount (-1: not in the map), the slots of K landmarks
-of which the first d numbers are seen, measurements y (K, m) with the noise R (K, p, p) of their innovations, and the
-gate on d2.  The head of the observed block is the robot's pose and, if it is in the map, the mount.  Nothing is changed
-unless all of it succeeds.
+place that differs).  A map is its mean x, covariance P with n rows in use, tables of `blocks` and `atoms`, the axes of
+its gauge, and the addresses of the `routines` that its kinds of blocks need.  A scan is the slots of its robot and of
+its sensor's mount (-1: not in the map), the slots of K landmarks of which the first d numbers are seen, measurements y
+(K, m) with the noise R (K, p, p) of their innovations, and the gate on d2.  The head of the observed block is the
+robot's pose and, if it is in the map, the mount.  Nothing is changed unless all of it succeeds.
+
+What is called by address is compiled once, alone; what a map has no use for is not compiled at all.  Compiled code
+here indexes its arrays: slices, products and fancy indices are what takes numba long.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
-from numba.extending import register_jitable
+from numba import types
+from numba.extending import overload
 
-from kalmark.compiled import compiled
+from kalmark.compiled import address_of, by_address, compiled, signature_of
+from kalmark.filter import parallax
 from kalmark.filter.kernels import (
     Array,
     Flags,
@@ -24,12 +30,14 @@ from kalmark.filter.kernels import (
     cholesky_inverse,
     downdate,
     downdate_and_transport,
+    lower_product,
     rows_of,
     submatrix,
     transport,
 )
 from kalmark.filter.observed import (
     Linear,
+    chosen,
     diagonal_blocks,
     head_sizes,
     innovation,
@@ -37,17 +45,47 @@ from kalmark.filter.observed import (
     least_squares,
     linearized,
     observed_block,
+    raveled,
     settled,
     sparse_product,
     squared_distances,
     stacked,
+    transport_rows,
+    within,
 )
-from kalmark.filter.parallax import anchored, carried, carry_back, retract_parallax, spread, transport_parallax
-from kalmark.geometry.spaces import Table, generator, retract
-from kalmark.models.observe import linearize, sensor_at
+from kalmark.filter.parallax import anchored
+from kalmark.geometry.spaces import Table, generator, generator_plane, retract, retract_plane
+from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
-Map = tuple[Array, Array, int, Table, Table, int]  # x, P, n, blocks, atoms, axes
+Routines = tuple[int, int, int, int, int, int, int, int]  # addresses, see `routines`
+Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
+
+RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
+GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
+ITERATE = signature_of(
+    f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({VIEW}, UniTuple(i8, 8), UniTuple(i8, 3), i8[:, ::1], f8[::1], "
+    "f8[:, ::1], f8[:, ::1], f8[:, :, ::1], Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8)))"
+)
+call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
+_RETRACT, _GENERATOR, _ITERATE, _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8)
+
+
+@cache
+def routines(axes: int, inverse_depths: bool) -> Routines:
+    """Return the addresses of what a correction calls in a map of these axes, compiled now.
+
+    They are `retract`, `generator` and `iterate`, and what inverse distances need, 0 where there are none.
+    """
+    moves, turns = (retract_plane, generator_plane) if axes == 1 else (retract, generator)
+    first = address_of(moves, RETRACT), address_of(turns, GENERATOR), address_of(compiled_iterate, ITERATE)
+    return (*first, *((sensor_address(axes), *parallax.addresses()) if inverse_depths else (0, 0, 0, 0, 0)))
+
+
+@compiled
+def generators(ways: Routines, atoms: Table, x: Array, n: int, axes: int) -> Array:
+    """Return how the errors (n, axes) of a mean x move when the world turns about its origin."""
+    return call_generator(ways[_GENERATOR], (atoms, x, n, axes, np.zeros(3)))
 
 
 @compiled
@@ -58,15 +96,16 @@ def gauge(mean: Array, correction: Array, pose: int, axes: int) -> Array:
     """
     theta = (3 if pose == 3 else 6) - axes
     turn = correction[theta : theta + axes].copy()
-    if axes == 6:
-        turn[:3] += np.cross(mean[:3], turn[3:])  # xi_p = d_p - generator_p d_theta
+    if axes == 6:  # xi_p = d_p - generator_p d_theta
+        turn[0] += mean[1] * turn[5] - mean[2] * turn[4]
+        turn[1] += mean[2] * turn[3] - mean[0] * turn[5]
+        turn[2] += mean[0] * turn[4] - mean[1] * turn[3]
     return turn
 
 
-@register_jitable  # type: ignore[untyped-decorator]
 def iterate(
-    model: Any, sizes: tuple[int, int, int], table: Table, mean: Array, P_ss: Array, y: Array, R: Array, linear: Linear,
-    limits: tuple[int, float],
+    model: Any, ways: Routines, sizes: tuple[int, int, int], table: Table, mean: Array, P_ss: Array, y: Array, R: Array,
+    linear: Linear, limits: tuple[int, float],
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
 
@@ -78,36 +117,67 @@ def iterate(
     back where inverse distances are corrected by their parallax.
     """
     (pose, head, axes), (most, tolerance) = sizes, limits
-    k, d = len(y), (len(mean) - head) // len(y)
+    k = len(y)
     theta = (3 if pose == 3 else 6) - axes
     correction = np.zeros(len(P_ss))
-    turned = generator(table, mean, len(P_ss), axes, mean[:3])
+    origin = mean[:3].copy()
+    turned = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
     depths = anchored(table if most > 1 else table[:0])  # a single step is worse off with it: docs/bearing_only.md
-    s, S = s_j, S_j = sensor_at(model, mean[:head])
-    h = S.shape[1]
-    baselines = (depths, s, S, spread(P_ss, np.arange(h), mean, s, S, depths))
-    x_j, (v, H, HP, Z) = mean, linear
+    v, H, HP, Z = linear
+    s = s_j = v
+    S = S_j = HP
+    baselines = (depths, s, S, s)
+    if len(depths):
+        s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
+        rows = np.arange(S.shape[1])
+        baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P_ss, rows, mean, s, S, depths)))
+        s_j, S_j = s, S
+    x_j = mean
     for j in range(most):
         if j > 0:
-            _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, d), y)
-            H, v = stacked(E_r, E_l), z.copy().ravel()
-            carry_back(H, h, depths, carried(mean, x_j, baselines, s_j, S_j))
-            turn = generator(table, x_j, len(P_ss), axes, mean[:3]) - turned
-            H[:, theta : theta + axes] += sparse_product(H, turn, h, k)
-            v += sparse_product(H, correction.reshape(-1, 1), h, k).ravel()
-            HP, Z = joint_innovation(H, P_ss, R, h)
+            _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, (len(mean) - head) // k), y)
+            H, v = stacked(E_r, E_l), raveled(z)
+            if len(depths):
+                parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
+            now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
+            transport_rows(H, v, now, turned, theta, correction)
+            HP, Z = joint_innovation(H, P_ss, R, E_r.shape[2])
         M, positive = cholesky_inverse(Z)
         if not positive:
             break
-        step = least_squares(HP, M, v)
-        change, correction = step - correction, step
-        if settled(table, change, P_ss, tolerance):
+        before, correction = correction, least_squares(HP, M, v)
+        if settled(table, correction, before, P_ss, tolerance):
             break
         x_j = mean.copy()
-        retract(table, x_j, correction, gauge(mean, correction, pose, axes))
-        s_j, S_j = sensor_at(model, x_j[:head])
-        retract_parallax(x_j, mean, baselines, correction, correction[:h], s_j)
+        call_retract(ways[_RETRACT], (table, x_j, correction, gauge(mean, correction, pose, axes)))
+        if len(depths):
+            s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
+            d_head = correction[: S.shape[1]]
+            parallax.call_retract(ways[_RETRACT_PARALLAX], (x_j, mean, baselines, correction, d_head, s_j))
     return H, M, v, positive
+
+
+compiled_iterate = compiled(iterate)
+
+
+def iterated(
+    model: Any, ways: Routines, sizes: tuple[int, int, int], table: Table, mean: Array, P_ss: Array, y: Array, R: Array,
+    linear: Linear, limits: tuple[int, float],
+) -> tuple[Array, Array, Array, bool]:  # fmt: skip
+    """Return what `iterate` returns, compiled for a compiled model."""
+    if isinstance(model, tuple):
+        return call_iterate(ways[_ITERATE], (model, ways, sizes, table, mean, P_ss, y, R, linear, limits))
+    return iterate(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
+
+
+@overload(iterated, strict=False)  # type: ignore[untyped-decorator]
+def _compiled_iterated(
+    model: Any, ways: Any, sizes: Any, table: Any, mean: Any, P_ss: Any, y: Any, R: Any, linear: Any, limits: Any
+) -> Any:
+    def call(model, ways, sizes, table, mean, P_ss, y, R, linear, limits):  # type: ignore[no-untyped-def]
+        return call_iterate(ways[_ITERATE], (model, ways, sizes, table, mean, P_ss, y, R, linear, limits))
+
+    return call if isinstance(model, types.BaseTuple) else None
 
 
 @compiled
@@ -118,8 +188,15 @@ def gain(
 
     `sizes`: the columns of the head in H, and how many observations there are.
     """
-    V = M @ sparse_product(H, rows_of(P, index, n), sizes[0], sizes[1])
-    return V, (M @ v) @ V
+    V = lower_product(M, sparse_product(H, rows_of(P, index, n), sizes[0], sizes[1]))
+    correction = np.zeros(n)
+    for i in range(len(M)):
+        w = 0.0
+        for j in range(i + 1):
+            w += M[i, j] * v[j]
+        for j in range(n):
+            correction[j] += w * V[i, j]
+    return V, correction
 
 
 def invariant(
@@ -130,44 +207,57 @@ def invariant(
     docs/invariant.md, docs/bearing_only.md.  Returns e, z, Z, d2 at the prediction, which were fused, and whether the
     covariances are valid.
     """
-    x, P, n, blocks, atoms, axes = map_
+    x, P, n, blocks, atoms, axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
     e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
+    h = E_r.shape[2]
     P_ss = submatrix(P, index)
     linear = linearized(z, E_r, E_l, P_ss, R)
     Z = diagonal_blocks(linear[3], z.shape[1])
     d2, valid = squared_distances(Z, z)
-    near = (d2 <= gate) & (d2 < np.inf)
-    if not valid or not near.any():
+    near, count = within(d2, gate)
+    if not valid or count == 0:
         return e, z, Z, d2, near, valid
-    if not near.all():
-        index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
-        y, R, P_ss = y[near], R[near], submatrix(P, index)
-        linear = linearized(z[near], E_r[near], E_l[near], P_ss, R)
-    H, M, v, positive = iterate(model, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
+    if count < len(near):
+        slots, y, R = chosen(near, count, slots, y, R)
+        index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+        P_ss = submatrix(P, index)
+        _e, z_near, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(count, d), y)
+        linear = linearized(z_near, E_r, E_l, P_ss, R)
+    H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return e, z, Z, d2, near, False
-    before, x_before = generator(atoms, x, n, axes, mean[:3]), x.copy()
+    origin, x_before = mean[:3].copy(), x.copy()
+    before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    V, correction = gain(P, n, index, H, M, v, (h, count))
     depths = anchored(atoms if limits[0] > 1 else atoms[:0])
-    s, S = sensor_at(model, mean[:head])
-    rows = index[: S.shape[1]]
-    baselines = (depths, s, S, spread(P, rows, x, s, S, depths))
-    V, correction = gain(P, n, index, H, M, v, (len(rows), len(y)))
-    retract(atoms, x, correction, gauge(mean, correction[index], pose, axes))
-    theta = index[(3 if pose == 3 else 6) - axes]
-    downdate_and_transport(P, V, generator(atoms, x, n, axes, mean[:3]) - before, theta)
+    s, S = v, H
+    rows, baselines = index[:h], (depths, s, S, s)
     if len(depths):
-        s_now, S_now = sensor_at(model, observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2])
-        retract_parallax(x, x_before, baselines, correction, correction[rows], s_now)
-        transport_parallax(P, n, rows, depths, carried(x_before, x, baselines, s_now, S_now))
+        s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
+        baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
+    d_head = np.empty(h)
+    for i in range(h):
+        d_head[i] = correction[rows[i]]
+    call_retract(ways[_RETRACT], (atoms, x, correction, gauge(mean, d_head, pose, axes)))
+    now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    for i in range(n):
+        for a in range(axes):
+            now[i, a] -= before[i, a]
+    downdate_and_transport(P, V, now, index[(3 if pose == 3 else 6) - axes])
+    if len(depths):
+        observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
+        s, S = sensor_at(model, observer, ways[_SENSOR_AT])
+        parallax.call_retract(ways[_RETRACT_PARALLAX], (x, x_before, baselines, correction, d_head, s))
+        parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, rows, x_before, x, baselines, s, S))
     return e, z, Z, d2, near, True
 
 
 def compared(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
     """Return each observation's innovation covariance Z (K, p, p) and d2 (K,); nothing is corrected.  [S] (83)."""
-    x, P, _n, blocks, atoms, _axes = map_
+    x, P, _n, blocks, atoms, _axes, _ways = map_
     robot, mount, slots, d, y, R, _gate = scan
     index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     head = head_sizes(blocks, atoms, robot, mount)[1]
@@ -178,14 +268,14 @@ def compared(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
 
 def fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
     """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if not valid."""
-    x, P, _n, blocks, atoms, axes = map_
+    x, P, _n, blocks, atoms, axes, ways = map_
     robot, mount, slots, d, y, R, _gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
     _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     P_ss = submatrix(P, index)
     linear = linearized(z, E_r, E_l, P_ss, R)
-    _H, M, v, positive = iterate(model, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
+    _H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return np.inf, np.inf
     w, log_det = M @ v, 0.0
@@ -203,7 +293,7 @@ def averaged(
     it would be alone; inverse distances are corrected as they are.  Returns d2 (K,) of the first matching's pairs, each
     for itself, NaN for none, and whether the covariances are valid.
     """
-    x, P, n, blocks, atoms, axes = map_
+    x, P, n, blocks, atoms, axes, ways = map_
     robot, mount, slots, d, y, R, _gate = scan
     pose, head = head_sizes(blocks, atoms, robot, mount)
     q = R.shape[1]
@@ -219,7 +309,7 @@ def averaged(
             d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
         S = submatrix(P, index)
         linear = linearized(z, E_r, E_l, S, R[rows])
-        H, M, v, positive = iterate(model, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
+        H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
         if not positive:
             return d2, False
         V_i, D[:, i] = gain(P, n, index, H, M, v, (E_r.shape[2], len(rows)))
@@ -228,13 +318,15 @@ def averaged(
     index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
-    before = generator(atoms, x, n, axes, mean[:3])
-    retract(atoms, x, correction, gauge(mean, correction[index], pose, axes) if transports else np.zeros(0))
+    origin = mean[:3].copy()
+    before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    turn = gauge(mean, correction[index], pose, axes) if transports else np.zeros(0)
+    call_retract(ways[_RETRACT], (atoms, x, correction, turn))
     downdate(P, V)
     add_square(P, spread)
     if transports:
         theta = index[(3 if pose == 3 else 6) - axes]
-        transport(P, generator(atoms, x, n, axes, mean[:3]) - before, theta)
+        transport(P, call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)) - before, theta)
     return d2, True
 
 
@@ -242,7 +334,7 @@ def textbook(
     model: Any, map_: Map, scan: Scan, _: None
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3."""
-    x, P, n, blocks, atoms, _axes = map_
+    x, P, n, blocks, atoms, _axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
     k, p = len(y), R.shape[1]
     e, z, Z, d2 = np.empty((k, y.shape[1])), np.empty((k, p)), np.empty((k, p, p)), np.empty(k)
@@ -258,7 +350,7 @@ def textbook(
             M, _positive = cholesky_inverse(Z[i])
             V, correction = gain(P, n, index, stacked(E_r, E_l), M, z[i].copy(), (E_r.shape[2], 1))
             downdate(P, V)
-            retract(atoms, x, correction, np.zeros(0))
+            call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
     return e, z, Z, d2, near, valid
 
 
@@ -266,7 +358,7 @@ def first_estimates(
     model: Any, map_: Map, scan: Scan, x_first: Array
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
-    x, P, n, blocks, atoms, _axes = map_
+    x, P, n, blocks, atoms, _axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
     k, head = len(slots), head_sizes(blocks, atoms, robot, mount)[1]
     index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
@@ -274,17 +366,17 @@ def first_estimates(
     e, z, _, _ = linearize(model, mean[:head], mean[head:].reshape(k, d), y)
     _, _, E_r, E_l = linearize(model, first[:head], first[head:].reshape(k, d), y)
     Z, d2, valid = innovation(P, index, E_r, E_l, R, z)
-    near = (d2 <= gate) & (d2 < np.inf)
-    if not valid or not near.any():
+    near, count = within(d2, gate)
+    if not valid or count == 0:
         return e, z, Z, d2, near, valid
     index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
     H = stacked(E_r[near], E_l[near])
-    sizes = E_r.shape[2], len(H) // R.shape[1]
+    sizes = E_r.shape[2], count
     M, positive = cholesky_inverse(joint_innovation(H, submatrix(P, index), R[near], sizes[0])[1])
     if positive:
         V, correction = gain(P, n, index, H, M, z[near].ravel(), sizes)
         downdate(P, V)
-        retract(atoms, x, correction, np.zeros(0))
+        call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
     return e, z, Z, d2, near, positive
 
 

@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from kalmark.declare import Count, Positive, register
-from kalmark.filter import corrections
+from kalmark.filter import corrections, prediction
 from kalmark.filter.kernels import Array, Flags, Index
 from kalmark.filter.map import Map, StochasticMap
 
@@ -30,6 +30,24 @@ class Update(NamedTuple):
     y: Array
     R: Array
     gate: float = math.inf
+
+
+class Movement(NamedTuple):
+    """One part of a robot's motion: the control u (m,), held for `dt_s` seconds, with the covariance N of its error.
+
+    `model` is the motion, compiled (a tuple) or in Python; `added` are the slots of constant blocks that are added to
+    the control, of which one has its error where it is `shared` with other parts.  D is the noise gathered in the
+    robot's frame, (0, 0) for none.
+    """
+
+    model: Any
+    robot: int
+    added: Sequence[int]
+    shared: bool
+    u: Array
+    N: Array
+    D: Array
+    dt_s: float
 
 
 class Correction(NamedTuple):
@@ -52,8 +70,8 @@ class Estimator(Protocol):
     coordinates: ClassVar[str]
     default_gate: ClassVar[float]
 
-    def predict(self, map_: Map, robot: int, index: Index, F: Array, Q: Array, moved: Array) -> None:
-        """Move a robot to the mean `moved`: P <- F P F' + Q on the rows `index`.  [S] (14)-(17)."""
+    def predict(self, map_: Map, movement: Movement) -> bool:
+        """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
 
     def correct(self, map_: Map, update: Update) -> Correction:
         """Fuse a scan."""
@@ -81,20 +99,23 @@ class _Estimator:
 
     source: ClassVar[Callable[..., Any]]
     compiled: ClassVar[Callable[..., Any]]
+    from_first: ClassVar[bool] = False  # whether displacements count from the first estimates
     transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
 
-    def predict(self, map_: Map, robot: int, index: Index, F: Array, Q: Array, moved: Array) -> None:
-        """Move a robot to the mean `moved`: P <- F P F' + Q on the rows `index`.  [S] (14)-(17)."""
-        map_.predict(index, F, Q)
-        map_.set_predicted(robot, moved)
+    def predict(self, map_: Map, movement: Movement) -> bool:
+        """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
+        model, robot, added, *control = movement
+        m, robot, _, here = map_.movable(robot, added)
+        run: Any = prediction.compiled_predicted if isinstance(model, tuple) else prediction.predicted
+        return bool(run(m.whole, (model, robot, here, *control), m.x_first, self.from_first))
 
     def correct(self, map_: Map, update: Update) -> Correction:
         """Fuse a scan, where d2 is within the gate."""
         model, robot, mount, slots, d, y, R, gate = update
         run = type(self).compiled if isinstance(model, tuple) else type(self).source
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
-        where, scan = (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), (robot_here, mount_here, here, d, y, R, gate)
-        done = Correction(*run(model, where, scan, self._option(m)))
+        scan = robot_here, mount_here, here, d, y, R, gate
+        done = Correction(*run(model, m.whole, scan, self._option(m)))
         map_.corrected(robot, self.transports)
         return done
 
@@ -106,8 +127,7 @@ class _Estimator:
         model, *scan = update
         run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
         m = map_.opened(update.robot, update.mount, update.slots, self.transports).map
-        where = m.x, m.P, m.n, m.blocks, m.atoms, m.axes
-        d2, valid = run(model, where, tuple(scan), self._limits(), pairs, weights, self.transports)
+        d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)
         return d2, bool(valid)
 
     def _option(self, map_: StochasticMap) -> Any:
@@ -176,6 +196,7 @@ class Fej(_Estimator):
     """
 
     coordinates: ClassVar[str] = "world"
+    from_first: ClassVar[bool] = True
     default_gate: ClassVar[float] = math.inf
     source = corrections.first_estimates
     compiled = corrections.compiled_first_estimates

@@ -116,15 +116,47 @@ def product(A: Array, B: Array) -> Array:
 @compiled
 def quadratic(A: Array, S: Array) -> Array:
     """Return A S A' (m, m) of A (m, n) and S (n, n), symmetric to the last bit."""
-    C = product(product(A, S), A.T.copy())
-    return 0.5 * (C + C.T)
+    AS, C = product(A, S), np.empty((len(A), len(A)))
+    for i in range(len(A)):
+        for j in range(i + 1):
+            one = other = 0.0
+            for k in range(A.shape[1]):
+                one += AS[i, k] * A[j, k]
+                other += AS[j, k] * A[i, k]
+            C[i, j] = C[j, i] = 0.5 * (one + other)
+    return C
+
+
+@compiled
+def lower_product(M: Array, B: Array) -> Array:
+    """Return M B of a lower triangle M (m, m) and B (m, n), four rows of B at a time."""
+    m, n = B.shape
+    out = np.zeros((m, n))
+    for i in range(m):
+        j = 0
+        while j + 4 <= i + 1:
+            a, b, c, d = M[i, j], M[i, j + 1], M[i, j + 2], M[i, j + 3]
+            for k in range(n):
+                out[i, k] += a * B[j, k] + b * B[j + 1, k] + c * B[j + 2, k] + d * B[j + 3, k]
+            j += 4
+        while j <= i:
+            a = M[i, j]
+            for k in range(n):
+                out[i, k] += a * B[j, k]
+            j += 1
+    return out
 
 
 @compiled
 def moved_noise(moved: Array, F: Array, R_u: Array, N: Array) -> tuple[Array, bool]:
     """Return Q = R_u N R_u' (n, n), and whether Q, the moved mean (n,) and F (n, n) are finite."""
-    Q = quadratic(R_u, N)
-    return Q, bool(np.isfinite(moved).all() and np.isfinite(F).all() and np.isfinite(Q).all())
+    Q, total = quadratic(R_u, N), 0.0
+    for i in range(len(moved)):
+        total += 0.0 * moved[i]
+    for i in range(len(F)):
+        for j in range(len(F)):
+            total += 0.0 * (F[i, j] + Q[i, j])
+    return Q, total == 0.0  # 0 times what is not finite is NaN
 
 
 @compiled
@@ -142,23 +174,24 @@ def predict(P: Array, n: int, index: Index, F: Array, Q: Array) -> None:
 def augment(P: Array, n: int, at: int, index: Index, G: Array, Q: Array) -> None:
     """Append a block at rows `at`: P_Lx = G P_x, P_LL = G P G' + Q, G (d, k) on the rows `index`.  [S] (35)-(38)."""
     d = len(G)
+    clear(P, n, at, d)
+    B, P_LL = product(G, rows_of(P, index, n)), quadratic(G, submatrix(P, index))
+    rows = np.empty(d, np.int64)
     for a in range(d):
-        P[at + a, : at + d] = 0.0
-        P[at + d : n, at + a] = 0.0
-    B = G @ rows_of(P, index, n)
-    P_LL = G @ (submatrix(P, index) @ G.T) + Q
-    for a in range(d):
+        rows[a] = at + a
         for b in range(d):
-            B[a, at + b] = 0.5 * (P_LL[a, b] + P_LL[b, a])
-    set_rows(P, np.arange(at, at + d), B)
+            B[a, at + b] = P_LL[a, b] + 0.5 * (Q[a, b] + Q[b, a])
+    set_rows(P, rows, B)
 
 
 @compiled
 def clear(P: Array, n: int, at: int, d: int) -> None:
     """Set the rows and columns at..at+d of P (n, n) to zero: a removed block, or a new one that is known exactly."""
     for a in range(at, at + d):
-        P[a, : a + 1] = 0.0
-        P[a:n, a] = 0.0
+        for b in range(a + 1):
+            P[a, b] = 0.0
+        for b in range(a, n):
+            P[b, a] = 0.0
 
 
 @compiled
@@ -193,14 +226,31 @@ def add_square(P: Array, D: Array) -> None:
 def transport(P: Array, a: Array, theta: int) -> None:
     """P <- A P A' with A = I + a e_theta', a (n, 1 or 3): P += a w' + w a', w = P[:, theta] + a P[theta, theta] / 2."""
     n, axes = a.shape
-    at = np.arange(theta, theta + axes)
-    a_T = a.T.copy()
-    w_T = rows_of(P, at, n) + product(0.5 * submatrix(P, at), a_T)
+    a_T, w_T = np.empty((axes, n)), np.empty((axes, n))
+    for c in range(axes):
+        for j in range(n):
+            w_T[c, j] = P[theta + c, j] if j <= theta + c else P[j, theta + c]
+            a_T[c, j] = a[j, c]
+    half_turned(w_T, a_T, theta)
     for c in range(axes):
         for i in range(n):
             a_i, w_i = a_T[c, i], w_T[c, i]
             for j in range(i + 1):
                 P[i, j] += a_i * w_T[c, j] + w_i * a_T[c, j]
+
+
+@compiled
+def half_turned(w: Array, a: Array, theta: int) -> None:
+    """Add half of P[theta, theta] a to the rows w = P[theta] (axes, n), in place."""
+    axes, n = w.shape
+    half = np.empty((axes, axes))
+    for c in range(axes):
+        for b in range(axes):
+            half[c, b] = 0.5 * w[c, theta + b]
+    for c in range(axes):
+        for b in range(axes):
+            for j in range(n):
+                w[c, j] += half[c, b] * a[b, j]
 
 
 @compiled
@@ -229,18 +279,29 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: int) -> None:
         downdate(P, V)
         transport(P, a, theta)
         return
-    q, at = len(V), np.arange(theta, theta + axes)
+    q = len(V)
+    w, a_T = np.empty((axes, n)), np.empty((axes, n))
+    for c in range(axes):
+        for j in range(n):
+            s = P[theta + c, j] if j <= theta + c else P[j, theta + c]
+            for i in range(q):
+                s -= V[i, theta + c] * V[i, j]
+            w[c, j], a_T[c, j] = s, a[j, c]
+    half_turned(w, a_T, theta)
     L, R = np.empty((q + 2 * axes, n)), np.empty((q + 2 * axes, n))
-    V_theta, a_T = V[:, theta : theta + axes].copy(), a.T.copy()
-    w = rows_of(P, at, n) - V_theta.T @ V
-    w += product(0.5 * w[:, theta : theta + axes], a_T)
-    L[:q], L[q : q + axes], L[q + axes :] = V, -w, -a_T
-    R[:q], R[q : q + axes], R[q + axes :] = V, a_T, w
+    for i in range(len(L)):
+        for j in range(n):
+            if i < q:
+                L[i, j] = R[i, j] = V[i, j]
+            elif i < q + axes:
+                L[i, j], R[i, j] = -w[i - q, j], a_T[i - q, j]
+            else:
+                L[i, j], R[i, j] = -a_T[i - q - axes, j], w[i - q - axes, j]
     for first in range(0, n, BAND):
         last = min(first + BAND, n)
         C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[1]
         subtract_outer(C, P.shape[1], here, last - first, R.ctypes.data, last, len(L), n)
-    L[0], R[0] = 0.0, 0.0  # keeps them alive until the calls are over
+    L[0, 0], R[0, 0] = 0.0, 0.0  # keeps them alive until the calls are over
 
 
 @compiled
@@ -251,8 +312,10 @@ def cholesky_inverse(S: Array) -> tuple[Array, bool]:
     L^-1.
     """
     n = len(S)
-    T = np.zeros((n, 2 * n))
-    T[:, :n] = S
+    T, M = np.zeros((n, 2 * n)), np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            T[i, j] = S[i, j]
     for i in range(n):
         j = 0
         while j + 4 <= i:
@@ -266,9 +329,11 @@ def cholesky_inverse(S: Array) -> tuple[Array, bool]:
                 T[i, k] -= a * T[j, k]
             j += 1
         if not T[i, i] > 0.0:
-            return T[:, n:].copy(), False
+            return M, False
         scale = 1.0 / np.sqrt(T[i, i])
         T[i, n + i] = 1.0
         for k in range(i, n + i + 1):
             T[i, k] *= scale
-    return T[:, n:].copy(), True
+        for k in range(i + 1):
+            M[i, k] = T[i, n + k]
+    return M, True

@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
 from kalmark.filter.kernels import Array, Index
-from kalmark.geometry.spaces import REMOVED, Space, Table
+from kalmark.geometry.spaces import REMOVED, RHO, Space, Table
 
 State = dict[str, Any]  # of a JSON file
 Read = Callable[[str, tuple[int, ...]], Array]  # of a name and the shape expected
@@ -39,6 +39,7 @@ class Layout:
         self.spaces: list[Space | None] = []
         self.used = 0  # slots
         self.axes = 1  # of the gauge: 1 in the plane, 3 in space, 6 where translations have a generator, too
+        self.inverse_depths = False  # whether there are any, or have been
         self.n = 0  # rows of P in use
         self.x_n = 0  # numbers of x in use
         self._free: dict[tuple[int, ...], list[int]] = {}
@@ -75,6 +76,7 @@ class Layout:
         self.atoms[atom_at : atom_at + count, 0] = space.kinds
         self.spaces[slot], self.used = space, self.used + 1
         self.axes = max(self.axes, 6 if space.steps else space.axes)
+        self.inverse_depths = self.inverse_depths or RHO in space.kinds
         where = self.numbers(slot)
         self.x[where] = self.x_first[where] = mean
         return slot

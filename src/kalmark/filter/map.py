@@ -12,13 +12,14 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from kalmark.filter import kernels
+from kalmark.filter import corrections, kernels
 from kalmark.filter.kernels import Array, Index
 from kalmark.filter.layout import CAPACITY, P_AT, P_SIZE, Layout, Read, State, next_capacity, spaces_of
 from kalmark.filter.neighbours import Sorts, distances, near_places, paired
 from kalmark.filter.prefault import Prefault
 from kalmark.geometry.spaces import Space, Table
 
+NO_SLOTS = np.zeros(0, dtype=np.int64)
 AT_ONCE = 32  # inactive blocks to be read jointly, where the caller does not ask for it
 
 
@@ -106,6 +107,9 @@ class Map(Protocol):
     def set_predicted(self, slot: int, mean: Array) -> None:
         """Write a block's mean after a motion."""
 
+    def movable(self, robot: int, added: Sequence[int]) -> Marginal:
+        """Return the dense map on which a robot is moved, by a control to which blocks are `added`; slots there."""
+
     def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> Marginal:
         """Return the dense map on which a scan of these blocks is fused, and their slots there."""
 
@@ -134,12 +138,21 @@ class StochasticMap(Layout):
         self.prefault = Prefault()
 
     @classmethod
-    def of(cls, x: Array, P: Array, blocks: Table, atoms: Table, axes: int) -> StochasticMap:
+    def of(
+        cls, x: Array, P: Array, blocks: Table, atoms: Table, axes: int, inverse_depths: bool
+    ) -> StochasticMap:  # fmt: skip
         """Return a map to be read only, of these arrays."""
         m = cls.__new__(cls)
         m._rows, m._numbers = {}, {}
-        m.x, m.P, m.blocks, m.atoms, m.axes, m.n, m.x_n = x, P, blocks, atoms, axes, len(P), len(x)
+        m.x, m.P, m.blocks, m.atoms, m.n, m.x_n = x, P, blocks, atoms, len(P), len(x)
+        m.axes, m.inverse_depths = axes, inverse_depths
         return m
+
+    @property
+    def whole(self) -> corrections.Map:
+        """The map as compiled code takes it."""
+        ways = corrections.routines(self.axes, self.inverse_depths)
+        return self.x, self.P, self.n, self.blocks, self.atoms, self.axes, ways
 
     # ------------------------------------------------------------------ reading
     index, means = Layout.rows, Layout.stored
@@ -225,6 +238,10 @@ class StochasticMap(Layout):
         """Write a block's mean after a motion."""
         where = self.numbers(slot)
         self.x[where] = self.x_first[where] = mean
+
+    def movable(self, robot: int, added: Sequence[int]) -> Marginal:
+        """Return this map, and the slots as they are."""
+        return Marginal(self, robot, -1, np.array(added, dtype=np.int64) if added else NO_SLOTS)
 
     # ------------------------------------------------------------------ correcting
     def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> Marginal:

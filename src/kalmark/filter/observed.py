@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
-from kalmark.filter.kernels import Array, Index
+from kalmark.filter.kernels import Array, Flags, Index
 from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table
 
 Linear = tuple[Array, Array, Array, Array]  # of all observations at once: innovation v (K p,), H, H P, Z
@@ -41,7 +41,8 @@ def observed_block(
     for i in range(before + len(slots)):
         slot, width = (robot, pose) if i == 0 else ((mount, head - pose) if i < before else (slots[i - before], d))
         x_at, p_at, first = blocks[slot, 0], blocks[slot, 2], blocks[slot, 4]
-        mean[x_to : x_to + width] = x[x_at : x_at + width]
+        for j in range(width):
+            mean[x_to + j] = x[x_at + j]
         rows = 0
         for a in range(first, first + blocks[slot, 5]):
             if atoms[a, 1] - x_at < width:
@@ -172,16 +173,85 @@ def linearized(z: Array, E_r: Array, E_l: Array, P_ss: Array, R: Array) -> Linea
     """
     H = stacked(E_r, E_l)
     HP, Z = joint_innovation(H, P_ss, R, E_r.shape[2])
-    return z.copy().ravel(), H, HP, Z
+    return raveled(z), H, HP, Z
+
+
+@compiled
+def raveled(z: Array) -> Array:
+    """Return innovations z (K, p) as one (K p,)."""
+    k, p = z.shape
+    v = np.empty(k * p)
+    for i in range(k):
+        for a in range(p):
+            v[i * p + a] = z[i, a]
+    return v
 
 
 @compiled
 def joint_innovation(H: Array, P_ss: Array, R: Array, head: int) -> tuple[Array, Array]:
     """Return H P and Z = H P H' + blockdiag(R) of all observations, R (K, p, p)."""
     HP = sparse_product(H, P_ss, head, len(R))
-    Z = sparse_product(H, HP.T.copy(), head, len(R))
+    Z = sparse_product(H, transposed(HP), head, len(R))
     add_blocks(Z, R)
     return HP, Z
+
+
+@compiled
+def transposed(A: Array) -> Array:
+    """Return A' (n, m) of A (m, n)."""
+    out = np.empty((A.shape[1], len(A)))
+    for i in range(len(A)):
+        for j in range(A.shape[1]):
+            out[j, i] = A[i, j]
+    return out
+
+
+@compiled
+def within(d2: Array, gate: float) -> tuple[Flags, int]:
+    """Return which squared distances (K,) are finite and within the gate, and how many."""
+    near, count = np.zeros(len(d2), np.bool_), 0
+    for i in range(len(d2)):
+        if d2[i] <= gate and d2[i] < np.inf:
+            near[i] = True
+            count += 1
+    return near, count
+
+
+@compiled
+def chosen(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[Index, Array, Array]:
+    """Return those `count` of slots (K,), measurements y (K, m) and noises R (K, p, p) that are `near`."""
+    p = R.shape[1]
+    slots_near, y_near, R_near = np.empty(count, np.int64), np.empty((count, y.shape[1])), np.empty((count, p, p))
+    to = 0
+    for i in range(len(near)):
+        if near[i]:
+            slots_near[to] = slots[i]
+            for a in range(y.shape[1]):
+                y_near[to, a] = y[i, a]
+            for a in range(p):
+                for b in range(p):
+                    R_near[to, a, b] = R[i, a, b]
+            to += 1
+    return slots_near, y_near, R_near
+
+
+@compiled
+def transport_rows(H: Array, v: Array, now: Array, then: Array, theta: int, correction: Array) -> None:
+    """Transport the rows of H from an iterate to the mean, H <- H (I + (now - then) e_theta'), then v += H correction.
+
+    `now` and `then` (n, axes) are the generators there and here.
+    """
+    n, axes = now.shape
+    added = np.empty(axes)
+    for r in range(len(H)):
+        for a in range(axes):
+            added[a] = 0.0
+            for c in range(n):
+                added[a] += H[r, c] * (now[c, a] - then[c, a])
+        for a in range(axes):
+            H[r, theta + a] += added[a]
+        for c in range(n):
+            v[r] += H[r, c] * correction[c]
 
 
 @compiled
@@ -213,12 +283,15 @@ def least_squares(HP: Array, M: Array, v: Array) -> Array:
 
 
 @compiled
-def settled(table: Table, change: Array, P: Array, tolerance: float) -> bool:
-    """Return whether each atom of a mean changes by less than that many of its sigmas, however the world is turned."""
+def settled(table: Table, now: Array, before: Array, P: Array, tolerance: float) -> bool:
+    """Return whether each atom of a mean moves by less than that many of its sigmas between two corrections.
+
+    However the world is turned.
+    """
     for i in range(len(table)):
         size, variance = 0.0, 0.0
         for j in range(table[i, 2], table[i, 2] + ERROR_SIZE[table[i, 0]]):
-            size += change[j] ** 2
+            size += (now[j] - before[j]) ** 2
             variance += P[j, j]
         if size > tolerance**2 * variance:
             return False

@@ -16,12 +16,28 @@ from __future__ import annotations
 
 import numpy as np
 
-from kalmark.compiled import compiled
+from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter.kernels import Array, Index, rows_of, submatrix
 from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, VECTOR, X_AT, Table
 
 Baselines = tuple[Table, Array, Array, Array]  # of the anchored at the prediction: table, s, S, c2
 RHO_X, RHO_P, ANCHOR_X, ANCHOR_P = range(4)
+
+BASELINES = "Tuple((i8[:, ::1], f8[::1], f8[:, ::1], f8[::1]))"
+SPREAD = signature_of("f8[::1](f8[:, ::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], i8[:, ::1])")
+RETRACT = signature_of(f"none(f8[::1], f8[::1], {BASELINES}, f8[::1], f8[::1], f8[::1])")
+CARRY_BACK = signature_of(f"none(f8[:, ::1], f8[::1], f8[::1], {BASELINES}, f8[::1], f8[:, ::1])")
+TRANSPORT = signature_of(f"none(f8[:, ::1], i8, i8[::1], f8[::1], f8[::1], {BASELINES}, f8[::1], f8[:, ::1])")
+call_spread, call_retract = by_address(SPREAD), by_address(RETRACT)
+call_carry_back, call_transport = by_address(CARRY_BACK), by_address(TRANSPORT)
+
+
+def addresses() -> tuple[int, int, int, int]:
+    """Return the addresses of `spread`, `retract_parallax`, `carry_back` and `transport_parallax`, compiled now."""
+    return (
+        address_of(spread, SPREAD), address_of(retract_parallax, RETRACT), address_of(carry_back, CARRY_BACK),
+        address_of(transport_parallax, TRANSPORT),
+    )  # fmt: skip
 
 
 @compiled
@@ -100,8 +116,10 @@ def carried(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: 
 
 
 @compiled
-def carry_back(H: Array, head: int, table: Table, C: Array) -> None:
+def carry_back(H: Array, before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: Array) -> None:
     """H <- H T in place, T the map of errors that `carried` describes; the head is H's first columns."""
+    table, head = baselines[0], S_now.shape[1]
+    C = carried(before, x, baselines, s_now, S_now)
     last = C.shape[1] - 1
     for i in range(len(table)):
         p, anchor = table[i, RHO_P], table[i, ANCHOR_P]
@@ -113,8 +131,14 @@ def carry_back(H: Array, head: int, table: Table, C: Array) -> None:
 
 
 @compiled
-def transport_parallax(P: Array, n: int, head: Index, table: Table, C: Array) -> None:
-    """P <- T P T' in place, on the lower triangle: one row and one column of each inverse distance.  O(N n)."""
+def transport_parallax(
+    P: Array, n: int, head: Index, before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: Array
+) -> None:  # fmt: skip
+    """P <- T P T' in place, on the lower triangle: one row and one column of each inverse distance.  O(N n).
+
+    T is the map of errors that `carried` describes.
+    """
+    table, C = baselines[0], carried(before, x, baselines, s_now, S_now)
     h, count = len(head), len(table)
     size = C.shape[1] - h - 1
     X = np.empty((count, n))  # (T - I) P at the rows of rho

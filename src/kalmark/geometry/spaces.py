@@ -56,16 +56,9 @@ KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 
 
 @compiled
-def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
-    """Move the mean x (size,) in place by the correction d (dof,): by plain plus, with `turn` by the exponential.
-
-    `turn` is (0,), d_theta (1,) in the plane, (3,) in space, or (xi_p, d_theta) (6,) where a translation matters.
-    Points move by V(d_theta) d: rotated by Exp(d_theta), then carried along V xi, since V (generator d_theta) =
-    (E - I) l.  Orientations turn by Exp(d_theta), then by their own xi.
-    """
+def retract_plane(atoms: Table, x: Array, d: Array, turn: Array) -> None:
+    """Move what lives in the plane, and plain numbers, as `retract` does."""
     p, q = exponential_v(turn[0]) if len(turn) == 1 else (1.0, 0.0)
-    whole = turn[len(turn) - 3 :] if len(turn) >= 3 else np.zeros(3)
-    V = left_jacobian(whole) if len(turn) >= 3 else np.eye(3)
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
         if kind == VECTOR:
@@ -75,14 +68,29 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
             x[at] += d[k]
         elif kind in (HEADING, ANGLE):
             x[at] = wrap(x[at] + d[k])
-        elif kind == ROTATION:
+
+
+@compiled
+def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
+    """Move the mean x (size,) in place by the correction d (dof,): by plain plus, with `turn` by the exponential.
+
+    `turn` is (0,), d_theta (1,) in the plane, (3,) in space, or (xi_p, d_theta) (6,) where a translation matters.
+    Points move by V(d_theta) d: rotated by Exp(d_theta), then carried along V xi, since V (generator d_theta) =
+    (E - I) l.  Orientations turn by Exp(d_theta), then by their own xi.
+    """
+    retract_plane(atoms, x, d, turn)
+    whole = turn[len(turn) - 3 :] if len(turn) >= 3 else np.zeros(3)
+    V = left_jacobian(whole) if len(turn) >= 3 else np.eye(3)
+    for i in range(len(atoms)):
+        kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
+        if kind == ROTATION:
             own = exp(d[k : k + 3] - whole)
             x[at : at + 4] = multiply(exp(whole), multiply(own, x[at : at + 4]))
         elif kind == TURNED:
             x[at : at + 4] = multiply(exp(d[k : k + 3]), x[at : at + 4])
         elif kind == DIRECTION:
             _retract_direction(x[at : at + 2], d[k : k + 2], whole)
-        elif kind >= VECTOR3:
+        elif kind >= VECTOR3 and kind != RHO:
             if kind == PLUECKER and len(turn) == 6:
                 _move_moment(x[at : at + 6], turn[:3].copy(), V, whole)
             _add_vectors(x[at : at + LINEAR[kind]], V, d[k : k + LINEAR[kind]])
@@ -126,6 +134,19 @@ def _direction_generator(m: Array) -> Array:
 
 
 @compiled
+def generator_plane(atoms: Table, x: Array, size: int, axes: int, origin: Array) -> Array:
+    """Return how the errors (size, axes) of what lives in the plane move when the world turns, as `generator` does."""
+    g = np.zeros((size, axes))
+    for i in range(len(atoms)):
+        kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
+        if kind == VECTOR:
+            g[k, 0], g[k + 1, 0] = -x[at + 1], x[at]
+        elif kind == HEADING:
+            g[k, 0] = 1.0
+    return g
+
+
+@compiled
 def generator(atoms: Table, x: Array, size: int, axes: int, origin: Array) -> Array:
     """Return how the errors (size, axes) move when the world turns about its origin, d x / d phi.
 
@@ -133,20 +154,15 @@ def generator(atoms: Table, x: Array, size: int, axes: int, origin: Array) -> Ar
     last three are turns about the robot, which stands at `origin` (3,): d = xi + (generator - generator_t
     generator_p) d_theta + generator_t d_p.
     """
-    g = np.zeros((size, axes))
-    turn = axes - 3
+    g, turn = generator_plane(atoms, x, size, axes, origin), axes - 3
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
-        if kind == VECTOR:
-            g[k, 0], g[k + 1, 0] = -x[at + 1], x[at]
-        elif kind == HEADING:
-            g[k, 0] = 1.0
-        elif kind == ROTATION:
+        if kind == ROTATION:
             for j in range(3):
                 g[k + j, turn + j] = 1.0
         elif kind == DIRECTION:
             g[k : k + 2, turn:] = _direction_generator(direction_many(x[at : at + 2].reshape(1, 2))[0][0])
-        elif LINEAR[kind] > 0:
+        elif kind >= 0 and LINEAR[kind] > 0:
             for a in range(0, LINEAR[kind], 3):
                 g[k + a, turn + 1], g[k + a, turn + 2] = x[at + a + 2], -x[at + a + 1]
                 g[k + a + 1, turn], g[k + a + 1, turn + 2] = -x[at + a + 2], x[at + a]

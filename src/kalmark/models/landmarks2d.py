@@ -30,29 +30,34 @@ Array = npt.NDArray[np.float64]
 @compiled
 def point_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return v (K, d) of points l (K, d) with d - 2 attributes, V_T (K, d, 3), V_l (K, d, d).  [S] (56)."""
-    k, d = l.shape
-    p, P_T, P_l = to_frame_many(T, l)
-    if d == 2:
-        return p, P_T, P_l
-    v, V_T, V_l = l.copy(), np.zeros((k, d, 3)), np.zeros((k, d, d))
-    v[:, :2], V_T[:, :2], V_l[:, :2, :2] = p, P_T, P_l
-    for j in range(2, d):
-        V_l[:, j, j] = 1.0
-    return v, V_T, V_l
+    return with_attributes(l, to_frame_many(T, l))
 
 
 @compiled
 def point_from_view(T: Array, v: Array) -> tuple[Array, Array, Array]:
     """Return points l (K, d) with attributes that look like v (K, d) from T, L_T, L_v.  [S] (55)."""
-    k, d = v.shape
-    p, P_T, P_v = from_frame_many(T, v)
+    return with_attributes(v, from_frame_many(T, v))
+
+
+@compiled
+def with_attributes(a: Array, points: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """Return points (K, 2), with Jacobians in a pose and in `a` (K, d), followed by the attributes in `a`."""
+    k, d = a.shape
+    p, P_T, P_a = points
     if d == 2:
-        return p, P_T, P_v
-    l, L_T, L_v = v.copy(), np.zeros((k, d, 3)), np.zeros((k, d, d))
-    l[:, :2], L_T[:, :2], L_v[:, :2, :2] = p, P_T, P_v
-    for j in range(2, d):
-        L_v[:, j, j] = 1.0
-    return l, L_T, L_v
+        return p, P_T, P_a
+    b, B_T, B_a = np.empty((k, d)), np.zeros((k, d, 3)), np.zeros((k, d, d))
+    for i in range(k):
+        for j in range(d):
+            if j >= 2:
+                b[i, j], B_a[i, j, j] = a[i, j], 1.0
+                continue
+            b[i, j] = p[i, j]
+            for c in range(3):
+                B_T[i, j, c] = P_T[i, j, c]
+            for c in range(2):
+                B_a[i, j, c] = P_a[i, j, c]
+    return b, B_T, B_a
 
 
 @compiled

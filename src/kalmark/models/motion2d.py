@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from kalmark.declare import NotNegative, Number, Positive, register
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import SE2, Space
+from kalmark.models.moving import Compiled
 
 __all__ = ["Ackermann", "Odometry2D", "Unicycle"]
 
@@ -32,9 +33,15 @@ Turning = Annotated[NotNegative, "Random walk of the heading, while it moves."]
 
 
 @compiled
-def increment(r: Array, u: Array) -> tuple[Array, Array, Array]:
+def increment(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
     """Move r (3,) by u (3,) = (dx, dy, dtheta) in its own frame: the new r, R_r, R_u (3, 3).  [S] (59)-(60)."""
     return compose(r, u)
+
+
+@compiled
+def unicycle(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (3,) by the speed and turn rate u (2,) for dt s: the new r, R_r (3, 3), R_u (3, 2)."""
+    return arc(r, u[0], u[1], dt)
 
 
 @compiled
@@ -47,14 +54,22 @@ def arc(r: Array, v: float, w: float, dt: float) -> tuple[Array, Array, Array]:
     p, q = exponential_v(a)
     p_a, q_a = exponential_v_rate(a)
     s = v * dt
-    r2, R_r, R_d = compose(r, np.array([s * p, s * q, a]))
-    D_u = np.array([[dt * p, s * dt * p_a], [dt * q, s * dt * q_a], [0.0, dt]])
-    return r2, R_r, R_d @ D_u
+    step, R_u = np.empty(3), np.empty((3, 2))
+    step[0], step[1], step[2] = s * p, s * q, a
+    r2, R_r, R_d = compose(r, step)
+    for i in range(3):
+        R_u[i, 0] = R_d[i, 0] * (dt * p) + R_d[i, 1] * (dt * q)
+        R_u[i, 1] = R_d[i, 0] * (s * dt * p_a) + R_d[i, 1] * (s * dt * q_a) + R_d[i, 2] * dt
+    return r2, R_r, R_u
 
 
 @compiled
-def ackermann(r: Array, u: Array, dt: float, wheelbase: float, offset: float) -> tuple[Array, Array, Array]:
-    """Move the rear axle's centre r (3,) by u (2,) = (speed of the left rear wheel, steering), along the exact arc."""
+def ackermann(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move the rear axle's centre r (3,) by u (2,) = (speed of the left rear wheel, steering), along the exact arc.
+
+    `par`: wheelbase and offset of the encoder.
+    """
+    wheelbase, offset = par[0], par[1]
     tan = math.tan(u[1])
     slip = 1.0 / (1.0 - tan * offset / wheelbase)
     v, w = u[0] * slip, u[0] * slip * tan / wheelbase
@@ -66,7 +81,7 @@ def ackermann(r: Array, u: Array, dt: float, wheelbase: float, offset: float) ->
     return r2, R_r, R_vw @ VW_u
 
 
-class Planar:
+class Planar(Compiled):
     """What the planar motions share: the space and the diffusion."""
 
     space: ClassVar[Space] = SE2
@@ -105,14 +120,11 @@ class Unicycle(Planar):
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
     held: ClassVar[bool] = True
+    moves: ClassVar[Any] = unicycle
 
     @cached_property
     def _N(self) -> Array:
         return np.diag(np.square([self.sigma_v_mps, self.sigma_w_radps]))
-
-    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved pose (3,), R_r (3, 3), R_u (3, 2)."""
-        return arc(r, u[0], u[1], dt_s)
 
     def control_noise(self, u: Array) -> Array:
         """Return N (2, 2) of the held speed and turn rate."""
@@ -141,14 +153,11 @@ class Odometry2D(Planar):
 
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
     held: ClassVar[bool] = False
+    moves: ClassVar[Any] = increment
 
     @cached_property
     def _N(self) -> Array:
         return np.diag(np.square([self.sigma_x_m, self.sigma_y_m, self.sigma_theta_rad]))
-
-    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved pose (3,), R_r (3, 3), R_u (3, 3)."""
-        return increment(r, u)
 
     def control_noise(self, u: Array) -> Array:
         """Return N (3, 3) of one increment."""
@@ -180,14 +189,16 @@ class Ackermann(Planar):
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
     held: ClassVar[bool] = True
+    moves: ClassVar[Any] = ackermann
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The wheelbase and the offset of the encoder, m."""
+        return np.array([self.wheelbase_m, self.encoder_offset_m])
 
     @cached_property
     def _N(self) -> Array:
         return np.diag(np.square([self.sigma_v_mps, self.sigma_steering_rad]))
-
-    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved pose (3,), R_r (3, 3), R_u (3, 2)."""
-        return ackermann(r, u, dt_s, self.wheelbase_m, self.encoder_offset_m)
 
     def control_noise(self, u: Array) -> Array:
         """Return N (2, 2) of the held speed and steering."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ from kalmark.declare import NotNegative, register
 from kalmark.geometry import frames3d
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
 from kalmark.geometry.spaces import ROTATION, SCALAR, SE3, VECTOR3, Space
+from kalmark.models.moving import Compiled
 
 __all__ = ["ConstantVelocity3D", "Odometry3D", "Velocity3D"]
 
@@ -20,7 +21,13 @@ Array = npt.NDArray[np.float64]
 
 
 @compiled
-def twist(r: Array, u: Array, dt: float) -> tuple[Array, Array, Array]:
+def increment(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (7,) by u (6,) = (dx, dy, dz, rotation vector) in its own frame: the new r, R_r, R_u (6, 6)."""
+    return frames3d.move(r, u)
+
+
+@compiled
+def twist(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
     """Move r (7,) for dt s by the constant velocity u = (v, w) in its own frame, exactly; R_r (6, 6), R_u (6, 6)."""
     Q, turn, way = matrix(r[3:]), u[3:] * dt, u[:3] * dt
     V = left_jacobian(turn)
@@ -36,7 +43,7 @@ def twist(r: Array, u: Array, dt: float) -> tuple[Array, Array, Array]:
 
 
 @compiled
-def coast(r: Array, u: Array, dt: float) -> tuple[Array, Array, Array]:
+def coast(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
     """Move r (13,) for dt s at its own velocity, which u then changes; R_r (12, 12), R_u (12, 6).  [TB] constVel."""
     Q, turn = matrix(r[3:7]), r[10:] * dt
     moved = r.copy()
@@ -53,7 +60,7 @@ def coast(r: Array, u: Array, dt: float) -> tuple[Array, Array, Array]:
 
 
 @register("motion", "odometry_3d")
-class Odometry3D:
+class Odometry3D(Compiled):
     """Increments dx, dy, dz and a rotation vector rx, ry, rz, in the robot's frame.
 
     A control is u (6,), m and rad.  The sigmas are those of one increment.
@@ -67,14 +74,11 @@ class Odometry3D:
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
     held: ClassVar[bool] = False
+    moves: ClassVar[Any] = increment
 
     @cached_property
     def _N(self) -> Array:
         return np.diag(np.square([self.sigma_x_m, self.sigma_y_m, self.sigma_z_m, *3 * [self.sigma_rotation_rad]]))
-
-    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved pose (7,), R_r (6, 6), R_u (6, 6)."""
-        return frames3d.move(r, u)
 
     def control_noise(self, u: Array) -> Array:
         """Return N (6, 6) of one increment."""
@@ -85,7 +89,7 @@ class Odometry3D:
 
 
 @register("motion", "velocity_3d")
-class Velocity3D:
+class Velocity3D(Compiled):
     """Velocity and turn rate in the robot's frame, each held until the next control.
 
     A control is u = (vx, vy, vz, wx, wy, wz), m/s and rad/s.
@@ -108,15 +112,12 @@ class Velocity3D:
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
     held: ClassVar[bool] = True
+    moves: ClassVar[Any] = twist
 
     @cached_property
     def _N(self) -> Array:
         v, w = (self.sigma_vx_mps, self.sigma_vy_mps, self.sigma_vz_mps), (self.sigma_wx_radps, self.sigma_wy_radps)
         return np.diag(np.square([*v, *w, self.sigma_wz_radps]))
-
-    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved pose (7,), R_r (6, 6), R_u (6, 6)."""
-        return twist(r, u, dt_s)
 
     def control_noise(self, u: Array) -> Array:
         """Return N (6, 6) of the held velocity."""
@@ -133,7 +134,7 @@ class Velocity3D:
 
 
 @register("motion", "constant_velocity_3d")
-class ConstantVelocity3D:
+class ConstantVelocity3D(Compiled):
     """Velocity and turn rate are in the state: it goes on as it goes, controls are changes of both, and needs none.
 
     The state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.  The robot coasts to the
@@ -149,15 +150,12 @@ class ConstantVelocity3D:
     space: ClassVar[Space] = Space("SE3 with velocity", (VECTOR3, ROTATION, VECTOR3, SCALAR, SCALAR, SCALAR))
     columns: ClassVar[tuple[str, ...]] = ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps")
     held: ClassVar[bool] = False
+    moves: ClassVar[Any] = coast
     coasts: ClassVar[bool] = True
 
     @cached_property
     def _N(self) -> Array:
         return np.diag(np.square([*3 * [self.sigma_v_mps], *3 * [self.sigma_w_radps]]))
-
-    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
-        """Return the moved state (13,), R_r (12, 12), R_u (12, 6)."""
-        return coast(r, u, dt_s)
 
     def control_noise(self, u: Array) -> Array:
         """Return N (6, 6) of one impulse."""

@@ -26,12 +26,13 @@ from kalmark.models.seen import EXPECT, LOOK, residual
 
 Array = npt.NDArray[np.float64]
 View = tuple[int, int, int, int, Array, Array, npt.NDArray[np.bool_]]
-# addresses of `linearize_built_in`, the landmark's `look`, the sensor's `expected`; its code, mount, parameters, angles
+# addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles
 VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
 LINEARIZE = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
-call_linearize = by_address(LINEARIZE)
+SENSOR_AT = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], f8[::1])")
+call_linearize, call_sensor_at = by_address(LINEARIZE), by_address(SENSOR_AT)
 MOUNT = 4  # where a view has the mount
 
 NOTHING = np.zeros(0)
@@ -104,7 +105,7 @@ def built_in_view(
     look: Any, expect: Any, code: int, mount: Array, par: Array, angular: npt.NDArray[np.bool_]
 ) -> View:  # fmt: skip
     """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,)."""
-    linearize_at = address_of(linearize_built_in, LINEARIZE)
+    linearize_at = address_of(linearize_in_plane if len(mount) == 3 else linearize_in_space, LINEARIZE)
     return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular
 
 
@@ -137,56 +138,95 @@ def _compiled_linearize(view: Any, head: Any, l: Any, y: Any) -> Any:
     return None
 
 
-def sensor_at(view: Any, head: Array) -> tuple[Array, Array]:
-    """Return the position (2 or 3,) of the sensor of a view, and its Jacobian in the head."""
-    return position_of_mount(view[MOUNT] if isinstance(view, tuple) else view.mount, head)
+def sensor_at(view: Any, head: Array, address: int) -> tuple[Array, Array]:
+    """Return the position (2 or 3,) of the sensor of a view, and its Jacobian in the head, by `sensor_address`."""
+    return call_sensor_at(address, (view[MOUNT] if isinstance(view, tuple) else view.mount, head))
 
 
 @overload(sensor_at, strict=False)  # type: ignore[untyped-decorator]
-def _compiled_sensor_at(view: Any, head: Any) -> Any:
-    return lambda view, head: position_of_mount(view[MOUNT], head)
+def _compiled_sensor_at(view: Any, head: Any, address: Any) -> Any:
+    return lambda view, head, address: call_sensor_at(address, (view[MOUNT], head))
+
+
+def sensor_address(axes: int) -> int:
+    """Return the address of what `sensor_at` calls in the plane (one axis) or in space."""
+    return address_of(_sensor_in_plane if axes == 1 else _sensor_in_space, SENSOR_AT)
 
 
 @compiled
-def position_of_mount(mount: Array, head: Array) -> tuple[Array, Array]:
-    """Return the position S (d,) of a mount on a robot, and S_h (d, h); h is the pose and, if in the map, the mount."""
-    pose = len(mount)
-    at = head[pose : 2 * pose] if len(head) > pose else mount
-    size = 2 if pose == 3 else 3
-    if pose == 3:
-        T, T_r, T_s = compose(head[:pose], at)
-    else:
-        T, T_r, T_s = frames3d.compose(head[:pose], at)
-    if len(head) == pose:
-        return T[:size].copy(), T_r[:size].copy()
-    return T[:size].copy(), np.concatenate((T_r[:size], T_s[:size], np.zeros((size, len(head) - 2 * pose))), axis=1)
+def _sensor_in_plane(mount: Array, head: Array) -> tuple[Array, Array]:
+    """Return the position S (2,) of a mount on a robot, and S_h (2, h); h is the pose and, if in the map, the mount."""
+    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 else mount)
+    return _position(T, T_r, T_s, 2, len(head))
 
 
 @compiled
-def linearize_built_in(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what `expectation` returns, compiled.
+def _sensor_in_space(mount: Array, head: Array) -> tuple[Array, Array]:
+    """Return the position S (3,) of a mount on a robot, and S_h (3, h); h is the pose and, if in the map, the mount."""
+    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 else mount)
+    return _position(T, T_r, T_s, 3, len(head))
+
+
+@compiled
+def _position(T: Array, T_r: Array, T_s: Array, size: int, head: int) -> tuple[Array, Array]:
+    pose, dof = len(T), len(T_r)
+    S_h = np.zeros((size, dof if head == pose else 2 * dof + head - 2 * pose))
+    for i in range(size):
+        for j in range(dof):
+            S_h[i, j] = T_r[i, j]
+            if head > pose:
+                S_h[i, dof + j] = T_s[i, j]
+    return T[:size].copy(), S_h
+
+
+@compiled
+def linearize_in_plane(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what `expectation` returns in the plane, compiled.
 
     The landmarks l are (K, n), the measurements y (K, m); e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n).
     """
+    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 else view[MOUNT])
+    return _linearized(view, head, T, T_r, T_s, l, y)
+
+
+@compiled
+def linearize_in_space(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what `expectation` returns in space, compiled.
+
+    The landmarks l are (K, n), the measurements y (K, m); e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n).
+    """
+    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 else view[MOUNT])
+    return _linearized(view, head, T, T_r, T_s, l, y)
+
+
+@compiled
+def _linearized(
+    view: View, head: Array, T: Array, T_r: Array, T_s: Array, l: Array, y: Array
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Apply the chain rule from the sensor's pose T on, T_r and T_s being its Jacobians."""
     _, look_at, expect_at, code, at, par, angular = view
     pose = len(at)
-    mount = head[pose : 2 * pose] if len(head) > pose else at
     if len(head) > 2 * pose:
         par = head[2 * pose :].copy()
-    T, T_r, T_s = compose(head[:pose], mount) if pose == 3 else frames3d.compose(head[:pose], mount)
     v, V_T, V_l = seen.look(look_at, (T, l))
     e, z, E_v = seen.expect(expect_at, (code, par, angular, v, y))
-    E_T = chained(E_v, V_T)
-    E_l = chained(E_v, V_l)
+    E_T, E_l = chained(E_v, V_T), chained(E_v, V_l)
     if len(head) == pose:
         return e, z, turned(E_T, T_r), E_l
     k, p, n = E_T.shape
     E_h = np.zeros((k, p, 2 * n + len(head) - 2 * pose))
     for i in range(k):
-        E_h[i, :, n : 2 * n] = E_T[i] @ T_s
+        for a in range(p):
+            for b in range(n):
+                for c in range(n):
+                    E_h[i, a, n + c] += E_T[i, a, b] * T_s[b, c]
         if len(head) > 2 * pose:  # gain and offset of the range, the first number
             E_h[i, 0, 2 * n], E_h[i, 0, 2 * n + 1] = -e[i, 0] / par[0], 1.0 / par[0]
-    E_h[:, :, :n] = turned(E_T, T_r)
+    turned(E_T, T_r)
+    for i in range(k):
+        for a in range(p):
+            for c in range(n):
+                E_h[i, a, c] = E_T[i, a, c]
     return e, z, E_h, E_l
 
 

@@ -1,4 +1,4 @@
-"""How a robot moves: the control it holds, cut into parts by the scans between, and the prediction of one part.
+"""How a robot moves: the control it holds, cut into parts by the scans between.
 
 A rate acts from its time until the robot's next control, so a scan in between splits its interval.  An increment is the
 motion that ended at its time.  A robot that coasts moves without a control, which changes its velocity at its time.
@@ -11,6 +11,7 @@ controls (`sigma_v_bias_mps` and the like).  Both add to the control, and the sc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -18,15 +19,13 @@ import numpy.typing as npt
 
 from kalmark.errors import EventError
 from kalmark.events import Control
-from kalmark.filter.estimators import Estimator
-from kalmark.filter.kernels import moved_noise
-from kalmark.filter.map import Map
-from kalmark.geometry.angles import rotation
-from kalmark.geometry.rotations import matrix
+from kalmark.filter.estimators import Movement
 from kalmark.geometry.spaces import Rn, Space
+from kalmark.models.moving import step_of
 from kalmark.models.protocols import Motion, bias_covariance, coasts
 
 Array = npt.NDArray[np.float64]
+NO_NOISE = np.zeros((0, 0))
 
 
 class Part(NamedTuple):
@@ -112,50 +111,21 @@ class Moving:
     held: HeldInput
     error: int | None = None
 
-    def added(self) -> list[int]:
-        """Return the slots of the blocks that are added to the control."""
-        return [block for block in (self.error, self.bias) if block is not None]
+    @cached_property
+    def model(self) -> Any:
+        """The motion as the filter takes it."""
+        return step_of(self.motion)
 
+    def movement(self, part: Part) -> Movement:
+        """Return what one part of its control does to the robot."""
+        added = [block for block in (self.error, self.bias) if block is not None]
+        D = self.motion.diffusion(part.u, part.dt_s)
+        shared = self.error is not None
+        return Movement(self.model, self.slot, added, shared, part.u, part.N, NO_NOISE if D is None else D, part.dt_s)
 
-class Prediction(NamedTuple):
-    """A robot's state after one part of its motion, with F (n, n) and R_u (n, k).
-
-    Q (n, n) is the noise of the control's error, D that of the diffusion; `valid` if all of it is finite.
-    """
-
-    moved: Array
-    F: Array
-    R_u: Array
-    Q: Array
-    D: Array | None
-    valid: bool
-
-    def joined(self, added: int, shared: bool) -> tuple[Array, Array]:
-        """Return F and Q (n + k added, n + k added) of the robot and `added` constant blocks (k,) added to its control.
-
-        With a `shared` error the control's noise is in one of these blocks.
-        """
-        (n, k), F, Q = self.R_u.shape, self.F, np.zeros_like(self.Q) if shared else self.Q
-        if added:
-            F, Q = np.eye(n + added * k), np.zeros((n + added * k,) * 2)
-            F[:n, :n], F[:n, n:] = self.F, np.tile(self.R_u, added)
-            if not shared:
-                Q[:n, :n] = self.Q
-        if self.D is not None:
-            G = body_axes(self.moved)
-            Q[: len(G), : len(G)] += G @ self.D @ G.T
-        return F, Q
-
-
-def predict(map_: Map, estimator: Estimator, moving: Moving, part: Part) -> Prediction:
-    """Return where one part of its control moves a robot: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
-    r, u = map_.mean(moving.slot), part.u
-    for block in moving.added():
-        u = u + map_.mean(block)
-    moved, F, R_u = moving.motion.move(r, u, part.dt_s)
-    F = estimator.pose_jacobian(map_, moving.slot, F)
-    Q, valid = moved_noise(moved, F, R_u, part.N)
-    return Prediction(moved, F, R_u, Q, moving.motion.diffusion(part.u, part.dt_s), valid)
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but the compiled model, whose address means nothing to another process."""
+        return {name: value for name, value in self.__dict__.items() if name != "model"}
 
 
 def bias_name(robot: str) -> str:
@@ -167,15 +137,3 @@ def bias_block(motion: Motion) -> tuple[Space, Array, Array] | None:
     """Return the space, the mean (k,) and the covariance (k, k) of the bias of a motion's controls, or None."""
     cov = bias_covariance(motion)
     return None if cov is None else (Rn(len(cov)), np.zeros(len(cov)), cov)
-
-
-def body_axes(state: Array) -> Array:
-    """Return what turns an error from the robot's frame into the world's: (3, 3) in the plane, (6 or more) in space."""
-    if len(state) < 7:
-        G = np.eye(3)
-        G[:2, :2] = rotation(state[2])
-        return G
-    G = np.eye(len(state) - 1)
-    turned = min(9, len(G))  # position, orientation and velocity; a body rate is in the robot's frame anyway
-    G[:turned, :turned] = np.kron(np.eye(turned // 3), matrix(state[3:7]))
-    return G

@@ -12,6 +12,7 @@ return decisions and actions.  This page alone changes the map, the tracks and t
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -47,10 +48,10 @@ from kalmark.slam.checks import (
     refuse_bad_fix,
     refuse_odd_parts,
 )
-from kalmark.slam.motion import HeldInput, Moving, Part, bias_block, bias_name, predict
+from kalmark.slam.motion import HeldInput, Moving, Part, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
 from kalmark.slam.robot import Robot, mount_name, robots_given
-from kalmark.tracks.channel import Channel, Parts
+from kalmark.tracks.channel import Channel, ObservationModel, Parts
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import ChannelKey, Late, Pending, Status, Track, Tracks
@@ -212,22 +213,16 @@ class Slam:
     def _move(self, name: str, part: Part) -> None:
         """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
         moving = self._moving[name]
-        step, added = predict(self.map, self.estimator, moving, part), moving.added()
-        if not step.valid:
+        before = moving.error
+        if before is None and not (part.first and part.last) and part.N.any():
+            with suppress(MapError):  # it is full: each part has an error of its own
+                moving.error = self.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
+        if not self.estimator.predict(self.map, moving.movement(part)):
+            if before is None and moving.error is not None:
+                self.map.remove(moving.error)
+                moving.error = None
             what = f"{name!r} at t={seconds(self.t_ns or 0)} s"
             raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
-        if moving.error is None and not (part.first and part.last) and part.N.any():
-            k = len(part.u)
-            try:
-                moving.error = self.map.add(Rn(k), np.zeros(k), part.N)
-                added.append(moving.error)
-            except MapError:  # it is full: each part has an error of its own
-                pass
-        index = self.map.index(moving.slot)
-        if added:
-            index = np.concatenate([index, *map(self.map.index, added)])
-        F, Q = step.joined(len(added), shared=moving.error is not None)
-        self.estimator.predict(self.map, moving.slot, index, F, Q, step.moved)
         self.clones.moved(name)
 
     # ------------------------------------------------------------------ scans
@@ -238,24 +233,24 @@ class Slam:
         if policy.holds_back:
             decisions = accepted(query, decisions, policy.upkeep.odds)
         self.tracks.learn(*query.learned)
-        known = self.tracks.known_to(scan.channel, scan.event.robot, [name for name, _ in decisions])
-        found = self._correct(scan, policy, known, decisions)
+        names = [name for name, _ in decisions]
+        groups = self.tracks.by_model(scan.channel, names, scan.event.robot)
+        found = self._correct(scan, policy, groups, decisions)
         if policy.reviews:
             self._review(scan, policy, found)
         if len(found) < len(decisions):
             seen = {o.index: o for o in found}
-            self._start(scan, policy, known, decisions, seen)
+            self._start(scan, policy, [k for _, rows in groups for k in rows], decisions, seen)
             found = list(seen.values())
         scan.report.observations = tuple(sorted(found))
 
     def _correct(
-        self, scan: ScanContext, policy: Policy, known: list[int], decisions: Sequence[Decision]
-    ) -> list[Observation]:
-        """Fuse the observations `known` of landmarks in the map, those of one type at once.  [S] (26)-(30)."""
-        names: list[Any] = [decisions[k][0] for k in known]
-        groups = [(m, [known[i] for i in rows]) for m, rows in self.tracks.by_model(scan.channel, names)]
+        self, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],
+        decisions: Sequence[Decision],
+    ) -> list[Observation]:  # fmt: skip
+        """Fuse observations of landmarks in the map, the groups of those of one type at once.  [S] (26)-(30)."""
         report, found, most = scan.report, list[Observation](), policy.attention.updates
-        if most is not None and len(known) > most:
+        if most is not None and sum(len(rows) for _, rows in groups) > most:
             groups, out = budget.chosen(scan, policy.attention, groups, decisions)
             why = f"not among the {most} of most information"
             found += [Observation(k, scan.ids[k], "ignored", decisions[k][0], None, why) for k in out]  # type: ignore[arg-type]
@@ -266,7 +261,7 @@ class Slam:
         for model, rows in groups:
             if not rows:
                 continue
-            names = [decisions[k][0] for k in rows]
+            names: list[Any] = [decisions[k][0] for k in rows]
             slots = self.tracks.slots_of(names)
             if scan.channel.far is not None and (near := far.approach(scan, model, slots, rows)) is not None:
                 self.estimator.correct(self.map, near)
@@ -312,7 +307,8 @@ class Slam:
             seen[o.index] = o
         if confirmed:
             by_name = [confirmed.get(k, (None, "")) for k in range(len(decisions))]
-            for o in self._correct(scan, policy, list(confirmed), by_name):
+            groups = self.tracks.by_model(scan.channel, [name for name, _ in by_name], scan.event.robot)
+            for o in self._correct(scan, policy, groups, by_name):
                 seen[o.index] = o._replace(outcome="new", reason=by_name[o.index][1])
         new = [k for k in new if k not in seen]
         reasons = budget.left_out(scan, policy.attention, policy.starts, new, known, decisions)

@@ -75,7 +75,7 @@ class ObservationModel:
         """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
         run = corrections.compiled_compared if isinstance(self.model, tuple) else corrections.compared
         scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), math.inf
-        return run(self.model, (m.x, m.P, m.n, m.blocks, m.atoms, m.axes), scan)
+        return run(self.model, m.whole, scan)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled model, whose addresses mean nothing to another process."""

@@ -259,19 +259,21 @@ class Tracks:
         """Return the landmarks of the kinds that a sensor can observe."""
         return [name for name, track in self.confirmed.items() if track.model.kind in channel.models]
 
-    def known_to(self, channel: Channel, robot: str, names: Sequence[Any]) -> list[int]:
-        """Return the indices of those names that a sensor of this robot can observe in the map."""
-        sorts = list(map(self.sorts.get, names))
-        if channel.models.keys() >= set(sorts) and robot not in names:
-            return list(range(len(names)))
-        return [i for i, sort in enumerate(sorts) if sort in channel.models and names[i] != robot]
+    def by_model(
+        self, channel: Channel, names: Sequence[Any], robot: str = ""
+    ) -> list[tuple[ObservationModel, list[int]]]:
+        """Return the indices of names grouped by observation model, points of known depth first.
 
-    def by_model(self, channel: Channel, names: Sequence[Id]) -> list[tuple[ObservationModel, list[int]]]:
-        """Return the indices of names grouped by observation model, points of known depth first."""
-        sorts = list(map(self.sorts.__getitem__, names))
-        if len(set(sorts)) == 1:
-            return [(channel.models[sorts[0]], list(range(len(names))))]
+        Left out are names that a sensor of this robot does not observe in the map, itself among them.
+        """
+        sorts, at = list(map(self.sorts.get, names)), range(len(names))
+        if robot in names:
+            at = [i for i in at if names[i] != robot]
+        elif len(set(sorts)) == 1:
+            return [(channel.models[sorts[0]], list(at))] if sorts[0] in channel.models else []
         groups: dict[int, tuple[ObservationModel, list[int]]] = {}
-        for i, model in enumerate(channel.models[sort] for sort in sorts):
-            groups.setdefault(id(model), (model, []))[1].append(i)
+        for i in at:
+            if (sort := sorts[i]) in channel.models:
+                model = channel.models[sort]
+                groups.setdefault(id(model), (model, []))[1].append(i)
         return sorted(groups.values(), key=lambda group: group[0].landmark.kind not in EUCLIDEAN)

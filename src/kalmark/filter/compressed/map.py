@@ -30,7 +30,7 @@ from kalmark.filter.compressed.search import Search
 from kalmark.filter.compressed.storage import PANEL, Triangle
 from kalmark.filter.kernels import Array, Index
 from kalmark.filter.layout import P_AT, Layout, State, laid_out
-from kalmark.filter.map import AT_ONCE, Marginal, Pairs, StochasticMap
+from kalmark.filter.map import AT_ONCE, NO_SLOTS, Marginal, Pairs, StochasticMap
 from kalmark.filter.neighbours import Sorts, distances, near_places
 from kalmark.geometry.spaces import RHO, Rn, Space, Table
 
@@ -144,7 +144,9 @@ class CompressedMap(Layout):
             return Marginal(m, int(self._at[robot]), self.entered.get(mount, -1), self._at[slots])
         active = m.x, m.P, m.blocks[own], m.atoms, self._extra_rows()
         tables: tuple[Any, ...] = (*active, *self._kept(inactive), *self._displacements())
-        return Marginal(StochasticMap.of(*joined(*tables), self.axes), int(here[0]), int(here[1]), here[2:])
+        return Marginal(
+            StochasticMap.of(*joined(*tables), self.axes, self.inverse_depths), int(here[0]), int(here[1]), here[2:]
+        )
 
     def pairs(self, sorts: Sorts, robot: int, mount: int, p: Array, nearest: int, farther: float) -> Pairs:
         """Return the wanted blocks near p (K, 2 or 3); inactive ones by their means when the interval began."""
@@ -300,6 +302,13 @@ class CompressedMap(Layout):
         self._enter(slot)
         self.active.set_predicted(self.entered[slot], mean)
         self.take_as_moving(slot)
+
+    def movable(self, robot: int, added: Sequence[int]) -> Marginal:
+        """Return the active map, which the robot and the blocks `added` to its control enter, and their slots there."""
+        for slot in (robot, *added):
+            self._enter(slot)
+        self.take_as_moving(robot)
+        return Marginal(self.active, self.entered[robot], -1, self._at[list(added)] if added else NO_SLOTS)
 
     # ------------------------------------------------------------------ correcting
     def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> Marginal:

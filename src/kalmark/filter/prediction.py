@@ -1,0 +1,108 @@
+"""The prediction: a robot moves by one part of its control.  R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17).
+
+The same source runs twice, as in `corrections`: compiled for the built-in motions, as plain Python for a user's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from kalmark.compiled import compiled
+from kalmark.filter import kernels
+from kalmark.filter.corrections import Map, generators
+from kalmark.filter.kernels import Array, Index
+from kalmark.geometry.rotations import matrix
+from kalmark.models.moving import step
+
+Motion = tuple[Any, int, Index, bool, Array, Array, Array, float]  # as `estimators.Movement`
+
+
+@compiled
+def in_world(state: Array, D: Array) -> Array:
+    """Return a noise D (k, k) of the robot's frame in the world's: in the plane (3, 3), in space (6 or more)."""
+    k = len(D)
+    G = np.eye(k)
+    if len(state) < 7:
+        G[0, 0] = G[1, 1] = math.cos(state[2])
+        G[1, 0] = math.sin(state[2])
+        G[0, 1] = -G[1, 0]
+    else:
+        Q = matrix(state[3:7])
+        for i in range(0, min(9, k), 3):  # position, orientation, velocity; a body rate is in the robot's frame anyway
+            for a in range(3):
+                for b in range(3):
+                    G[i + a, i + b] = Q[a, b]
+    return kernels.quadratic(G, D)
+
+
+@compiled
+def joined(F: Array, R_u: Array, Q: Array, added: int, shared: bool) -> tuple[Array, Array]:
+    """Return F and Q (n + k added, .) of a robot and `added` constant blocks (k,) that are added to its control.
+
+    With a `shared` error the control's noise is in one of these blocks.
+    """
+    n, k = R_u.shape
+    size = n + k * added
+    F_all, Q_all = np.eye(size), np.zeros((size, size))
+    for i in range(n):
+        for j in range(n):
+            F_all[i, j] = F[i, j]
+            if not shared:
+                Q_all[i, j] = Q[i, j]
+        for j in range(k * added):
+            F_all[i, n + j] = R_u[i, j % k]
+    return F_all, Q_all
+
+
+@compiled
+def transported(F: Array, now: Array, then: Array, at: int) -> Array:
+    """Return F (I + (now - then) e_theta'), the rows `at` and following of two generators (n, axes)."""
+    axes, out = now.shape[1], F.copy()
+    theta = 2 if axes == 1 else 3
+    for i in range(len(F)):
+        for a in range(axes):
+            for j in range(len(F)):
+                out[i, theta + a] += F[i, j] * (now[at + j, a] - then[at + j, a])
+    return out
+
+
+def predicted(map_: Map, motion: Motion, x_first: Array, from_first: bool) -> bool:
+    """Move a robot in a map; return whether all of it is finite: if not, nothing has changed.
+
+    `from_first`: displacements count from the first estimates, F (I + (generator(x) - generator(x_first)) e_theta').
+    """
+    x, P, n, blocks, atoms, _axes, ways = map_
+    model, robot, added, shared, u, N, D, dt_s = motion
+    at, size, p_at, dof = blocks[robot, 0], blocks[robot, 1], blocks[robot, 2], blocks[robot, 3]
+    k = len(u)
+    index, total = np.empty(dof + k * len(added), np.int64), u.copy()
+    for i in range(dof):
+        index[i] = p_at + i
+    for b in range(len(added)):
+        for i in range(k):
+            index[dof + b * k + i] = blocks[added[b], 2] + i
+            total[i] += x[blocks[added[b], 0] + i]
+    r = x[at : at + size].copy()
+    moved, F, R_u = step(model, r, total, dt_s)
+    if from_first:
+        axes = 1 if size == 3 else 3
+        F = transported(F, generators(ways, atoms, x, n, axes), generators(ways, atoms, x_first, n, axes), p_at)
+    Q, valid = kernels.moved_noise(moved, F, R_u, N)
+    if not valid:
+        return False
+    F, Q = joined(F, R_u, Q, len(added), shared)
+    if len(D):
+        Q_D = in_world(moved, D)
+        for i in range(len(D)):
+            for j in range(len(D)):
+                Q[i, j] += Q_D[i, j]
+    kernels.predict(P, n, index, F, Q)
+    for i in range(size):
+        x[at + i] = x_first[at + i] = moved[i]
+    return True
+
+
+compiled_predicted = compiled(predicted)
