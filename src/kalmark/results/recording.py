@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from kalmark.declare import load_plugin
 from kalmark.errors import RunError
 from kalmark.logs.source import LeftOut, records_of
 from kalmark.results.files import read_yaml, replace_file
@@ -81,13 +82,18 @@ class Recording:
         return replace(self, truth=Truth.of(log, self.history, self.truth.anchored), summary={})
 
     def final_slam(self) -> Slam:
-        """Return the filter after the last event, read from ``map.kmk`` if the run was loaded."""
+        """Return the filter after the last event, read from ``map.kmk`` if the run was loaded.
+
+        This runs the `plugins` of the run's configuration.
+        """
         if self.slam is not None:
             return self.slam
         if self.folder is None or not (self.folder / "map.kmk").is_file():
             raise RunError(f"{self.folder or 'run'}: no map.kmk, expected the saved map of the run")
         from kalmark.slam.slam import Slam
 
+        for plugin in self.config.get("plugins") or ():
+            load_plugin(Path(plugin))
         return Slam.load(self.folder / "map.kmk")
 
     @classmethod
