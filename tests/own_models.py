@@ -73,7 +73,7 @@ class SignReader:
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return v (K, 3) of measurements y (K, 3), and V_y (K, 3, 3)."""
         v = np.column_stack([y[:, 0] * np.cos(y[:, 1]), y[:, 0] * np.sin(y[:, 1]), y[:, 2]])
-        return v, np.linalg.inv(self.expect(v)[1])
+        return v, np.array(np.linalg.inv(self.expect(v)[1]))
 
 
 @km.register("landmark", "sign")
