@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.campaign.replay import replay_of
 from kalmark.config import load_config
 from kalmark.geometry import compose, wrap
 from kalmark.logs import FORMATS, open_log
@@ -119,6 +120,12 @@ def test_models_of_a_user_go_from_python_to_the_command_line_and_back(own: Any, 
     for name in FILES:
         assert (tmp_path / "second" / name).read_text() == (saved / name).read_text(), name
     assert "associated 1" in kalmark("explain", "second", "--scan", "3", folder=tmp_path)
+    for what, refused in (  # what only does points
+        ("batch solution", lambda: load_run(tmp_path / "second").evaluate(batch=True)),
+        ("day, to be replayed", lambda: replay_of(config, open_log(tmp_path / "day.signs"), progress=False)),
+    ):
+        with pytest.raises(km.KalmarkError, match=f"{what}: landmark 1 is a sign, expected points"):
+            refused()
     again = load_config(tmp_path / "second" / "config.yaml")
     assert (again.plugins, again.robots, again.landmarks) == (config.plugins, config.robots, config.landmarks)
 

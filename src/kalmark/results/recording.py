@@ -92,9 +92,13 @@ class Recording:
             raise RunError(f"{self.folder or 'run'}: no map.kmk, expected the saved map of the run")
         from kalmark.slam.slam import Slam
 
+        self.run_plugins()
+        return Slam.load(self.folder / "map.kmk")
+
+    def run_plugins(self) -> None:
+        """Run the `plugins` of the run's configuration: what they register is known from then on."""
         for plugin in self.config.get("plugins") or ():
             load_plugin(Path(plugin))
-        return Slam.load(self.folder / "map.kmk")
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
