@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import figures
 import pytest
+
+from kalmark.cli.app import app
+from kalmark.declare import built_in, is_own, world_of_class
+from kalmark.logs import FORMATS
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -44,6 +50,35 @@ def test_pages_call_kalmark_and_python_as_the_readme_says_once_the_environment_i
     assert readme.index(". .venv/bin/activate") < readme.index("\nkalmark ")
     for page in PAGES:
         assert not re.findall(r"\.venv/bin/(?!activate)\S+", page.read_text()), page.name
+
+
+ROLES = {  # what a row of CONTRIBUTING is about, and where that is
+    "a sensor in the plane": lambda: classes_of("sensor", "plane"),
+    "a sensor in space": lambda: classes_of("sensor", "space"),
+    "a landmark in the plane": lambda: classes_of("landmark", "plane"),
+    "a landmark in space": lambda: classes_of("landmark", "space"),
+    "a motion": lambda: classes_of("motion"),
+    "a log format": lambda: [one.read for one in FORMATS.values() if is_own(one.read)],
+    "an estimator": lambda: classes_of("estimator"),
+    "an association": lambda: classes_of("association"),
+    "a verb": lambda: [command.callback for command in app.registered_commands if not command.hidden],
+}
+
+
+def classes_of(role: str, world: str = "") -> list[Any]:
+    return [each for each in built_in(role) if world in ("", world_of_class(each))]
+
+
+def test_the_files_to_touch_are_those_that_have_the_models() -> None:
+    source = ROOT / "src" / "kalmark"
+    rows = dict(re.findall(r"^\| (an? [^|]+) \| (`[^|]+) \|", (ROOT / "CONTRIBUTING.md").read_text(), re.M))
+    assert rows.keys() == ROLES.keys()
+    for what, files in rows.items():
+        listed = {path for name in re.findall("`(.*?)`", files) for path in source.glob(name.replace("NAME", "*"))}
+        having = {Path(inspect.getfile(each)) for each in ROLES[what]() if is_own(each)}
+        assert having and having <= listed, f"{what}: {having - listed}"
+        for name in re.findall("`(.*?)`", files):
+            assert "NAME" in name or (source / name).is_file(), f"{what}: {name}"
 
 
 def test_every_page_the_documentation_points_to_exists() -> None:

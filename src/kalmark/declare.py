@@ -250,8 +250,8 @@ def register(role: str, name: str) -> Callable[[Class], Class]:
     return registered
 
 
-def is_own(model: type) -> bool:
-    """Return whether a class is of kalmark itself."""
+def is_own(model: Any) -> bool:
+    """Return whether a class or a function is of kalmark itself."""
     return model.__module__.split(".")[0] == "kalmark"
 
 
@@ -291,8 +291,8 @@ def registered_name(model: type) -> str | None:
 
 def own_name(model: type) -> str:
     """Return how a user's class that has no name is called: file.py:Class, or module:Class without a file."""
-    file = vars(sys.modules.get(model.__module__, sys)).get("__file__")
-    return f"{Path(file).name if file and model.__module__ != 'builtins' else model.__module__}:{model.__qualname__}"
+    file = _file_of(sys.modules.get(model.__module__))
+    return f"{model.__module__ if file is None else file.name}:{model.__qualname__}"
 
 
 def by_class_name(role: str, name: str) -> type | None:
@@ -302,29 +302,40 @@ def by_class_name(role: str, name: str) -> type | None:
 
 # ------------------------------------------------------------------ a user's own files
 def load_plugin(file: Path) -> ModuleType:
-    """Run a Python file of the user's, once, and return it; what it registers is known from then on.
+    """Run a Python file of the user's, unless it is imported already, and return it.
 
-    Raises KalmarkError if it cannot be run.
+    What it registers is known from then on.  Raises KalmarkError if it cannot be run.
     """
     file = file.resolve()
     if file not in _PLUGINS:
-        name = f"plugin_{file.stem}"
-        spec = util.spec_from_file_location(name, file)
-        if spec is None or spec.loader is None or not file.is_file():
-            raise KalmarkError(f"{file}: no such file, expected Python code")
-        module = util.module_from_spec(spec)
-        sys.modules[name] = module
-        try:
-            spec.loader.exec_module(module)
-        except Exception as error:
-            raise KalmarkError(f"{file} cannot be run: {type(error).__name__}: {error}{line_of(error)}") from None
-        _PLUGINS[file] = module
+        imported = (module for module in [*sys.modules.values()] if _file_of(module, file.name) == file)
+        _PLUGINS[file] = next(imported, None) or _run(file)
     return _PLUGINS[file]
 
 
-def plugin_of(model: type) -> Path | None:
-    """Return the file that has a user's class, None if it was not run as a plugin."""
-    return next((file for file, module in _PLUGINS.items() if module.__name__ == model.__module__), None)
+def _run(file: Path) -> ModuleType:
+    name = f"plugin_{file.stem}"
+    spec = util.spec_from_file_location(name, file)
+    if spec is None or spec.loader is None or not file.is_file():
+        raise KalmarkError(f"{file}: no such file, expected Python code")
+    module = sys.modules[name] = util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise KalmarkError(f"{file} cannot be run: {type(error).__name__}: {error}{line_of(error)}") from None
+    return module
+
+
+def _file_of(module: Any, ending: str = "") -> Path | None:
+    """Return the file of a module if it has one, with this ending of its name."""
+    file = vars(module).get("__file__") if isinstance(module, ModuleType) else None
+    return Path(file).resolve() if isinstance(file, str) and file.endswith(ending) else None
+
+
+def plugin_of(model: Any) -> Path | None:
+    """Return the file of a user's class or function, None of kalmark's own and where there is no file."""
+    return None if is_own(model) else _file_of(sys.modules.get(model.__module__))
 
 
 def register_by_file(role: str, name: str) -> bool:

@@ -191,7 +191,7 @@ def test_in_a_few_beams_that_are_far_apart_there_is_nothing(detector: Laser, n: 
         (lambda: Corners(bend_deg=120), "Corners: bend_deg is 120, expected a number between 0 and 90"),
         (lambda: Reflectors(signature="yes"), "Reflectors: signature is 'yes', expected True or False"),
         (lambda: km.detect.Tags(family=["36h11"]), r"Tags: family is \['36h11'\], expected one of"),
-        (lambda: km.detect.Tags(size_m="0.1"), "Tags: size_m is '0.1', expected a positive length"),
+        (lambda: km.detect.Tags(size_m="0.1"), "Tags: size_m is '0.1', expected a number"),
     ],
 )
 def test_a_parameter_that_a_detector_cannot_have_is_refused(make: Callable[[], object], message: str) -> None:

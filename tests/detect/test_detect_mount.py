@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -15,6 +15,8 @@ from kalmark.cli.run import run_log
 from kalmark.config.building import build_robot
 from kalmark.config.reading import load_config
 from kalmark.geometry.rotations import matrix
+from kalmark.results.describe import describe
+from kalmark.results.files import config_yaml
 from laser_worlds import ANGLES, SIGMA_M, LaserWorld
 
 Data = Callable[[str], Path]
@@ -82,6 +84,45 @@ def test_the_configuration_gives_the_radius_to_a_sensor_that_takes_it(tmp_path: 
     mounts = build_robot(load_config(path), "robot").sensors
     assert mounts["a"].detector == km.detect.Trunks(beams=3, signature=False)
     assert mounts["b"].detector == km.detect.Corners(signature=True)
+
+
+class WallSeen:
+    """The distance and the direction of a wall."""
+
+    columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad")
+    angular: ClassVar[tuple[bool, ...]] = (False, True)
+    world: ClassVar[str] = "plane"
+
+    def expect(self, v: Any) -> Any: ...
+    def noise(self, y: Any) -> Any: ...
+
+
+def test_detectors_of_walls_and_tags_are_recorded_and_read_again(tmp_path: Path) -> None:
+    seen = km.register("sensor", "wall_seen")(WallSeen)()
+    path = tmp_path / "config.yaml"
+    walls = km.Mount(seen, detector=km.detect.Walls(split_m=0.3, signature=False))
+    tags = km.Mount(km.sensors.TagCorners(), detector=km.detect.Tags("25h9"))
+    for given, motion in ((walls, km.motion.Unicycle()), (tags, km.motion.Odometry3D())):
+        path.write_text(config_yaml(describe(km.Slam(km.Robot("r", motion, sensors={"s": given})))))
+        found = build_robot(load_config(path), "r").sensors["s"]
+        assert type(found.sensor) is type(given.sensor)
+        assert found.detector == given.detector
+
+
+@pytest.mark.parametrize(
+    ("sensor", "expected"),
+    [
+        ("range_bearing, detector: {type: walls}", "'walls', expected one of corners, reflectors, trunks"),
+        ("bearing, detector: {type: trunks}", "expected nothing: no detector finds what this sensor measures"),
+    ],
+)
+def test_a_detector_of_something_else_than_the_sensor_measures_is_refused(
+    sensor: str, expected: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(f"robots: {{each: {{sensors: {{s: {{type: {sensor}}}}}}}}}")
+    with pytest.raises(km.errors.ConfigError, match=expected):
+        load_config(path)
 
 
 def test_victoria_park_from_raw_scans_goes_the_way_of_the_known_trees(data: Data) -> None:

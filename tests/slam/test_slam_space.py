@@ -14,8 +14,9 @@ from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose, move
 from kalmark.geometry.rotations import from_euler, multiply
 from kalmark.geometry.spaces import MOUNTS
-from kalmark.models.landmarks import BUILT_IN
+from kalmark.models.landmarks import BUILT_IN, LINES
 from kalmark.models.motion3d import coast
+from kalmark.models.pointwise import jacobian
 
 FORWARD = from_euler(np.radians([-90.0, 0.0, -90.0]))[0]  # a camera that looks along the robot's x
 AT = np.concatenate([[0.0, 0.0, 0.6], FORWARD])
@@ -169,6 +170,25 @@ def test_lines_locate_the_robot_and_their_segments_grow() -> None:
         ends, cov = slam.segment(5)
         assert ends.shape == (2, 3) and cov.shape == (2, 3, 3) and np.isfinite(ends).all()
         assert np.linalg.norm(slam.mean("r")[:3] - truth[:3]) < 0.1, kind.kind
+
+
+@pytest.mark.parametrize("kind", LINES, ids=lambda kind: kind.__name__)
+def test_a_line_s_place_has_its_own_covariance(kind: Any) -> None:
+    model, rng = kind(), np.random.default_rng(7)
+    slam = km.Slam([robot(km.sensors.Segments())], landmarks=model)
+    l, A = rng.normal(size=model.space.size) + 0.5, rng.normal(size=(model.space.dof,) * 2)
+    slam.add_landmark("wall", l, A @ A.T * 1e-4)
+
+    def foot(error: np.ndarray) -> np.ndarray:
+        """Return the point of the line nearest to its anchor, or to the origin, by two of its points."""
+        moved = model.space.plus(l, error)
+        (p, q), a = model.endpoints(moved[None], np.array([[0.0, 1.0]]))[0][0], moved[:3] * model.anchored
+        return p - (p - a) @ (q - p) / ((q - p) @ (q - p)) * (q - p)
+
+    where, P = slam.place("wall")
+    np.testing.assert_allclose(where, foot(np.zeros(model.space.dof)), rtol=1e-9, atol=1e-12)
+    J = jacobian(foot, np.zeros(model.space.dof))
+    np.testing.assert_allclose(P, J @ slam.covariance("wall") @ J.T, rtol=1e-5, atol=1e-7 * np.abs(P).max())
 
 
 @pytest.mark.parametrize("sensor", [km.sensors.TagPose(), km.sensors.TagCorners()], ids=lambda s: type(s).__name__)

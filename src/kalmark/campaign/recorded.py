@@ -19,7 +19,7 @@ from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.logs.log import Log
 from kalmark.report import Report
-from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.landmarks import MapLandmarks, refuse_other_than_points
 from kalmark.results.progress import track
 from kalmark.results.warnings import NO_ID
 from kalmark.slam.slam import Slam
@@ -69,6 +69,7 @@ def recorded(config: Config, log: Log, progress: bool = True) -> Recorded:
     slam = build_slam(config, log)
     bar = track(log.events, f"{log.name}, the map", len(log.events), show=progress)
     reports = [report for event in bar if (report := _processed(slam, event, config)) is not None]
+    refuse_other_than_points(slam, f"{log.name}, to be replayed")
     found = MapLandmarks.of(slam)
     landmarks = {i: p for i, p in zip(found.ids, found.means, strict=True) if np.isfinite(p).all()}
     sizes = {len(p) for p in landmarks.values()}

@@ -23,6 +23,7 @@ from kalmark.declare import (
     Parameter,
     class_of,
     classes,
+    is_own,
     load_plugin,
     parameters,
     plugin_of,
@@ -49,10 +50,15 @@ class ModelSection(Section):
 
 
 class Choice:
-    """The section of one model of a role, by its `type`; without `typed` there is one model, and no type."""
+    """The section of one model of a role, by its `type`; without `typed` there is one model, and no type.
 
-    def __init__(self, role: str, world: str = "", default: str | None = None, *, typed: bool = True) -> None:
-        self.role, self.world, self.default, self.typed = role, world, default, typed
+    With `sensor`, a class, it is that of a detector for it.
+    """
+
+    def __init__(
+        self, role: str, world: str = "", default: str | None = None, *, typed: bool = True, sensor: Any = None
+    ) -> None:
+        self.role, self.world, self.default, self.typed, self.sensor = role, world, default, typed, sensor
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
         """Return how pydantic validates it: at the time, as a plugin may have added models since."""
@@ -60,7 +66,8 @@ class Choice:
 
     def names(self) -> list[str]:
         """Return the types there are."""
-        return [*classes(self.role, self.world)]
+        found = classes(self.role, self.world)
+        return [name for name, models in found.items() if self.sensor is None or finds(models[0], self.sensor)]
 
     def validated(self, value: Any) -> Section:
         """Return the section of a mapping.  Raises the errors of pydantic."""
@@ -68,6 +75,8 @@ class Choice:
             return value
         name: Any = self.role
         if self.typed:
+            if not self.names():
+                raise expected("nothing: no detector finds what this sensor measures")
             name = value.get("type", self.default) if isinstance(value, dict) else None
             if name is None:
                 raise PydanticCustomError("union_tag_not_found", "no type", {"types": self.names()})
@@ -82,6 +91,11 @@ class Choice:
         return section
 
 
+def finds(detector: Any, sensor: Any) -> bool:
+    """Return whether a detector's class may find what a sensor's measures: if both are kalmark's, by their columns."""
+    return not (is_own(detector) and is_own(sensor)) or detector.columns[:2] == sensor.columns[:2]
+
+
 def section_of(role: str, name: str, world: str = "") -> type[Section]:
     """Return the section of a model; it has `type` where a role has several models."""
     return _section(role, name, world, tuple(classes(role, world)[name]))
@@ -90,8 +104,8 @@ def section_of(role: str, name: str, world: str = "") -> type[Section]:
 @cache
 def _section(role: str, name: str, world: str, models: tuple[type, ...]) -> type[Section]:
     fields: dict[str, Any] = {} if name == role else {"type": (str, name)}
-    if role == "sensor" and tuple(vars(models[0]).get("columns", ()))[:2] == ("range_m", "bearing_rad"):
-        fields["detector"] = (Annotated[Any, Choice("detector")], None)
+    if role == "sensor":
+        fields["detector"] = (Annotated[Any, Choice("detector", sensor=models[0])] | None, None)
     for parameter in parameters(models[0]):
         others = [own for model in models[1:] for own in parameters(model) if own.name == parameter.name]
         fields[parameter.name] = _field(parameter, others, models)

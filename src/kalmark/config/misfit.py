@@ -10,7 +10,7 @@ from kalmark.config.reading import did_you_mean
 from kalmark.config.schema import Config
 from kalmark.config.tree import OVERRIDE, Tree
 from kalmark.declare import built_in, registered_name
-from kalmark.detect.scan import RAW
+from kalmark.detect.scan import RAW, Laser
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import Scan
 from kalmark.logs.log import Log
@@ -48,7 +48,7 @@ def refuse_controls(config: Config, key: str, name: str, columns: tuple[str, ...
 def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], log: Log) -> None:
     """Refuse observations that a sensor does not take and, unless bad input is skipped, sensors not configured."""
     for (robot, sensor), given in log.sensor_columns.items():
-        if robot != name or sensor not in mounts:
+        if robot != name or sensor not in mounts or not isinstance(mounts[sensor].detector, Laser | None):
             continue
         raw = mounts[sensor].detector is not None
         columns = RAW[: max(len(given), 2)] if raw else mounts[sensor].sensor.columns

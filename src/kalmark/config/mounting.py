@@ -9,7 +9,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from kalmark.config.choices import BASES, Choice, ModelSection, section_of
-from kalmark.config.sections import NotNegative, Number, Reserved, Section, Sigmas, expected
+from kalmark.config.sections import NotNegative, Number, Section, Sigmas, expected
 from kalmark.declare import register
 from kalmark.geometry.rotations import from_euler
 
@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 Landmark = Annotated[Any, Choice("landmark", default="point")]
 Association = Annotated[Any, Choice("association", default="identity")]
 Initialization = Annotated[Any, Choice("initialization", default="immediate")]
+Detector = Annotated[Any, Choice("detector")]
 Attention = Annotated[Any, Choice("attention", typed=False)]
 Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
 
@@ -129,8 +130,8 @@ class Mounted(ModelSection):
     """Which landmarks of a scan to take; all if absent."""
     upkeep: Upkeep | None = None
     """What makes a landmark; the configuration's `upkeep` if absent."""
-    detector: Reserved = None
-    """How landmarks are found in raw scans: of sensors of ranges and bearings, else reserved."""
+    detector: Detector | None = None
+    """How landmarks are found in raw scans: one that finds what the sensor measures."""
 
 
 class PlaneMounted(Mounted):

@@ -96,11 +96,3 @@ def _robot(value: Any) -> int | str:
 
 
 RobotName = Annotated[int | str, PlainValidator(_robot)]
-
-
-def _none_yet(value: Any) -> None:
-    if value is not None:
-        raise expected("nothing: this key is reserved and not available yet")
-
-
-Reserved = Annotated[Any, PlainValidator(_none_yet)]

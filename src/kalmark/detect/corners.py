@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
-from kalmark.declare import Count, NotNegative, Positive, declared, register
+from kalmark.declare import Count, NotNegative, Positive, register
 from kalmark.detect.lines import grown, lines, straight_pieces
 from kalmark.detect.scan import Acute, Array, Detections, Laser
 from kalmark.geometry.gaussian import gate
@@ -16,14 +16,17 @@ TRIM = 2  # beams at the ends of a wall that are left out of the fit: which of t
 PROBABILITY = 0.9999  # with which a straight wall passes for one
 
 
-@declared
+@register("detector", "walls")
 class Walls(Laser):
     """Straight walls, by the distance of their line from the laser, m, and the direction of its normal, rad.
 
-    A piece of surface is cut where it bends by more than `split_m`.  A wall has at least `beams` beams and `length_m`,
-    and fits a line by the chi-square of its ranges.  Its ends (K, 2, 2), m in the laser's frame, are an attribute:
-    where the beams on it end, so it may be longer.  kalmark has no landmark for a wall of the plane yet.
+    They are for a sensor and a landmark of your own: kalmark has none of walls of the plane yet.  A piece of surface is
+    cut where it bends by more than `split_m`.  A wall has at least `beams` beams and `length_m`, and fits a line by the
+    chi-square of its ranges.  Its ends (K, 2, 2), m in the laser's frame, are an attribute: where the beams on it end,
+    so it may be longer.
     """
+
+    columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad")
 
     split_m: Annotated[Positive, "A wall is straight to this."] = 0.2
     beams: Annotated[Count, "Beams on a wall, at least."] = 8
@@ -41,7 +44,7 @@ class Walls(Laser):
         ends = np.stack([far * np.cos(a[beams]), far * np.sin(a[beams])], axis=2)
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         most = np.array([gate(PROBABILITY, int(n)) for n in np.maximum(beams[:, 1] - beams[:, 0] - 1 - 2 * TRIM, 1)])
-        found = Detections(("distance_m", "normal_rad"), u, P, beams, {"ends_m": ends, "length_m": length})
+        found = Detections(Walls.columns, u, P, beams, {"ends_m": ends, "length_m": length})
         return found.take((chi2 <= most) & (length >= self.length_m))
 
     def _widened(self, found: Detections) -> Detections:
@@ -59,6 +62,8 @@ class Corners(Walls):
     The angle, rad, is the signature, over pi where the corner stands out.  One is where two walls meet that follow each
     other in the scan: within `gap_m` of the ends of both, and at `bend_deg` at least.
     """
+
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "opening_rad")
 
     gap_m: Annotated[NotNegative, "How far from the corner the ends of its walls may be."] = 0.3
     bend_deg: Annotated[Acute, "Angle between the walls, at least."] = 30.0
@@ -81,7 +86,7 @@ class Corners(Walls):
         y = np.column_stack([np.hypot(*c.T), np.arctan2(c[:, 1], c[:, 0]), np.mod(opening, 2 * math.pi)])
         beams = np.column_stack([walls.beams[first, 0], walls.beams[second, 1]])
         shape = {"opening_rad": y[:, 2]}
-        found = Detections(("range_m", "bearing_rad", "opening_rad"), y, Y @ N @ Y.swapaxes(1, 2), beams, shape)
+        found = Detections(self.columns, y, Y @ N @ Y.swapaxes(1, 2), beams, shape)
         return found.take((gaps <= self.gap_m).all(axis=0) & (y[:, 0] > 0))
 
     def _widened(self, found: Detections) -> Detections:

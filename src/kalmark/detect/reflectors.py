@@ -47,5 +47,5 @@ class Reflectors(Laser):
         cov[:, 0, 0], cov[:, 1, 1] = self.sigma_range_m**2 / counts, variance
         light = np.bincount(owner, intensities[index], len(beams)) / counts
         width = y[:, 0] * (last - first)
-        found = Detections(("range_m", "bearing_rad"), y, cov, beams, {"intensity": light, "width_m": width})
+        found = Detections(self.columns, y, cov, beams, {"intensity": light, "width_m": width})
         return found.take(width <= self.width_max_m)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -54,6 +54,8 @@ class Laser:
     detection: the distance of the real object from the fitted one, and the rotation of the whole scan by the robot's
     motion during it or by a late time stamp.  With `signature` the third component of a detection is kept.
     """
+
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")  # of what is found
 
     sigma_range_m: Annotated[float, Within(ge=1e-6), "Noise of the range of one beam."] = 0.03
     sigma_position_m: Annotated[

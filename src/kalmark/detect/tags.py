@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.declare import Positive, register
 from kalmark.errors import EventError, ModelError
 from kalmark.events import Scan, when
+from kalmark.models.sensors_camera import TagCorners
 
 Array = npt.NDArray[np.float64]
 
-FAMILIES = {"16h5": "DICT_APRILTAG_16h5", "25h9": "DICT_APRILTAG_25h9",
-            "36h10": "DICT_APRILTAG_36h10", "36h11": "DICT_APRILTAG_36h11"}  # fmt: skip
+Family = Literal["16h5", "25h9", "36h10", "36h11"]
 
 
 @lru_cache(maxsize=8)
@@ -29,21 +28,17 @@ def _detector(family: str) -> Any:
     aruco: Any = cv2.aruco
     parameters = aruco.DetectorParameters()
     parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-    return aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, FAMILIES[family])), parameters)
+    return aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, f"DICT_APRILTAG_{family}")), parameters)
 
 
-@dataclass(frozen=True)
+@register("detector", "tags")
 class Tags:
     """Tags of one family and one size, by the pixels of their corners, as a `TagCorners` sensor takes them."""
 
-    family: str = "36h11"
-    size_m: float = 0.1
+    columns: ClassVar[tuple[str, ...]] = TagCorners.columns
 
-    def __post_init__(self) -> None:
-        if not isinstance(self.family, str) or self.family not in FAMILIES:
-            raise ModelError(f"Tags: family is {self.family!r}, expected one of {', '.join(FAMILIES)}")
-        if not isinstance(self.size_m, int | float) or not 0 < self.size_m < math.inf:
-            raise ModelError(f"Tags: size_m is {self.size_m!r}, expected a positive length")
+    family: Annotated[Family, "Family of the tags."] = "36h11"
+    size_m: Annotated[Positive, "Length of a side of the black square."] = 0.1
 
     def detect(self, image: Any) -> tuple[Array, list[int]]:
         """Return the corners and the size (K, 9) of the tags in an image (H, W) or (H, W, 3) of bytes, and their ids.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -23,6 +23,8 @@ class Trunks(Laser):
     `sigma_position_m` is added to the radius too.
     """
 
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "radius_m")
+
     beams: Annotated[Count, "Beams on a trunk, at least."] = 2
     radius_min_m: Annotated[NotNegative, "Smallest radius."] = 0.0
     radius_max_m: Annotated[Limit, "Largest radius."] = 1.0
@@ -37,8 +39,7 @@ class Trunks(Laser):
         y, P, chi2, beams = circles(r, a, pieces, step, self.sigma_range_m**2, width**2 / 12, max(self.beams, 1))
         rms = np.sqrt(chi2 / (beams[:, 1] - beams[:, 0] + 1)) * self.sigma_range_m
         round_ = (rms <= self.roughness_m) & (self.radius_min_m <= y[:, 2]) & (y[:, 2] <= self.radius_max_m)
-        columns = ("range_m", "bearing_rad", "radius_m")
-        return Detections(columns, y, P, beams, {"radius_m": y[:, 2], "rms_m": rms}).take(round_)
+        return Detections(self.columns, y, P, beams, {"radius_m": y[:, 2], "rms_m": rms}).take(round_)
 
     def _widened(self, found: Detections) -> Detections:
         """Return the circles with the noise that is not in the beams, that of the radius included."""

@@ -24,6 +24,7 @@ from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.align import rigid, rmse
 from kalmark.results.history import as_id
+from kalmark.results.landmarks import refuse_other_than_points
 from kalmark.results.progress import track
 
 if TYPE_CHECKING:
@@ -70,7 +71,9 @@ def given_by(run: Recording, known: Known | None = None) -> Given:
         raise KalmarkError(
             f"batch solution: the filter rejected {run.fixes_rejected} fixes, expected a run that used all"
         )
-    history, robots = run.history, run.final_slam().robots
+    history, slam = run.history, run.final_slam()
+    refuse_other_than_points(slam, "batch solution")
+    robots = slam.robots
     landmarks = dict(
         zip(run.landmarks.ids, zip(run.landmarks.means, run.landmarks.covariances, strict=True), strict=True)
     )
@@ -203,6 +206,7 @@ def _log_of(run: Recording) -> Iterable[Event]:
 
     if run.log.path is None:
         raise KalmarkError("batch solution: the run does not say which log it was made from, expected the log itself")
+    run.run_plugins()
     try:
         config = Config.model_validate({"log": run.config.get("log", {})})
     except ValueError as error:

@@ -10,6 +10,7 @@ import numpy as np
 
 from kalmark.declare import own_name, parameters, plugin_of, registered_name
 from kalmark.geometry.rotations import to_euler
+from kalmark.logs import FORMATS
 from kalmark.logs.log import Log
 
 
@@ -40,9 +41,11 @@ def model(value: Any) -> dict[str, Any]:
 def describe(slam: Any, log: Any = None) -> dict[str, Any]:
     """Return the configuration of a Slam: log, robots, sensors, landmarks, association, estimator, map."""
     out: dict[str, Any] = {}
+    own: list[Any] = [type(each) for each in _models(slam)]
     if isinstance(log, Log) and log.path is not None:
         out["log"] = {"path": str(log.path), "format": log.format, "robots": list(log.robots)}
-    plugins = sorted({str(file) for each in _models(slam) if (file := plugin_of(type(each))) is not None})
+        own += [FORMATS[log.format].read] if log.format in FORMATS else []
+    plugins = sorted({str(file) for each in own if (file := plugin_of(each)) is not None})
     if plugins:
         out["plugins"] = plugins
     out["robots"] = {name: _robot(robot) for name, robot in slam.robots.items()}

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from kalmark.errors import RunError
+from kalmark.declare import is_own
+from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
+from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.results.columns import padded_all
 from kalmark.results.history import as_id
 from kalmark.results.shapes import LINE, POINT, TAG, place
@@ -123,6 +125,14 @@ class MapLandmarks:
         self.means.append(np.array([float(row[name]) for name in names]))
         self.covariances.append(cov)
         self.observations.append(int(row["observations"]))
+
+
+def refuse_other_than_points(slam: Slam, what: str) -> None:
+    """Refuse a map with landmarks of a user's own that are more than points with numbers.  Raises KalmarkError."""
+    for track in slam.tracks.confirmed.values():
+        first, *others = track.model.space.kinds
+        if not is_own(type(track.model)) and (first not in (VECTOR, VECTOR3) or {*others} - {SCALAR}):
+            raise KalmarkError(f"{what}: landmark {track.id!r} is a {track.model.kind}, expected points")
 
 
 def _pairs(errors: set[tuple[str, ...]]) -> list[tuple[str, str]]:

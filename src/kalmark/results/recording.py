@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from kalmark.declare import load_plugin
 from kalmark.errors import RunError
 from kalmark.logs.source import LeftOut, records_of
 from kalmark.results.files import read_yaml, replace_file
@@ -81,14 +82,23 @@ class Recording:
         return replace(self, truth=Truth.of(log, self.history, self.truth.anchored), summary={})
 
     def final_slam(self) -> Slam:
-        """Return the filter after the last event, read from ``map.kmk`` if the run was loaded."""
+        """Return the filter after the last event, read from ``map.kmk`` if the run was loaded.
+
+        This runs the `plugins` of the run's configuration.
+        """
         if self.slam is not None:
             return self.slam
         if self.folder is None or not (self.folder / "map.kmk").is_file():
             raise RunError(f"{self.folder or 'run'}: no map.kmk, expected the saved map of the run")
         from kalmark.slam.slam import Slam
 
+        self.run_plugins()
         return Slam.load(self.folder / "map.kmk")
+
+    def run_plugins(self) -> None:
+        """Run the `plugins` of the run's configuration: what they register is known from then on."""
+        for plugin in self.config.get("plugins") or ():
+            load_plugin(Path(plugin))
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
