@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import operator
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -67,12 +68,7 @@ class Within:
         """Return whether a number is within."""
         if math.isnan(value) or (math.isinf(value) and not self.infinite):
             return False
-        return not (
-            (self.ge is not None and value < self.ge)
-            or (self.gt is not None and value <= self.gt)
-            or (self.le is not None and value > self.le)
-            or (self.lt is not None and value >= self.lt)
-        )
+        return all(vars(operator)[name](value, limit) for name, limit in self.limits.items())
 
     def words(self, kind: str) -> str:
         """Return what is expected: `kind` is "number" or "whole number"."""

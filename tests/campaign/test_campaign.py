@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from kalmark.campaign import Campaign, run_campaign
-from kalmark.campaign.picture import curves
+from kalmark.campaign.campaign import curves
 from kalmark.campaign.running import Plan, configs_of, joblib_backend
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.simulate import load_world

@@ -11,10 +11,9 @@ import pytest
 
 import kalmark as km
 from kalmark.campaign import Replay, open_scene, run_campaign
-from kalmark.campaign.recorded import LEAST, Look, Steer
-from kalmark.campaign.replay import steered
+from kalmark.campaign.replay import LEAST, Look, Steer, steered
 from kalmark.cli import main
-from kalmark.cli.simulate import fitting_config
+from kalmark.cli.logs import fitting_config
 from kalmark.config import build_slam, open_run
 from kalmark.errors import ConfigError, KalmarkError, LogError
 from kalmark.logs import write_native

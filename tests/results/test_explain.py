@@ -84,7 +84,7 @@ def test_merged_and_removed_landmarks_are_listed_in_a_file_of_their_own(tmp_path
     merged = [row for row in rows if row["change"] == "merged"]
     assert merged
     assert all(row["reason"].startswith(f"merged into '{row['into']}'") for row in merged)
-    step = run.history.decisions.changes[0].step
+    step = run.history.changes[0].step
     told = explain(run, (run.history.t_ns[step] - run.history.t_ns[0]) * 1e-9)
     assert any(change.what in ("merged", "removed") for change in told.changes)
     with (tmp_path / "run" / "associations.csv").open() as file:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalmark.results.align import identity, rigid, rigid_robust, rmse
+from kalmark.results.measures import identity, rigid, rigid_robust, rmse
 
 
 def rotation_2d(a: float) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from kalmark.geometry import V, V_inverse
-from kalmark.results.consistency import (
+from kalmark.results.measures import (
     anees_interval,
     diverged,
     left_jacobian_inverse,

@@ -15,11 +15,11 @@ import pytest
 from matplotlib.image import imread
 
 from kalmark.association import ByIdentity
-from kalmark.cli.tables import print_summary
+from kalmark.cli.shared import print_summary
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
-from kalmark.results.headline import headline
+from kalmark.results.evaluate import headline
 from kalmark.results.plot import LANDMARK_COLOUR, draw_map, save_map
 from kalmark.results.record import record
 from kalmark.results.report import report_html, show

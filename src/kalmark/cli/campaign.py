@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.options import Overrides, announce_compilation_elsewhere, computing, writable
-from kalmark.cli.tables import number, print_table
+from kalmark.cli.shared import Overrides, announce_compilation_elsewhere, computing, number, print_table, writable
 
 if TYPE_CHECKING:
     from kalmark.campaign import Campaign

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.tables import print_table
+from kalmark.cli.shared import print_table
 from kalmark.errors import KalmarkError, ModelError
 
 if TYPE_CHECKING:

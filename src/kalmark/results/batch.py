@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kalmark.batch.data import Associations, Given, Known, replayed
 from kalmark.batch.problem import Problem
@@ -22,15 +21,13 @@ from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.models.landmarks import Point2D, Point3D, Tag
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
-from kalmark.results.align import rigid, rmse
-from kalmark.results.history import as_id
+from kalmark.results.history import Array, as_id
+from kalmark.results.measures import rigid, rmse
 from kalmark.results.progress import track
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.results.recording import Recording
-
-Array = npt.NDArray[np.float64]
 
 
 def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
@@ -66,10 +63,9 @@ def solve_batch(
 
 def given_by(run: Recording, known: Known | None = None) -> Given:
     """Return what the batch solution needs of a run: of the observations exactly those that the filter used."""
-    if run.fixes_rejected:
-        raise KalmarkError(
-            f"batch solution: the filter rejected {run.fixes_rejected} fixes, expected a run that used all"
-        )
+    rejected = sum(not fix.used for fix in run.history.fixes)
+    if rejected:
+        raise KalmarkError(f"batch solution: the filter rejected {rejected} fixes, expected a run that used all")
     history, robots = run.history, run.final_slam().robots
     landmarks = dict(
         zip(run.landmarks.ids, zip(run.landmarks.means, run.landmarks.covariances, strict=True), strict=True)
@@ -98,7 +94,7 @@ def given_by(run: Recording, known: Known | None = None) -> Given:
         landmarks=landmarks,
         known=beforehand,
         starts={start.robot: (start.mean, start.covariance) for start in history.starts},
-        fixes=run.fixes,
+        fixes=len(run.history.fixes),
     )
 
 

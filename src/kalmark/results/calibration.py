@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.results.columns import Array
 from kalmark.results.describe import describe_pose
-from kalmark.results.history import Biased, Mounted
+from kalmark.results.history import Array, Biased, Mounted
 from kalmark.results.words import figure
 
 AXES = {3: ("x", "y", "theta"), 5: ("x", "y", "theta", "gain", "offset"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
@@ -108,34 +107,32 @@ def _range_figures(parameters: Array, P: Array) -> dict[str, float]:
     return {"scale": 1.0 / gain, "bias_m": offset / gain, "sigma_scale": sigma[0], "sigma_bias_m": sigma[1]}
 
 
-def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
+def _found(summary: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str, str]]:
+    """Yield every direction of every mount in a summary, and its sigmas before and after as people read them."""
+    for name, figures in summary.get("mounts", {}).items():
+        for row in figures.get("directions", ()):
+            yield name, row, _sigma(row["prior_sigma"], row["unit"]), _sigma(row["sigma"], row["unit"])
+
+
+def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
-    return [
-        (name, row["direction"], *(_sigma(row[key], row["unit"]) for key in ("prior_sigma", "sigma")),
-         f"{row['ratio']:.3f}")
-        for name, figures in summary.get("mounts", {}).items()
-        for row in figures.get("directions", ())
-    ]  # fmt: skip
+    return [(name, row["direction"], *sigmas, f"{row['ratio']:.3f}") for name, row, *sigmas in _found(summary)]
 
 
 MOUNT_COLUMNS = ("mount", "direction", "sigma before", "after", "ratio (1: not observed)")
 
 
-def mount_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
+def mount_warnings(_: Any, summary: Mapping[str, Any]) -> Iterator[str]:
     """Return a line for every direction of a mount that was not observed."""
-    for name, figures in summary.get("mounts", {}).items():
-        for row in figures.get("directions", ()):
-            if row["ratio"] > UNOBSERVED:
-                after, before = (_sigma(row[key], row["unit"]) for key in ("sigma", "prior_sigma"))
-                axis = row["direction"].split()[0]
-                yield f"mount {name}: its {axis} ({row['direction']}) was not observed: sigma {after} of {before}"
+    for name, row, before, after in _found(summary):
+        if row["ratio"] > UNOBSERVED:
+            axis = row["direction"].split()[0]
+            yield f"mount {name}: its {axis} ({row['direction']}) was not observed: sigma {after} of {before}"
 
 
 def _sigma(value: float, unit: str) -> str:
     """Return a sigma as people read it: 5 cm, 1.2 mm, 0.06 deg."""
     if unit != "m":
         return f"{figure(value)} {unit}".rstrip()
-    for scale, name in ((1.0, "m"), (1e-2, "cm")):
-        if value >= scale:
-            return f"{figure(value / scale)} {name}"
-    return f"{figure(value * 1e3)} mm"
+    scale, name = (1.0, "m") if value >= 1.0 else (1e-2, "cm") if value >= 1e-2 else (1e-3, "mm")
+    return f"{figure(value / scale)} {name}"

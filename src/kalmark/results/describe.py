@@ -13,11 +13,6 @@ from kalmark.geometry.rotations import to_euler
 from kalmark.logs.log import Log
 
 
-def type_name(model: Any) -> str:
-    """Return a model's name in configuration files, or file.py:Class for a user's own that has none."""
-    return registered_name(type(model)) or own_name(type(model))
-
-
 def plain(value: Any) -> Any:
     """Return a value made of dicts, lists, texts, numbers and None only, ready for YAML or JSON."""
     if isinstance(value, dict):
@@ -33,8 +28,10 @@ def plain(value: Any) -> Any:
 
 def model(value: Any) -> dict[str, Any]:
     """Return the type and the parameters of a model, as a mapping."""
-    given = {own.name: vars(value)[own.name] for own in parameters(type(value))}
-    return {"type": type_name(value)} | {key: plain(item) for key, item in given.items() if item is not None}
+    kind = type(value)
+    given = {own.name: vars(value)[own.name] for own in parameters(kind)}
+    name = registered_name(kind) or own_name(kind)  # file.py:Class for a user's own that has none
+    return {"type": name} | {key: plain(item) for key, item in given.items() if item is not None}
 
 
 def describe(slam: Any, log: Any = None) -> dict[str, Any]:
@@ -70,33 +67,29 @@ def _keys(value: Any) -> dict[str, Any]:
 
 
 def _robot(robot: Any) -> dict[str, Any]:
-    out: dict[str, Any] = {"motion": model(robot.motion)}
-    out["start"] = _start(robot)
-    out["sensors"] = {}
-    for name, mount in robot.sensors.items():
-        sensor = model(mount.sensor)
-        at = describe_pose(mount.at)
-        if any(at.values()):
-            sensor["mount"] = at
-        for part in ("landmark", "association", "detector", "initialization"):
-            if vars(mount)[part] is not None:
-                sensor[part] = model(vars(mount)[part])
-        if mount.attention != type(mount.attention)():
-            sensor["attention"] = _keys(mount.attention)
-        if mount.upkeep is not None:
-            sensor["upkeep"] = _keys(mount.upkeep)
-        if mount.cov is not None:
-            sensor["mount"] = at | _sigmas(mount.cov)
-        out["sensors"][name] = sensor
+    start = describe_pose(robot.start)
+    rates = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    start |= dict(zip(rates, plain(robot.start)[7:], strict=False))
+    if robot.cov is not None:
+        start |= _sigmas(robot.cov)
+    sensors = {name: _sensor(mount) for name, mount in robot.sensors.items()}
+    return {"motion": model(robot.motion), "start": start, "sensors": sensors}
+
+
+def _sensor(mount: Any) -> dict[str, Any]:
+    out, at = model(mount.sensor), describe_pose(mount.at)
+    if any(at.values()):
+        out["mount"] = at
+    for part in ("landmark", "association", "detector", "initialization"):
+        if vars(mount)[part] is not None:
+            out[part] = model(vars(mount)[part])
+    if mount.attention != type(mount.attention)():
+        out["attention"] = _keys(mount.attention)
+    if mount.upkeep is not None:
+        out["upkeep"] = _keys(mount.upkeep)
+    if mount.cov is not None:
+        out["mount"] = at | _sigmas(mount.cov)
     return out
-
-
-def _start(robot: Any) -> dict[str, float]:
-    out = describe_pose(robot.start)
-    out |= dict(
-        zip(("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"), plain(robot.start)[7:], strict=False)
-    )
-    return out if robot.cov is None else out | _sigmas(robot.cov)
 
 
 def describe_pose(pose: Any) -> dict[str, float]:
@@ -104,12 +97,8 @@ def describe_pose(pose: Any) -> dict[str, float]:
     pose = [float(value) for value in pose]
     if len(pose) == 3:
         return dict(zip(("x_m", "y_m", "theta_rad"), pose, strict=True))
-    roll, pitch, yaw = np.degrees(to_euler(np.array(pose[3:7]))[0]).tolist()
-    return dict(zip(("x_m", "y_m", "z_m"), pose[:3], strict=True)) | {
-        "roll_deg": roll,
-        "pitch_deg": pitch,
-        "yaw_deg": yaw,
-    }
+    angles = np.degrees(to_euler(np.array(pose[3:7]))[0]).tolist()
+    return dict(zip(("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg"), (*pose[:3], *angles), strict=True))
 
 
 def _sigmas(cov: Any) -> dict[str, float]:

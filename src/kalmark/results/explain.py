@@ -12,13 +12,11 @@ import numpy as np
 from kalmark.errors import RunError
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import FullSensor, finds_depth
-from kalmark.results.cameras import mount_now
-from kalmark.results.columns import Array, Ints
-from kalmark.results.decisions import Change
 from kalmark.results.files import seconds
-from kalmark.results.history import History
+from kalmark.results.history import Array, Change, History, Ints
+from kalmark.results.landmarks import LINE
+from kalmark.results.readings import mount_now
 from kalmark.results.recording import Recording
-from kalmark.results.shapes import LINE
 from kalmark.results.truth import as_rigid
 from kalmark.results.words import count, figure
 
@@ -82,7 +80,7 @@ class Explanation:
     @property
     def in_log(self) -> str:
         """The time of the log in s, by which the scan is found again."""
-        return _short(self.log_t_s)
+        return self.log_t_s.rstrip("0").rstrip(".")  # it has nine decimals
 
     def lines(self) -> Iterator[str]:
         """Tell it."""
@@ -110,10 +108,6 @@ class Explanation:
         return f"{fate.index:4d}{known}: {fate.outcome}{name}{d2}{': ' if fate.reason else ''}{fate.reason}"
 
 
-def _short(seconds_: str) -> str:
-    return seconds_.rstrip("0").rstrip(".") if "." in seconds_ else seconds_
-
-
 def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation:
     """Return why the scan nearest to a time became what it did.
 
@@ -126,14 +120,14 @@ def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation
     steps = np.arange(len(history.t_ns)) if robot is None else np.flatnonzero(history.robot == robot)
     if not len(steps):
         raise RunError("the run has no scan, expected one to explain")
-    begin, t = float(history.t_ns[0]) * 1e-9, (history.t_ns[steps] - history.t_ns[0]) * 1e-9
-    span = float((history.t_ns[-1] - history.t_ns[0]) * 1e-9)
+    begin, t = float(history.t_ns[0]) * 1e-9, history.t_s
+    span = float(t[-1])
     in_log = -AROUND_S <= t_s - begin <= span + AROUND_S
     since = t_s - begin if in_log else t_s
     if not -AROUND_S <= since <= span + AROUND_S:
         first, last = seconds(history.t_ns[0]), seconds(history.t_ns[-1])
         raise RunError(f"scan is {t_s:g} s, expected {first} to {last} s of the log, or 0 to {span:.3f} s since then")
-    told = with_known(run, explained(run, int(steps[np.argmin(np.abs(t - since))])))
+    told = with_known(run, explained(run, int(steps[np.argmin(np.abs(t[steps] - since))])))
     return replace(told, asked=f"{t_s:.12g} s {'in the log' if in_log else 'since the first scan'} was asked for")
 
 
@@ -143,7 +137,6 @@ def with_known(run: Recording, told: Explanation) -> Explanation:
     Both are seen from the pose after the scan: the way from one to the other is the innovation.  Nothing is added where
     the run has no map, or the sensor does not tell how far away it sees.
     """
-    rows = np.flatnonzero(run.history.step == told.step)
     open_ = [k for k, fate in enumerate(told.fates) if fate.id and not np.isfinite(fate.seen_at).all()]
     if not open_:
         return told
@@ -151,6 +144,7 @@ def with_known(run: Recording, told: Explanation) -> Explanation:
         slam = run.final_slam()
     except RunError:
         return told
+    rows = run.history.step == told.step
     places, expected = (_seen(slam, told, values[rows]) for values in (run.history.y, run.history.e))
     fates = list(told.fates)
     for k in open_:
@@ -184,7 +178,7 @@ def explained(run: Recording, step: int) -> Explanation:
     sensor = str(history.sensor[rows[0]]) if len(rows) else ""
     return Explanation(
         step=step,
-        t_s=float((history.t_ns[step] - history.t_ns[0]) * 1e-9),
+        t_s=float(history.t_s[step]),
         log_t_s=seconds(history.t_ns[step]),
         robot=str(history.robot[step]),
         sensor=sensor,
@@ -192,19 +186,19 @@ def explained(run: Recording, step: int) -> Explanation:
         covariance=history.pose_covariances[step],
         gates=_gates(run, str(history.robot[step]), sensor, rows),
         fates=tuple(fate_of(history, int(row)) for row in rows),
-        changes=tuple(c for c in history.decisions.changes if c.step == step),
+        changes=tuple(c for c in history.changes if c.step == step),
     )
 
 
 def fate_of(history: History, row: int) -> Fate:
     """Return what became of an observation."""
-    told, d = history.decisions, 3 if history.in_space else 2
-    mine = np.flatnonzero(told.row == row)
-    mine = mine[np.argsort(told.d2[mine], kind="stable")]
-    compared = tuple(Compared(str(told.landmark[i]), float(told.d2[i]), told.place[i]) for i in mine)
-    seen_at = told.seen_at[row] if row < len(told.seen_at) else np.full(d, np.nan)
-    id_, outcome, landmark, reason = (str(getattr(history, k)[row]) for k in ("id", "outcome", "landmark", "reason"))
-    return Fate(int(history.index[row]), id_, outcome, landmark, float(history.d2[row]), reason, seen_at, compared)
+    names, d2 = history.candidate_landmark, history.candidate_d2
+    mine = np.flatnonzero(history.candidate_row == row)
+    mine = mine[np.argsort(d2[mine], kind="stable")]
+    compared = tuple(Compared(str(names[i]), float(d2[i]), history.candidate_place[i]) for i in mine)
+    id_, outcome, landmark, reason = (str(vars(history)[k][row]) for k in ("id", "outcome", "landmark", "reason"))
+    d2_, at = float(history.d2[row]), history.seen_at[row]
+    return Fate(int(history.index[row]), id_, outcome, landmark, d2_, reason, at, compared)
 
 
 def _gates(run: Recording, robot: str, sensor: str, rows: Ints) -> tuple[float, float] | None:

@@ -45,8 +45,11 @@ def associations_csv(history: History) -> str:
     Of an observation that was averaged over landmarks, one row each with its weight, which is then a column more.
     """
     times, robots = [seconds(t_ns) for t_ns in history.t_ns.tolist()], history.robot.tolist()
-    soft, shares = history.decisions, defaultdict(list)
-    for row, name, weight in zip(soft.share_row.tolist(), soft.share_landmark, soft.share_weight.tolist(), strict=True):
+    shares, soft = (
+        defaultdict(list),
+        (history.share_row.tolist(), history.share_landmark, history.share_weight.tolist()),
+    )
+    for row, name, weight in zip(*soft, strict=True):
         shares[row].append((name, weight))
     columns = (history.step, history.sensor, history.index, history.id, history.outcome, history.landmark)
     told = zip(*(column.tolist() for column in (*columns, history.d2, history.reason)), strict=True)
@@ -62,7 +65,7 @@ def changes_csv(history: History) -> str:
     """Return one row for each landmark that was removed or merged with another: after which scan, and why."""
     rows = [
         [seconds(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
-        for c in history.decisions.changes
+        for c in history.changes
     ]
     return _csv(CHANGES, rows)
 

@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kalmark.results.columns import Array, Ints
-from kalmark.results.history import Camera, History
-from kalmark.results.shapes import EUCLIDEAN
+from kalmark.results.history import Array, Camera, History, Ints
+from kalmark.results.landmarks import EUCLIDEAN
 
 COLUMN = re.compile(r"([uv])([lr]?)(\d*)_px")
 COLOURS = {  # by whether the landmark is Euclidean, then whether it was used

@@ -34,7 +34,7 @@ class LogReference:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the reference as it stands in ``summary.json``."""
-        return {"name": self.name, "format": self.format, "path": self.path, "robots": list(self.robots)}
+        return vars(self) | {"robots": list(self.robots)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,6 @@ class Recording:
     truth: Truth
     log: LogReference = LogReference()
     coordinates: str = "world"
-    controls: int = 0
-    fixes: int = 0
-    fixes_rejected: int = 0
     wall_s: float = 0.0
     skipped: list[str] = field(default_factory=list)
     stopped: str = ""
@@ -108,12 +105,16 @@ class Recording:
                 landmarks=MapLandmarks.read(folder / "landmarks.csv"),
                 truth=Truth.from_arrays(named),
                 log=LogReference(log["name"], log["format"], log["path"], tuple(log["robots"])),
-                **{key: summary[key] for key in ("coordinates", "controls", "fixes", "fixes_rejected", "wall_s")},
-                skipped=_skipped(named),
+                coordinates=summary["coordinates"],
+                wall_s=summary["wall_s"],
+                skipped=[
+                    line if n == 1 else LeftOut(line, n)
+                    for line, n in zip(named["skipped"].tolist(), named["skipped_records"].tolist(), strict=True)
+                ],
                 stopped=summary.get("stopped", ""),
                 folder=folder,
                 summary=summary,
-                reference={name: summary[name] for name in named.get("reference", np.empty(0)).tolist()},
+                reference={name: summary[name] for name in named["reference"].tolist()},
             )
         except (KeyError, ValueError, OSError) as error:
             raise RunError(f"{folder}: not a run that this version reads: {error}") from None
@@ -135,9 +136,3 @@ class Recording:
             source = self.folder / "map.kmk"
             if source.is_file():
                 replace_file(folder / "map.kmk", lambda path: path.write_bytes(source.read_bytes()))
-
-
-def _skipped(named: dict[str, Any]) -> list[str]:
-    lines = named["skipped"].tolist()
-    records = named["skipped_records"].tolist() if "skipped_records" in named else [1] * len(lines)
-    return [line if n == 1 else LeftOut(line, n) for line, n in zip(lines, records, strict=True)]

@@ -8,9 +8,8 @@ from importlib import resources
 from typing import Any
 
 from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
-from kalmark.results.evaluate import summary_of
+from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.files import config_yaml
-from kalmark.results.headline import headline
 from kalmark.results.recording import Recording
 from kalmark.results.series import change_rows, reasons, series
 from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words

@@ -46,7 +46,7 @@ class Run(Recording):
         write(folder / "landmarks.csv", self.landmarks.to_csv())
         write(folder / "associations.csv", associations_csv(self.history))
         (folder / "changes.csv").unlink(missing_ok=True)
-        if self.history.decisions.changes:
+        if self.history.changes:
             write(folder / "changes.csv", changes_csv(self.history))
         replace_file(folder / "history.npz", self.save_arrays)
         self.save_map(folder)
@@ -56,8 +56,8 @@ class Run(Recording):
 
     def report(self, folder: str | Path) -> list[Path]:
         """Write ``map.png``, ``report.html`` and each camera's last scan into a folder; return their paths."""
-        from kalmark.results.plot import save_map  # matplotlib is slow to import
-        from kalmark.results.plot_sensor import save_sensor
+        from kalmark.results.plot import save_figure, save_map  # matplotlib is slow to import
+        from kalmark.results.plot_scan import draw_sensor
         from kalmark.results.report import report_html
 
         folder = Path(folder)
@@ -65,11 +65,7 @@ class Run(Recording):
         written = [folder / "map.png", folder / "report.html"]
         for robot, sensor in cameras_that_saw(self.history):
             written.append(folder / f"sensor_{file_name(robot)}_{file_name(sensor)}.png")
-            replace_file(written[-1], partial(save_sensor, self, robot, sensor))
+            picture = draw_sensor(self, robot, sensor)
+            replace_file(written[-1], partial(save_figure, picture, dpi=110, bbox_inches=None))
         write(folder / "report.html", report_html(self))
         return written
-
-
-def load_run(folder: str | Path) -> Run:
-    """Read a run folder.  Raises RunError naming the file that is missing or cannot be read."""
-    return Run.load(folder)

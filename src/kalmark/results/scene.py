@@ -14,12 +14,11 @@ import numpy as np
 
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
-from kalmark.results.align import Rigid, rigid, rigid_robust
-from kalmark.results.columns import Array, Ints
-from kalmark.results.evaluate import FIX_GAP_S, antenna_path
-from kalmark.results.history import Camera
+from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
+from kalmark.results.history import Array, Camera, Flags, Ints
+from kalmark.results.landmarks import EUCLIDEANS, LINE, Shapes, shapes
+from kalmark.results.measures import Rigid, rigid
 from kalmark.results.recording import Recording
-from kalmark.results.shapes import EUCLIDEANS, LINE, Shapes, shapes
 from kalmark.results.truth import moved
 
 COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b0457a", "#6b6f2a")
@@ -62,30 +61,30 @@ class Scene:
     @classmethod
     def of(cls, run: Recording, step: int | None = None) -> Scene:
         """Return what to draw of a run after a step, by default the last; the box is that of the whole run."""
-        history, d = run.history, 3 if run.history.in_space else 2
+        history, d = run.history, run.history.d
         to_map = _truth_to_map(run, d)
         mine = {robot: history.robot == robot for robot in history.robots}
         truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
         scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
-        moved_truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
+        truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
         landmarks = {i: l if d == 3 else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()}
         used, last = _used_fixes(run, d), run.landmarks
         whole = shapes(*last.places(), last.kinds, d)
         now, ids = whole, tuple(last.ids)
         if step is not None:
             _, _, ids, means, covariances, kinds = history.map_at(step)
-            now = shapes(means, covariances, kinds or [""] * len(ids), d)
+            now = shapes(means, covariances, kinds, d)
         until = slice(None) if step is None else slice(step + 1)
         poses, P = history.poses, history.pose_covariances
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
         true = [l.reshape(-1, d) if len(l) == LINE else l[None, :d] for l in landmarks.values()]
-        low, high = _box(poses[:, :d], ends, whole, [*moved_truth.values(), *used.values(), *true])
+        low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true])
         return cls(
             d,
             {robot: poses[until][rows[until]] for robot, rows in mine.items()},
             {robot: P[until][rows[until]] for robot, rows in mine.items()},
             {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()},
-            moved_truth,
+            truth,
             {robot: _fixes_in_map(run, robot) for robot in scored},
             used,
             landmarks,
@@ -109,10 +108,6 @@ class Scene:
     def line(self, robot: str) -> Array:
         """Return a robot's path (N, d), NaN in gaps of time."""
         return broken(self.paths[robot][:, : self.d], self.stretches[robot])
-
-    def true_path(self, robot: str) -> Array:
-        """Return a robot's true path (N, d), NaN in gaps of time."""
-        return broken(self.truth[robot], self.stretches[robot])
 
     def inside(self, lines: Array) -> Array:
         """Return polylines (..., d) with NaN where they leave the box."""
@@ -155,11 +150,15 @@ def contours(means: Array, covariances: Array, sigmas: float = 3.0) -> Array:
     circles = np.zeros((d * (d - 1) // 2, d, len(alpha)))
     for circle, (i, j) in zip(circles, combinations(range(d), 2), strict=True):
         circle[i], circle[j] = np.cos(alpha), np.sin(alpha)
-    known = np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    known = _known(means, covariances)
     values, axes = np.linalg.eigh(np.where(known[:, None, None], covariances, 0.0))
     half = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     out = means[:, None, None, :] + sigmas * np.einsum("kij,cjp->kcpi", half, circles)
     return np.where(known[:, None, None, None], out, np.nan)
+
+
+def _known(means: Array, covariances: Array) -> Flags:
+    return np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
 
 
 def joined(lines: Sequence[Array] | Array, d: int = 3) -> Array:
@@ -194,7 +193,7 @@ def grouped(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
 
 def _used_fixes(run: Recording, d: int) -> dict[str, Array]:
     """Return the fixes (N, d) of each robot that the filter used; they are in the frame of the map."""
-    used = [fix for fix in run.history.inputs.fixes if fix.used]
+    used = [fix for fix in run.history.fixes if fix.used]
     rows = {name: np.array([fix.y for fix in used if fix.robot == name]) for name in sorted({f.robot for f in used})}
     return {name: np.pad(y, ((0, 0), (0, d - y.shape[1]))) for name, y in rows.items()}
 
@@ -210,12 +209,8 @@ def _truth_to_map(run: Recording, d: int) -> Rigid:
 
 def _fixes_in_map(run: Recording, robot: str) -> Array:
     """Return where the robot was (N, 2) by each fix: aligned robustly, the antenna's offset taken off."""
-    fixes = run.truth.fixes[robot]
-    antenna, offset = antenna_path(run.history, robot, fixes)
-    known = np.isfinite(antenna).all(axis=1)
-    if known.sum() < 2:
-        return np.empty((0, 2))
-    return rigid_robust(antenna[known], fixes.xy[known]).inverse()(fixes.xy[known]) - offset[known]
+    to_fixes, _, offset, xy = aligned_fixes(run, robot)
+    return to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
 
 
 def _placed(pose: Array, points: Array) -> Array:
@@ -235,13 +230,12 @@ def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, mo
     Contours reach out of it where they are huge.
     """
     d = path.shape[1]
-    means, covariances = drawn.points.means, drawn.points.covariances
-    known = np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    means, covariances = drawn.means, drawn.covariances
+    known = _known(means, covariances)
     sigma = np.sqrt(np.maximum(np.einsum("kii->ki", np.where(known[:, None, None], covariances, 0.0)), 0.0))
     middle = path.mean(axis=0) if len(path) else np.zeros(d)
     distance = np.linalg.norm(np.where(known[:, None], means, np.inf) - middle, axis=1)
-    near = np.logical_or(drawn.group == EUCLIDEANS, sigma.max(axis=1, initial=0.0) < CLEAR * distance)
-    clear = np.logical_and(known, near)
+    clear = known & ((drawn.group == EUCLIDEANS) | (sigma.max(axis=1, initial=0.0) < CLEAR * distance))
     last = np.array([pose[:d] for pose, _ in ends.values()]).reshape(-1, d)
     spread = np.array([np.sqrt(np.maximum(np.diagonal(P)[:d], 0.0)) for _, P in ends.values()]).reshape(-1, d)
     points = np.concatenate([path, means[clear], *more])

@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 
 from kalmark.report import OUTCOMES
-from kalmark.results.columns import Array, Ints
-from kalmark.results.consistency import anees_interval, nees, nis, pose_error
 from kalmark.results.explain import Explanation, Fate, explained
-from kalmark.results.history import Camera, History, MapSnapshot
-from kalmark.results.images import Image, Sighting, colour_of, images, steps_of
-from kalmark.results.inputs import UsedFix
+from kalmark.results.history import Array, Camera, Change, History, Ints, MapSnapshot
+from kalmark.results.images import Sighting, colour_of, images, steps_of
+from kalmark.results.landmarks import shapes
+from kalmark.results.measures import anees_interval, nees, nis, pose_error
 from kalmark.results.recording import Recording
 from kalmark.results.scene import Scene, broken, grouped, joined, squares, stretches_of
-from kalmark.results.shapes import shapes
 
 BINS = 120
 POINTS = 2000  # of a curve
@@ -34,12 +32,13 @@ UNSURE = ("between ", "its nearest ", "it does not fit", "cliques as large")  # 
 
 def series(run: Recording) -> dict[str, Any]:
     """Return all that the pictures of a report need; times in seconds since the first step."""
-    scene, t = Scene.of(run), _since_start(run)
+    scene, t = Scene.of(run), run.history.t_s
     dof, maps = (3, 6)[scene.d - 2], _fewer(run.history.maps)
+    true = scene.true_points()
     return {
         "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
-        "trueLandmarks": _points(scene),
+        "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
         "trueLines": xy(joined(scene.true_lines())),
         "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
         "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.used.items()},
@@ -55,16 +54,6 @@ def series(run: Recording) -> dict[str, Any]:
     }
 
 
-def _since_start(run: Recording) -> Array:
-    t_ns = run.history.t_ns
-    return (t_ns - t_ns[0]) * 1e-9 if len(t_ns) else np.empty(0)
-
-
-def _points(scene: Scene) -> dict[str, Any]:
-    points = scene.true_points()
-    return {"id": [str(i) for i in points], **xy(np.array(list(points.values())).reshape(-1, scene.d))}
-
-
 def _fewer(maps: tuple[MapSnapshot, ...]) -> list[MapSnapshot]:
     """Return maps evenly spread, the last among them, of so many landmarks that the page stays of a size to open."""
     total = sum(len(m.ids) for m in maps)
@@ -74,18 +63,15 @@ def _fewer(maps: tuple[MapSnapshot, ...]) -> list[MapSnapshot]:
 
 def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
     """Return a map: all points, in space the endpoints of lines last, with the group that each is drawn in."""
-    drawn = shapes(m.means, m.covariances, m.kinds or [""] * len(m.ids), scene.d)
-    points = drawn.points
-    more: dict[str, Any] = {}
-    if scene.d == 3:
-        more = {"lines": xy(joined(drawn.lines)), "tags": xy(joined(squares(drawn.tags, scene.size)))}
+    drawn = shapes(m.means, m.covariances, m.kinds, scene.d)
+    lines = {"lines": xy(joined(drawn.lines)), "tags": xy(joined(squares(drawn.tags, scene.size)))}
     return {
         "t": round(t_s, 3),
-        "id": [str(m.ids[row]) for row in points.row],
+        "id": [str(m.ids[row]) for row in drawn.row],
         "group": drawn.group.tolist(),
         "count": len(m.ids),
-        **more,
-        **gaussians(points.means, points.covariances),
+        **(lines if scene.d == 3 else {}),
+        **gaussians(drawn.means, drawn.covariances),
     }
 
 
@@ -97,17 +83,18 @@ def _camera(run: Recording, camera: Camera, maps: list[MapSnapshot], t: Array) -
     return {
         "name": f"{camera.robot} · {camera.sensor}",
         "size": [float(side) for side in camera.size],
-        "scans": [_scan(run, camera, int(steps[k]), t) for k in used],
+        "scans": [
+            {
+                "t": round(float(t[step]), 3),
+                "images": [
+                    {"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]}
+                    for image in images(run.history, camera, step)
+                ],
+            }
+            for step in steps[used].tolist()
+        ],
         "frames": [int(np.searchsorted(used, k)) if k >= 0 else None for k in last],
     }
-
-
-def _scan(run: Recording, camera: Camera, step: int, t: Array) -> dict[str, Any]:
-    return {"t": round(float(t[step]), 3), "images": [_image(image) for image in images(run.history, camera, step)]}
-
-
-def _image(image: Image) -> dict[str, Any]:
-    return {"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]}
 
 
 def _seen(s: Sighting) -> dict[str, Any]:
@@ -125,10 +112,10 @@ def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]
     rows = rows[thin(len(rows))]
     mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
     out: dict[str, Any] = {"name": robot, "colour": scene.colour(robot), "t": significant(t[rows], 7)}
-    d = 3 if run.history.in_space else 2
+    d = scene.d
     out |= gaussians(mean[:, :d], P[:, :d, :d])
     stretches = scene.stretches[robot][thin(len(scene.stretches[robot]))]
-    out["gaps"] = (np.flatnonzero(np.diff(stretches)) + 1).tolist()
+    out["gaps"] = _gaps(stretches)
     out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
     if robot in scene.truth:
         true = scene.truth[robot]
@@ -186,31 +173,34 @@ def _outcomes(run: Recording, t: Array) -> dict[str, Any]:
 
 
 def _innovations(run: Recording, scene: Scene) -> list[dict[str, Any]]:
-    """Return each robot's innovations of fixes and their sigmas in m; times in seconds since the first step."""
-    t_ns = run.history.t_ns
-    begin = int(t_ns[0]) if len(t_ns) else 0
-    by_robot = {robot: [fix for fix in run.history.inputs.fixes if fix.robot == robot] for robot in scene.paths}
-    return [
-        {"name": robot, "colour": scene.colour(robot), **_fix_curves(fixes, begin)}
-        for robot, fixes in by_robot.items()
-        if fixes
-    ]
+    """Return each robot's innovations of fixes and their sigmas in m, thinned, and by themselves those rejected."""
+    begin_ns, out = int(run.history.t_ns[:1].sum()), []
+    for robot in scene.paths:
+        fixes = [fix for fix in run.history.fixes if fix.robot == robot]
+        if not fixes:
+            continue
+        t_ns, used = np.array([fix.t_ns for fix in fixes]), np.array([fix.used for fix in fixes])
+        t, z = (t_ns - begin_ns) * 1e-9, np.array([fix.z for fix in fixes])
+        sigma = np.sqrt(np.maximum([np.diagonal(fix.Z) for fix in fixes], 0.0))
+        rows, bad = thin(len(fixes)), np.flatnonzero(~used)
+        bad = bad[thin(len(bad))]
+        out.append(
+            {
+                "name": robot,
+                "colour": scene.colour(robot),
+                "t": significant(t[rows], 7),
+                "z": [significant(column) for column in z[rows].T],
+                "sigma": [significant(column) for column in sigma[rows].T],
+                "gaps": _gaps(stretches_of(t_ns)[rows]),
+                "rejected": {"t": significant(t[bad], 7), "z": [significant(column) for column in z[bad].T]},
+            }
+        )
+    return out
 
 
-def _fix_curves(fixes: list[UsedFix], begin_ns: int) -> dict[str, Any]:
-    """Return the curves of a robot's fixes, thinned, and those of them that were rejected, by themselves."""
-    t_ns, used = np.array([fix.t_ns for fix in fixes]), np.array([fix.used for fix in fixes])
-    t, z = (t_ns - begin_ns) * 1e-9, np.array([fix.z for fix in fixes])
-    sigma = np.sqrt(np.maximum([np.diagonal(fix.Z) for fix in fixes], 0.0))
-    rows, bad = thin(len(fixes)), np.flatnonzero(~used)
-    bad = bad[thin(len(bad))]
-    return {
-        "t": significant(t[rows], 7),
-        "z": [significant(column) for column in z[rows].T],
-        "sigma": [significant(column) for column in sigma[rows].T],
-        "gaps": (np.flatnonzero(np.diff(stretches_of(t_ns)[rows])) + 1).tolist(),
-        "rejected": {"t": significant(t[bad], 7), "z": [significant(column) for column in z[bad].T]},
-    }
+def _gaps(stretches: Ints) -> list[int]:
+    """Return before which of the points with these numbers of gaps there is one."""
+    return (np.flatnonzero(np.diff(stretches)) + 1).tolist()
 
 
 def reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
@@ -227,9 +217,9 @@ def reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
 
 def _association(run: Recording, t: Array) -> dict[str, Any]:
     """Return ambiguous scans in the order of time, and when landmarks were merged or removed."""
-    changes = [c for c in run.history.decisions.changes if not c.reason.startswith(TENTATIVE)]
+    changes = _told_changes(run.history)
     return {
-        "scans": [_ambiguous_scan(explained(run, step)) for step in ambiguous(run.history).tolist()],
+        "scans": [_ambiguous(explained(run, step)) for step in ambiguous(run.history).tolist()],
         "changes": {
             what: significant(np.array([t[c.step] for c in changes if c.what == what][:MARKS]), 7)
             for what in dict.fromkeys(c.what for c in changes)
@@ -239,40 +229,35 @@ def _association(run: Recording, t: Array) -> dict[str, Any]:
 
 def ambiguous(history: History) -> Ints:
     """Return the steps of the most ambiguous scans, in the order of time: those with most observations in doubt."""
-    told = history.decisions
-    if not len(told.row):
+    if not len(history.candidate_row):
         return np.zeros(0, dtype=np.int64)
-    reasons = history.reason
     doubt = (history.outcome == "deferred").astype(np.int64)
-    doubt += np.logical_or.reduce([np.char.startswith(reasons, start) for start in UNSURE])
+    doubt += np.logical_or.reduce([np.char.startswith(history.reason, start) for start in UNSURE])
     shown = np.zeros(len(history.step), dtype=np.bool_)
-    shown[told.row] = True
+    shown[history.candidate_row] = True
     score = np.bincount(history.step[shown], doubt[shown], len(history.t_ns))
     best = np.argsort(-score, kind="stable")[:SCANS]
     return np.sort(best[score[best] > 0])
 
 
+def _told_changes(history: History) -> list[Change]:
+    return [c for c in history.changes if not c.reason.startswith(TENTATIVE)]
+
+
 def change_rows(run: Recording) -> Iterator[tuple[str, str, str, str]]:
     """Return rows of what became of landmarks: when, which, what, why; tentative ones that went are not among them."""
     history = run.history
-    told = [c for c in history.decisions.changes if not c.reason.startswith(TENTATIVE)]
+    told = _told_changes(history)
     for c in told[:CHANGES]:
-        t_s = (history.t_ns[c.step] - history.t_ns[0]) * 1e-9
-        yield f"{t_s:.1f}", c.landmark, c.what, c.reason
+        yield f"{history.t_s[c.step]:.1f}", c.landmark, c.what, c.reason
     if len(told) > CHANGES:
         yield "", "", "", f"and {len(told) - CHANGES} more: see associations.csv"
 
 
-def _ambiguous_scan(told: Explanation) -> dict[str, Any]:
+def _ambiguous(told: Explanation) -> dict[str, Any]:
     pose = gaussians(told.pose[None, :2], told.covariance[None, :2, :2])
-    return {
-        "t": round(told.t_s, 3),
-        "in_log": told.in_log,
-        "robot": told.robot,
-        "sensor": told.sensor,
-        "pose": pose,
-        "seen": [_fate(fate) for fate in told.fates],
-    }
+    out = {"t": round(told.t_s, 3), "in_log": told.in_log, "robot": told.robot, "sensor": told.sensor, "pose": pose}
+    return out | {"seen": [_fate(fate) for fate in told.fates]}
 
 
 def _fate(fate: Fate) -> dict[str, Any]:

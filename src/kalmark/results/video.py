@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from kalmark.errors import RunError
+from kalmark.results.evaluate import headline
 from kalmark.results.files import replace_file
-from kalmark.results.headline import headline
 from kalmark.results.images import images, steps_of
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
-from kalmark.results.plot_sensor import draw_image
+from kalmark.results.plot_scan import draw_image
 from kalmark.results.progress import track
 from kalmark.results.recording import Recording
 from kalmark.results.scene import INK, Scene

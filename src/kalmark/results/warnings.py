@@ -1,4 +1,11 @@
-"""What is worth a second look before a run's figures are believed, one line each."""
+"""What is worth a second look before a run's figures are believed, and what noise is stated too large: a line each.
+
+An innovation has the noise of its measurement in it, and the uncertainty of pose and map on top: E[z z'] = H P H' + R
+is at least R, whatever P the filter believes in.  Squares of z that add up to far less than R therefore say that R is
+too large, and by how much at least.  They do not say it of errors that last from one sighting to the next: the map
+takes those in, and a larger white noise is a fair price for them.  So nothing is said where the truth shows the filter
+to be too sure of itself already.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +15,14 @@ from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2
 
-from kalmark.results.by_position import LEAST, no_ids
+from kalmark.declare import registered_name
+from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
-from kalmark.results.inputs import UsedFix
+from kalmark.results.history import Flags, History, UsedFix
+from kalmark.results.matching import LEAST, no_ids
+from kalmark.results.measures import nis
 from kalmark.results.recording import Recording
 from kalmark.results.windows import window_warnings
 from kalmark.results.words import count, figure
@@ -27,12 +36,25 @@ BEARINGS = ("range_bearing", "range_bearing_3d")
 ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
 MARGIN = 0.1  # of an image, by which its measurements may lie outside it
 FEW_FIXES = 5  # fewer say little of the noise
+LOW = 0.5  # squares of innovations over those of the stated noise: it is 1.4 times too large
+TINY_NIS = 0.1
+TINY = 1e-6  # of those squares, where a log has no noise
+NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
+COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 
 
 def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
-    parts = (_lost, _windows, _observations, _robots, _sensors, _truth, _fixes, _noise)
-    return [line for part in parts for line in part(run, summary)] + list(mount_warnings(summary))
+    parts = (_lost, window_warnings, _observations, _robots, _sensors, _truth, _fixes, _noise, mount_warnings)
+    return [line for part in parts for line in part(run, summary)]
+
+
+def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
+    """Return a line for each sensor whose noise is stated far too large; one if the NIS is tiny for another reason."""
+    lines, nis_ = list(_stated_too_large(run, summary)), summary["nis_per_dof"]
+    if not lines and nis_ is not None and nis_ < TINY_NIS and summary["associated"] >= NUMBER // 2:
+        lines = [f"NIS per degree of freedom {figure(nis_, 2)} where 1 is consistent: the noise is set too large"]
+    return lines
 
 
 def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
@@ -42,10 +64,6 @@ def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     if lost:
         names = ", ".join(lost)
         yield f"DIVERGED: the error of {names} exceeds 10 of its own sigmas and 5 % of the path; do not use this map"
-
-
-def _windows(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
-    yield from window_warnings(run.history)
 
 
 def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
@@ -70,7 +88,7 @@ def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     yield from _images(run)
 
 
-def _by_design(run: Recording) -> npt.NDArray[np.bool_]:
+def _by_design(run: Recording) -> Flags:
     """Tell which observations were left alone because a sensor's attention is set so."""
     reasons = run.history.reason
     return np.logical_or.reduce([np.char.startswith(reasons, start) for start in ATTENTION])
@@ -95,7 +113,7 @@ def _images(run: Recording) -> Iterator[str]:
             )
 
 
-def _has_bearing(run: Recording) -> npt.NDArray[np.bool_]:
+def _has_bearing(run: Recording) -> Flags:
     """Tell of each observation whether all but its first column are bearings, by the type of its sensor."""
     pairs = list(zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True))
     found = {pair: run.section(*pair).get("type") in BEARINGS for pair in set(pairs)}
@@ -106,7 +124,7 @@ def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history = run.history
     for name in history.robots:
         mine = history.robot == name
-        scans, controls = history.t_ns[mine], history.inputs.controls.get(name)
+        scans, controls = history.t_ns[mine], history.controls.get(name)
         coasts = np.isfinite(history.mean[mine]).sum(axis=1).max(initial=0) > 7  # its velocity is estimated
         if len(scans) and controls is None and not coasts:
             yield f"robot {name} has {count(len(scans), 'scan')} but no controls: it is taken to stand still"
@@ -160,7 +178,7 @@ def _some(names: set[str]) -> str:
 
 
 def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
-    fixes = run.history.inputs.fixes
+    fixes = run.history.fixes
     starts = {start.robot: start for start in run.history.starts}
     for name in dict.fromkeys(fix.robot for fix in fixes):
         first = next(fix for fix in fixes if fix.robot == name)
@@ -202,3 +220,38 @@ def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     value = summary["nis_per_dof"]
     if value is not None and value > NIS_HIGH and summary["associated"] >= 50:
         yield f"NIS per degree of freedom {figure(value, 2)} where 1 is consistent: the noise is set too small"
+
+
+def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+    history = run.history
+    nees = [figures["pose_nees"] for figures in summary["robots"].values() if figures.get("pose_nees") is not None]
+    if summary["diverged"] or (nees and float(np.mean(nees)) > POSE_NEES[summary["pose_dof"]]):
+        return
+    for sensor in dict.fromkeys(history.sensor.tolist()):
+        mine = (history.outcome == "associated") & (history.sensor == sensor) & np.isfinite(history.noise).any(axis=1)
+        if mine.sum() >= NUMBER and len(set(history.step[mine].tolist())) >= SCANS:
+            sections = [run.section(robot, sensor) for robot in run.config.get("robots") or {}]
+            columns = next((COLUMNS.get(str(section.get("type")), ()) for section in sections if section), ())
+            yield from _compared(history, sensor, mine, columns)
+
+
+def _compared(history: History, sensor: str, mine: Any, columns: tuple[str, ...]) -> Iterator[str]:
+    size = int(np.isfinite(history.noise[mine]).sum(axis=1).max())  # the padding after its numbers is that of others
+    z, sigma = history.z[mine], history.noise[mine]
+    squares = np.nanmean((z[:, :size] / sigma[:, :size]) ** 2, axis=0)
+    low = np.flatnonzero(squares < LOW)
+    if not len(low):
+        return
+    value, dof = nis(z, history.Z[mine])
+    factors = 1.0 / np.sqrt(np.maximum(squares, TINY))
+    if len(columns) == size:
+        told = "sigma is", ", ".join(f"{figure(factors[k], 2)} times ({columns[k]})" for k in low)
+    elif len(low) == size:
+        told = "sigmas are", f"{figure(float(1.0 / np.sqrt(np.mean(np.maximum(squares, TINY)))), 2)} times"
+    else:
+        return
+    share = figure(float(np.nansum(value) / dof.sum()), 2)
+    yield (
+        f"sensor {sensor}: NIS {share} where 1 is expected: its {told[0]} stated about {told[1]} too large, "
+        "unless its errors last from one sighting to the next"
+    )

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from kalmark.results.columns import Array, Ints
-from kalmark.results.consistency import nis
-from kalmark.results.history import History
+from kalmark.results.history import Array, History, Ints
+from kalmark.results.measures import nis
+from kalmark.results.recording import Recording
 from kalmark.results.words import figure
 
 DEGREES = 100  # of freedom in a window, at least
@@ -116,8 +116,7 @@ def _windows(history: History, step: Ints, value: Array, weight: Ints, least: in
     _, scan = np.unique(step, return_inverse=True)
     counts = weight * np.minimum(1.0, least / scans / np.maximum(np.bincount(scan, weight), 1.0))[scan]
     number = ((np.cumsum(counts) - counts) / least + 1e-9).astype(np.int64)
-    t = (history.t_ns - history.t_ns[0]) * 1e-9
-    out = []
+    t, out = history.t_s, []
     for i in range(int(number[-1]) + 1):
         mine = number == i
         if counts[mine].sum() >= 0.9 * least:
@@ -127,8 +126,9 @@ def _windows(history: History, step: Ints, value: Array, weight: Ints, least: in
     return out
 
 
-def window_warnings(history: History) -> Iterator[str]:
+def window_warnings(run: Recording, _: Any = None) -> Iterator[str]:
     """Return a line for each sign that the map is wrong."""
+    history = run.history
     begin_s = float(history.t_ns[0]) * 1e-9 if len(history.t_ns) else 0.0
     yield from _of(nis_windows(history), _high_nis, begin_s)
     yield from _of(left_out_windows(history), _left_out, begin_s)

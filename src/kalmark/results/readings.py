@@ -1,4 +1,4 @@
-"""The cameras of a run: where they sit on their robots and what their images are; and what else calibrates itself."""
+"""What a recording reads off the filter: cameras, what calibrates itself, stated noise, and what corners are off by."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.results.columns import Array
-from kalmark.results.history import Biased, Camera, Mounted
+from kalmark.events import Scan
+from kalmark.geometry.frames3d import compose
+from kalmark.models.sensors import TagCorners
+from kalmark.models.tags import project_corners, tag_seen_from
+from kalmark.results.history import Array, Biased, Camera, Mounted
 from kalmark.slam.motion import bias_name
 
 if TYPE_CHECKING:
+    from kalmark.report import Report
     from kalmark.slam.slam import Slam
 
 
@@ -99,3 +103,43 @@ def _corners(sensor: Imaging) -> Array:
         across, down = u / width - 0.5, v / height - 0.5
         return np.column_stack([2 * HALF_VIEW * across, 2 * HALF_VIEW * down * height / width, np.ones(4)])
     return np.column_stack([(u - sensor.cx_px) / sensor.fx_px, (v - sensor.cy_px) / sensor.fy_px, np.ones(4)])
+
+
+USED = ("associated", "new")
+
+
+def stated_noise(slam: Slam, report: Report) -> Array:
+    """Return the sigmas (K, p) of the noise that a scan's observations were given, (K, 0) where they are not of z."""
+    count, width = report.z.shape
+    event = report.event
+    if not count or not isinstance(event, Scan):
+        return np.empty((count, 0))
+    sensor = slam.robots[event.robot].sensors[event.sensor].sensor
+    R = sensor.noise(event.y) if event.cov is None else np.broadcast_to(event.cov, (count, *event.cov.shape[-2:]))
+    if R.shape != (count, width, width):
+        return np.empty((count, 0))
+    return np.sqrt(np.einsum("kii->ki", R))
+
+
+def left_px(slam: Slam, scan: Scan, report: Report) -> Array:
+    """Return what a scan's correction leaves of each observation (K,): the RMS of a tag's corners, NaN of all else.
+
+    `slam` is the filter just after the scan; an observation that it did not use has NaN, too.
+    """
+    left, mount = np.full(len(report.observations), np.nan), slam.robots[scan.robot].sensors[scan.sensor]
+    used = [o for o in report.observations if o.outcome in USED]
+    if not used or not isinstance(mount.sensor, TagCorners):
+        return left
+    at = mount_now(slam, scan.robot, scan.sensor, mount.at)
+    tags = np.array([slam.mean(o.landmark)[:7] for o in used])  # type: ignore[arg-type]
+    v = tag_seen_from(compose(slam.mean(scan.robot)[:7], at)[0], tags)[0]
+    rows = [o.index for o in used]
+    y, par = scan.y[rows], np.array(mount.sensor.parameters)
+    e = project_corners(mount.sensor.lens_code, v, np.ascontiguousarray(y[:, 8]), par)[0]
+    left[rows] = np.nan_to_num(rms_of_corners(y[:, :8] - e), nan=np.inf)  # behind the camera
+    return left
+
+
+def rms_of_corners(residuals: Array) -> Array:
+    """Return the RMS (K,) of the distances of four corners whose residuals are (K, 8)."""
+    return np.sqrt(0.25 * np.sum(residuals**2, axis=1))
