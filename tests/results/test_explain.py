@@ -15,11 +15,11 @@ from garden import GARDEN, look, slam_of
 from kalmark.cli import main
 from kalmark.errors import RunError
 from kalmark.geometry.frames import compose
-from kalmark.results.explain import Compared, explain
+from kalmark.report import Candidate
+from kalmark.results.explain import explain
 from kalmark.results.plot_scan import draw_scan
-from kalmark.results.report import report_html
+from kalmark.results.report import change_rows, report_html, series
 from kalmark.results.run import Run
-from kalmark.results.series import change_rows, series
 from kalmark.results.words import figure
 
 
@@ -138,7 +138,7 @@ def test_what_has_an_id_is_drawn_with_its_landmark_and_d2_as_what_has_none(tmp_p
     axes = draw_scan(run, told).axes[0]
     assert {f"{k}: {figure(fate.d2, 2)}" for k, fate in enumerate(told.fates)} <= {t.get_text() for t in axes.texts}
     assert not any("compared with" in line for line in told.lines()), "the line of the observation says it"
-    far = replace(told.fates[0], landmark="", compared=(Compared("far", 4110.0, np.array([500.0, 0.0])),))
+    far = replace(told.fates[0], landmark="", compared=(Candidate(0, "far", 4110.0, np.array([500.0, 0.0])),))
     lone = draw_scan(run, replace(told, fates=(far, *told.fates[1:]))).axes[0]
     assert "far" not in {t.get_text() for t in lone.texts}
     assert lone.get_xlim()[1] < 100.0
@@ -150,7 +150,7 @@ def test_a_drawn_scan_has_no_far_landmarks_and_no_text_over_another(tmp_path: Pa
     held = explain(lost_run(tmp_path), 7.0)
     places = [np.array(p) for p in ([4.0, 1.0], [4.3, 1.2], [4.4, 0.8], [4.6, 1.1])]
     near = tuple(
-        Compared(f"u{k}", d2, p) for k, (d2, p) in enumerate(zip([1.23, 4.56, 7.89, 120.0], places, strict=True))
+        Candidate(0, f"u{k}", d2, p) for k, (d2, p) in enumerate(zip([1.23, 4.56, 7.89, 120.0], places, strict=True))
     )
     fates = tuple(
         replace(held.fates[0], index=k, landmark="", seen_at=np.array([3.0, y]), compared=compared)

@@ -16,8 +16,8 @@ from kalmark.events import Control, Fix, Scan
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
 from kalmark.logs import open_log, write_native
-from kalmark.results.files import replace_file
 from kalmark.results.record import record
+from kalmark.results.recording import replace_file
 from kalmark.results.run import Run
 from results_world import STEP_NS, circle, slam_for
 

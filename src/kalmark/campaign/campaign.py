@@ -114,11 +114,8 @@ def mounts(scores: Sequence[Scores]) -> dict[str, float]:
     names = ("mount", "mount_dof", "mount_m", "mount_rad")
     last = {name: np.array([_last(s.series[name]) for s in scores]) for name in names}
     below = last["mount"] <= chi2.ppf(0.9973, last["mount_dof"])
-    return {
-        "mount_m": rms(last["mount_m"]),
-        "mount_deg": float(np.degrees(rms(last["mount_rad"]))),
-        "mount_sure": int(below.sum()),
-    }
+    degrees = float(np.degrees(rms(last["mount_rad"])))
+    return {"mount_m": rms(last["mount_m"]), "mount_deg": degrees, "mount_sure": int(below.sum())}
 
 
 def _last(values: Array) -> float:

@@ -31,10 +31,10 @@ from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
 from kalmark.models.protocols import bias_covariance
 from kalmark.report import Report
-from kalmark.results.files import config_yaml
 from kalmark.results.history import Array
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
+from kalmark.results.recording import config_yaml
 from kalmark.results.warnings import NO_ID
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
@@ -261,17 +261,15 @@ class _Replaying:
 
     def __init__(self, replay: Replay, chance: Chance) -> None:
         self.replay, self.chance = replay, chance
-        self.robots = {name: self._driven(build_robot(replay.settings, name)) for name in replay.robots}
+        self.robots: dict[str, _Driven] = {}
+        for name in replay.robots:
+            robot = build_robot(replay.settings, name)
+            motion, cov, start = robot.motion, bias_covariance(robot.motion), drawn_start(robot, chance.route)
+            bias = 0.0 if cov is None else gaussian(cov, chance.route)
+            sensors = {key: drawn_mount(mount, chance.mounts) for key, mount in robot.sensors.items()}
+            self.robots[name] = _Driven(motion, start, bias, sensors, HeldInput(motion))
         self.events: list[Event] = []
         self.origins: dict[Key, tuple[Id | None, ...]] = {}
-
-    def _driven(self, robot: Robot) -> _Driven:
-        motion, cov = robot.motion, bias_covariance(robot.motion)
-        start = drawn_start(robot, self.chance.route)
-        sensors = {key: drawn_mount(mount, self.chance.mounts) for key, mount in robot.sensors.items()}
-        return _Driven(
-            motion, start, 0.0 if cov is None else gaussian(cov, self.chance.route), sensors, HeldInput(motion)
-        )
 
     def simulation(self) -> Simulation:
         """Return the log of all events, and what it does not tell: states as they are after each scan."""

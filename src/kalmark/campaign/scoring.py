@@ -28,17 +28,7 @@ from kalmark.models.landmarks import Polar2D
 from kalmark.models.protocols import Pointed, Segmented, place_of
 from kalmark.report import Report
 from kalmark.results.history import Array
-from kalmark.results.measures import (
-    SINGULAR,
-    diverged,
-    nees,
-    path_m,
-    point_error,
-    pose_error,
-    rigid,
-    rmse,
-    rotation_error,
-)
+from kalmark.results.measures import SINGULAR, diverged, nees, point_error, pose_error, rigid, rmse, rotation_error
 from kalmark.simulate.robots import Simulation
 from kalmark.slam.slam import Slam
 
@@ -166,10 +156,6 @@ class Scores:
     nis_dof: int
     diverged: bool
     stopped: str
-
-    def same(self, other: Scores) -> bool:
-        """Tell whether two scores are equal bit for bit."""
-        return all(self.series[k].tobytes() == other.series[k].tobytes() for k in SERIES)
 
 
 def score(slam: Slam, simulated: Simulation, steps: Sequence[int], map_every: int = 10) -> Scores:
@@ -314,7 +300,7 @@ class _Scorer:
         s["position_m"], s["heading_rad"] = (np.linalg.norm(e, axis=-1) for e in (world[..., :d], world[..., d:]))
         aligned, raw, count = self._final_map()
         parts = zip(own[..., :d], self.P[..., :d, :d], s["position_m"], self.truth[..., :d], strict=True)
-        lost = any(diverged(e, P, error_m, path_m(truth)) for e, P, error_m, truth in parts)
+        lost = any(diverged(e, P, error_m, truth) for e, P, error_m, truth in parts)
         return Scores(s, aligned, raw, count, self.nis, self.nis_dof, lost or bool(stopped), stopped)
 
     def _final_map(self) -> tuple[float, float, int]:

@@ -4,30 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from kalmark.cli.shared import RunFolder, computing, print_summary
-
-
-def evaluate_run(folder: Path, truth: Path | None = None, *, batch: bool = False) -> dict[str, Any]:
-    """Return the figures of a run, judged by its own truth or by that of another log.
-
-    The comparison with the batch solution is kept in the run's ``summary.json`` (if judged by its own truth).
-    """
-    from kalmark.results.files import write
-    from kalmark.results.run import Run
-
-    run = Run.load(folder)
-    if truth is not None:
-        from kalmark.logs import open_log
-
-        run = run.with_truth(open_log(truth))
-    summary = run.evaluate(batch=batch)
-    if batch and truth is None:
-        write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
-    return summary
 
 
 def evaluate(
@@ -39,8 +20,17 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
 ) -> None:
     """Print the figures of a run."""
+    from kalmark.logs import open_log
+    from kalmark.results.recording import write
+    from kalmark.results.run import Run
+
     with computing():
-        summary = evaluate_run(run, truth, batch=batch)
+        loaded = Run.load(run)
+        if truth is not None:
+            loaded = loaded.with_truth(open_log(truth))
+        summary = loaded.evaluate(batch=batch)
+        if batch and truth is None:
+            write(run / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
@@ -75,9 +65,9 @@ def explain(
 ) -> None:
     """Say why one scan's observations became what they did, and draw it: what each was compared with, d2, gates."""
     from kalmark.results.explain import explain as explanation_of
-    from kalmark.results.files import file_name, replace_file
     from kalmark.results.plot import save_figure
     from kalmark.results.plot_scan import draw_scan
+    from kalmark.results.recording import file_name, replace_file
     from kalmark.results.run import Run
 
     loaded = Run.load(run)

@@ -36,7 +36,7 @@ def simulate(
 def fitting_config(world: World, seed: int) -> str:
     """Return the text of a configuration of the filter that fits a world, for a log in its own folder."""
     from kalmark.config import config_dict
-    from kalmark.results.files import config_yaml
+    from kalmark.results.recording import config_yaml
 
     config = world.config()
     log = config.log.model_copy(update={"path": ".", "format": "native"})
@@ -76,11 +76,6 @@ def list_() -> None:
 @data.command()
 def fetch(name: Annotated[str, typer.Argument(help="A dataset, or a group like mrclam.")]) -> None:
     """Download a dataset into the cache, every file checked by its hash; what KALMARK_DATA has is used from there."""
-    typer.echo(str(fetch_with_bar(name)))
-
-
-def fetch_with_bar(name: str) -> Path:
-    """Return the folder of a dataset, showing a bar while it downloads."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -95,7 +90,7 @@ def fetch_with_bar(name: str) -> Path:
         bar.update(task, description=file, completed=done, total=total)
 
     try:
-        return fetch_data(name, show)
+        typer.echo(str(fetch_data(name, show)))
     finally:
         if bar.live.is_started:
             bar.stop()

@@ -90,25 +90,19 @@ def finish(result: Run, out: Path, title: str) -> None:
     typer.echo(f"{out}: map.png, report.html and the rest of the run")
 
 
-def run_world(world_path: str | Path, seed: int, *, progress: bool = True) -> Run:
-    """Return the run of the filter that fits a world over one log simulated in it."""
-    from kalmark.config import build_slam, config_dict
-    from kalmark.results.record import record
-    from kalmark.simulate import load_world, simulate
-
-    world = load_world(world_path)
-    config = world.config().model_copy(update={"seed": seed})
-    log = simulate(world, seed)
-    return record(build_slam(config, log), log, progress=progress, config=config_dict(config))
-
-
 def demo(
     out: Annotated[Path, typer.Option(help="The run folder to write.")] = Path("out/demo"),
     seed: Annotated[int, typer.Option(min=0, help="Seed of the simulation.")] = 1,
 ) -> None:
     """Simulate Sola's cloister, map it, and write a run folder with the picture."""
+    from kalmark.config import build_slam, config_dict
+    from kalmark.results.record import record
+    from kalmark.simulate import load_world, simulate
+
     writable(out)
     with computing():
-        result = run_world("cloister", seed)
+        world = load_world("cloister")
+        log, config = simulate(world, seed), world.config().model_copy(update={"seed": seed})
+        result = record(build_slam(config, log), log, config=config_dict(config))
         result.save(out)
     finish(result, out, f"Sola's cloister, seed {seed}")

@@ -197,13 +197,13 @@ def _log_of(run: Recording) -> Iterable[Event]:
     from kalmark.config.opening import open_config_log
     from kalmark.config.schema import Config
 
+    what = "batch solution: the run"
     if run.log.path is None:
-        raise KalmarkError("batch solution: the run does not say which log it was made from, expected the log itself")
+        raise KalmarkError(f"{what} does not say which log it was made from, expected the log itself")
     try:
         config = Config.model_validate({"log": run.config.get("log", {})})
     except ValueError as error:
-        what = "the run's configuration does not say how to read its log"
-        raise KalmarkError(f"batch solution: {what}: {error}") from None
+        raise KalmarkError(f"{what}'s configuration does not say how to read its log: {error}") from None
     return open_config_log(config, run.log.path)
 
 

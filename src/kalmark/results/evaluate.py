@@ -17,8 +17,7 @@ from kalmark.results.matching import association_figures, best_known, by_positio
 from kalmark.results.measures import Rigid, diverged, identity, nees, nis, path_m, pose_error, rigid, rigid_robust, rmse
 from kalmark.results.recording import Recording
 from kalmark.results.truth import Truth, fitted
-from kalmark.results.warnings import POSE_NEES, advice, fix_nis_per_dof, warnings
-from kalmark.results.windows import window_figures
+from kalmark.results.warnings import POSE_NEES, advice, fix_nis_per_dof, warnings, window_figures
 from kalmark.results.words import count, figure
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
@@ -142,7 +141,6 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
     d = 3 if mean.shape[1] == 7 else 2
     world = pose_error(mean, truth, "world")
     own = pose_error(mean, truth, coordinates)
-    length_m = path_m(truth[:, :d])
     error_m = np.linalg.norm(world[:, :d], axis=1)
     return {
         "ate_m": rmse(rigid(mean[:, :d], truth[:, :d])(mean[:, :d]) - truth[:, :d]),
@@ -150,8 +148,8 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
         "heading_rmse_deg": float(np.degrees(rmse(world[:, d:]))),
         "pose_nees": _mean(nees(own, P)),
         "pose_nees_world": _mean(nees(world, P)),
-        "path_m": length_m,
-        "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, length_m),
+        "path_m": path_m(truth[:, :d]),
+        "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, truth[:, :d]),
     }
 
 

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kalmark.errors import RunError
+from kalmark.events import seconds as short
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import FullSensor, finds_depth
-from kalmark.results.files import seconds
+from kalmark.report import Candidate
 from kalmark.results.history import Array, Change, History, Ints
 from kalmark.results.landmarks import LINE
 from kalmark.results.readings import mount_now
-from kalmark.results.recording import Recording
+from kalmark.results.recording import Recording, seconds
 from kalmark.results.truth import as_rigid
 from kalmark.results.words import count, figure
 
@@ -30,15 +31,6 @@ FARTHEST = 100.0  # d2 of the nearest that is not drawn either
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """A landmark that an observation was compared with, and where it was in the map."""
-
-    landmark: str
-    d2: float
-    place: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Fate:
     """One observation: where it seemed to come from (d,), what became of it and why, what it was compared with."""
 
@@ -49,10 +41,10 @@ class Fate:
     d2: float
     reason: str
     seen_at: Array
-    compared: tuple[Compared, ...]
+    compared: tuple[Candidate, ...]
 
     @property
-    def near(self) -> list[Compared]:
+    def near(self) -> list[Candidate]:
         """What to draw of what it was compared with: what it may be of, the landmark decided on, and the nearest."""
         least = min((other.d2 for other in self.compared if other.d2 <= FARTHEST), default=0.0)
         return [c for c in self.compared if c.d2 <= max(FAR, least) or c.landmark == self.landmark]
@@ -62,12 +54,13 @@ class Fate:
 class Explanation:
     """One scan of a run: its step, time since the first scan, the robot, the gates on d2, all that was decided.
 
-    `asked` says how the time asked for was taken, where one was.
+    `in_log` is the time of the log in s, by which the scan is found again; `asked` says how the time asked for was
+    taken, where one was.
     """
 
     step: int
     t_s: float
-    log_t_s: str
+    in_log: str
     robot: str
     sensor: str
     pose: Array
@@ -76,11 +69,6 @@ class Explanation:
     fates: tuple[Fate, ...]
     changes: tuple[Change, ...]
     asked: str = ""
-
-    @property
-    def in_log(self) -> str:
-        """The time of the log in s, by which the scan is found again."""
-        return self.log_t_s.rstrip("0").rstrip(".")  # it has nine decimals
 
     def lines(self) -> Iterator[str]:
         """Tell it."""
@@ -94,18 +82,13 @@ class Explanation:
             near, far = self.gates
             yield f"paired where d2 is at most {near:.2f}, a new landmark where it is above {far:.2f} from all"
         for fate in self.fates:
-            yield self._line(fate)
+            name, known = f" {fate.landmark}" if fate.landmark else "", f" (id {fate.id})" if fate.id else ""
+            d2 = "" if math.isnan(fate.d2) else f", d2 {figure(fate.d2)}"
+            yield f"{fate.index:4d}{known}: {fate.outcome}{name}{d2}{': ' if fate.reason else ''}{fate.reason}"
             if fate.compared and [c.landmark for c in fate.compared] != [fate.landmark]:
                 yield "      compared with " + ", ".join(f"{c.landmark} (d2 {figure(c.d2)})" for c in fate.compared)
         for change in self.changes:
             yield f"{change.landmark} {change.what}: {change.reason}"
-
-    @staticmethod
-    def _line(fate: Fate) -> str:
-        name = f" {fate.landmark}" if fate.landmark else ""
-        known = f" (id {fate.id})" if fate.id else ""
-        d2 = "" if math.isnan(fate.d2) else f", d2 {figure(fate.d2)}"
-        return f"{fate.index:4d}{known}: {fate.outcome}{name}{d2}{': ' if fate.reason else ''}{fate.reason}"
 
 
 def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation:
@@ -149,7 +132,9 @@ def with_known(run: Recording, told: Explanation) -> Explanation:
     fates = list(told.fates)
     for k in open_:
         fate, there = fates[k], np.isfinite(expected[k]).all() and fates[k].landmark
-        compared = (Compared(fate.landmark, fate.d2, expected[k]),) if there and not math.isnan(fate.d2) else ()
+        compared = (
+            (Candidate(fate.index, fate.landmark, fate.d2, expected[k]),) if there and not math.isnan(fate.d2) else ()
+        )
         fates[k] = replace(fate, seen_at=places[k], compared=compared)
     return replace(told, fates=tuple(fates))
 
@@ -176,29 +161,21 @@ def explained(run: Recording, step: int) -> Explanation:
     history = run.history
     rows = np.flatnonzero(history.step == step)
     sensor = str(history.sensor[rows[0]]) if len(rows) else ""
-    return Explanation(
-        step=step,
-        t_s=float(history.t_s[step]),
-        log_t_s=seconds(history.t_ns[step]),
-        robot=str(history.robot[step]),
-        sensor=sensor,
-        pose=history.poses[step],
-        covariance=history.pose_covariances[step],
-        gates=_gates(run, str(history.robot[step]), sensor, rows),
-        fates=tuple(fate_of(history, int(row)) for row in rows),
-        changes=tuple(c for c in history.changes if c.step == step),
-    )
+    robot, changes = str(history.robot[step]), tuple(c for c in history.changes if c.step == step)
+    fates, gates = tuple(fate_of(history, int(row)) for row in rows), _gates(run, robot, sensor, rows)
+    pose, P, when = history.poses[step], history.pose_covariances[step], short(int(history.t_ns[step]))
+    return Explanation(step, float(history.t_s[step]), when, robot, sensor, pose, P, gates, fates, changes)
 
 
 def fate_of(history: History, row: int) -> Fate:
     """Return what became of an observation."""
-    names, d2 = history.candidate_landmark, history.candidate_d2
+    index, names, d2 = int(history.index[row]), history.candidate_landmark, history.candidate_d2
     mine = np.flatnonzero(history.candidate_row == row)
     mine = mine[np.argsort(d2[mine], kind="stable")]
-    compared = tuple(Compared(str(names[i]), float(d2[i]), history.candidate_place[i]) for i in mine)
+    compared = tuple(Candidate(index, str(names[i]), float(d2[i]), history.candidate_place[i]) for i in mine)
     id_, outcome, landmark, reason = (str(vars(history)[k][row]) for k in ("id", "outcome", "landmark", "reason"))
     d2_, at = float(history.d2[row]), history.seen_at[row]
-    return Fate(int(history.index[row]), id_, outcome, landmark, d2_, reason, at, compared)
+    return Fate(index, id_, outcome, landmark, d2_, reason, at, compared)
 
 
 def _gates(run: Recording, robot: str, sensor: str, rows: Ints) -> tuple[float, float] | None:

@@ -49,10 +49,16 @@ class Image(NamedTuple):
 
 def images(history: History, camera: Camera, step: int) -> list[Image]:
     """Return the images of the scan that a camera made at a step."""
-    rows = np.flatnonzero(history.step == step)
-    return [
-        Image(SIDES[side], [_sighting(history, int(row), at) for row in rows]) for side, at in _points(camera).items()
-    ]
+    found = [Image(SIDES[side], []) for side in _points(camera)]
+    for row in np.flatnonzero(history.step == step):
+        y, e, z, Z = history.y[row], history.e[row], history.z[row], history.Z[row]
+        whole = np.isfinite(z).sum() == np.isfinite(y).sum()
+        name, outcome = str(history.landmark[row]) or str(history.id[row]), str(history.outcome[row])
+        for image, at in zip(found, _points(camera).values(), strict=True):
+            Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
+            euclidean = str(history.kind[row]) in EUCLIDEAN
+            image.sightings.append(Sighting(name, outcome, euclidean, y[at], e[at], Z_at))
+    return found
 
 
 def colour_of(sighting: Sighting) -> tuple[str, str]:
@@ -64,11 +70,6 @@ def steps_of(history: History, camera: Camera) -> Ints:
     """Return the steps at which a camera saw something."""
     mine = (history.sensor == camera.sensor) & (history.robot[history.step] == camera.robot)
     return np.unique(history.step[mine])
-
-
-def cameras_that_saw(history: History) -> list[tuple[str, str]]:
-    """Return robot and name of every camera that made an observation."""
-    return [(camera.robot, camera.sensor) for camera in history.cameras if len(steps_of(history, camera))]
 
 
 def _points(camera: Camera) -> dict[str, Ints]:
@@ -85,15 +86,6 @@ def _points(camera: Camera) -> dict[str, Ints]:
         side: np.array([[at["u"], at.get("v", left.get("v", 0))] for at in points.values()], dtype=np.int64)
         for side, points in found.items()
     }
-
-
-def _sighting(history: History, row: int, at: Ints) -> Sighting:
-    y, e = history.y[row], history.e[row]
-    whole = int(np.isfinite(history.z[row]).sum()) == int(np.isfinite(y).sum())
-    Z = history.Z[row][np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
-    kind = str(history.kind[row]) if len(history.kind) else ""
-    name = str(history.landmark[row]) or str(history.id[row])
-    return Sighting(name, str(history.outcome[row]), kind in EUCLIDEAN, y[at], e[at], Z)
 
 
 def trimmed(a: Array, b: Array, size: tuple[float, float]) -> Array | None:

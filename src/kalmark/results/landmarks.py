@@ -151,10 +151,15 @@ class MapLandmarks:
 
     def to_csv(self) -> str:
         """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations."""
-        axes = [self._axes(kind, len(mean)) for kind, mean in zip(self.kinds, self.means, strict=True)]
+        axes = [
+            _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
+            for kind, mean in zip(self.kinds, self.means, strict=True)
+        ]
         columns = list(dict.fromkeys(name for names in axes for name in names))
         columns = columns or list(_POINT if self.in_space else _POINT[:2])
-        pairs = _pairs({_errors(names) for names in axes} or {_errors(columns)})
+        errors = {_errors(names) for names in axes} or {_errors(columns)}
+        used = {pair for names in errors for pair in combinations_with_replacement(names, 2)}
+        pairs = [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations"])
@@ -164,9 +169,6 @@ class MapLandmarks:
             cov = [repr(float(self.covariances[i][row[a], row[b]])) if {a, b} <= row.keys() else "" for a, b in pairs]
             writer.writerow([self.ids[i], self.kinds[i], *mean, *cov, self.observations[i]])
         return out.getvalue()
-
-    def _axes(self, kind: str, n: int) -> tuple[str, ...]:
-        return _SPACE.get(n, _POINT) if self.in_space else _PLANE.get(kind, _POINT)[:n]
 
     @classmethod
     def read(cls, path: Path) -> MapLandmarks:
@@ -192,12 +194,6 @@ class MapLandmarks:
         self.means.append(np.array([float(row[name]) for name in names]))
         self.covariances.append(cov)
         self.observations.append(int(row["observations"]))
-
-
-def _pairs(errors: set[tuple[str, ...]]) -> list[tuple[str, str]]:
-    """Return the pairs of error components that some landmark has the covariance of, in the order of their columns."""
-    used = {pair for names in errors for pair in combinations_with_replacement(names, 2)}
-    return [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
 
 
 def _errors(names: Sequence[str]) -> tuple[str, ...]:

@@ -203,11 +203,11 @@ def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tu
     return float(chi2.ppf(tail, dof * runs)) / runs, float(chi2.ppf(1.0 - tail, dof * runs)) / runs
 
 
-def diverged(d: Array, P: Array, error_m: Array, path_m: float) -> bool:
+def diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:
     """Tell whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
 
     `d` (N, 2 or 3) is the position error in the estimator's coordinates, `P` its covariance, `error_m` (N,) its
-    length in metres.  Sigmas are counted as the Mahalanobis distance.
+    length in metres, `truth` (N, 2 or 3) the true path.  Sigmas are counted as the Mahalanobis distance.
     """
     far = np.sqrt(nees(d, P)) > DIVERGED_SIGMAS
-    return bool(np.any(far & (error_m > DIVERGED_PATH * path_m)))
+    return bool(np.any(far & (error_m > DIVERGED_PATH * path_m(truth))))

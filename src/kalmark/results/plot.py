@@ -255,7 +255,7 @@ def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
     """Draw a scene in perspective above a grid on the ground, with the shadows of paths and of few landmarks."""
     axes.set_axis_off()
     axes.set_aspect("equal", adjustable="box")
-    floor = ground(scene)
+    floor = scene.ground
     shadows = [np.column_stack([line[:, :2], np.full(len(line), floor)]) for line in map(scene.line, scene.paths)]
     if len(scene.ids) <= CROWD:
         standing = scene.shapes.means[scene.shapes.group != LINES]
@@ -282,14 +282,9 @@ def spacing(size: float) -> float:
     return float(power * next(m for m in (1, 2, 5, 10) if size / (m * power) <= 14))
 
 
-def ground(scene: Scene) -> float:
-    """Return the height of the ground: 0, or the lowest there is."""
-    return 0.0 if scene.low[2] <= 0.0 <= scene.high[2] else float(scene.low[2])
-
-
 def _ground(axes: Axes, scene: Scene, projection: Projection) -> list[Stroke]:
     """Return the grid on the ground and a scale of heights at a corner; draw ticks at the edges that face the eye."""
-    low, high, eye, z = scene.low, scene.high, projection.axes[2], ground(scene)
+    low, high, eye, z = scene.low, scene.high, projection.axes[2], scene.ground
     step = spacing(float((high - low)[:2].max()))
     xs, ys = (np.arange(np.ceil(low[i] / step), np.floor(high[i] / step) + 1) * step for i in (0, 1))
     lines = [np.array([[x, low[1], z], [x, high[1], z]]) for x in xs]

@@ -64,7 +64,7 @@ def draw_scan(run: Recording, told: Explanation) -> Figure:
 def _observations(axes: Axes, told: Explanation, low: Array, high: Array) -> None:
     """Draw the marks of observations and landmarks, and the lines between; then their texts, each where it has room."""
     fates = [fate for fate in told.fates if np.isfinite(fate.seen_at[:2]).all()]
-    squares = {other.landmark: other.place[:2] for fate in fates for other in fate.near}
+    squares = {str(other.landmark): other.place[:2] for fate in fates for other in fate.near}
     labels = _Labels(axes, low, high, [*squares.values(), *(fate.seen_at[:2] for fate in fates)])
     for place in squares.values():
         axes.plot(*place, "s", color=INK, mfc="none", ms=8, zorder=4)
@@ -186,7 +186,7 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     thin lines.  `t_s`, and the time in the title, are seconds since the first scan, as in the report.  Raises RunError
     if there is no such camera or scan.
     """
-    camera, at = find(run, robot, sensor), chosen(run, robot, sensor, step, t_s)
+    camera, at = chosen(run, robot, sensor, step, t_s)
     seen = images(run.history, camera, at)
     shape = camera.size[1] / camera.size[0]
     width = 9.0 if len(seen) == 1 else 14.0
@@ -194,7 +194,7 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     grid = figure.subplots(1, len(seen), squeeze=False)[0]
     for axes, image in zip(grid, seen, strict=True):
         draw_image(axes, image, camera.size)
-    t, outcomes = (run.history.t_ns[at] - run.history.t_ns[0]) * 1e-9, Counter(s.outcome for s in seen[0].sightings)
+    t, outcomes = run.history.t_s[at], Counter(s.outcome for s in seen[0].sightings)
     said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
     figure.suptitle(
         f"{robot} · {sensor} · t = {t:.3f} s · {said}", x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK
@@ -203,25 +203,25 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     return figure
 
 
-def find(run: Recording, robot: str, sensor: str) -> Camera:
-    """Return a camera of a run by its name.  Raises RunError if there is none of that name."""
-    for camera in run.history.cameras:
-        if (camera.robot, camera.sensor) == (robot, sensor):
-            return camera
-    names = ", ".join(f"{c.robot}.{c.sensor}" for c in run.history.cameras) or "none"
-    raise RunError(f"camera {robot}.{sensor} is not in this run, expected one of: {names}")
+def chosen(
+    run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None
+) -> tuple[Camera, int]:
+    """Return a camera and the step of its scan: the last of all, of those up to a step, or of those up to a time.
 
-
-def chosen(run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> int:
-    """Return the step of a camera's scan: the last of all, of those up to a step, or of those up to a time."""
-    steps = steps_of(run.history, find(run, robot, sensor))
+    Raises RunError if there is no such camera or scan.
+    """
+    cameras = {(camera.robot, camera.sensor): camera for camera in run.history.cameras}
+    if (robot, sensor) not in cameras:
+        names = ", ".join(map(".".join, cameras)) or "none"
+        raise RunError(f"camera {robot}.{sensor} is not in this run, expected one of: {names}")
+    steps = steps_of(run.history, cameras[robot, sensor])
     if t_s is not None:
         steps = steps[run.history.t_ns[steps] - run.history.t_ns[0] <= round(t_s * 1e9)]
     if step is not None:
         steps = steps[steps <= step]
     if len(steps) == 0:
         raise RunError(f"camera {robot}.{sensor} saw nothing until then, expected a scan with an observation")
-    return int(steps[-1])
+    return cameras[robot, sensor], int(steps[-1])
 
 
 def draw_image(axes: Axes, image: Image, size: tuple[float, float]) -> None:

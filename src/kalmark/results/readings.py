@@ -42,30 +42,31 @@ HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has 
 
 def cameras(slam: Slam) -> tuple[Camera, ...]:
     """Return the sensors of a filter that measure pixels of an image of known size; mounts in the map as estimated."""
-    return tuple(
-        Camera(
-            robot.name,
-            name,
-            mount_now(slam, robot.name, name, mount.at),
-            _size(mount.sensor),
-            columns,
-            _corners(mount.sensor),
-        )
-        for robot in slam.robots.values()
-        for name, mount in robot.sensors.items()
-        if (columns := tuple(mount.sensor.columns))[0].endswith("_px") and isinstance(mount.sensor, Imaging)
-    )
+    found = []
+    for robot in slam.robots.values():
+        for name, mount in robot.sensors.items():
+            sensor, columns = mount.sensor, tuple(mount.sensor.columns)
+            if columns[0].endswith("_px") and isinstance(sensor, Imaging):
+                at, size = (
+                    mount_now(slam, robot.name, name, mount.at),
+                    (float(sensor.width_px), float(sensor.height_px)),
+                )
+                found.append(Camera(robot.name, name, at, size, columns, _corners(sensor)))
+    return tuple(found)
 
 
 def mounts(slam: Slam) -> tuple[Mounted, ...]:
     """Return the mounts of the sensors that calibrate themselves, as estimated and as given."""
-    found = []
-    for robot in slam.robots.values():
-        for sensor, mount in robot.sensors.items():
-            name, block = f"{robot.name}.{sensor}", mount.block(sensor)
-            if block is not None and _in_map(slam, name):
-                found.append(Mounted(name, slam.mean(name), slam.covariance(name), block[2]))
-    return tuple(found)
+    named = {
+        f"{robot.name}.{key}": mount.block(key)
+        for robot in slam.robots.values()
+        for key, mount in robot.sensors.items()
+    }
+    return tuple(
+        Mounted(name, slam.mean(name), slam.covariance(name), block[2])
+        for name, block in named.items()
+        if block is not None and _in_map(slam, name)
+    )
 
 
 def biases(slam: Slam) -> tuple[Biased, ...]:
@@ -91,13 +92,9 @@ def mount_now(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
     return np.array(slam.mean(name)[: len(at)] if _in_map(slam, name) else at, dtype=np.float64)
 
 
-def _size(sensor: Imaging) -> tuple[float, float]:
-    return float(sensor.width_px), float(sensor.height_px)
-
-
 def _corners(sensor: Imaging) -> Array:
     """Return the rays (4, 3), z = 1, to the corners of the image of a camera without distortion."""
-    width, height = _size(sensor)
+    width, height = float(sensor.width_px), float(sensor.height_px)
     u, v = np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height])
     if not isinstance(sensor, Focal):
         across, down = u / width - 0.5, v / height - 0.5
@@ -136,10 +133,6 @@ def left_px(slam: Slam, scan: Scan, report: Report) -> Array:
     rows = [o.index for o in used]
     y, par = scan.y[rows], np.array(mount.sensor.parameters)
     e = project_corners(mount.sensor.lens_code, v, np.ascontiguousarray(y[:, 8]), par)[0]
-    left[rows] = np.nan_to_num(rms_of_corners(y[:, :8] - e), nan=np.inf)  # behind the camera
+    rms = np.sqrt(0.25 * np.sum((y[:, :8] - e) ** 2, axis=1))
+    left[rows] = np.nan_to_num(rms, nan=np.inf)  # behind the camera
     return left
-
-
-def rms_of_corners(residuals: Array) -> Array:
-    """Return the RMS (K,) of the distances of four corners whose residuals are (K, 8)."""
-    return np.sqrt(0.25 * np.sum(residuals**2, axis=1))

@@ -9,9 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.results.evaluate import evaluate
-from kalmark.results.files import associations_csv, changes_csv, config_yaml, file_name, replace_file, tum, write
-from kalmark.results.images import cameras_that_saw
-from kalmark.results.recording import Recording
+from kalmark.results.images import steps_of
+from kalmark.results.recording import (
+    Recording,
+    associations_csv,
+    changes_csv,
+    config_yaml,
+    file_name,
+    replace_file,
+    tum,
+    write,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +71,7 @@ class Run(Recording):
         folder = Path(folder)
         replace_file(folder / "map.png", lambda path: save_map(self, path))
         written = [folder / "map.png", folder / "report.html"]
-        for robot, sensor in cameras_that_saw(self.history):
+        for robot, sensor, *_ in (camera for camera in self.history.cameras if len(steps_of(self.history, camera))):
             written.append(folder / f"sensor_{file_name(robot)}_{file_name(sensor)}.png")
             picture = draw_sensor(self, robot, sensor)
             replace_file(written[-1], partial(save_figure, picture, dpi=110, bbox_inches=None))

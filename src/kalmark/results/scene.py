@@ -1,7 +1,7 @@
 """What the pictures of a run show at one step, in the frame of the map: paths, landmarks, truth, fixes, cameras.
 
 One description for robots in the plane (d = 2) and in space (d = 3); `kalmark.results.plot` draws it for ``map.png``,
-`kalmark.results.series` writes it into the page.
+`kalmark.results.report` writes it into the page.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
 from kalmark.results.history import Array, Camera, Flags, Ints
 from kalmark.results.landmarks import EUCLIDEANS, LINE, Shapes, shapes
-from kalmark.results.measures import Rigid, rigid
+from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording
 from kalmark.results.truth import moved
 
@@ -62,7 +62,11 @@ class Scene:
     def of(cls, run: Recording, step: int | None = None) -> Scene:
         """Return what to draw of a run after a step, by default the last; the box is that of the whole run."""
         history, d = run.history, run.history.d
-        to_map = _truth_to_map(run, d)
+        known = np.isfinite(run.truth.poses).all(axis=1)
+        if run.truth.frame == "truth":
+            to_map = run.truth.to_map()
+        else:  # they share no frame
+            to_map = rigid(run.truth.poses[known][:, :d], history.mean[known][:, :d])
         mine = {robot: history.robot == robot for robot in history.robots}
         truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
         scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
@@ -72,33 +76,31 @@ class Scene:
         whole = shapes(*last.places(), last.kinds, d)
         now, ids = whole, tuple(last.ids)
         if step is not None:
-            _, _, ids, means, covariances, kinds = history.map_at(step)
-            now = shapes(means, covariances, kinds, d)
+            kept = history.map_at(step)
+            now, ids = shapes(kept.means, kept.covariances, kept.kinds, d), kept.ids
         until = slice(None) if step is None else slice(step + 1)
         poses, P = history.poses, history.pose_covariances
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
         true = [l.reshape(-1, d) if len(l) == LINE else l[None, :d] for l in landmarks.values()]
         low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true])
-        return cls(
-            d,
-            {robot: poses[until][rows[until]] for robot, rows in mine.items()},
-            {robot: P[until][rows[until]] for robot, rows in mine.items()},
-            {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()},
-            truth,
-            {robot: _fixes_in_map(run, robot) for robot in scored},
-            used,
-            landmarks,
-            ids,
-            now,
-            history.cameras,
-            low,
-            high,
-        )
+        paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
+        stretches = {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()}
+        fixes = {}
+        for robot in scored:  # the antenna's offset is taken off
+            to_fixes, _, offset, xy = aligned_fixes(run, robot)
+            fixes[robot] = to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
+        cameras = history.cameras
+        return cls(d, paths, covariances, stretches, truth, fixes, used, landmarks, ids, now, cameras, low, high)
 
     @property
     def size(self) -> float:
         """The longest side of the box."""
         return float((self.high - self.low).max())
+
+    @property
+    def ground(self) -> float:
+        """The height of the ground: 0, or the lowest there is."""
+        return 0.0 if self.low[2] <= 0.0 <= self.high[2] else float(self.low[2])
 
     def colour(self, robot: str) -> str:
         """Return the robot's colour."""
@@ -121,10 +123,14 @@ class Scene:
         return [_placed(pose, line) for pose in path[at[: len(path)]] for line in body]
 
     def body(self, robot: str) -> list[Array]:
-        """Return what is drawn of a robot in space as polylines (P, 3) in its own frame."""
-        size = 0.03 * self.size
-        mine = [_pyramid(camera, size) for camera in self.cameras if camera.robot == robot]
-        return mine or [0.6 * size * BODY]
+        """Return what is drawn of a robot in space as polylines (P, 3) in its own frame: pyramids, or a dart."""
+        size, lines = 0.03 * self.size, []
+        for camera in self.cameras:
+            if camera.robot == robot:
+                a, b, c, d = size * camera.corners
+                top = np.zeros(3)  # one polyline passes all edges
+                lines.append(_placed(camera.mount, np.array([a, b, top, a, d, top, c, d, c, b])))
+        return lines or [0.6 * size * BODY]
 
     def true_lines(self) -> list[Array]:
         """Return the true lines (2, 3)."""
@@ -198,30 +204,8 @@ def _used_fixes(run: Recording, d: int) -> dict[str, Array]:
     return {name: np.pad(y, ((0, 0), (0, d - y.shape[1]))) for name, y in rows.items()}
 
 
-def _truth_to_map(run: Recording, d: int) -> Rigid:
-    """Return what brings the truth into the map: nothing if they share a frame, else the best rigid alignment."""
-    truth = run.truth
-    if truth.frame == "truth":
-        return truth.to_map()
-    known = np.isfinite(truth.poses).all(axis=1)
-    return rigid(truth.poses[known][:, :d], run.history.mean[known][:, :d])
-
-
-def _fixes_in_map(run: Recording, robot: str) -> Array:
-    """Return where the robot was (N, 2) by each fix: aligned robustly, the antenna's offset taken off."""
-    to_fixes, _, offset, xy = aligned_fixes(run, robot)
-    return to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
-
-
 def _placed(pose: Array, points: Array) -> Array:
     return points @ matrix(np.ascontiguousarray(pose[3:7])).T + pose[:3]
-
-
-def _pyramid(camera: Camera, depth: float) -> Array:
-    """Return a camera's pyramid, `depth` long, as one polyline in its robot's frame that passes all its edges."""
-    a, b, c, d = depth * camera.corners
-    top = np.zeros(3)
-    return _placed(camera.mount, np.array([a, b, top, a, d, top, c, d, c, b]))
 
 
 def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:

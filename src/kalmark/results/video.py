@@ -16,12 +16,11 @@ from PIL import Image
 
 from kalmark.errors import RunError
 from kalmark.results.evaluate import headline
-from kalmark.results.files import replace_file
 from kalmark.results.images import images, steps_of
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_scan import draw_image
 from kalmark.results.progress import track
-from kalmark.results.recording import Recording
+from kalmark.results.recording import Recording, replace_file
 from kalmark.results.scene import INK, Scene
 
 INCHES, DPI = (12.8, 7.2), 80
@@ -86,14 +85,12 @@ def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool) 
     """Yield one figure again and again, drawn anew after each of the steps."""
     figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    first, title = run.history.t_ns[0], headline(run)[0]
+    t_s, title = run.history.t_s, headline(run)[0]
     for k, step in enumerate(track(steps, "video", len(steps), show=progress)):
         figure.clear()
-        turned = orbit_deg * k / max(len(steps) - 1, 1)
-        _draw(figure, run, step, turned)
-        t = (run.history.t_ns[step] - first) * 1e-9
+        _draw(figure, run, step, orbit_deg * k / max(len(steps) - 1, 1))
         figure.text(0.02, 0.955, title, fontsize=12, fontweight="bold", color=INK)
-        figure.text(0.98, 0.955, f"{t:.1f} s", fontsize=12, ha="right", color=INK)
+        figure.text(0.98, 0.955, f"{t_s[step]:.1f} s", fontsize=12, ha="right", color=INK)
         yield figure
 
 
