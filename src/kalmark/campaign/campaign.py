@@ -257,14 +257,9 @@ class Campaign:
             for estimator, scores in self.scores.items():
                 anees = [Anees(name, scores) for name in names]
                 columns = [column for a in anees for column in (a.mean, a.low, a.high)]
-                columns += [_rms(scores, name) for name in ("position_m", "heading_rad")]
+                errors = [[s.series[name] for s in scores] for name in ("position_m", "heading_rad")]
+                columns += [np.sqrt((np.ma.masked_invalid(e) ** 2).mean(axis=0).filled(np.nan)) for e in errors]
                 for i, robot in enumerate(self.robots):
                     for k, t_s in enumerate(self.t_s):
                         row = [f"{v:.9g}" if np.isfinite(v := column[i, k]) else "" for column in columns]
                         writer.writerow([estimator, robot, k + 1, f"{t_s:.9f}", anees[0].runs[i, k], *row])
-
-
-def _rms(scores: tuple[Scores, ...], name: str) -> Any:
-    values = np.array([s.series[name] for s in scores])
-    count = np.isfinite(values).sum(axis=0)
-    return np.where(count > 0, np.sqrt(np.nansum(values**2, axis=0) / np.maximum(count, 1)), np.nan)

@@ -298,18 +298,15 @@ class _Scorer:
         for name, size in (("pose", own.shape[-1]), ("heading", own.shape[-1] - d)):
             s[f"{name}_dof"] = np.where(np.isfinite(s[name]), float(size), np.nan)
         s["position_m"], s["heading_rad"] = (np.linalg.norm(e, axis=-1) for e in (world[..., :d], world[..., d:]))
-        aligned, raw, count = self._final_map()
-        parts = zip(own[..., :d], self.P[..., :d, :d], s["position_m"], self.truth[..., :d], strict=True)
-        lost = any(diverged(e, P, error_m, truth) for e, P, error_m, truth in parts)
-        return Scores(s, aligned, raw, count, self.nis, self.nis_dof, lost or bool(stopped), stopped)
-
-    def _final_map(self) -> tuple[float, float, int]:
         robot = self.log.robots[0]
         mean = self.slam.mean(robot)
-        judged = [j for _, j in self._landmarks(robot_turn(mean, self._state(robot, self.last)), mean[: self.d])]
-        place, true = (np.concatenate([np.empty((0, self.d)), *(j[i] for j in judged)]) for i in (3, 4))
-        aligned = rmse(rigid(place, true)(place) - true) if len(judged) >= self.d else float("nan")
-        return aligned, rmse(place - true), sum(true is not None for true in self.true_id.values())
+        judged = [j for _, j in self._landmarks(robot_turn(mean, self._state(robot, self.last)), mean[:d])]
+        place, true = (np.concatenate([np.empty((0, d)), *(j[i] for j in judged)]) for i in (3, 4))
+        aligned = rmse(rigid(place, true)(place) - true) if len(judged) >= d else float("nan")
+        count = sum(true is not None for true in self.true_id.values())
+        parts = zip(own[..., :d], self.P[..., :d, :d], s["position_m"], self.truth[..., :d], strict=True)
+        lost = any(diverged(e, P, error_m, truth) for e, P, error_m, truth in parts)
+        return Scores(s, aligned, rmse(place - true), count, self.nis, self.nis_dof, lost or bool(stopped), stopped)
 
 
 def joint_nees(d: Array, P: Array) -> Any:

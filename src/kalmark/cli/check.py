@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any
 
 import typer
@@ -39,10 +38,20 @@ def check(
 
 
 def _model(name: str) -> Any:
+    from kalmark.declare import line_of, load_plugin
+
     place, _, attribute = name.partition(":")
     if not place or not attribute:
         raise KalmarkError(f"{name}: expected module:Class or file.py:Class")
-    module = _module(place, name)
+    if place.endswith(".py"):
+        module = load_plugin(Path(place))
+    else:
+        try:
+            sys.path.insert(0, str(Path.cwd()))
+            module = import_module(place)
+        except Exception as error:
+            what = f"{type(error).__name__}: {error}{line_of(error)}"
+            raise KalmarkError(f"{name}: {place} cannot be imported: {what}") from None
     if attribute not in vars(module):
         raise KalmarkError(f"{name}: {place} has no {attribute}, expected a class, an object or a function")
     model = vars(module)[attribute]
@@ -52,16 +61,3 @@ def _model(name: str) -> Any:
         return model()
     except TypeError as error:
         raise KalmarkError(f"{name}: {error}; expected a model whose every parameter has a default") from None
-
-
-def _module(place: str, name: str) -> ModuleType:
-    from kalmark.declare import line_of, load_plugin
-
-    if place.endswith(".py"):
-        return load_plugin(Path(place))
-    try:
-        sys.path.insert(0, str(Path.cwd()))
-        return import_module(place)
-    except Exception as error:
-        what = f"{type(error).__name__}: {error}{line_of(error)}"
-        raise KalmarkError(f"{name}: {place} cannot be imported: {what}") from None

@@ -59,19 +59,14 @@ def directions(prior: Array, posterior: Array) -> list[Direction]:
     inverse[values > SINGULAR] = values[values > SINGULAR] ** -0.5
     root = (vectors * inverse) @ vectors.T
     ratios, axes = np.linalg.eigh(root @ P @ root)
-    return [
-        _direction(names, sigma, axis, math.sqrt(max(ratio, 0.0)))
-        for ratio, axis in zip(ratios[::-1], axes.T[::-1], strict=True)
-    ]
-
-
-def _direction(names: list[str], sigma: Array, axis: Array, ratio: float) -> Direction:
-    """Return a direction by the squares of its unit vector (n,), the largest first, the smallest left out."""
-    order = np.argsort(-(axis**2), kind="stable").tolist()
-    shares = {names[i]: float(axis[i] ** 2) for i in order if axis[i] ** 2 >= NAMED}
-    unit = UNITS.get(names[order[0]], "deg")
-    before = float(np.degrees(sigma[order[0]]) if unit == "deg" else sigma[order[0]])
-    return Direction(shares, ratio * before, before, unit)
+    found = []
+    for ratio, shares in zip(ratios[::-1].tolist(), axes.T[::-1] ** 2, strict=True):
+        order = np.argsort(-shares, kind="stable").tolist()
+        first, named = order[0], {names[i]: float(shares[i]) for i in order if shares[i] >= NAMED}
+        unit = UNITS.get(names[first], "deg")
+        before = float(np.degrees(sigma[first]) if unit == "deg" else sigma[first])
+        found.append(Direction(named, math.sqrt(max(ratio, 0.0)) * before, before, unit))
+    return found
 
 
 def mount_figures(mount: Mounted) -> dict[str, Any]:

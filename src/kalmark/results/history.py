@@ -237,7 +237,18 @@ class History:
     def arrays(self) -> Arrays:
         """Return everything as named arrays, those of the contract among them (t in seconds)."""
         named: Arrays = {"t": self.t_ns * 1e-9}
-        named |= {name: vars(self)[name] for name in _array_fields()} | _map_arrays(self.maps)
+        named |= {name: vars(self)[name] for name in _array_fields()}
+        blocks = [m.covariances for m in self.maps]
+        width = max((block.shape[1] for block in blocks), default=2)
+        named |= {
+            "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
+            "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
+            "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
+            "map_landmark": texts([i for m in self.maps for i in m.ids]),
+            "map_kind": texts([kind for m in self.maps for kind in m.kinds]),
+            "map_mean": padded_all([mean for m in self.maps for mean in m.means]),
+            "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
+        }
         named["control_robot"] = texts(list(self.controls))
         named["control_span"] = np.array(list(self.controls.values()), dtype=np.int64).reshape(-1, 3)
         for name, (prefix, cls, joined) in ROWS.items():
@@ -249,40 +260,21 @@ class History:
         """Return the history that `arrays` gave.  Raises KeyError if one is missing."""
         given: dict[str, Any] = {name: named[name] for name in _array_fields()}
         given |= {name: rows_of(prefix, kind, named, joined) for name, (prefix, kind, joined) in ROWS.items()}
+        ends, keys = np.cumsum(named["map_size"])[:-1], ("mean", "covariance", "landmark", "kind")
+        parts = zip(*(np.split(named[f"map_{key}"], ends) for key in keys), strict=True)
+        times = zip(
+            named["map_step"].tolist(), named["map_t_ns"].tolist(), parts, strict=False
+        )  # no map: one empty part
+        given["maps"] = tuple(
+            MapSnapshot(step, t_ns, tuple(map(as_id, names.tolist())), means, covariances, tuple(kinds.tolist()))
+            for step, t_ns, (means, covariances, names, kinds) in times
+        )
         spans = zip(named["control_robot"].tolist(), named["control_span"].tolist(), strict=True)
-        return cls(**given, maps=_maps(named), controls={robot: Controlled(*span) for robot, span in spans})
+        return cls(**given, controls={robot: Controlled(*span) for robot, span in spans})
 
 
 def _array_fields() -> list[str]:
     return [f.name for f in fields(History) if f.name not in ("maps", "controls", *ROWS)]
-
-
-def _map_arrays(maps: tuple[MapSnapshot, ...]) -> Arrays:
-    blocks = [m.covariances for m in maps]
-    width = max((block.shape[1] for block in blocks), default=2)
-    return {
-        "map_step": np.array([m.step for m in maps], dtype=np.int64),
-        "map_t_ns": np.array([m.t_ns for m in maps], dtype=np.int64),
-        "map_size": np.array([len(m.ids) for m in maps], dtype=np.int64),
-        "map_landmark": texts([i for m in maps for i in m.ids]),
-        "map_kind": texts([kind for m in maps for kind in m.kinds]),
-        "map_mean": padded_all([mean for m in maps for mean in m.means]),
-        "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
-    }
-
-
-def _maps(named: Named) -> tuple[MapSnapshot, ...]:
-    ends = np.cumsum(named["map_size"])[:-1]
-    means, covariances, names, kinds = (
-        np.split(named[f"map_{key}"], ends) for key in ("mean", "covariance", "landmark", "kind")
-    )
-    steps, t_ns = named["map_step"].tolist(), named["map_t_ns"].tolist()
-    return tuple(
-        MapSnapshot(
-            steps[i], t_ns[i], tuple(map(as_id, names[i].tolist())), means[i], covariances[i], tuple(kinds[i].tolist())
-        )
-        for i in range(len(steps))
-    )
 
 
 def as_id(text: str) -> Id:

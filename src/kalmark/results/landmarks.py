@@ -178,22 +178,19 @@ class MapLandmarks:
             table = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ()))
             for number, row in enumerate(rows, start=2):
                 try:
-                    table._append(row)
+                    names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
+                    errors = _errors(names)
+                    cov = np.empty((len(errors), len(errors)))
+                    for (i, a), (j, b) in combinations_with_replacement(enumerate(errors), 2):
+                        cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
+                    table.ids.append(as_id(row["id"]))
+                    table.kinds.append(row["kind"])
+                    table.means.append(np.array([float(row[name]) for name in names]))
+                    table.covariances.append(cov)
+                    table.observations.append(int(row["observations"]))
                 except (KeyError, TypeError, ValueError) as error:
                     raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
         return table
-
-    def _append(self, row: dict[str, str]) -> None:
-        names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
-        errors = _errors(names)
-        cov = np.empty((len(errors), len(errors)))
-        for (i, a), (j, b) in combinations_with_replacement(enumerate(errors), 2):
-            cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
-        self.ids.append(as_id(row["id"]))
-        self.kinds.append(row["kind"])
-        self.means.append(np.array([float(row[name]) for name in names]))
-        self.covariances.append(cov)
-        self.observations.append(int(row["observations"]))
 
 
 def _errors(names: Sequence[str]) -> tuple[str, ...]:

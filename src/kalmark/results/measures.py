@@ -28,16 +28,6 @@ class Rigid(NamedTuple):
         """Return the points (..., d) rotated and shifted."""
         return points @ self.rotation.T + self.shift
 
-    @property
-    def angle(self) -> float:
-        """The rotation angle of a 2-D alignment, in radians."""
-        return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
-
-    @property
-    def quaternion(self) -> Array:
-        """The rotation of an alignment in space as a unit quaternion xyzw (4,)."""
-        return from_matrix(np.ascontiguousarray(self.rotation))
-
     def inverse(self) -> Rigid:
         """Return the alignment that undoes this one."""
         return Rigid(self.rotation.T, -self.rotation.T @ self.shift)
@@ -45,10 +35,11 @@ class Rigid(NamedTuple):
     def poses(self, poses: Array) -> Array:
         """Return poses (N, 3) = (x, y, theta) or (N, 7) = (x, y, z, qx, qy, qz, qw) rotated and shifted."""
         if poses.shape[1] == 7:
-            turn = self.quaternion
+            turn = from_matrix(np.ascontiguousarray(self.rotation))
             turned = np.array([multiply(turn, q) for q in np.ascontiguousarray(poses[:, 3:])])
             return np.column_stack([self(poses[:, :3]), turned.reshape(-1, 4)])
-        return np.column_stack([self(poses[:, :2]), poses[:, 2] + self.angle])
+        angle = np.arctan2(self.rotation[1, 0], self.rotation[0, 0])
+        return np.column_stack([self(poses[:, :2]), poses[:, 2] + angle])
 
 
 def identity(d: int = 2) -> Rigid:

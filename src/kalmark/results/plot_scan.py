@@ -44,9 +44,15 @@ def draw_scan(run: Recording, told: Explanation) -> Figure:
     """
     figure = Figure(figsize=(9.5, 8.5), layout="constrained", facecolor="white")
     axes = figure.subplots()
-    _robot(axes, run, told)
-    low, high = _extent(told)
-    _landmarks(axes, run, told, low, high)
+    mine = np.flatnonzero(run.history.robot[: told.step + 1] == told.robot)[-PATH:]
+    axes.plot(*run.history.poses[mine, :2].T, color=ROBOT, lw=1)
+    axes.plot(*contours(told.pose[None, :2], told.covariance[None, :2, :2])[0, 0].T, color=ROBOT, lw=1)
+    axes.plot(*told.pose[:2], "o", color=ROBOT, ms=7)
+    (low, high), kept = _extent(told), run.history.map_at(told.step)
+    inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
+    means, covariances = kept.means[inside, :2], kept.covariances[inside, :2, :2]
+    axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
+    axes.plot(*joined(contours(means, covariances)[:, 0], 2).T, color=FAINT, lw=0.8)
     _observations(axes, told, low, high)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -135,23 +141,6 @@ def _label(fate: Fate) -> str:
     """Return an observation's number, and the d2 of the landmark decided on."""
     d2 = next((c.d2 for c in fate.compared if c.landmark == fate.landmark), None)
     return str(fate.index) if d2 is None else f"{fate.index}: {figure_of(d2, 2)}"
-
-
-def _robot(axes: Axes, run: Recording, told: Explanation) -> None:
-    history = run.history
-    mine = np.flatnonzero(history.robot[: told.step + 1] == told.robot)[-PATH:]
-    axes.plot(*history.poses[mine, :2].T, color=ROBOT, lw=1)
-    axes.plot(*contours(told.pose[None, :2], told.covariance[None, :2, :2])[0, 0].T, color=ROBOT, lw=1)
-    axes.plot(*told.pose[:2], "o", color=ROBOT, ms=7)
-
-
-def _landmarks(axes: Axes, run: Recording, told: Explanation, low: Array, high: Array) -> None:
-    """Draw the map as it was kept last before the scan, and later if it was not kept before."""
-    kept = run.history.map_at(told.step)
-    inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
-    means, covariances = kept.means[inside, :2], kept.covariances[inside, :2, :2]
-    axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
-    axes.plot(*joined(contours(means, covariances)[:, 0], 2).T, color=FAINT, lw=0.8)
 
 
 def _extent(told: Explanation) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from itertools import combinations_with_replacement
 from typing import Any
@@ -42,7 +42,9 @@ UNSURE = ("between ", "its nearest ", "it does not fit", "cliques as large")  # 
 def series(run: Recording) -> dict[str, Any]:
     """Return all that the pictures of a report need; times in seconds since the first step."""
     scene, t = Scene.of(run), run.history.t_s
-    dof, maps = (3, 6)[scene.d - 2], _fewer(run.history.maps)
+    dof, maps = (3, 6)[scene.d - 2], run.history.maps
+    stride = max(1, -(-sum(len(m.ids) for m in maps) // LANDMARKS))  # the page stays of a size to open
+    maps = maps[::-1][::stride][::-1]  # the last among them
     true = scene.true_points()
     return {
         "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
@@ -63,13 +65,6 @@ def series(run: Recording) -> dict[str, Any]:
     }
 
 
-def _fewer(maps: tuple[MapSnapshot, ...]) -> list[MapSnapshot]:
-    """Return maps evenly spread, the last among them, of so many landmarks that the page stays of a size to open."""
-    total = sum(len(m.ids) for m in maps)
-    stride = max(1, -(-total // LANDMARKS))
-    return [m for k, m in enumerate(reversed(maps)) if k % stride == 0][::-1]
-
-
 def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
     """Return a map: all points, in space the endpoints of lines last, with the group that each is drawn in."""
     drawn = shapes(m.means, m.covariances, m.kinds, scene.d)
@@ -79,7 +74,7 @@ def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
     return {**head, "count": len(m.ids), **more, **gaussians(drawn.means, drawn.covariances)}
 
 
-def _camera(run: Recording, camera: Camera, maps: list[MapSnapshot], t: Array) -> dict[str, Any]:
+def _camera(run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array) -> dict[str, Any]:
     """Return what a camera saw last at each of the maps: `frames` are indices of its `scans`, None before the first."""
     steps = steps_of(run.history, camera)
     last = np.searchsorted(steps, [m.step for m in maps], side="right") - 1
