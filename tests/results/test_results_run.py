@@ -222,7 +222,7 @@ def test_an_interrupted_save_leaves_no_summary_and_no_temporary_file(
     def interrupt(_: object) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kalmark.results.run.associations_csv", interrupt)
+    monkeypatch.setattr("kalmark.results.recording.associations_csv", interrupt)
     with pytest.raises(KeyboardInterrupt):
         run.save(tmp_path)
     assert not (tmp_path / "summary.json").exists()

@@ -21,6 +21,11 @@ from kalmark.results.evaluate import none_for_nan
 from kalmark.results.history import Array
 from kalmark.results.scene import COLOURS, grouped
 
+POINTS = 400  # of a curve, at most
+COARSE, FINE = (1.0, 2.0, 5.0), (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # ticks in a decade
+_WORDS = {"joint": "joint state, a dimension", "state": "pose and velocity"}
+_WITH_WORLD = ("pose", "landmarks", "joint")
+
 
 class Anees:
     """The average NEES over runs at each (robot, step), its 95 % band, and whether it lies inside.
@@ -124,10 +129,6 @@ def _last(values: Array) -> float:
     return max((float(row[-1]) for row in rows if len(row)), default=float("nan"))
 
 
-POINTS = 400  # of a curve, at most
-COARSE, FINE = (1.0, 2.0, 5.0), (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # ticks in a decade
-
-
 def draw(path: Path, title: str, t_s: Array, panels: Sequence[tuple[str, float, dict[str, Anees]]]) -> None:
     """Write the picture to a PNG file.  NEES in the estimator's coordinates, robots averaged, logarithmic.
 
@@ -177,10 +178,6 @@ def _draw_panel(axis: Any, t_s: Array, label: str, ideal: float, estimators: dic
     axis.set_ylabel(label)
     axis.grid(visible=True, which="both", linewidth=0.3)
     axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False, borderpad=0.1)
-
-
-_WORDS = {"joint": "joint state, a dimension", "state": "pose and velocity"}
-_WITH_WORLD = ("pose", "landmarks", "joint")
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,11 @@ from kalmark.slam.slam import Slam
 
 FAR = 3.0  # a point of unknown depth is judged once its depth exceeds so many of its sigmas
 NO_POINTS = np.empty((0, 0))
+NEES = ("pose", "heading", "state", "landmarks", "joint", "mount")
+SERIES = (
+    *NEES, "pose_world", "landmarks_world", "joint_world", *(f"{name}_dof" for name in NEES),
+    "position_m", "heading_rad", "mount_m", "mount_rad",
+)  # fmt: skip
 
 
 class Judged(NamedTuple):
@@ -129,13 +134,6 @@ def _line(model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordina
     own, world = (point_error(q[0], ends, turn, c) @ across.T for c in (coordinates, "world"))
     F = (across @ Q_l[0]).reshape(4, -1)
     return Judged(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)
-
-
-NEES = ("pose", "heading", "state", "landmarks", "joint", "mount")
-SERIES = (
-    *NEES, "pose_world", "landmarks_world", "joint_world", *(f"{name}_dof" for name in NEES),
-    "position_m", "heading_rad", "mount_m", "mount_rad",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,8 @@ from kalmark.cli.shared import Overrides, print_table, writable
 if TYPE_CHECKING:
     from kalmark.simulate import World
 
+data = typer.Typer(help="List and fetch datasets.", no_args_is_help=True)
+
 
 def simulate(
     world: Annotated[str, typer.Argument(metavar="WORLD", help="A YAML file or a shipped name.")],
@@ -57,9 +59,6 @@ def convert(
     log = open_log(source, log_format)
     write_native(log, out)
     typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}, read as {log.format}")
-
-
-data = typer.Typer(help="List and fetch datasets.", no_args_is_help=True)
 
 
 @data.command("list")

@@ -16,6 +16,7 @@ Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
 ]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that `kalmark run` wrote.")]
+_SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
 @contextmanager
@@ -52,9 +53,6 @@ def writable(folder: Path) -> Path:
     if not os.access(existing, os.W_OK | os.X_OK):
         raise KalmarkError(f"--out {folder}: {existing} cannot be written to")
     return folder
-
-
-_SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:

@@ -22,6 +22,7 @@ UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m", "gain": ""}  # of the othe
 UNOBSERVED = 0.9  # of its prior sigma: so much is left of a direction that counts as not observed
 SINGULAR = 1e-12  # eigenvalues of a prior's correlations that are zero
 NAMED = 0.01  # the least share of an axis in a direction that is named
+MOUNT_COLUMNS = ("mount", "direction", "sigma before", "after", "ratio (1: not observed)")
 
 
 class Direction(NamedTuple):
@@ -112,9 +113,6 @@ def _found(summary: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], st
 def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
     return [(name, row["direction"], *sigmas, f"{row['ratio']:.3f}") for name, row, *sigmas in _found(summary)]
-
-
-MOUNT_COLUMNS = ("mount", "direction", "sigma before", "after", "ratio (1: not observed)")
 
 
 def mount_warnings(_: Any, summary: Mapping[str, Any]) -> Iterator[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,8 @@ import numpy as np
 from kalmark.declare import own_name, parameters, plugin_of, registered_name
 from kalmark.geometry.rotations import to_euler
 from kalmark.logs.log import Log
+
+PARTS = ("landmark", "association", "detector", "initialization")  # of a mounted sensor, if it has its own
 
 
 def plain(value: Any) -> Any:
@@ -39,7 +40,10 @@ def describe(slam: Any, log: Any = None) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if isinstance(log, Log) and log.path is not None:
         out["log"] = {"path": str(log.path), "format": log.format, "robots": list(log.robots)}
-    plugins = sorted({str(file) for each in _models(slam) if (file := plugin_of(type(each))) is not None})
+    models = [slam.landmark_type, slam.association, slam.estimator, *(robot.motion for robot in slam.robots.values())]
+    for mount in (mount for robot in slam.robots.values() for mount in robot.sensors.values()):
+        models += [mount.sensor, *(vars(mount)[part] for part in PARTS)]
+    plugins = sorted({str(file) for each in models if (file := plugin_of(type(each))) is not None})
     if plugins:
         out["plugins"] = plugins
     out["robots"] = {name: _robot(robot) for name, robot in slam.robots.items()}
@@ -51,15 +55,6 @@ def describe(slam: Any, log: Any = None) -> dict[str, Any]:
     reparametrize = "off" if slam.reparametrize is None else float(slam.reparametrize)
     out["map"] = {"type": slam.map_type, "numbers": slam.numbers, "reparametrize": reparametrize}
     return out
-
-
-def _models(slam: Any) -> Iterator[Any]:
-    """Yield the models of a filter that may be a user's own."""
-    yield from (slam.landmark_type, slam.association, slam.estimator)
-    for robot in slam.robots.values():
-        yield robot.motion
-        for mount in robot.sensors.values():
-            yield from (mount.sensor, mount.landmark, mount.association, mount.detector, mount.initialization)
 
 
 def _keys(value: Any) -> dict[str, Any]:
@@ -80,7 +75,7 @@ def _sensor(mount: Any) -> dict[str, Any]:
     out, at = model(mount.sensor), describe_pose(mount.at)
     if any(at.values()):
         out["mount"] = at
-    for part in ("landmark", "association", "detector", "initialization"):
+    for part in PARTS:
         if vars(mount)[part] is not None:
             out[part] = model(vars(mount)[part])
     if mount.attention != type(mount.attention)():

@@ -97,9 +97,8 @@ def headline(run: Recording) -> tuple[str, list[str]]:
 
     if errors:
         parts.append(f"position {figure(mean_of('ate_raw_m'))} m ({figure(mean_of('ate_m'))} m aligned)")
-        parts.append(
-            f"{'orientation' if run.history.in_space else 'heading'} {figure(mean_of('heading_rmse_deg'), 2)}°"
-        )
+        turn = "orientation" if run.history.in_space else "heading"
+        parts.append(f"{turn} {figure(mean_of('heading_rmse_deg'), 2)}°")
     if summary.get("landmark_rmse_m") is not None:
         raw, aligned = figure(summary["landmark_rmse_raw_m"]), figure(summary["landmark_rmse_m"])
         how = ", matched by position" if "landmarks_matched" in summary else ""

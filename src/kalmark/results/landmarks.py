@@ -40,6 +40,12 @@ POINT, LINE, TAG = 3, 6, 7
 EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
 # kinds whose state is their place; what is not (inverse depth, say) is not well known yet
 EUCLIDEAN = ("", "point", "point3", "point_signature", "tag")
+_PLANE = {"point_signature": ("x_m", "y_m", "signature")}
+_POINT = ("x_m", "y_m", "z_m")
+_LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
+_TAG = (*_POINT, "qx", "qy", "qz", "qw")
+_SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
+_ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
 
 
 def place(
@@ -97,14 +103,6 @@ def shapes(means: Array, covariances: Array, kinds: Sequence[str], d: int = 3) -
         means[tags, :TAG].reshape(-1, TAG),
         np.where(np.isin(row, lines), LINES, np.where(np.isin(kinds, EUCLIDEAN), EUCLIDEANS, OTHERS)[row]),
     )
-
-
-_PLANE = {"point_signature": ("x_m", "y_m", "signature")}
-_POINT = ("x_m", "y_m", "z_m")
-_LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
-_TAG = (*_POINT, "qx", "qy", "qz", "qw")
-_SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
-_ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from kalmark.results.history import Array, History, as_id
 from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
 from kalmark.results.recording import Recording
 
+LEAST = 3  # matched pairs
+
 
 def known_as(history: History) -> dict[str, str]:
     """Return what the log calls each landmark that the filter named: what most observations fused with it are."""
@@ -55,9 +57,6 @@ def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]
         "nameless": int(nameless.sum()),
         "nameless_fused": int((nameless & fused).sum()),
     }
-
-
-LEAST = 3  # matched pairs
 
 
 def no_ids(run: Recording) -> bool:

@@ -17,6 +17,10 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, multiply
 from kalmark.results.history import Array, Ints
 
+SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix that still counts as regular
+DIVERGED_SIGMAS = 10.0
+DIVERGED_PATH = 0.05
+
 
 class Rigid(NamedTuple):
     """A rotation (d, d) followed by a shift (d,): what takes one set of positions onto another."""
@@ -84,11 +88,6 @@ def rigid_robust(source: Array, target: Array, floor_m: float = 0.1, iterations:
 def rmse(errors: Array) -> float:
     """Return the root of the mean squared length of the errors (N, d), NaN if there are none."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else float("nan")
-
-
-SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix that still counts as regular
-DIVERGED_SIGMAS = 10.0
-DIVERGED_PATH = 0.05
 
 
 def path_m(positions: Array) -> float:

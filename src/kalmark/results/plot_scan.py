@@ -32,6 +32,7 @@ LEAST_M = 1.0
 PAPER = 490.0  # width of the axes in points, about
 MARK = 6.0  # half a cross or a square, in points
 ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
+MEASURED, NAME = "#7d838d", "#1e4d2b"
 
 
 def draw_scan(run: Recording, told: Explanation) -> Figure:
@@ -163,9 +164,6 @@ def _legend(told: Explanation) -> list[Line2D]:
         Line2D([], [], ls="", marker=".", color=FAINT, label="other landmarks, as kept last"),
         *marks,
     ]
-
-
-MEASURED, NAME = "#7d838d", "#1e4d2b"
 
 
 def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> Figure:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from kalmark.report import Report
     from kalmark.slam.slam import Slam
 
+HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has no focal length
+USED = ("associated", "new")
+
 
 @runtime_checkable
 class Imaging(Protocol):
@@ -35,9 +38,6 @@ class Focal(Protocol):
     fy_px: float
     cx_px: float
     cy_px: float
-
-
-HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has no focal length
 
 
 def cameras(slam: Slam) -> tuple[Camera, ...]:
@@ -100,9 +100,6 @@ def _corners(sensor: Imaging) -> Array:
         across, down = u / width - 0.5, v / height - 0.5
         return np.column_stack([2 * HALF_VIEW * across, 2 * HALF_VIEW * down * height / width, np.ones(4)])
     return np.column_stack([(u - sensor.cx_px) / sensor.fx_px, (v - sensor.cy_px) / sensor.fy_px, np.ones(4)])
-
-
-USED = ("associated", "new")
 
 
 def stated_noise(slam: Slam, report: Report) -> Array:

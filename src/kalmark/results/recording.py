@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
 CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
+NEEDED = ("summary.json", "config.yaml", "history.npz", "landmarks.csv")
 
 
 def seconds(t_ns: int) -> str:
@@ -124,9 +125,6 @@ def replace_file(path: Path, writer: Callable[[Path], Any]) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-NEEDED = ("summary.json", "config.yaml", "history.npz", "landmarks.csv")
 
 
 @dataclass(frozen=True)
@@ -225,19 +223,27 @@ class Recording:
         except (KeyError, ValueError, OSError) as error:
             raise RunError(f"{folder}: not a run that this version reads: {error}") from None
 
-    def save_arrays(self, path: Path) -> None:
-        """Write ``history.npz``."""
+    def save_files(self, folder: Path) -> None:
+        """Write all files of the run into a folder but its figures, its pictures and its page."""
+        for robot in self.history.robots:
+            write(folder / f"trajectory_{file_name(robot)}.tum", tum(self.history, robot))
+        write(folder / "config.yaml", config_yaml(self.config))
+        write(folder / "landmarks.csv", self.landmarks.to_csv())
+        write(folder / "associations.csv", associations_csv(self.history))
+        (folder / "changes.csv").unlink(missing_ok=True)
+        if self.history.changes:
+            write(folder / "changes.csv", changes_csv(self.history))
+        replace_file(folder / "history.npz", self._save_arrays)
+        saved = None if self.folder is None else self.folder / "map.kmk"
+        if self.slam is not None:
+            replace_file(folder / "map.kmk", self.slam.save)
+        elif saved is not None and saved.is_file() and saved.parent.resolve() != folder.resolve():
+            replace_file(folder / "map.kmk", partial(shutil.copyfile, saved))
+
+    def _save_arrays(self, path: Path) -> None:
         arrays: dict[str, Any] = {**self.history.arrays(), **self.truth.arrays()}
         arrays["skipped"] = np.array(self.skipped, dtype=np.str_)
         arrays["skipped_records"] = np.array([records_of(line) for line in self.skipped], dtype=np.int64)
         arrays["reference"] = np.array(list(self.reference), dtype=np.str_)
         with path.open("wb") as file:
             np.savez_compressed(file, **arrays)
-
-    def save_map(self, folder: Path) -> None:
-        """Write ``map.kmk`` into a folder: the filter, or what the run was loaded with."""
-        saved = None if self.folder is None else self.folder / "map.kmk"
-        if self.slam is not None:
-            replace_file(folder / "map.kmk", self.slam.save)
-        elif saved is not None and saved.is_file() and saved.parent.resolve() != folder.resolve():
-            replace_file(folder / "map.kmk", partial(shutil.copyfile, saved))

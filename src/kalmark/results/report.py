@@ -37,6 +37,18 @@ CHANGES = 200  # in the table
 MARKS = 2000  # in the timeline
 TENTATIVE = "tentative: "  # how the reasons of those begin that never were landmarks
 UNSURE = ("between ", "its nearest ", "it does not fit", "cliques as large")  # how reasons of ambiguity begin
+_ROBOT = (
+    ("scans", "scans", ""),
+    ("path_m", "path", "m"),
+    *ROBOT,
+    ("pose_nees_world", "in world coordinates", ""),
+    *(row for row in TOTALS if row[0] in ("fix_median_m", "fix_rms_10m", "fix_within_10m")),
+    ("diverged", "diverged", ""),
+)
+_HINTS = {
+    False: "3-sigma ellipses; drag the slider through time",
+    True: "3-sigma ellipsoids; drag to turn, scroll to come closer, drag the slider through time",
+}
 
 
 def series(run: Recording) -> dict[str, Any]:
@@ -283,22 +295,6 @@ def rounded(values: Array, digits: int) -> list[float | None]:
 def significant(values: Array, digits: int = 4) -> list[float | None]:
     """Return values to so many significant digits, None for NaN and infinity."""
     return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values.tolist()]
-
-
-_ROBOT = (
-    ("scans", "scans", ""),
-    ("path_m", "path", "m"),
-    *ROBOT,
-    ("pose_nees_world", "in world coordinates", ""),
-    *(row for row in TOTALS if row[0] in ("fix_median_m", "fix_rms_10m", "fix_within_10m")),
-    ("diverged", "diverged", ""),
-)
-
-
-_HINTS = {
-    False: "3-sigma ellipses; drag the slider through time",
-    True: "3-sigma ellipsoids; drag to turn, scroll to come closer, drag the slider through time",
-}
 
 
 def report_html(run: Recording) -> str:

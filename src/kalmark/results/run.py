@@ -10,16 +10,7 @@ from typing import Any
 
 from kalmark.results.evaluate import evaluate
 from kalmark.results.images import steps_of
-from kalmark.results.recording import (
-    Recording,
-    associations_csv,
-    changes_csv,
-    config_yaml,
-    file_name,
-    replace_file,
-    tum,
-    write,
-)
+from kalmark.results.recording import Recording, file_name, replace_file, write
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +39,7 @@ class Run(Recording):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "summary.json").unlink(missing_ok=True)
         summary = self.summary or self.evaluate()
-        for robot in self.history.robots:
-            write(folder / f"trajectory_{file_name(robot)}.tum", tum(self.history, robot))
-        write(folder / "config.yaml", config_yaml(self.config))
-        write(folder / "landmarks.csv", self.landmarks.to_csv())
-        write(folder / "associations.csv", associations_csv(self.history))
-        (folder / "changes.csv").unlink(missing_ok=True)
-        if self.history.changes:
-            write(folder / "changes.csv", changes_csv(self.history))
-        replace_file(folder / "history.npz", self.save_arrays)
-        self.save_map(folder)
+        self.save_files(folder)
         self.report(folder)
         write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
         return folder

@@ -110,15 +110,11 @@ def fitted(poses: Array, size: int) -> Array:
     if poses.shape[1] == size:
         return poses
     if size == 3:
-        return np.column_stack([poses[:, :2], yaw(poses[:, 3:])])
+        x, y, z, w = poses[:, 3:].T
+        yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))  # where their x points
+        return np.column_stack([poses[:, :2], yaw])
     flat, half = np.zeros(len(poses)), poses[:, 2] / 2
     return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
-
-
-def yaw(q: Array) -> Array:
-    """Return the headings (N,) of orientations (N, 4): where their x points as seen from above."""
-    x, y, z, w = np.moveaxis(q, -1, 0)
-    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
 
 
 def as_rigid(pose: Array) -> Rigid:

@@ -57,16 +57,11 @@ def write_video(
 
 
 def _mp4(drawn: Iterator[Figure], fps: float, path: Path) -> None:
-    writer: Any = None
-    try:
-        for figure in drawn:
-            if writer is None:
-                writer = FFMpegWriter(fps=fps)  # type: ignore[arg-type]
-                writer.setup(figure, str(path), DPI)
+    writer: Any = FFMpegWriter(fps=fps)  # type: ignore[arg-type]
+    with writer.saving(next(drawn), str(path), DPI):
+        writer.grab_frame()
+        for _ in drawn:  # the same figure, drawn anew
             writer.grab_frame()
-    finally:
-        if writer is not None:
-            writer.finish()
 
 
 def _gif(drawn: Iterator[Figure], fps: float, path: Path) -> None:
@@ -114,11 +109,9 @@ def _draw(figure: Figure, run: Recording, step: int, turned: float) -> None:
 
 def _last_images(run: Recording, step: int) -> list[tuple[str, Any, tuple[float, float]]]:
     """Return the images of what each camera saw last up to a step, with titles."""
-    out = []
+    out: list[tuple[str, Any, tuple[float, float]]] = []
     for camera in run.history.cameras:
         steps = steps_of(run.history, camera)
-        steps = steps[steps <= step]
-        if len(steps):
-            for image in images(run.history, camera, int(steps[-1])):
-                out.append((f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size))
+        last = images(run.history, camera, int(steps[steps <= step][-1])) if (steps <= step).any() else []
+        out += [(f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size) for image in last]
     return out[:MOST_IMAGES]

@@ -42,6 +42,20 @@ PAIRS = 60  # of successive innovations in a window
 WINDOW_SCANS = 10  # at least, as good as, in a window: the observations of one share the error of the pose
 SCANS_PAIRED = 30  # in a window of pairs
 MOST_GAP_STEPS = 5
+NO_ID = "no id in the log"  # the reason that association by identity gives
+POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
+NIS_HIGH = 3.0  # per degree of freedom
+FIX_NIS_HIGH = 5.0
+FIRST_FIX = {d: float(chi2.ppf(0.9999, d)) for d in (2, 3)}
+BEARINGS = ("range_bearing", "range_bearing_3d")
+ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
+MARGIN = 0.1  # of an image, by which its measurements may lie outside it
+FEW_FIXES = 5  # fewer say little of the noise
+LOW = 0.5  # squares of innovations over those of the stated noise: it is 1.4 times too large
+TINY_NIS = 0.1
+TINY = 1e-6  # of those squares, where a log has no noise
+NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
+COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 
 
 @dataclass(frozen=True)
@@ -79,10 +93,8 @@ def left_out_windows(history: History) -> list[Window]:
     """Return the share of observations that were rejected, or ignored because they fit nothing, window by window."""
     mine = history.outcome != "tentative"
     out = np.isin(history.outcome[mine], ["rejected", "ignored", "deferred"]) & (history.d2[mine] > 0)
-    told = np.char.startswith(history.reason[mine], "between ") | np.char.startswith(
-        history.reason[mine], "it does not"
-    )
-    wrong = (out | told).astype(np.float64)
+    told = [np.char.startswith(history.reason[mine], start) for start in ("between ", "it does not")]
+    wrong = np.logical_or.reduce([out, *told]).astype(np.float64)
     return _windows(history, history.step[mine], wrong, np.ones(len(wrong), dtype=np.int64), OBSERVATIONS, WINDOW_SCANS)
 
 
@@ -93,9 +105,9 @@ def autocorrelations(history: History) -> list[Window]:
     robots = history.robot[history.step[rows]]
     order = np.lexsort((history.step[rows], history.landmark[rows], history.sensor[rows], robots))
     one, two = order[:-1], order[1:]
-    same = (history.landmark[rows[one]] == history.landmark[rows[two]]) & (robots[one] == robots[two])
-    same &= history.sensor[rows[one]] == history.sensor[rows[two]]
-    same &= history.step[rows[two]] - history.step[rows[one]] <= MOST_GAP_STEPS
+    same = history.step[rows[two]] - history.step[rows[one]] <= MOST_GAP_STEPS
+    for of in (history.landmark[rows], history.sensor[rows], robots):
+        same &= of[one] == of[two]
     one, two = one[same], two[same]
     turn = np.argsort(history.step[rows[two]], kind="stable")
     a, b, step = white[one[turn]], white[two[turn]], history.step[rows[two[turn]]]
@@ -174,22 +186,6 @@ def _left_out(worst: Window, median: float, count: int) -> str:
     if worst.value < LEFT_OUT or median > LEFT_OUT / 2:
         return ""
     return f"{worst.value:.0%} of the observations fit nothing, median {median:.0%},"
-
-
-NO_ID = "no id in the log"  # the reason that association by identity gives
-POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
-NIS_HIGH = 3.0  # per degree of freedom
-FIX_NIS_HIGH = 5.0
-FIRST_FIX = {d: float(chi2.ppf(0.9999, d)) for d in (2, 3)}
-BEARINGS = ("range_bearing", "range_bearing_3d")
-ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
-MARGIN = 0.1  # of an image, by which its measurements may lie outside it
-FEW_FIXES = 5  # fewer say little of the noise
-LOW = 0.5  # squares of innovations over those of the stated noise: it is 1.4 times too large
-TINY_NIS = 0.1
-TINY = 1e-6  # of those squares, where a log has no noise
-NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
-COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 
 
 def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
