@@ -16,14 +16,13 @@ import pytest
 import kalmark as km
 from kalmark.errors import RunError
 from kalmark.results.history import Camera
-from kalmark.results.images import images, trimmed
 from kalmark.results.landmarks import EUCLIDEANS, LINES, OTHERS, shapes
 from kalmark.results.plot import Projection, corners, draw_map, save_map, spacing
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
-from kalmark.results.scene import Scene, contours
+from kalmark.results.scene import Scene, contours, images, trimmed
 from results_space import FORWARD, SIGMA, START, slam_for, spiral, with_camera
 
 WRONG = 13

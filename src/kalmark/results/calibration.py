@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.results.describe import describe_pose
 from kalmark.results.history import Array, Biased, Mounted
+from kalmark.results.readings import describe_pose
 from kalmark.results.words import figure
 
 AXES = {3: ("x", "y", "theta"), 5: ("x", "y", "theta", "gain", "offset"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}

@@ -17,9 +17,8 @@ from matplotlib.lines import Line2D
 from kalmark.errors import RunError
 from kalmark.results.explain import Explanation, Fate
 from kalmark.results.history import Array, Camera
-from kalmark.results.images import Image, Sighting, colour_of, images, steps_of, trimmed
 from kalmark.results.recording import Recording
-from kalmark.results.scene import INK, contours, joined
+from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
 from kalmark.results.words import figure as figure_of
 
 OUTCOME = {

@@ -16,11 +16,10 @@ from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log
 from kalmark.logs.source import nearest
 from kalmark.logs.start import begins_at
-from kalmark.results.describe import describe, plain
 from kalmark.results.history import Array, Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
-from kalmark.results.readings import biases, cameras, left_px, mounts, stated_noise
+from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, stated_noise
 from kalmark.results.recording import LogReference
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth

@@ -24,9 +24,9 @@ from ruamel.yaml import YAML
 
 from kalmark.errors import RunError
 from kalmark.logs.source import LeftOut, records_of
-from kalmark.results.describe import plain
 from kalmark.results.history import History
 from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.readings import plain
 from kalmark.results.truth import Truth, fitted
 
 if TYPE_CHECKING:

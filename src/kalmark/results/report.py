@@ -22,11 +22,21 @@ from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.explain import Explanation, Fate, explained
 from kalmark.results.history import Array, Camera, Change, History, Ints, MapSnapshot
-from kalmark.results.images import Sighting, colour_of, images, steps_of
 from kalmark.results.landmarks import shapes
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
 from kalmark.results.recording import Recording, config_yaml
-from kalmark.results.scene import Scene, broken, grouped, joined, squares, stretches_of
+from kalmark.results.scene import (
+    Scene,
+    Sighting,
+    broken,
+    colour_of,
+    grouped,
+    images,
+    joined,
+    squares,
+    steps_of,
+    stretches_of,
+)
 from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words
 
 BINS = 120

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.results.evaluate import evaluate
-from kalmark.results.images import steps_of
 from kalmark.results.recording import Recording, file_name, replace_file, write
+from kalmark.results.scene import steps_of
 
 
 @dataclass(frozen=True, eq=False)

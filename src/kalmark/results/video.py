@@ -16,12 +16,11 @@ from PIL import Image
 
 from kalmark.errors import RunError
 from kalmark.results.evaluate import headline
-from kalmark.results.images import images, steps_of
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_scan import draw_image
 from kalmark.results.progress import track
 from kalmark.results.recording import Recording, replace_file
-from kalmark.results.scene import INK, Scene
+from kalmark.results.scene import INK, Scene, images, steps_of
 
 INCHES, DPI = (12.8, 7.2), 80
 MOST_IMAGES = 3  # beside the map
