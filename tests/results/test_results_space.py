@@ -14,6 +14,7 @@ from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import exp, left_jacobian_inverse, log, multiply
 from kalmark.geometry.spaces import RHO, VECTOR3, Space, retract
+from kalmark.report import LandmarkTable
 from kalmark.results.evaluate import landmark_figures, line_figures
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.measures import pose_error, rotation_error, turned_back
@@ -127,7 +128,7 @@ class Line:
 
 def pretended(models: list[Any], means: list[Any], covariances: list[Any]) -> Any:
     """Return what looks like a filter with such landmarks."""
-    table = SimpleNamespace(
+    table = LandmarkTable(
         ids=list(range(len(models))),
         kinds=[model.kind for model in models],
         means=[np.array(mean) for mean in means],
