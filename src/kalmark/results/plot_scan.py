@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 
 from kalmark.errors import RunError
 from kalmark.results.explain import Explanation, Fate
-from kalmark.results.history import Array, Camera
+from kalmark.results.history import Array
 from kalmark.results.recording import Recording
 from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
 from kalmark.results.words import figure as figure_of
@@ -172,42 +172,31 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     thin lines.  `t_s`, and the time in the title, are seconds since the first scan, as in the report.  Raises RunError
     if there is no such camera or scan.
     """
-    camera, at = chosen(run, robot, sensor, step, t_s)
-    seen = images(run.history, camera, at)
+    history, cameras = run.history, {(camera.robot, camera.sensor): camera for camera in run.history.cameras}
+    if (robot, sensor) not in cameras:
+        names = ", ".join(map(".".join, cameras)) or "none"
+        raise RunError(f"camera {robot}.{sensor} is not in this run, expected one of: {names}")
+    camera = cameras[robot, sensor]
+    steps = steps_of(history, camera)
+    if t_s is not None:
+        steps = steps[history.t_ns[steps] - history.t_ns[0] <= round(t_s * 1e9)]
+    if step is not None:
+        steps = steps[steps <= step]
+    if len(steps) == 0:
+        raise RunError(f"camera {robot}.{sensor} saw nothing until then, expected a scan with an observation")
+    seen = images(history, camera, int(steps[-1]))
     shape = camera.size[1] / camera.size[0]
     width = 9.0 if len(seen) == 1 else 14.0
     figure = Figure(figsize=(width, (width - 1.0) / len(seen) * shape + 1.5), layout="constrained", facecolor="white")
     grid = figure.subplots(1, len(seen), squeeze=False)[0]
     for axes, image in zip(grid, seen, strict=True):
         draw_image(axes, image, camera.size)
-    t, outcomes = run.history.t_s[at], Counter(s.outcome for s in seen[0].sightings)
+    outcomes = Counter(s.outcome for s in seen[0].sightings)
     said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
-    figure.suptitle(
-        f"{robot} · {sensor} · t = {t:.3f} s · {said}", x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK
-    )
+    title = f"{robot} · {sensor} · t = {history.t_s[steps[-1]]:.3f} s · {said}"
+    figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
     figure.legend(handles=legend(seen), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
-
-
-def chosen(
-    run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None
-) -> tuple[Camera, int]:
-    """Return a camera and the step of its scan: the last of all, of those up to a step, or of those up to a time.
-
-    Raises RunError if there is no such camera or scan.
-    """
-    cameras = {(camera.robot, camera.sensor): camera for camera in run.history.cameras}
-    if (robot, sensor) not in cameras:
-        names = ", ".join(map(".".join, cameras)) or "none"
-        raise RunError(f"camera {robot}.{sensor} is not in this run, expected one of: {names}")
-    steps = steps_of(run.history, cameras[robot, sensor])
-    if t_s is not None:
-        steps = steps[run.history.t_ns[steps] - run.history.t_ns[0] <= round(t_s * 1e9)]
-    if step is not None:
-        steps = steps[steps <= step]
-    if len(steps) == 0:
-        raise RunError(f"camera {robot}.{sensor} saw nothing until then, expected a scan with an observation")
-    return cameras[robot, sensor], int(steps[-1])
 
 
 def draw_image(axes: Axes, image: Image, size: tuple[float, float]) -> None:
