@@ -19,7 +19,7 @@ import kalmark as km
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import LogError
 from kalmark.geometry import V_inverse
-from kalmark.results.align import rigid
+from kalmark.results.measures import rigid
 
 AT, STEP = np.array([0.2, 0.1, 0.0]), np.array([0.5, 0.0, 0.05])
 ROWS: dict[str, dict[str, Any]] = {

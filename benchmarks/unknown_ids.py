@@ -21,11 +21,11 @@ from scipy.optimize import linear_sum_assignment
 import kalmark as km
 from kalmark import config as cfg
 from kalmark.cli.run import run_log
-from kalmark.results.align import rigid, rmse
 from kalmark.results.evaluate import known_landmarks
+from kalmark.results.matching import known_as
+from kalmark.results.measures import rigid, rmse
 from kalmark.results.record import record
 from kalmark.results.run import Run
-from kalmark.results.scoring import known_as
 
 BESIDE_M = 0.5
 FAR = 1e6  # a d2 of what is no candidate

@@ -26,7 +26,7 @@ from kalmark.cli.run import run_log
 from kalmark.config import load_config, open_config_log
 from kalmark.events import Scan
 from kalmark.filter.kernels import one_thread
-from kalmark.results.align import rigid
+from kalmark.results.measures import rigid
 from kalmark.results.run import Run
 
 NEAR_M, SIGHTINGS = 0.5, 3

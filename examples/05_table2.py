@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 import kalmark as km
 from kalmark.campaign import run_campaign
-from kalmark.campaign.statistics import Anees
+from kalmark.campaign.campaign import Anees
 
 RUNS = int(sys.argv[1]) if len(sys.argv) > 1 else 2
 

@@ -14,7 +14,7 @@ from kalmark.config.choices import section_of
 from kalmark.declare import classes, parameters
 from kalmark.errors import ConfigError
 from kalmark.logs import Log, Trajectory
-from kalmark.results.files import config_yaml
+from kalmark.results.recording import config_yaml
 
 SECOND = 1_000_000_000
 

@@ -15,7 +15,7 @@ from kalmark.config import Config, build_slam, config_dict, load_config, open_ru
 from kalmark.config import opening as opening_module
 from kalmark.errors import ConfigError
 from kalmark.logs import Log, Trajectory
-from kalmark.results.files import config_yaml
+from kalmark.results.recording import config_yaml
 
 SECOND = 1_000_000_000
 RADAR = {"type": "range_bearing_3d", "sigma_range_m": 0.3, "mount": {"z_m": 0.6, "yaw_deg": 90.0}}

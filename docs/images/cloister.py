@@ -12,12 +12,12 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 import kalmark as km
-from kalmark.results.run import load_run
+from kalmark.results.run import Run
 
 RUN, CAMPAIGN = (Path(p) for p in (sys.argv[1:] or ["out/demo", "out/cloister"]))
 INK, COLOURS = "#20303c", {"invariant": "#1f5fa8", "ekf": "#c4543a"}
 
-run, slam = load_run(RUN), km.Slam.load(RUN / "map.kmk")
+run, slam = Run.load(RUN), km.Slam.load(RUN / "map.kmk")
 rows = list(csv.DictReader((CAMPAIGN / "anees.csv").open()))
 
 figure = Figure(figsize=(11, 4.6), layout="constrained", facecolor="white")

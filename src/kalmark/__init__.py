@@ -53,36 +53,29 @@ _MODULES = {
     "sensors": "kalmark.models.sensors",
 }
 _NAMES = {
-    "Attention": "kalmark.management.attention",
-    "Control": "kalmark.events",
-    "Delayed": "kalmark.management.delayed",
-    "Fix": "kalmark.events",
-    "Log": "kalmark.logs",
-    "Mount": "kalmark.slam.robot",
-    "Observation": "kalmark.report",
-    "Report": "kalmark.report",
-    "Robot": "kalmark.slam.robot",
-    "Run": "kalmark.results.run",
-    "Scan": "kalmark.events",
-    "Slam": "kalmark.slam.slam",
-    "Upkeep": "kalmark.management.upkeep",
-    "open_log": "kalmark.logs",
-    "pointwise": "kalmark.models.pointwise",
-    "record": "kalmark.results.record",
-    "register": "kalmark.declare",
+    "kalmark.declare": ("register",),
+    "kalmark.events": ("Control", "Fix", "Scan"),
+    "kalmark.logs": ("Log", "open_log"),
+    "kalmark.management.attention": ("Attention",),
+    "kalmark.management.delayed": ("Delayed",),
+    "kalmark.management.upkeep": ("Upkeep",),
+    "kalmark.models.pointwise": ("pointwise",),
+    "kalmark.report": ("Observation", "Report"),
+    "kalmark.results.record": ("record",),
+    "kalmark.results.run": ("Run",),
+    "kalmark.slam.robot": ("Mount", "Robot"),
+    "kalmark.slam.slam": ("Slam",),
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for on first use: the compiled models take a second that `kalmark --help` need not wait."""
-    if name in _MODULES:
-        value: Any = import_module(_MODULES[name])
-    elif name in _NAMES:
-        value = getattr(import_module(_NAMES[name]), name)
-    else:
+    home = _MODULES.get(name) or next((module for module, names in _NAMES.items() if name in names), None)
+    if home is None:
         raise AttributeError(f"module 'kalmark' has no attribute {name!r}")
-    globals()[name] = value
-    return value
+    module: Any = import_module(home)
+    globals()[name] = module if name in _MODULES else vars(module)[name]
+    return globals()[name]
 
 
 def __dir__() -> list[str]:

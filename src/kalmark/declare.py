@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import operator
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -67,12 +68,7 @@ class Within:
         """Return whether a number is within."""
         if math.isnan(value) or (math.isinf(value) and not self.infinite):
             return False
-        return not (
-            (self.ge is not None and value < self.ge)
-            or (self.gt is not None and value <= self.gt)
-            or (self.le is not None and value > self.le)
-            or (self.lt is not None and value >= self.lt)
-        )
+        return all(vars(operator)[name](value, limit) for name, limit in self.limits.items())
 
     def words(self, kind: str) -> str:
         """Return what is expected: `kind` is "number" or "whole number"."""
@@ -167,10 +163,7 @@ def _parameters(model: Any) -> tuple[Parameter, ...]:
 
 
 def _parameter(field: dataclasses.Field[Any], hint: Any) -> Parameter:
-    extras: tuple[Any, ...] = ()
-    if get_origin(hint) is Annotated:
-        hint, *rest = get_args(hint)
-        extras = tuple(rest)
+    hint, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     words = tuple(word for part in parts if get_origin(part) is Literal for word in get_args(part))
     kinds = [part for part in parts if part is not NoneType and get_origin(part) is not Literal]

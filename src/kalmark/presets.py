@@ -47,120 +47,84 @@ class Preset:
     sources: Mapping[str, str]
 
 
-LASER = Preset(
-    RangeBearing(
-        sigma_range_m=math.sqrt(9.0036e-4),
-        sigma_bearing_rad=math.sqrt(6.7143e-4),
-        range_min_m=0.02,
-        range_max_m=5.6,
-        fov_rad=math.radians(239.77),
-    ),
-    rate_hz=10.0,
-    dropouts=0.41,
-    sources={
-        "sigma_range_m": f"{WOODS}: published variance r_var = 9.0036e-4",
-        "sigma_bearing_rad": f"{WOODS}: published variance b_var = 6.7143e-4",
-        "range_min_m": f"{HOKUYO}, 8.12: DMIN 20 mm of the URG-04LX",
-        "range_max_m": f"{HOKUYO}, 8.12: DMAX 5600 mm of the URG-04LX",
-        "fov_rad": f"{HOKUYO}, Table 2: detection range 239.77 deg of the URG-04LX",
-        "rate_hz": f"{HOKUYO}, 8.12: SCAN 600 rpm of the URG-04LX",
-        "dropouts": f"{WOODS}: of those in view, by the true poses, 41 % were not seen",
-    },
+def _preset(sensor: Any, /, **documented: tuple[float, str]) -> Preset:
+    """Return a preset of a sensor's class by its parameters, rate and dropouts, each with its source."""
+    numbers = {name: value for name, (value, _) in documented.items()}
+    rate_hz, dropouts = numbers.pop("rate_hz"), numbers.pop("dropouts")
+    return Preset(sensor(**numbers), rate_hz, dropouts, {name: source for name, (_, source) in documented.items()})
+
+
+LASER = _preset(
+    RangeBearing,
+    sigma_range_m=(math.sqrt(9.0036e-4), f"{WOODS}: published variance r_var = 9.0036e-4"),
+    sigma_bearing_rad=(math.sqrt(6.7143e-4), f"{WOODS}: published variance b_var = 6.7143e-4"),
+    range_min_m=(0.02, f"{HOKUYO}, 8.12: DMIN 20 mm of the URG-04LX"),
+    range_max_m=(5.6, f"{HOKUYO}, 8.12: DMAX 5600 mm of the URG-04LX"),
+    fov_rad=(math.radians(239.77), f"{HOKUYO}, Table 2: detection range 239.77 deg of the URG-04LX"),
+    rate_hz=(10.0, f"{HOKUYO}, 8.12: SCAN 600 rpm of the URG-04LX"),
+    dropouts=(0.41, f"{WOODS}: of those in view, by the true poses, 41 % were not seen"),
 )
 """A small laser range finder: range and bearing."""
 
-SONAR = Preset(
-    RangeBearing(
-        sigma_range_m=0.04,
-        sigma_bearing_rad=math.radians(55.0) / math.sqrt(12.0),
-        range_min_m=0.03,
-        range_max_m=6.0,
-        fov_rad=math.radians(55.0),
-    ),
-    rate_hz=346.0 / (2 * 6.0),
-    dropouts=0.41,
-    sources={
-        "sigma_range_m": f"{FAQ}: 'We quote 3-4cm'",
-        "sigma_bearing_rad": f"{FAQ}: lobe of the SRF08 55 deg at -6 dB; the echo may come from anywhere in it",
-        "range_min_m": SRF08,
-        "range_max_m": SRF08,
-        "fov_rad": f"{FAQ}: lobe of the SRF08 55 deg at -6 dB",
-        "rate_hz": f"{FAQ}: speed of sound 346 m/s, there and back over the 6 m of {SRF08}; the least it can wait",
-        "dropouts": "assumption: as often as the laser",
-    },
+LOBE = f"{FAQ}: lobe of the SRF08 55 deg at -6 dB"
+SPEED = f"{FAQ}: speed of sound 346 m/s, there and back over the 6 m of {SRF08}; the least it can wait"
+SONAR = _preset(
+    RangeBearing,
+    sigma_range_m=(0.04, f"{FAQ}: 'We quote 3-4cm'"),
+    sigma_bearing_rad=(math.radians(55.0) / math.sqrt(12.0), f"{LOBE}; the echo may come from anywhere in it"),
+    range_min_m=(0.03, SRF08),
+    range_max_m=(6.0, SRF08),
+    fov_rad=(math.radians(55.0), LOBE),
+    rate_hz=(346.0 / (2 * 6.0), SPEED),
+    dropouts=(0.41, "assumption: as often as the laser"),
 )
 """An ultrasonic ranger: good ranges, poor bearings."""
 
-CAMERA = Preset(
-    Bearing(sigma_bearing_rad=math.tan(math.radians(45.0)) / 424.0, fov_rad=math.radians(90.0)),
-    rate_hz=90.0,
-    dropouts=0.17,
-    sources={
-        "sigma_bearing_rad": f"{PIXEL}, of 848 over 90 deg ({D435}): focal length 424 px",
-        "fov_rad": f"{D435}: about 90 x 58 deg",
-        "rate_hz": f"{D435}: 90 fps at 848 x 480",
-        "dropouts": f"{STARRY}: of the markers in the image, by the true poses, 17 % were not seen",
-    },
+CAMERA = _preset(
+    Bearing,
+    sigma_bearing_rad=(
+        math.tan(math.radians(45.0)) / 424.0,
+        f"{PIXEL}, of 848 over 90 deg ({D435}): focal length 424 px",
+    ),
+    fov_rad=(math.radians(90.0), f"{D435}: about 90 x 58 deg"),
+    rate_hz=(90.0, f"{D435}: 90 fps at 848 x 480"),
+    dropouts=(0.17, f"{STARRY}: of the markers in the image, by the true poses, 17 % were not seen"),
 )
 """A camera, used in the plane: bearings alone."""
 
-RGBD = Preset(
-    RangeBearing(
-        sigma_range_m=0.04,
-        sigma_bearing_rad=2 * math.tan(math.radians(57.0 / 2)) / 640.0,
-        fov_rad=math.radians(57.0),
-    ),
-    rate_hz=30.0,
-    dropouts=0.17,
-    sources={
-        "sigma_range_m": f"{KINECT}: a few millimetres up to about 4 cm at the maximum range; the most is taken",
-        "sigma_bearing_rad": f"{PIXEL}, of 640 over 57 deg ({FOV})",
-        "fov_rad": FOV,
-        "rate_hz": f"{KINECT}: up to 30 fps",
-        "dropouts": "assumption: as often as the camera",
-    },
+RGBD = _preset(
+    RangeBearing,
+    sigma_range_m=(0.04, f"{KINECT}: a few millimetres up to about 4 cm at the maximum range; the most is taken"),
+    sigma_bearing_rad=(2 * math.tan(math.radians(57.0 / 2)) / 640.0, f"{PIXEL}, of 640 over 57 deg ({FOV})"),
+    fov_rad=(math.radians(57.0), FOV),
+    rate_hz=(30.0, f"{KINECT}: up to 30 fps"),
+    dropouts=(0.17, "assumption: as often as the camera"),
 )
 """A depth camera (Kinect), used in the plane: range and bearing.  The source does not give its maximum range."""
 
-ARVA = Preset(
-    Range(
-        sigma_range_m=0.0,
-        sigma_range_rel=math.hypot(0.074, 0.066),
-        range_max_m=40.0,
-        sigma_scale=math.log(2.23 / 0.5) / 3 / math.sqrt(12.0),
-    ),
-    rate_hz=1.0,
-    dropouts=2 / 9,
-    sources={
-        "sigma_range_m": "none beside the part that grows with the range",
-        "sigma_range_rel": f"7.4 % by the unknown orientation ({DIPOLE}), 6.6 % by the scatter of {BOUNCE}",
-        "range_max_m": f"{RAGNI}, 2.1: roughly the maximum distance at which a beacon receives the signal",
-        "sigma_scale": f"{BEACON}: 0.5 to 2.23 uA/m at 10 m; its cube root, uniform in the logarithm",
-        "rate_hz": f"{BEACON}: period 1000 +- 300 ms",
-        "dropouts": f"2 of the 9 {BOUNCE}, are blank",
-    },
+SPREAD = f"7.4 % by the unknown orientation ({DIPOLE}), 6.6 % by the scatter of {BOUNCE}"
+BEACONS = f"{BEACON}: 0.5 to 2.23 uA/m at 10 m; its cube root, uniform in the logarithm"
+ARVA = _preset(
+    Range,
+    sigma_range_m=(0.0, "none beside the part that grows with the range"),
+    sigma_range_rel=(math.hypot(0.074, 0.066), SPREAD),
+    range_max_m=(40.0, f"{RAGNI}, 2.1: roughly the maximum distance at which a beacon receives the signal"),
+    sigma_scale=(math.log(2.23 / 0.5) / 3 / math.sqrt(12.0), BEACONS),
+    rate_hz=(1.0, f"{BEACON}: period 1000 +- 300 ms"),
+    dropouts=(2 / 9, f"2 of the 9 {BOUNCE}, are blank"),
 )
 """An avalanche transceiver: ranges by field strength, true but for a factor, the strength of the beacons."""
 
-RFID = Preset(
-    RangeBearing(
-        sigma_range_m=0.0,
-        sigma_range_rel=0.15 * math.sqrt(math.pi / 2),
-        sigma_bearing_rad=math.radians(3.3),
-        range_max_m=6.0,
-        fov_rad=math.pi,
-    ),
-    rate_hz=1.0,
-    dropouts=0.34,
-    sources={
-        "sigma_range_m": "none beside the part that grows with the range",
-        "sigma_range_rel": f"{BACKSCATTER}: mean errors below 15 % in typical fading, as a Gaussian's sigma",
-        "sigma_bearing_rad": f"{ARRIVAL}: 3.3 deg rms with two antennas in line of sight",
-        "range_max_m": f"{TAGS}: the detection range is approximately 6 m",
-        "fov_rad": "two antennas half a wavelength apart tell directions from -90 to 90 deg",
-        "rate_hz": "assumption: one inventory a second",
-        "dropouts": f"{MULTI_TAG}: detection probability can be as low as 66 %",
-    },
+FADING = f"{BACKSCATTER}: mean errors below 15 % in typical fading, as a Gaussian's sigma"
+RFID = _preset(
+    RangeBearing,
+    sigma_range_m=(0.0, "none beside the part that grows with the range"),
+    sigma_range_rel=(0.15 * math.sqrt(math.pi / 2), FADING),
+    sigma_bearing_rad=(math.radians(3.3), f"{ARRIVAL}: 3.3 deg rms with two antennas in line of sight"),
+    range_max_m=(6.0, f"{TAGS}: the detection range is approximately 6 m"),
+    fov_rad=(math.pi, "two antennas half a wavelength apart tell directions from -90 to 90 deg"),
+    rate_hz=(1.0, "assumption: one inventory a second"),
+    dropouts=(0.34, f"{MULTI_TAG}: detection probability can be as low as 66 %"),
 )
 """A reader of passive UHF tags with two antennas: poor ranges, fair bearings."""
 

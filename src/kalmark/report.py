@@ -131,12 +131,8 @@ class Report:
 
     def blank(self, p: int) -> None:
         """Enter that nothing was predicted of any observation, whose innovations have p numbers."""
-        count = len(self.y)
-        self.e, self.z, self.Z = (
-            np.full(self.y.shape, np.nan),
-            np.full((count, p), np.nan),
-            np.full((count, p, p), np.nan),
-        )
+        shapes = self.y.shape, (len(self.y), p), (len(self.y), p, p)
+        self.e, self.z, self.Z = (np.full(shape, np.nan) for shape in shapes)
 
     def fill(self, rows: Sequence[int], done: Correction) -> None:
         """Enter what was predicted of the observations `rows`; the others stay as they are."""

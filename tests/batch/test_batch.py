@@ -25,7 +25,7 @@ from kalmark.logs import open_log
 from kalmark.logs.write import write_native
 from kalmark.results.batch import batch_entry, compare, given_by, solve_batch
 from kalmark.results.record import record
-from kalmark.results.run import Run, load_run
+from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 from results_world import circle, slam_for
 
@@ -305,7 +305,7 @@ def test_a_saved_run_finds_its_log_again(tmp_path: Path) -> None:
     log = open_log(tmp_path / "log")
     run = record(slam_for(circle()), log, progress=False)
     run.save(tmp_path / "run")
-    loaded = load_run(tmp_path / "run")
+    loaded = Run.load(tmp_path / "run")
     assert loaded.evaluate(batch=True)["batch"] == pytest.approx(compare(run, solve_batch(run, log)), rel=1e-6)
 
 

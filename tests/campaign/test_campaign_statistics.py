@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kalmark.campaign.campaign import Anees, figures
 from kalmark.campaign.scoring import SERIES, Scores, joint_nees
-from kalmark.campaign.statistics import Anees, figures
-from kalmark.results.consistency import anees_interval, nees
+from kalmark.results.measures import anees_interval, nees
 
 STEPS = 2000
 

@@ -13,7 +13,7 @@ from kalmark.errors import ModelError
 from kalmark.models.observe import PythonView, linearize, linearize_in_plane, sensor_address, sensor_at, view_of
 from kalmark.models.pointwise import jacobian
 from kalmark.results.calibration import mount_figures
-from kalmark.results.cameras import mounts
+from kalmark.results.readings import mounts
 
 AT = np.array([0.3, -0.2, 0.4])
 UNKNOWN = {"sigma_scale": 0.1, "sigma_bias_m": 0.3}

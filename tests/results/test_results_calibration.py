@@ -13,10 +13,10 @@ from kalmark.config import build_slam
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.frames3d import compose, move, plus, to_frame
 from kalmark.results.calibration import Direction, directions, mount_rows
-from kalmark.results.cameras import mounts
+from kalmark.results.readings import mounts
 from kalmark.results.record import record
 from kalmark.results.report import report_html
-from kalmark.results.run import Run, load_run
+from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 from results_space import FORWARD, MOUNT, NOISE, STEP_NS
 
@@ -81,7 +81,7 @@ def test_what_was_not_observed_is_warned_of_and_stands_in_every_report(planar: R
     page = report_html(planar)
     assert said in page
     assert "<td>z 1.00</td>" in page
-    loaded = load_run(planar.save(tmp_path / "run"))
+    loaded = Run.load(planar.save(tmp_path / "run"))
     assert loaded.evaluate()["mounts"] == summary["mounts"]
     saved = mounts(loaded.final_slam())[0]  # the prior is in map.kmk, too
     np.testing.assert_array_equal(saved.prior, PRIOR)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from kalmark.geometry import V, V_inverse
-from kalmark.results.consistency import (
+from kalmark.results.measures import (
     anees_interval,
     diverged,
     left_jacobian_inverse,
@@ -79,6 +79,6 @@ def test_a_run_has_diverged_only_if_far_in_sigmas_and_in_metres() -> None:
     P = np.broadcast_to(0.01 * np.eye(2), (2, 2, 2))
     d = np.array([[0.1, 0.0], [1.5, 0.0]])
     error = np.linalg.norm(d, axis=1)
-    assert diverged(d, P, error, path_m=20.0)
-    assert not diverged(d, P, error, path_m=100.0)
-    assert not diverged(d, 100 * P, error, path_m=20.0)
+    assert diverged(d, P, error, np.array([[0, 0], [20.0, 0]]))
+    assert not diverged(d, P, error, np.array([[0, 0], [100.0, 0]]))
+    assert not diverged(d, 100 * P, error, np.array([[0, 0], [20.0, 0]]))

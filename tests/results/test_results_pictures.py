@@ -15,17 +15,16 @@ import pytest
 from matplotlib.image import imread
 
 from kalmark.association import ByIdentity
-from kalmark.cli.tables import print_summary
+from kalmark.cli.shared import print_summary
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
-from kalmark.results.headline import headline
+from kalmark.results.evaluate import headline
 from kalmark.results.plot import LANDMARK_COLOUR, draw_map, save_map
 from kalmark.results.record import record
-from kalmark.results.report import report_html, show
+from kalmark.results.report import POINTS, reasons, report_html, series, show
 from kalmark.results.run import Run
 from kalmark.results.scene import Scene, contours, grouped, stretches_of
-from kalmark.results.series import POINTS, reasons, series
 from kalmark.results.words import BATCH, ROBOT, TOTALS, count, figure, header
 from results_world import circle, slam_for
 

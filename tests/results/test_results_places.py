@@ -11,7 +11,7 @@ import pytest
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
 from kalmark.results.plot import draw_map
 from kalmark.results.record import record
-from kalmark.results.run import load_run
+from kalmark.results.run import Run
 from results_world import circle, slam_for
 
 
@@ -66,7 +66,7 @@ def test_an_own_landmark_is_written_and_drawn_where_it_is(model: Any, mean: Any,
     rows = (tmp_path / "landmarks.csv").read_text().splitlines()
     assert rows[0].split(",")[:4] == ["id", "kind", "x_m", "y_m"]
     assert "z_m" not in rows[0]
-    loaded = load_run(tmp_path)
+    loaded = Run.load(tmp_path)
     np.testing.assert_array_equal(loaded.landmarks.means[k], run.landmarks.means[k])
     (axes,) = draw_map(loaded).axes
     assert np.isfinite(axes.get_xlim()).all()

@@ -16,9 +16,9 @@ from kalmark.events import Control, Fix, Scan
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
 from kalmark.logs import open_log, write_native
-from kalmark.results.files import replace_file
 from kalmark.results.record import record
-from kalmark.results.run import Run, load_run
+from kalmark.results.recording import replace_file
+from kalmark.results.run import Run
 from results_world import STEP_NS, circle, slam_for
 
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
@@ -194,7 +194,7 @@ def test_the_saved_configuration_is_one_that_can_be_read(run: Run, tmp_path: Pat
 
 def test_a_loaded_run_has_the_same_figures_and_can_be_saved_again(run: Run, tmp_path: Path) -> None:
     run.save(tmp_path / "one")
-    loaded = load_run(tmp_path / "one")
+    loaded = Run.load(tmp_path / "one")
     assert loaded.evaluate() == run.evaluate()
     assert loaded.final_slam().landmarks().ids == run.landmarks.ids
     loaded.save(tmp_path / "two")
@@ -204,14 +204,14 @@ def test_a_loaded_run_has_the_same_figures_and_can_be_saved_again(run: Run, tmp_
 
 def test_a_loaded_run_can_be_judged_by_other_truth(run: Run, tmp_path: Path) -> None:
     run.save(tmp_path)
-    loaded = load_run(tmp_path)
+    loaded = Run.load(tmp_path)
     assert loaded.with_truth(circle()).evaluate() == run.evaluate()
     assert "ate_m" not in loaded.with_truth(circle(truth=False)).evaluate()["robots"]["rover"]
 
 
 def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=r"summary\.json: no such file"):
-        load_run(tmp_path)
+        Run.load(tmp_path)
 
 
 def test_an_interrupted_save_leaves_no_summary_and_no_temporary_file(
@@ -222,7 +222,7 @@ def test_an_interrupted_save_leaves_no_summary_and_no_temporary_file(
     def interrupt(_: object) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kalmark.results.run.associations_csv", interrupt)
+    monkeypatch.setattr("kalmark.results.recording.associations_csv", interrupt)
     with pytest.raises(KeyboardInterrupt):
         run.save(tmp_path)
     assert not (tmp_path / "summary.json").exists()

@@ -14,11 +14,12 @@ from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import exp, left_jacobian_inverse, log, multiply
 from kalmark.geometry.spaces import RHO, VECTOR3, Space, retract
-from kalmark.results.consistency import pose_error, rotation_error, turned_back
+from kalmark.report import LandmarkTable
 from kalmark.results.evaluate import landmark_figures, line_figures
-from kalmark.results.files import tum
 from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.measures import pose_error, rotation_error, turned_back
 from kalmark.results.record import record
+from kalmark.results.recording import tum
 from kalmark.results.run import Run
 from kalmark.results.truth import ORIGIN, Truth, fitted
 from results_space import START, slam_for, spiral
@@ -127,7 +128,7 @@ class Line:
 
 def pretended(models: list[Any], means: list[Any], covariances: list[Any]) -> Any:
     """Return what looks like a filter with such landmarks."""
-    table = SimpleNamespace(
+    table = LandmarkTable(
         ids=list(range(len(models))),
         kinds=[model.kind for model in models],
         means=[np.array(mean) for mean in means],

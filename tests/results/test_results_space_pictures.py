@@ -16,14 +16,13 @@ import pytest
 import kalmark as km
 from kalmark.errors import RunError
 from kalmark.results.history import Camera
-from kalmark.results.images import images, trimmed
+from kalmark.results.landmarks import EUCLIDEANS, LINES, OTHERS, shapes
 from kalmark.results.plot import Projection, corners, draw_map, save_map, spacing
-from kalmark.results.plot_sensor import draw_sensor
+from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
 from kalmark.results.report import report_html
-from kalmark.results.run import Run, load_run
-from kalmark.results.scene import Scene, contours
-from kalmark.results.shapes import EUCLIDEANS, LINES, OTHERS, shapes
+from kalmark.results.run import Run
+from kalmark.results.scene import Scene, contours, images, trimmed
 from results_space import FORWARD, SIGMA, START, slam_for, spiral, with_camera
 
 WRONG = 13
@@ -62,9 +61,9 @@ def test_landmarks_are_sorted_by_what_is_drawn_of_them() -> None:
     covariances[:, :3, :3], covariances[1], covariances[2] = np.eye(3), 2 * np.eye(6), np.eye(6)
     drawn = shapes(means, covariances, ["point3", "pluecker_line", "tag", "inverse_depth"])
     assert drawn.group.tolist() == [EUCLIDEANS, LINES, EUCLIDEANS, OTHERS, LINES]
-    assert drawn.points.row.tolist() == [0, 1, 2, 3, 1]
-    assert drawn.points.means[4].tolist() == [4, 5, 6]
-    assert drawn.points.covariances[4].tolist() == (2 * np.eye(3)).tolist()
+    assert drawn.row.tolist() == [0, 1, 2, 3, 1]
+    assert drawn.means[4].tolist() == [4, 5, 6]
+    assert drawn.covariances[4].tolist() == (2 * np.eye(3)).tolist()
     assert (len(drawn.lines), len(drawn.tags)) == (1, 1)
 
 
@@ -102,7 +101,7 @@ def test_a_point_at_great_depth_does_not_shrink_the_picture(run: Run) -> None:
     a, b = Scene.of(run), Scene.of(replace(run, landmarks=far))
     assert b.size < 1.2 * a.size
     assert (b.shapes.group == OTHERS).sum() == 1
-    assert np.isnan(b.inside(b.shapes.points.means[:1])).all()
+    assert np.isnan(b.inside(b.shapes.means[:1])).all()
 
 
 def test_the_grid_is_of_two_metres_or_of_round_numbers() -> None:
@@ -243,7 +242,7 @@ def test_the_page_turns_under_the_mouse_and_stays_turned_when_time_moves_on(run:
 def test_the_folder_of_a_run_in_space_comes_back_whole(run: Run, tmp_path: Path) -> None:
     run.save(tmp_path / "one")
     assert (tmp_path / "one" / "sensor_rover_eye.png").is_file()
-    loaded = load_run(tmp_path / "one")
+    loaded = Run.load(tmp_path / "one")
     assert loaded.evaluate() == run.evaluate()
     loaded.save(tmp_path / "two")
     for name in ("summary.json", "trajectory_rover.tum", "landmarks.csv", "associations.csv", "sensor_rover_eye.png"):
@@ -263,7 +262,7 @@ def test_a_run_in_space_without_scans_has_its_pictures(tmp_path: Path) -> None:
     events = [km.Control(t_s=0.0, robot="rover", u=np.zeros(6))]
     run = record(slam_for(spiral(steps=2)), events, progress=False)
     run.save(tmp_path)
-    assert load_run(tmp_path).history.in_space
+    assert Run.load(tmp_path).history.in_space
     assert page_data((tmp_path / "report.html").read_text())["maps"] == []
 
 

@@ -18,7 +18,7 @@ from kalmark.models.motion import Unicycle
 from kalmark.models.sensors import Bearing, RangeBearing
 from kalmark.results.record import record
 from kalmark.results.report import report_html
-from kalmark.results.run import load_run
+from kalmark.results.run import Run
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 from results_space import spiral
@@ -190,7 +190,7 @@ def test_advice_is_kept_with_a_run_and_shown_in_its_report(tmp_path: Path) -> No
     run = record(slam_for(log), replace(log, events=events), progress=False)
     run.save(tmp_path)
     assert "its sigma is stated" in only(run.summary["advice"])
-    assert load_run(tmp_path).evaluate()["advice"] == run.summary["advice"]
+    assert Run.load(tmp_path).evaluate()["advice"] == run.summary["advice"]
     assert '<ul class="warnings advice"><li>sensor lidar: ' in (tmp_path / "report.html").read_text()
 
 
@@ -212,7 +212,7 @@ def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(
     page = report_html(run)
     assert '<ul class="warnings"><li>the filter stopped: the innovation is &lt;absurd&gt;</li>' in page
     run.save(tmp_path)
-    assert load_run(tmp_path).evaluate()["warnings"] == run.summary["warnings"]
+    assert Run.load(tmp_path).evaluate()["warnings"] == run.summary["warnings"]
 
 
 def test_warnings_and_fixes_outlive_saving(tmp_path: Path) -> None:
@@ -220,10 +220,10 @@ def test_warnings_and_fixes_outlive_saving(tmp_path: Path) -> None:
     log = replace(log, events=fixed(log, (11.0, 2.0)))
     run = record(slam_for(log), log, progress=False)
     run.save(tmp_path)
-    loaded = load_run(tmp_path)
+    loaded = Run.load(tmp_path)
     assert run.summary["warnings"]
     assert loaded.evaluate() == run.evaluate()
-    assert len(loaded.history.inputs.fixes) == 10
+    assert len(loaded.history.fixes) == 10
 
 
 def test_a_diverged_run_is_not_to_be_used() -> None:

@@ -1,41 +1,180 @@
 """`Replay`: a parametric bootstrap of a log.  The same route, the same sightings, all noise drawn anew from the models.
 
-The map that the filter makes of the log is the truth now.  A robot follows the log's path *by its own motion*: it
-takes, for each control of the log, one near it that leads to where the robot was at the end of the interval; its filter
-is told that one with noise.  Each scan sees the landmarks that it saw in the log, from the true pose.
+The log goes through its filter twice: once as it is, for the map and the association; then on that map, known, so that
+the path fits the map at every time and does not jump where a loop closes.  That map is the truth now.  A robot follows
+the path *by its own motion*: it takes, for each control of the log, one near it that leads to where the robot was at
+the end of the interval; its filter is told that one with noise.  Each scan sees the landmarks that it saw in the log,
+from the true pose.
 
 The true control depends on where the robot truly is, its error does not: that is all that a filter assumes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-import numpy.typing as npt
 from numpy.random import Generator, SeedSequence
 
-from kalmark.campaign.recorded import Look, Recorded, Steer, recorded
-from kalmark.config.building import build_robot, config_dict
+from kalmark.config.building import build_robot, build_slam, config_dict
+from kalmark.config.choices import section_of
 from kalmark.config.mounting import StartConfig
 from kalmark.config.opening import described
 from kalmark.config.schema import Config
 from kalmark.config.tree import name_on
-from kalmark.events import Control, Event, Fix, Id
+from kalmark.errors import DivergedError, EventError, KalmarkError
+from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
 from kalmark.models.protocols import bias_covariance
-from kalmark.results.files import config_yaml
+from kalmark.report import Report
+from kalmark.results.history import Array
+from kalmark.results.landmarks import MapLandmarks, refuse_other_than_points
+from kalmark.results.progress import track
+from kalmark.results.recording import config_yaml
+from kalmark.results.warnings import NO_ID
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
 from kalmark.slam.motion import HeldInput, Part
 from kalmark.slam.robot import Robot
-
-Array = npt.NDArray[np.float64]
+from kalmark.slam.slam import Slam
 
 BACK_S, BACK_M, BACK_RAD = 2.0, 0.5, 0.3  # the path is met again in so long a time, or on so long a way; not steeper
+LEAST = np.diag(np.square([1e-3, 1e-3, 1e-3]))  # m, m, rad: no path is followed nearer than that
+
+
+class Steer(NamedTuple):
+    """A control of the log, where the robot was `dt_s` later, (3,), and how sure that is, (3, 3)."""
+
+    event: Control
+    dt_s: float = 0.0
+    goal: Array = np.zeros(3)
+    cov: Array = LEAST
+
+
+class Look(NamedTuple):
+    """A scan of the log: rows of it, and the landmark of the map or the robot that each of these was of."""
+
+    event: Scan
+    rows: tuple[int, ...]
+    real: tuple[Id, ...]
+
+    @property
+    def cov(self) -> Array | None:
+        """The covariances (K, m, m) that came with the log, if any did."""
+        cov = self.event.cov
+        return cov if cov is None else np.broadcast_to(cov, (len(self.event.y), *cov.shape[-2:]))[list(self.rows)]
+
+    def scan(self, y: Array, ids: Any, keep: Any = slice(None)) -> Scan:
+        """Return a scan at the same time with other measurements y (K, m) and ids of the rows `keep`."""
+        e, cov = self.event, self.cov
+        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=y, ids=ids, cov=None if cov is None else cov[keep])
+
+
+class Recorded(NamedTuple):
+    """What there is to replay, in the order of the log, and the landmarks: (2,) m, or (3,) with a signature."""
+
+    events: list[Steer | Look | Fix]
+    landmarks: dict[Id, Array]
+
+
+def recorded(config: Config, log: Log, progress: bool = True) -> Recorded:
+    """Return what a log holds for a replay.  Raises KalmarkError where the filter gives up, or nothing was seen."""
+    slam = build_slam(config, log)
+    bar = track(log.events, f"{log.name}, the map", len(log.events), show=progress)
+    reports = [report for event in bar if (report := _processed(slam, event, config)) is not None]
+    refuse_other_than_points(slam, f"{log.name}, to be replayed")
+    found = MapLandmarks.of(slam)
+    landmarks = {i: p for i, p in zip(found.ids, found.means, strict=True) if np.isfinite(p).all()}
+    sizes = {len(p) for p in landmarks.values()}
+    if len(sizes) > 1:
+        raise KalmarkError(f"{log.name}: got points with and without a signature, expected one kind to replay")
+    events = _recognised(reports, landmarks, (*slam.robots,) if sizes == {2} else ())
+    if not any(isinstance(event, Look) for event in events):
+        nameless = any(o.reason == NO_ID for report in reports for o in report.observations)
+        hint = "; without ids try --set association.type=auto" if nameless else ""
+        raise KalmarkError(f"{log.name}: no observation is of a landmark of the map, expected some to replay{hint}")
+    slam = build_slam(_on_known_map(config), log)
+    for name, mean in landmarks.items():
+        slam.add_landmark(name, mean)
+    again = track(events, f"{log.name}, the path", len(events), show=progress)
+    return Recorded(_followed(slam, again, config), landmarks)
+
+
+def _processed(slam: Slam, event: Event, config: Config) -> Report | None:
+    """Process an event; None for a bad one that the configuration leaves out."""
+    try:
+        return slam.process(event)
+    except EventError:
+        if config.log.on_error == "raise":
+            raise
+        return None
+    except DivergedError as error:
+        raise KalmarkError(f"campaign: {error}, expected a filter that gets through its own log") from None
+
+
+def _recognised(reports: list[Report], landmarks: dict[Id, Array], robots: tuple[str, ...]) -> list[Event | Look]:
+    """Return the events with scans as looks at the landmarks of the final map; each is looked at once in a scan."""
+    merged: dict[Id, Id] = {}
+    for report in reversed(reports):
+        for gone, into, _ in report.merged:
+            merged[gone] = merged.get(into, into)
+    events: list[Event | Look] = []
+    for report in reports:
+        if not isinstance(report.event, Scan):
+            events.append(report.event)
+            continue
+        rows: dict[Id, int] = {}
+        for o in report.observations:
+            name: Any = o.id if o.landmark is None else merged.get(o.landmark, o.landmark)
+            if o.outcome != "rejected" and name != report.robot and (name in landmarks or name in robots):
+                rows.setdefault(name, o.index)
+        if rows:
+            events.append(Look(report.event, tuple(rows.values()), tuple(rows)))
+    return events
+
+
+def _on_known_map(config: Config) -> Config:
+    """Return the configuration with the association given, and every landmark kept as it is."""
+    own = {"association": None, "upkeep": None, "attention": None}
+    robots = {
+        name: robot.model_copy(
+            update={"sensors": {key: sensor.model_copy(update=own) for key, sensor in robot.sensors.items()}}
+        )
+        for name, robot in config.robots.items()
+    }
+    trusted = section_of("association", "identity").model_validate({"gate": "off"})
+    given = {"association": trusted, "upkeep": section_of("upkeep", "upkeep")()}
+    return config.model_copy(update={"robots": robots, **given})
+
+
+def _followed(slam: Slam, events: Iterable[Event | Look], config: Config) -> list[Steer | Look | Fix]:
+    """Return the events, each control with the pose at the end of its interval."""
+    followed: list[Steer | Look | Fix] = []
+    acting: dict[str, tuple[int, Steer]] = {}  # by robot: which control is in force, or was the last increment
+    for event in events:
+        raw = event.scan(event.event.y[list(event.rows)], event.real) if isinstance(event, Look) else event
+        if _processed(slam, raw, config) is None:
+            continue
+        if not isinstance(event, Control):
+            followed.append(cast("Look | Fix", event))
+            continue
+        name = event.robot
+        at, before = acting.get(name, (0, None))
+        P = slam.covariance(name)
+        xy = 0.5 * (P[0, 0] + P[1, 1])  # alike in all directions: a robot beside its path may turn towards it
+        end = slam.mean(name), np.diag([xy, xy, P[2, 2]]) + LEAST
+        dt_s = 0.0 if before is None else (event.t_ns - before.event.t_ns) * 1e-9
+        held = slam.robots[name].motion.held
+        if held and before is not None:
+            followed[at] = Steer(before.event, dt_s, *end)
+        steer = Steer(event) if held else Steer(event, dt_s, *end)
+        acting[name] = len(followed), steer
+        followed.append(steer)
+    return followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,17 +262,15 @@ class _Replaying:
 
     def __init__(self, replay: Replay, chance: Chance) -> None:
         self.replay, self.chance = replay, chance
-        self.robots = {name: self._driven(build_robot(replay.settings, name)) for name in replay.robots}
+        self.robots: dict[str, _Driven] = {}
+        for name in replay.robots:
+            robot = build_robot(replay.settings, name)
+            motion, cov, start = robot.motion, bias_covariance(robot.motion), drawn_start(robot, chance.route)
+            bias = 0.0 if cov is None else gaussian(cov, chance.route)
+            sensors = {key: drawn_mount(mount, chance.mounts) for key, mount in robot.sensors.items()}
+            self.robots[name] = _Driven(motion, start, bias, sensors, HeldInput(motion))
         self.events: list[Event] = []
         self.origins: dict[Key, tuple[Id | None, ...]] = {}
-
-    def _driven(self, robot: Robot) -> _Driven:
-        motion, cov = robot.motion, bias_covariance(robot.motion)
-        start = drawn_start(robot, self.chance.route)
-        sensors = {key: drawn_mount(mount, self.chance.mounts) for key, mount in robot.sensors.items()}
-        return _Driven(
-            motion, start, 0.0 if cov is None else gaussian(cov, self.chance.route), sensors, HeldInput(motion)
-        )
 
     def simulation(self) -> Simulation:
         """Return the log of all events, and what it does not tell: states as they are after each scan."""

@@ -86,18 +86,10 @@ def run_campaign(
     configs = configs_of(world, estimators)
     plan = Plan(world, configs, seed, map_every)
     results = list(track(results_of(plan, runs, jobs, backend), f"campaign {world.name}", runs, show=progress))
-    return Campaign(
-        world=world.name,
-        description=world.to_yaml(),
-        seed=seed,
-        runs=runs,
-        map_every=map_every,
-        robots=tuple(world.robots),
-        t_s=tuple(t * 1e-9 for t in world.times()),
-        scores={name: tuple(result[name] for result in results) for name in configs},
-        skip=skip,
-        kind="world" if isinstance(world, World) else "config",
-    )
+    scores = {name: tuple(result[name] for result in results) for name in configs}
+    robots, t_s = tuple(world.robots), tuple(t * 1e-9 for t in world.times())
+    kind = "world" if isinstance(world, World) else "config"
+    return Campaign(world.name, world.to_yaml(), seed, runs, map_every, robots, t_s, scores, skip, kind)
 
 
 def open_scene(

@@ -1,34 +1,139 @@
 """Score one estimator on one simulated log: its errors and NEES at every step, its map, its divergence.
 
-The error coordinates are those of `kalmark.campaign.errors`: the estimator's own and the world's.
+The error d of an estimate x is what the estimator would have to correct it by: in "log" coordinates its retraction
+(`kalmark.geometry.spaces.retract`) by the error `turn` of the observing robot's orientation gives the truth, in "world"
+coordinates plain plus does.  A landmark is judged by what of it has a truth, whatever its state in the map is:
+
+=======  ====================================================================  ===
+point    its Euclidean position                                                2|3
+line     across itself, where the true ends are: along it, nothing is known    4
+tag      its pose                                                              6
+=======  ====================================================================  ===
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from scipy.linalg import block_diag
 
-from kalmark.campaign import errors
-from kalmark.campaign.errors import Judged
 from kalmark.errors import DivergedError
 from kalmark.events import Id, Scan
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import conjugate, exp, log, multiply
+from kalmark.models.landmarks import Polar2D
+from kalmark.models.protocols import Pointed, Segmented, place_of
 from kalmark.report import Report
-from kalmark.results.align import rigid, rmse
-from kalmark.results.consistency import SINGULAR, diverged, nees, pose_error
+from kalmark.results.history import Array
+from kalmark.results.measures import SINGULAR, diverged, nees, point_error, pose_error, rigid, rmse, rotation_error
 from kalmark.simulate.robots import Simulation
 from kalmark.slam.slam import Slam
 
-Array = npt.NDArray[np.float64]
-
+FAR = 3.0  # a point of unknown depth is judged once its depth exceeds so many of its sigmas
+NO_POINTS = np.empty((0, 0))
 NEES = ("pose", "heading", "state", "landmarks", "joint", "mount")
 SERIES = (
     *NEES, "pose_world", "landmarks_world", "joint_world", *(f"{name}_dof" for name in NEES),
     "position_m", "heading_rad", "mount_m", "mount_rad",
 )  # fmt: skip
+
+
+class Judged(NamedTuple):
+    """A block's error d (f,) in own and in world coordinates, and its Jacobian F (f, dof) in the block's error.
+
+    `place` (k, 2|3) and `truth` (k, 2|3) are the points of it to align maps by.
+    """
+
+    own: Array
+    world: Array
+    F: Array
+    place: Array = NO_POINTS
+    truth: Array = NO_POINTS
+
+
+def state_error(mean: Array, truth: Array, turn: Any, coordinates: str) -> Array:
+    """Return the error of a robot's state: pose (3,) or (7,), or pose, velocity and body rate (13,)."""
+    if len(mean) == 3:
+        return np.append(point_error(mean[:2], truth[:2], turn, coordinates), wrap(truth[2] - mean[2]))
+    parts = [point_error(mean[:3], truth[:3], turn, coordinates), orientation_error(mean, truth, turn, coordinates)]
+    if len(mean) == 13:
+        parts += [point_error(mean[7:10], truth[7:10], turn, coordinates), truth[10:] - mean[10:]]
+    return np.concatenate(parts)
+
+
+def orientation_error(mean: Array, truth: Array, turn: Array, coordinates: str) -> Array:
+    """Return the error (3,) of a pose's orientation: after the turn about the observing robot's, what is its own."""
+    if coordinates == "world":
+        return rotation_error(mean[3:7], truth[3:7])
+    back = conjugate(exp(np.ascontiguousarray(turn)))
+    own: Array = log(multiply(back, multiply(truth[3:7].copy(), conjugate(mean[3:7].copy()))))
+    return own + turn
+
+
+def robot_turn(mean: Array, truth: Array) -> Any:
+    """Return the error of a robot's orientation: of its heading, or a rotation vector (3,)."""
+    return wrap(truth[2] - mean[2]) if len(mean) == 3 else rotation_error(mean[3:7], truth[3:7])
+
+
+def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array) -> Judged | None:
+    """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
+    if len(truth) == 6:
+        return _line(model, mean, P, truth, turn, coordinates, eye) if isinstance(model, Segmented) else None
+    if len(truth) == 7:
+        if len(mean) != 7:
+            return None
+        own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
+        return Judged(own, world, np.eye(6), mean[None, :3], truth[None, :3])
+    point, F = _position(model, mean, len(truth))
+    if isinstance(model, Pointed) and len(mean) > len(truth) and not _is_known(point, F @ P @ F.T, eye):
+        return None
+    own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
+    if isinstance(model, Polar2D):  # its Gaussian is on an arc: so is its error
+        return Judged(_unrolled(mean, own), _unrolled(mean, world), F, point[None], truth[None])
+    return Judged(own, world, F, point[None], truth[None])
+
+
+def _unrolled(l: Array, error: Array) -> Array:
+    """Return the error (2,) of a polar point l (4,) with its way along the arc about the anchor unrolled."""
+    u, d = np.array([np.cos(l[2]), np.sin(l[2])]), l[3]
+    n, w = np.array([-u[1], u[0]]), d * u + error
+    return d * np.arctan2(w @ n, w @ u) * n + (np.linalg.norm(w) - d) * u
+
+
+def _is_known(point: Array, P: Array, eye: Array) -> bool:
+    """Return whether all sigmas of a point (d,), covariance P (d, d), are below a third of its distance."""
+    return bool(np.isfinite(P).all() and FAR**2 * np.linalg.norm(P, 2) < np.sum((point - eye) ** 2))
+
+
+def _position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
+    """Return the Euclidean position (d,) of a landmark's state, and its Jacobian (d, dof)."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        found = place_of(model, mean[None])
+    if found is None or found[0].shape[1] != d:
+        return mean[:d], np.eye(d, len(mean))
+    return found[0][0], found[1][0]
+
+
+def _line(model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array) -> Judged | None:
+    """Judge a line by how far it passes, in two directions across it, from the two true ends (6,): four numbers."""
+    l = mean[None]
+    base, _ = model.endpoints(l, np.array([[0.0, 1.0]]))
+    a, along = base[0, 0], base[0, 1] - base[0, 0]
+    ends = truth.reshape(2, 3)
+    t = (ends - a) @ along / (along @ along)
+    q, Q_l = model.endpoints(l, t[None])
+    across = np.linalg.svd(along[None])[2][1:]  # (2, 3): at right angles to the line
+    to_eye = np.eye(3) - np.outer(along, along) / (along @ along)
+    if not all(
+        _is_known(to_eye @ q[0, i], to_eye @ Q_l[0, i] @ P @ Q_l[0, i].T @ to_eye, to_eye @ eye) for i in (0, 1)
+    ):
+        return None
+    own, world = (point_error(q[0], ends, turn, c) @ across.T for c in (coordinates, "world"))
+    F = (across @ Q_l[0]).reshape(4, -1)
+    return Judged(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +142,7 @@ class Scores:
 
     `series` has an array (robots, steps) for each of `SERIES`: NEES of the pose (3, in space 6), the heading or
     orientation (1, 3), the whole state if it has velocities (12), landmarks (the mean over the map), joint state, and
-    the robot's uncertain mounts (the mean), each with its degrees of freedom `..._dof`; then errors.  NaN where there
+    the robot's uncertain mounts (the mean), each with its degrees of freedom `..._dof`; then   NaN where there
     is nothing to say.
     """
 
@@ -49,10 +154,6 @@ class Scores:
     nis_dof: int
     diverged: bool
     stopped: str
-
-    def same(self, other: Scores) -> bool:
-        """Tell whether two scores are equal bit for bit."""
-        return all(self.series[k].tobytes() == other.series[k].tobytes() for k in SERIES)
 
 
 def score(slam: Slam, simulated: Simulation, steps: Sequence[int], map_every: int = 10) -> Scores:
@@ -111,8 +212,8 @@ class _Scorer:
         mean, P, dof = self.slam.mean(scan.robot), self.slam.covariance(scan.robot), self.P.shape[-1]
         self.mean[row, k], self.P[row, k] = mean[: self.mean.shape[-1]], P[:dof, :dof]
         if len(mean) > self.mean.shape[-1]:
-            turn = errors.robot_turn(mean, self._state(scan.robot, k))
-            d = errors.state_error(mean, self._state(scan.robot, k), turn, self.slam.estimator.coordinates)
+            turn = robot_turn(mean, self._state(scan.robot, k))
+            d = state_error(mean, self._state(scan.robot, k), turn, self.slam.estimator.coordinates)
             self.series["state"][row, k], self.series["state_dof"][row, k] = nees(d, P), len(d)
         if (k + 1) % self.map_every == 0 or k == self.last:
             self._score_map(scan.robot, row, k)
@@ -127,28 +228,30 @@ class _Scorer:
         Robots that lag behind are left out of the joint state: their truth of that time is not known.
         """
         slam, coordinates = self.slam, self.slam.estimator.coordinates
-        turn = errors.robot_turn(slam.mean(robot), self._state(robot, k))
+        turn = robot_turn(slam.mean(robot), self._state(robot, k))
         judged: dict[Id, Judged] = {}
         here = [name for name in self.rows if name != robot and not slam.lags(name)]
         for name in (robot, *here):
             mean = slam.mean(name)
             dof = slam.robots[name].motion.space.dof
-            judged[name] = errors.robot(mean, self._state(name, k), turn, coordinates, dof)
-        mounts: dict[Id, Judged] = {
-            name: errors.mount(slam.mean(name)[: len(truth)], truth) for name, (_, truth) in self.uncertain.items()
-        }
-        landmarks: dict[Id, Judged] = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
+            own, world = (state_error(mean, self._state(name, k), turn, c) for c in (coordinates, "world"))
+            judged[name] = Judged(own, world, np.eye(dof))
+        mounts: dict[Id, Judged] = {}  # rotations of the world frame do not change them
+        for name, (_, truth) in self.uncertain.items():
+            d = pose_error(slam.mean(name)[: len(truth)], truth)
+            mounts[name] = Judged(d, d, np.eye(len(d)))
+        landmarks = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
         self._score_landmarks(landmarks, row, k)
         self._score_mounts({n: mounts[n] for n, (carrier, _) in self.uncertain.items() if carrier == robot}, row, k)
         judged |= mounts | landmarks
-        F = block_diagonal([j.F for j in judged.values()])
+        F = block_diag(*(j.F for j in judged.values()))
         P = F @ slam.covariance(*judged) @ F.T
         d = np.array([np.concatenate([getattr(j, c) for j in judged.values()]) for c in ("own", "world")])
         series = self.series
         series["joint"][row, k], series["joint_world"][row, k] = joint_nees(d, P)
         series["joint_dof"][row, k] = len(P) if np.isfinite(series["joint"][row, k]) else np.nan
 
-    def _landmarks(self, turn: Any, eye: Array) -> Any:
+    def _landmarks(self, turn: Any, eye: Array) -> Iterator[tuple[Id, Judged]]:
         """Yield the landmarks that have a truth, and whose depth is known well enough."""
         slam = self.slam
         for name, true in self.true_id.items():
@@ -156,7 +259,7 @@ class _Scorer:
             if true in self.log.landmarks and model is not None:
                 mean, P = slam.mean(name), slam.covariance(name)
                 truth = self.log.landmarks[true]
-                if (j := errors.landmark(model, mean, P, truth, turn, slam.estimator.coordinates, eye)) is not None:
+                if (j := landmark(model, mean, P, truth, turn, slam.estimator.coordinates, eye)) is not None:
                     yield name, j
 
     def _score_landmarks(self, landmarks: dict[Id, Judged], row: int, k: int) -> None:
@@ -176,14 +279,13 @@ class _Scorer:
     def _score_mounts(self, mounts: dict[str, Judged], row: int, k: int) -> None:
         if not mounts:
             return
-        dof = len(next(iter(mounts.values())).own)
-        value = [nees(j.own, self.slam.covariance(name)[:dof, :dof]) for name, j in mounts.items()]
+        d, series = np.array([j.own for j in mounts.values()]), self.series
+        dof = d.shape[1]
+        value = nees(d, np.array([self.slam.covariance(name)[:dof, :dof] for name in mounts]))
         if np.isfinite(value).any():
-            self.series["mount"][row, k] = np.nanmean(value)
-            self.series["mount_dof"][row, k] = len(next(iter(mounts.values())).own)
-        d = [j.own for j in mounts.values()]
-        self.series["mount_m"][row, k] = max(np.linalg.norm(e[: self.d]) for e in d)
-        self.series["mount_rad"][row, k] = max(np.linalg.norm(e[self.d :]) for e in d)
+            series["mount"][row, k], series["mount_dof"][row, k] = np.nanmean(value), dof
+        series["mount_m"][row, k] = np.linalg.norm(d[:, : self.d], axis=1).max()
+        series["mount_rad"][row, k] = np.linalg.norm(d[:, self.d :], axis=1).max()
 
     def scores(self, stopped: str) -> Scores:
         """Return the scores."""
@@ -194,33 +296,15 @@ class _Scorer:
         for name, size in (("pose", own.shape[-1]), ("heading", own.shape[-1] - d)):
             s[f"{name}_dof"] = np.where(np.isfinite(s[name]), float(size), np.nan)
         s["position_m"], s["heading_rad"] = (np.linalg.norm(e, axis=-1) for e in (world[..., :d], world[..., d:]))
-        aligned, raw, count = self._final_map()
-        lost = any(
-            diverged(own[i, :, :d], self.P[i, :, :d, :d], s["position_m"][i], path_m(self.truth[i], d))
-            for i in range(len(self.rows))
-        )
-        return Scores(s, aligned, raw, count, self.nis, self.nis_dof, lost or bool(stopped), stopped)
-
-    def _final_map(self) -> tuple[float, float, int]:
         robot = self.log.robots[0]
         mean = self.slam.mean(robot)
-        judged = [j for _, j in self._landmarks(errors.robot_turn(mean, self._state(robot, self.last)), mean[: self.d])]
-        place, true = (np.concatenate([np.empty((0, self.d)), *(j[i] for j in judged)]) for i in (3, 4))
-        aligned = rmse(rigid(place, true)(place) - true) if len(judged) >= self.d else float("nan")
-        return aligned, rmse(place - true), sum(true is not None for true in self.true_id.values())
-
-
-def path_m(poses: Array, d: int) -> float:
-    """Return the length of a path of true poses (N, 3|7), whose first d numbers are the position."""
-    return float(np.linalg.norm(np.diff(poses[:, :d], axis=0), axis=1).sum())
-
-
-def block_diagonal(blocks: Sequence[Array]) -> Array:
-    """Return the blocks (f, dof) along the diagonal of one matrix."""
-    from scipy.linalg import block_diag
-
-    F: Array = block_diag(*blocks)
-    return F
+        judged = [j for _, j in self._landmarks(robot_turn(mean, self._state(robot, self.last)), mean[:d])]
+        place, true = (np.concatenate([np.empty((0, d)), *(j[i] for j in judged)]) for i in (3, 4))
+        aligned = rmse(rigid(place, true)(place) - true) if len(judged) >= d else float("nan")
+        count = sum(true is not None for true in self.true_id.values())
+        parts = zip(own[..., :d], self.P[..., :d, :d], s["position_m"], self.truth[..., :d], strict=True)
+        lost = any(diverged(e, P, error_m, truth) for e, P, error_m, truth in parts)
+        return Scores(s, aligned, rmse(place - true), count, self.nis, self.nis_dof, lost or bool(stopped), stopped)
 
 
 def joint_nees(d: Array, P: Array) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points, version
 from typing import Annotated
 
@@ -11,20 +11,29 @@ import typer
 
 from kalmark.cli.campaign import campaign
 from kalmark.cli.check import check
-from kalmark.cli.coming import COMING, coming
-from kalmark.cli.config import config
-from kalmark.cli.convert import convert
-from kalmark.cli.data import data
-from kalmark.cli.demo import demo
-from kalmark.cli.evaluate import evaluate
-from kalmark.cli.explain import explain
-from kalmark.cli.report import report
-from kalmark.cli.run import run
-from kalmark.cli.simulate import simulate
+from kalmark.cli.folders import evaluate, explain, report
+from kalmark.cli.logs import config, convert, data, simulate
+from kalmark.cli.run import demo, run
 from kalmark.errors import KalmarkError
 
+COMING = {  # verbs that are not there yet: not in the help, but they say so when they are called
+    "view": "replay a run interactively",
+    "diagnose": "say whether the filter is consistent on a log, and if not why",
+    "tune": "fit the noise of a configuration",
+    "live": "take events as JSON lines, give estimates",
+}
 USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
 INTERRUPTED = 130
+
+
+def coming(name: str, what: str) -> Callable[..., None]:
+    """Return the command that says it is not available yet."""
+
+    def command(arguments: Annotated[list[str] | None, typer.Argument(hidden=True)] = None) -> None:
+        raise KalmarkError(f"{name} is not available yet ({what})")
+
+    return command
+
 
 app = typer.Typer(
     name="kalmark",

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.options import Overrides, announce_compilation_elsewhere, computing, writable
-from kalmark.cli.tables import number, print_table
+from kalmark.cli.shared import Overrides, announce_compilation_elsewhere, computing, number, print_table, writable
 
 if TYPE_CHECKING:
     from kalmark.campaign import Campaign
@@ -77,14 +76,9 @@ def print_campaign(campaign: Campaign) -> None:
     for key, label in FIGURES:
         if any(figures.get(key) is not None for figures in estimators.values()):
             name = key.removesuffix("_anees")
-            words = (campaign.label(name), band(campaign, name)) if name in NEES else (label, "")
+            band = campaign.band(name) if name in NEES else None
+            words = (campaign.label(name) if name in NEES else label, "{:.2f} to {:.2f}".format(*band) if band else "")
             unit = "%" if key.endswith("_inside") else ""
             rows.append((*words, *(number(figures.get(key), unit) for figures in estimators.values())))
     title = f"{campaign.world}: {campaign.runs} runs, seed {campaign.seed}; ANEES (in brackets: of a consistent filter)"
     print_table(title, ("", "95 % band, one step", *estimators), rows, align="<>" + ">" * len(estimators))
-
-
-def band(campaign: Campaign, name: str) -> str:
-    """Return the band of an ANEES of so many runs at one step as text, "" if there is none."""
-    ends = campaign.band(name)
-    return f"{ends[0]:.2f} to {ends[1]:.2f}" if ends else ""

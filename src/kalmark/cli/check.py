@@ -5,39 +5,30 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from kalmark.cli.tables import print_table
+from kalmark.cli.shared import print_table
 from kalmark.errors import KalmarkError, ModelError
-
-if TYPE_CHECKING:
-    from kalmark.models.check import Finding
-
-
-def check_named(name: str) -> list[Finding]:
-    """Return what was found about the model ``module:Class``, ``file.py:Class`` or ``module:object``."""
-    import numpy as np
-
-    from kalmark.declare import line_of
-    from kalmark.models.check import check_model
-
-    model = _model(name)
-    try:
-        return check_model(model, np.random.default_rng(0))
-    except ModelError as error:
-        raise ModelError(f"{name}: {error}") from None
-    except Exception as error:
-        raise ModelError(f"{name}: raised {type(error).__name__}: {error}{line_of(error)}") from None
 
 
 def check(
     model: Annotated[str, typer.Argument(metavar="module:Class", help="Also file.py:Class, an object or a function.")],
 ) -> None:
     """Check a model of your own: shapes, and Jacobians against differences."""
-    findings = check_named(model)
+    import numpy as np
+
+    from kalmark.declare import line_of
+    from kalmark.models.check import check_model
+
+    found = _model(model)
+    try:
+        findings = check_model(found, np.random.default_rng(0))
+    except ModelError as error:
+        raise ModelError(f"{model}: {error}") from None
+    except Exception as error:
+        raise ModelError(f"{model}: raised {type(error).__name__}: {error}{line_of(error)}") from None
     rows = [(f.what, f"{f.error:.1e}", "" if f.ok else f"wrong at {f.where}") for f in findings]
     print_table(model, ("check", "difference", ""), rows, align="<><")
     wrong = [f for f in findings if not f.ok]
@@ -47,10 +38,20 @@ def check(
 
 
 def _model(name: str) -> Any:
+    from kalmark.declare import line_of, load_plugin
+
     place, _, attribute = name.partition(":")
     if not place or not attribute:
         raise KalmarkError(f"{name}: expected module:Class or file.py:Class")
-    module = _module(place, name)
+    if place.endswith(".py"):
+        module = load_plugin(Path(place))
+    else:
+        try:
+            sys.path.insert(0, str(Path.cwd()))
+            module = import_module(place)
+        except Exception as error:
+            what = f"{type(error).__name__}: {error}{line_of(error)}"
+            raise KalmarkError(f"{name}: {place} cannot be imported: {what}") from None
     if attribute not in vars(module):
         raise KalmarkError(f"{name}: {place} has no {attribute}, expected a class, an object or a function")
     model = vars(module)[attribute]
@@ -60,16 +61,3 @@ def _model(name: str) -> Any:
         return model()
     except TypeError as error:
         raise KalmarkError(f"{name}: {error}; expected a model whose every parameter has a default") from None
-
-
-def _module(place: str, name: str) -> ModuleType:
-    from kalmark.declare import line_of, load_plugin
-
-    if place.endswith(".py"):
-        return load_plugin(Path(place))
-    try:
-        sys.path.insert(0, str(Path.cwd()))
-        return import_module(place)
-    except Exception as error:
-        what = f"{type(error).__name__}: {error}{line_of(error)}"
-        raise KalmarkError(f"{name}: {place} cannot be imported: {what}") from None

@@ -1,16 +1,16 @@
-"""`kalmark run`: one log through one filter."""
+"""`kalmark run`: one log through one filter.  `kalmark demo`: Sola's cloister, simulated and solved."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.options import Overrides, computing, writable
-from kalmark.cli.tables import print_summary
+from kalmark.cli.shared import Overrides, computing, print_summary, writable
+from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -64,24 +64,16 @@ def run(
         result = run_log(config, log, overrides=overrides or (), on_error=on_error.value if on_error else None)
         summary = result.evaluate()
         if batch or (batch is None and summary.get("corner_rms_px") is not None):
-            summary = against_batch(result, summary, needed=bool(batch))
+            try:
+                summary = result.evaluate(batch=True)
+            except KalmarkError as error:
+                if batch:
+                    raise
+                typer.echo(f"warning: no batch solution: {error}", err=True)
         result.save(out)
     finish(result, out, name_on(name_of(Path(config), "config"), result.log.name))
     if summary.get("stopped"):
         raise typer.Exit(2)
-
-
-def against_batch(result: Run, summary: dict[str, Any], needed: bool) -> dict[str, Any]:
-    """Return the summary with the batch solution in it, or say why there is none unless that is needed."""
-    from kalmark.errors import KalmarkError
-
-    try:
-        return result.evaluate(batch=True)
-    except KalmarkError as error:
-        if needed:
-            raise
-        typer.echo(f"warning: no batch solution: {error}", err=True)
-        return summary
 
 
 def finish(result: Run, out: Path, title: str) -> None:
@@ -96,3 +88,21 @@ def finish(result: Run, out: Path, title: str) -> None:
         if len(result.skipped) > SHOWN:
             typer.echo("  ...")
     typer.echo(f"{out}: map.png, report.html and the rest of the run")
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="The run folder to write.")] = Path("out/demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulation.")] = 1,
+) -> None:
+    """Simulate Sola's cloister, map it, and write a run folder with the picture."""
+    from kalmark.config import build_slam, config_dict
+    from kalmark.results.record import record
+    from kalmark.simulate import load_world, simulate
+
+    writable(out)
+    with computing():
+        world = load_world("cloister")
+        log, config = simulate(world, seed), world.config().model_copy(update={"seed": seed})
+        result = record(build_slam(config, log), log, config=config_dict(config))
+        result.save(out)
+    finish(result, out, f"Sola's cloister, seed {seed}")

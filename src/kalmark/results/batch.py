@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kalmark.batch.data import Associations, Given, Known, replayed
 from kalmark.batch.problem import Problem
@@ -22,16 +21,14 @@ from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.models.landmarks import Point2D, Point3D, Tag
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
-from kalmark.results.align import rigid, rmse
-from kalmark.results.history import as_id
+from kalmark.results.history import Array, as_id
 from kalmark.results.landmarks import refuse_other_than_points
+from kalmark.results.measures import rigid, rmse
 from kalmark.results.progress import track
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.results.recording import Recording
-
-Array = npt.NDArray[np.float64]
 
 
 def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
@@ -67,10 +64,9 @@ def solve_batch(
 
 def given_by(run: Recording, known: Known | None = None) -> Given:
     """Return what the batch solution needs of a run: of the observations exactly those that the filter used."""
-    if run.fixes_rejected:
-        raise KalmarkError(
-            f"batch solution: the filter rejected {run.fixes_rejected} fixes, expected a run that used all"
-        )
+    rejected = sum(not fix.used for fix in run.history.fixes)
+    if rejected:
+        raise KalmarkError(f"batch solution: the filter rejected {rejected} fixes, expected a run that used all")
     history, slam = run.history, run.final_slam()
     refuse_other_than_points(slam, "batch solution")
     robots = slam.robots
@@ -101,7 +97,7 @@ def given_by(run: Recording, known: Known | None = None) -> Given:
         landmarks=landmarks,
         known=beforehand,
         starts={start.robot: (start.mean, start.covariance) for start in history.starts},
-        fixes=run.fixes,
+        fixes=len(run.history.fixes),
     )
 
 
@@ -204,14 +200,14 @@ def _log_of(run: Recording) -> Iterable[Event]:
     from kalmark.config.opening import open_config_log
     from kalmark.config.schema import Config
 
+    what = "batch solution: the run"
     if run.log.path is None:
-        raise KalmarkError("batch solution: the run does not say which log it was made from, expected the log itself")
+        raise KalmarkError(f"{what} does not say which log it was made from, expected the log itself")
     run.run_plugins()
     try:
         config = Config.model_validate({"log": run.config.get("log", {})})
     except ValueError as error:
-        what = "the run's configuration does not say how to read its log"
-        raise KalmarkError(f"batch solution: {what}: {error}") from None
+        raise KalmarkError(f"{what}'s configuration does not say how to read its log: {error}") from None
     return open_config_log(config, run.log.path)
 
 

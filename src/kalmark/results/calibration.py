@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.results.columns import Array
-from kalmark.results.describe import describe_pose
-from kalmark.results.history import Biased, Mounted
+from kalmark.results.history import Array, Biased, Mounted
+from kalmark.results.readings import describe_pose
 from kalmark.results.words import figure
 
 AXES = {3: ("x", "y", "theta"), 5: ("x", "y", "theta", "gain", "offset"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
@@ -23,6 +22,7 @@ UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m", "gain": ""}  # of the othe
 UNOBSERVED = 0.9  # of its prior sigma: so much is left of a direction that counts as not observed
 SINGULAR = 1e-12  # eigenvalues of a prior's correlations that are zero
 NAMED = 0.01  # the least share of an axis in a direction that is named
+MOUNT_COLUMNS = ("mount", "direction", "sigma before", "after", "ratio (1: not observed)")
 
 
 class Direction(NamedTuple):
@@ -60,19 +60,14 @@ def directions(prior: Array, posterior: Array) -> list[Direction]:
     inverse[values > SINGULAR] = values[values > SINGULAR] ** -0.5
     root = (vectors * inverse) @ vectors.T
     ratios, axes = np.linalg.eigh(root @ P @ root)
-    return [
-        _direction(names, sigma, axis, math.sqrt(max(ratio, 0.0)))
-        for ratio, axis in zip(ratios[::-1], axes.T[::-1], strict=True)
-    ]
-
-
-def _direction(names: list[str], sigma: Array, axis: Array, ratio: float) -> Direction:
-    """Return a direction by the squares of its unit vector (n,), the largest first, the smallest left out."""
-    order = np.argsort(-(axis**2), kind="stable").tolist()
-    shares = {names[i]: float(axis[i] ** 2) for i in order if axis[i] ** 2 >= NAMED}
-    unit = UNITS.get(names[order[0]], "deg")
-    before = float(np.degrees(sigma[order[0]]) if unit == "deg" else sigma[order[0]])
-    return Direction(shares, ratio * before, before, unit)
+    found = []
+    for ratio, shares in zip(ratios[::-1].tolist(), axes.T[::-1] ** 2, strict=True):
+        order = np.argsort(-shares, kind="stable").tolist()
+        first, named = order[0], {names[i]: float(shares[i]) for i in order if shares[i] >= NAMED}
+        unit = UNITS.get(names[first], "deg")
+        before = float(np.degrees(sigma[first]) if unit == "deg" else sigma[first])
+        found.append(Direction(named, math.sqrt(max(ratio, 0.0)) * before, before, unit))
+    return found
 
 
 def mount_figures(mount: Mounted) -> dict[str, Any]:
@@ -108,34 +103,29 @@ def _range_figures(parameters: Array, P: Array) -> dict[str, float]:
     return {"scale": 1.0 / gain, "bias_m": offset / gain, "sigma_scale": sigma[0], "sigma_bias_m": sigma[1]}
 
 
-def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
-    """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
-    return [
-        (name, row["direction"], *(_sigma(row[key], row["unit"]) for key in ("prior_sigma", "sigma")),
-         f"{row['ratio']:.3f}")
-        for name, figures in summary.get("mounts", {}).items()
-        for row in figures.get("directions", ())
-    ]  # fmt: skip
-
-
-MOUNT_COLUMNS = ("mount", "direction", "sigma before", "after", "ratio (1: not observed)")
-
-
-def mount_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Return a line for every direction of a mount that was not observed."""
+def _found(summary: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str, str]]:
+    """Yield every direction of every mount in a summary, and its sigmas before and after as people read them."""
     for name, figures in summary.get("mounts", {}).items():
         for row in figures.get("directions", ()):
-            if row["ratio"] > UNOBSERVED:
-                after, before = (_sigma(row[key], row["unit"]) for key in ("sigma", "prior_sigma"))
-                axis = row["direction"].split()[0]
-                yield f"mount {name}: its {axis} ({row['direction']}) was not observed: sigma {after} of {before}"
+            yield name, row, _sigma(row["prior_sigma"], row["unit"]), _sigma(row["sigma"], row["unit"])
+
+
+def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
+    return [(name, row["direction"], *sigmas, f"{row['ratio']:.3f}") for name, row, *sigmas in _found(summary)]
+
+
+def mount_warnings(_: Any, summary: Mapping[str, Any]) -> Iterator[str]:
+    """Return a line for every direction of a mount that was not observed."""
+    for name, row, before, after in _found(summary):
+        if row["ratio"] > UNOBSERVED:
+            axis = row["direction"].split()[0]
+            yield f"mount {name}: its {axis} ({row['direction']}) was not observed: sigma {after} of {before}"
 
 
 def _sigma(value: float, unit: str) -> str:
     """Return a sigma as people read it: 5 cm, 1.2 mm, 0.06 deg."""
     if unit != "m":
         return f"{figure(value)} {unit}".rstrip()
-    for scale, name in ((1.0, "m"), (1e-2, "cm")):
-        if value >= scale:
-            return f"{figure(value / scale)} {name}"
-    return f"{figure(value * 1e3)} mm"
+    scale, name = (1.0, "m") if value >= 1.0 else (1e-2, "cm") if value >= 1e-2 else (1e-3, "mm")
+    return f"{figure(value / scale)} {name}"

@@ -10,20 +10,15 @@ import numpy as np
 
 from kalmark.logs.source import records_of
 from kalmark.report import OUTCOMES
-from kalmark.results.advice import advice
-from kalmark.results.align import identity, rigid, rigid_robust, rmse
-from kalmark.results.by_position import by_position, no_ids
 from kalmark.results.calibration import bias_figures, mount_figures
-from kalmark.results.columns import Array, Ints
-from kalmark.results.consistency import diverged, nees, nis, pose_error
-from kalmark.results.history import History
-from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.history import Array, History, Ints
+from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
+from kalmark.results.matching import association_figures, best_known, by_position, no_ids
+from kalmark.results.measures import Rigid, diverged, identity, nees, nis, path_m, pose_error, rigid, rigid_robust, rmse
 from kalmark.results.recording import Recording
-from kalmark.results.scoring import association_figures, best_known
-from kalmark.results.shapes import EUCLIDEAN, LINE
-from kalmark.results.truth import Fixes, Truth, fitted
-from kalmark.results.warnings import fix_nis_per_dof, warnings
-from kalmark.results.windows import window_figures
+from kalmark.results.truth import Truth, fitted
+from kalmark.results.warnings import POSE_NEES, advice, fix_nis_per_dof, warnings, window_figures
+from kalmark.results.words import count, figure
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0
@@ -35,16 +30,17 @@ def evaluate(run: Recording) -> dict[str, Any]:
     history = run.history
     robots = {name: robot_figures(run, name) for name in history.robots}
     step_us = history.step_us[1:][np.isfinite(history.step_us[1:])]
+    controls, fixes = sum(c.number for c in history.controls.values()), history.fixes
     summary: dict[str, Any] = {
         "log": run.log.as_dict(),
         "estimator": run.estimator,
         "coordinates": run.coordinates,
         "frame": run.truth.frame if run.truth else None,
-        "events": run.controls + len(history.t_ns) + run.fixes,
-        "controls": run.controls,
+        "events": controls + len(history.t_ns) + len(fixes),
+        "controls": controls,
         "scans": len(history.t_ns),
-        "fixes": run.fixes,
-        "fixes_rejected": run.fixes_rejected,
+        "fixes": len(fixes),
+        "fixes_rejected": sum(not fix.used for fix in fixes),
         "observations": len(history.step),
         **{name: int(np.sum(history.outcome == name)) for name in OUTCOMES},
         "landmarks": len(run.landmarks),
@@ -57,8 +53,8 @@ def evaluate(run: Recording) -> dict[str, Any]:
         "diverged": bool(run.stopped) or any(figures.get("diverged", False) for figures in robots.values()),
     }
     summary |= window_figures(history)
-    if run.fixes:
-        summary["fix_nis_per_dof"] = fix_nis_per_dof(history.inputs.fixes)
+    if fixes:
+        summary["fix_nis_per_dof"] = fix_nis_per_dof(fixes)
     if run.stopped:
         summary["stopped"] = run.stopped
     summary["robots"] = robots
@@ -88,6 +84,40 @@ def summary_of(run: Recording) -> dict[str, Any]:
     return run.summary or evaluate(run)
 
 
+def headline(run: Recording) -> tuple[str, list[str]]:
+    """Return the title of a run and its key figures, a few words each."""
+    summary = summary_of(run)
+    name = run.log.name or "run"
+    title = f"{name} · {run.estimator}" if run.estimator else name
+    parts = [count(summary["landmarks"], "landmark"), count(summary["scans"], "scan")]
+    errors = [figures for figures in summary["robots"].values() if figures.get("ate_m") is not None]
+
+    def mean_of(key: str) -> float:
+        return _mean(np.array([f[key] for f in errors if f[key] is not None]))
+
+    if errors:
+        parts.append(f"position {figure(mean_of('ate_raw_m'))} m ({figure(mean_of('ate_m'))} m aligned)")
+        turn = "orientation" if run.history.in_space else "heading"
+        parts.append(f"{turn} {figure(mean_of('heading_rmse_deg'), 2)}°")
+    if summary.get("landmark_rmse_m") is not None:
+        raw, aligned = figure(summary["landmark_rmse_raw_m"]), figure(summary["landmark_rmse_m"])
+        how = ", matched by position" if "landmarks_matched" in summary else ""
+        parts.append(f"landmarks {raw} m ({aligned} m aligned{how})")
+    if summary.get("corner_rms_px") is not None:
+        batch = f" (batch {figure(summary['batch']['rms_px'])} px)" if "batch" in summary else ""
+        parts.append(f"corners {figure(summary['corner_rms_px'])} px{batch}")
+    if summary.get("fix_median_m") is not None:
+        parts.append(f"fixes: median {summary['fix_median_m']:.2f} m, {summary['fix_within_10m']:.1%} within 10 m")
+    if any(figures.get("pose_nees") is not None for figures in errors):
+        usual = f"consistent: {summary['pose_dof']}, one run up to {POSE_NEES[summary['pose_dof']]:g}"
+        parts.append(f"pose NEES {figure(mean_of('pose_nees'))} ({usual})")
+    if summary["nis_per_dof"] is not None:
+        parts.append(f"NIS/dof {summary['nis_per_dof']:.2f}")
+    if summary["diverged"]:
+        parts.append("DIVERGED")
+    return title, parts
+
+
 def robot_figures(run: Recording, name: str) -> dict[str, Any]:
     """Return the figures of one robot: against its truth if there is one, else against position fixes."""
     mine = run.history.robot == name
@@ -110,17 +140,15 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
     d = 3 if mean.shape[1] == 7 else 2
     world = pose_error(mean, truth, "world")
     own = pose_error(mean, truth, coordinates)
-    path_m = float(np.linalg.norm(np.diff(truth[:, :d], axis=0), axis=1).sum())
     error_m = np.linalg.norm(world[:, :d], axis=1)
-    values, values_world = nees(own, P), nees(world, P)
     return {
         "ate_m": rmse(rigid(mean[:, :d], truth[:, :d])(mean[:, :d]) - truth[:, :d]),
         "ate_raw_m": rmse(world[:, :d]),
         "heading_rmse_deg": float(np.degrees(rmse(world[:, d:]))),
-        "pose_nees": _mean(values),
-        "pose_nees_world": _mean(values_world),
-        "path_m": path_m,
-        "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, path_m),
+        "pose_nees": _mean(nees(own, P)),
+        "pose_nees_world": _mean(nees(world, P)),
+        "path_m": path_m(truth[:, :d]),
+        "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, truth[:, :d]),
     }
 
 
@@ -203,25 +231,26 @@ def path_at(history: History, robot: str, t_ns: Ints, max_gap_s: float = FIX_GAP
     return out
 
 
-def antenna_path(history: History, robot: str, fixes: Fixes) -> tuple[Array, Array]:
-    """Return where a robot's antenna was by its estimated path at the time of each fix, and its offset from the robot.
+def aligned_fixes(run: Recording, robot: str) -> tuple[Rigid, Array, Array, Array]:
+    """Return the robust alignment (`rigid_robust`) of the path to a robot's fixes, with what it aligns, all (N, 2).
 
-    Both (N, 2) in the frame of the map, NaN where the path is not known.
+    That is: where the antenna was by the estimated path at the time of each fix, its offset from the robot, both in the
+    frame of the map, and the fix.
     """
-    poses = path_at(history, robot, fixes.t_ns)
+    fixes = run.truth.fixes[robot]
+    poses = path_at(run.history, robot, fixes.t_ns)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = fixes.antenna
     offset = np.column_stack([c * x - s * y, s * x + c * y])
-    return poses[:, :2] + offset, offset
+    antenna = poses[:, :2] + offset
+    known = np.isfinite(antenna).all(axis=1) & np.isfinite(fixes.xy).all(axis=1)
+    antenna, offset, xy = antenna[known], offset[known], fixes.xy[known]
+    return rigid_robust(antenna, xy) if len(xy) > 1 else identity(), antenna, offset, xy
 
 
 def fix_distances(run: Recording, robot: str) -> Array:
-    """Return the distances of the fixes from the path that is aligned to them robustly (`rigid_robust`)."""
-    fixes = run.truth.fixes[robot]
-    antenna, _ = antenna_path(run.history, robot, fixes)
-    known = np.isfinite(antenna).all(axis=1) & np.isfinite(fixes.xy).all(axis=1)
-    antenna, xy = antenna[known], fixes.xy[known]
-    to_fixes = rigid_robust(antenna, xy) if len(xy) > 1 else identity()
+    """Return the distances of the fixes from the path that is aligned to them robustly."""
+    to_fixes, antenna, _, xy = aligned_fixes(run, robot)
     return np.linalg.norm(to_fixes(antenna) - xy, axis=1)
 
 

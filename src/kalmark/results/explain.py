@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kalmark.errors import RunError
+from kalmark.events import seconds as short
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import FullSensor, finds_depth
-from kalmark.results.cameras import mount_now
-from kalmark.results.columns import Array, Ints
-from kalmark.results.decisions import Change
-from kalmark.results.files import seconds
-from kalmark.results.history import History
-from kalmark.results.recording import Recording
-from kalmark.results.shapes import LINE
+from kalmark.report import Candidate
+from kalmark.results.history import Array, Change, History, Ints
+from kalmark.results.landmarks import LINE
+from kalmark.results.readings import mount_now
+from kalmark.results.recording import Recording, seconds
 from kalmark.results.truth import as_rigid
 from kalmark.results.words import count, figure
 
@@ -32,15 +31,6 @@ FARTHEST = 100.0  # d2 of the nearest that is not drawn either
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """A landmark that an observation was compared with, and where it was in the map."""
-
-    landmark: str
-    d2: float
-    place: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Fate:
     """One observation: where it seemed to come from (d,), what became of it and why, what it was compared with."""
 
@@ -51,10 +41,10 @@ class Fate:
     d2: float
     reason: str
     seen_at: Array
-    compared: tuple[Compared, ...]
+    compared: tuple[Candidate, ...]
 
     @property
-    def near(self) -> list[Compared]:
+    def near(self) -> list[Candidate]:
         """What to draw of what it was compared with: what it may be of, the landmark decided on, and the nearest."""
         least = min((other.d2 for other in self.compared if other.d2 <= FARTHEST), default=0.0)
         return [c for c in self.compared if c.d2 <= max(FAR, least) or c.landmark == self.landmark]
@@ -64,12 +54,13 @@ class Fate:
 class Explanation:
     """One scan of a run: its step, time since the first scan, the robot, the gates on d2, all that was decided.
 
-    `asked` says how the time asked for was taken, where one was.
+    `in_log` is the time of the log in s, by which the scan is found again; `asked` says how the time asked for was
+    taken, where one was.
     """
 
     step: int
     t_s: float
-    log_t_s: str
+    in_log: str
     robot: str
     sensor: str
     pose: Array
@@ -78,11 +69,6 @@ class Explanation:
     fates: tuple[Fate, ...]
     changes: tuple[Change, ...]
     asked: str = ""
-
-    @property
-    def in_log(self) -> str:
-        """The time of the log in s, by which the scan is found again."""
-        return _short(self.log_t_s)
 
     def lines(self) -> Iterator[str]:
         """Tell it."""
@@ -96,22 +82,13 @@ class Explanation:
             near, far = self.gates
             yield f"paired where d2 is at most {near:.2f}, a new landmark where it is above {far:.2f} from all"
         for fate in self.fates:
-            yield self._line(fate)
+            name, known = f" {fate.landmark}" if fate.landmark else "", f" (id {fate.id})" if fate.id else ""
+            d2 = "" if math.isnan(fate.d2) else f", d2 {figure(fate.d2)}"
+            yield f"{fate.index:4d}{known}: {fate.outcome}{name}{d2}{': ' if fate.reason else ''}{fate.reason}"
             if fate.compared and [c.landmark for c in fate.compared] != [fate.landmark]:
                 yield "      compared with " + ", ".join(f"{c.landmark} (d2 {figure(c.d2)})" for c in fate.compared)
         for change in self.changes:
             yield f"{change.landmark} {change.what}: {change.reason}"
-
-    @staticmethod
-    def _line(fate: Fate) -> str:
-        name = f" {fate.landmark}" if fate.landmark else ""
-        known = f" (id {fate.id})" if fate.id else ""
-        d2 = "" if math.isnan(fate.d2) else f", d2 {figure(fate.d2)}"
-        return f"{fate.index:4d}{known}: {fate.outcome}{name}{d2}{': ' if fate.reason else ''}{fate.reason}"
-
-
-def _short(seconds_: str) -> str:
-    return seconds_.rstrip("0").rstrip(".") if "." in seconds_ else seconds_
 
 
 def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation:
@@ -126,14 +103,14 @@ def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation
     steps = np.arange(len(history.t_ns)) if robot is None else np.flatnonzero(history.robot == robot)
     if not len(steps):
         raise RunError("the run has no scan, expected one to explain")
-    begin, t = float(history.t_ns[0]) * 1e-9, (history.t_ns[steps] - history.t_ns[0]) * 1e-9
-    span = float((history.t_ns[-1] - history.t_ns[0]) * 1e-9)
+    begin, t = float(history.t_ns[0]) * 1e-9, history.t_s
+    span = float(t[-1])
     in_log = -AROUND_S <= t_s - begin <= span + AROUND_S
     since = t_s - begin if in_log else t_s
     if not -AROUND_S <= since <= span + AROUND_S:
         first, last = seconds(history.t_ns[0]), seconds(history.t_ns[-1])
         raise RunError(f"scan is {t_s:g} s, expected {first} to {last} s of the log, or 0 to {span:.3f} s since then")
-    told = with_known(run, explained(run, int(steps[np.argmin(np.abs(t - since))])))
+    told = with_known(run, explained(run, int(steps[np.argmin(np.abs(t[steps] - since))])))
     return replace(told, asked=f"{t_s:.12g} s {'in the log' if in_log else 'since the first scan'} was asked for")
 
 
@@ -143,7 +120,6 @@ def with_known(run: Recording, told: Explanation) -> Explanation:
     Both are seen from the pose after the scan: the way from one to the other is the innovation.  Nothing is added where
     the run has no map, or the sensor does not tell how far away it sees.
     """
-    rows = np.flatnonzero(run.history.step == told.step)
     open_ = [k for k, fate in enumerate(told.fates) if fate.id and not np.isfinite(fate.seen_at).all()]
     if not open_:
         return told
@@ -151,11 +127,14 @@ def with_known(run: Recording, told: Explanation) -> Explanation:
         slam = run.final_slam()
     except RunError:
         return told
+    rows = run.history.step == told.step
     places, expected = (_seen(slam, told, values[rows]) for values in (run.history.y, run.history.e))
     fates = list(told.fates)
     for k in open_:
         fate, there = fates[k], np.isfinite(expected[k]).all() and fates[k].landmark
-        compared = (Compared(fate.landmark, fate.d2, expected[k]),) if there and not math.isnan(fate.d2) else ()
+        compared = (
+            (Candidate(fate.index, fate.landmark, fate.d2, expected[k]),) if there and not math.isnan(fate.d2) else ()
+        )
         fates[k] = replace(fate, seen_at=places[k], compared=compared)
     return replace(told, fates=tuple(fates))
 
@@ -182,29 +161,21 @@ def explained(run: Recording, step: int) -> Explanation:
     history = run.history
     rows = np.flatnonzero(history.step == step)
     sensor = str(history.sensor[rows[0]]) if len(rows) else ""
-    return Explanation(
-        step=step,
-        t_s=float((history.t_ns[step] - history.t_ns[0]) * 1e-9),
-        log_t_s=seconds(history.t_ns[step]),
-        robot=str(history.robot[step]),
-        sensor=sensor,
-        pose=history.poses[step],
-        covariance=history.pose_covariances[step],
-        gates=_gates(run, str(history.robot[step]), sensor, rows),
-        fates=tuple(fate_of(history, int(row)) for row in rows),
-        changes=tuple(c for c in history.decisions.changes if c.step == step),
-    )
+    robot, changes = str(history.robot[step]), tuple(c for c in history.changes if c.step == step)
+    fates, gates = tuple(fate_of(history, int(row)) for row in rows), _gates(run, robot, sensor, rows)
+    pose, P, when = history.poses[step], history.pose_covariances[step], short(int(history.t_ns[step]))
+    return Explanation(step, float(history.t_s[step]), when, robot, sensor, pose, P, gates, fates, changes)
 
 
 def fate_of(history: History, row: int) -> Fate:
     """Return what became of an observation."""
-    told, d = history.decisions, 3 if history.in_space else 2
-    mine = np.flatnonzero(told.row == row)
-    mine = mine[np.argsort(told.d2[mine], kind="stable")]
-    compared = tuple(Compared(str(told.landmark[i]), float(told.d2[i]), told.place[i]) for i in mine)
-    seen_at = told.seen_at[row] if row < len(told.seen_at) else np.full(d, np.nan)
-    id_, outcome, landmark, reason = (str(getattr(history, k)[row]) for k in ("id", "outcome", "landmark", "reason"))
-    return Fate(int(history.index[row]), id_, outcome, landmark, float(history.d2[row]), reason, seen_at, compared)
+    index, names, d2 = int(history.index[row]), history.candidate_landmark, history.candidate_d2
+    mine = np.flatnonzero(history.candidate_row == row)
+    mine = mine[np.argsort(d2[mine], kind="stable")]
+    compared = tuple(Candidate(index, str(names[i]), float(d2[i]), history.candidate_place[i]) for i in mine)
+    id_, outcome, landmark, reason = (str(vars(history)[k][row]) for k in ("id", "outcome", "landmark", "reason"))
+    d2_, at = float(history.d2[row]), history.seen_at[row]
+    return Fate(index, id_, outcome, landmark, d2_, reason, at, compared)
 
 
 def _gates(run: Recording, robot: str, sensor: str, rows: Ints) -> tuple[float, float] | None:

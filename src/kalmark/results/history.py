@@ -1,35 +1,65 @@
 """What a run leaves behind: one row a step, one row an observation, and the map at some sixty instants.
 
-A *step* is one scan and the controls before it.  Plain arrays, saved as ``history.npz`` without pickle.
+A *step* is one scan and the controls before it.  Plain arrays, saved as ``history.npz`` without pickle; rows of few are
+named tuples, each field an array in the file, vectors and matrices of several sizes padded with NaN.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
+import numpy.typing as npt
 
 from kalmark.events import Id
-from kalmark.results.columns import (
-    Array,
-    Arrays,
-    Flags,
-    Ints,
-    Matrix,
-    Named,
-    Names,
-    Size,
-    Texts,
-    Vector,
-    columns,
-    padded,
-    padded_all,
-    rows_of,
-    texts,
-)
-from kalmark.results.decisions import Decisions
-from kalmark.results.inputs import Inputs
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Texts = npt.NDArray[np.str_]
+Flags = npt.NDArray[np.bool_]
+Arrays = dict[str, npt.NDArray[Any]]
+Named = Mapping[str, npt.NDArray[Any]]
+Vector = Annotated[Array, 1]
+Matrix = Annotated[Array, 2]
+Names = tuple[str, ...]
+Size = tuple[float, float]
+R = TypeVar("R", bound=tuple[Any, ...])
+
+TYPES: dict[Any, Any] = {int: np.int64, bool: np.bool_, float: np.float64, str: np.str_}
+
+
+class Controlled(NamedTuple):
+    """A robot's controls: how many, and the times (ns) of the first and the last."""
+
+    number: int
+    first_ns: int
+    last_ns: int
+
+
+class UsedFix(NamedTuple):
+    """A fix that the filter was given: y (d,), innovation z (d,) and its covariance Z (d, d), d = 2 or 3.
+
+    `used`: not rejected.
+    """
+
+    t_ns: int
+    robot: str
+    used: bool
+    y: Vector
+    z: Vector
+    Z: Matrix
+
+
+class Change(NamedTuple):
+    """What became of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now."""
+
+    step: int
+    landmark: str
+    what: str
+    into: str
+    reason: str
 
 
 class Start(NamedTuple):
@@ -45,7 +75,7 @@ class MapSnapshot(NamedTuple):
     """The landmarks of the map after step `step`: ids, places (K, n) and their covariances (K, q, q), kinds.
 
     In the plane places are positions.  In space they are positions, endpoints of lines or poses of tags, padded with
-    NaN (see `kalmark.results.shapes`).
+    NaN (see `kalmark.results.landmarks`).
     """
 
     step: int
@@ -53,7 +83,7 @@ class MapSnapshot(NamedTuple):
     ids: tuple[Id, ...]
     means: Array
     covariances: Array
-    kinds: tuple[str, ...] = ()
+    kinds: tuple[str, ...]
 
 
 class Camera(NamedTuple):
@@ -92,6 +122,18 @@ class Biased(NamedTuple):
     covariance: Matrix
 
 
+ROWS: dict[
+    str, tuple[str, Any, bool]
+] = {  # fields of a history: their prefix in the file, and whether texts are joined
+    "changes": ("change", Change, False),
+    "fixes": ("used_fix", UsedFix, False),
+    "starts": ("start", Start, False),
+    "cameras": ("camera", Camera, True),
+    "mounts": ("mount", Mounted, True),
+    "biases": ("bias", Biased, True),
+}
+
+
 @dataclass(frozen=True, eq=False)
 class History:
     """A run's steps (S of them) and observations (O of them).
@@ -100,10 +142,16 @@ class History:
     Observations: `step` is the row of the step, `id`, `landmark` and `true_id`, what the log knows and the filter may
     not, are texts ("" for none), `kind` is that of the landmark after the scan, `d2` is NaN where there is none;
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
-    NaN where robots or sensors differ in size.  `late` (O,) says which tentative ones
-    were fused when their landmark was confirmed.  `left_px` (O,) is what the corners of tags are off by after the scan
-    (`kalmark.results.corners`); `decisions` has what they were compared with.  `noise` (O, p) are the sigmas stated
-    of z, NaN where they are not of its numbers.
+    NaN where robots or sensors differ in size.  `late` (O,) says which tentative ones were fused when their landmark
+    was confirmed.  `left_px` (O,) is what the corners of tags are off by after the scan
+    (`kalmark.results.readings.left_px`).  `noise` (O, p) are the sigmas stated of z, NaN where they are not of its
+    numbers.  `seen_at` (O, d) is where each observation without an id seemed to come from before the scan, NaN where
+    its sensor does not tell.
+
+    Observations `candidate_row` (C,) were compared with landmarks, `candidate_landmark` (C,), of distance
+    `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks
+    `share_landmark` with weights `share_weight`.  `changes` is what became of landmarks, `fixes` are those used, in the
+    order they came, `controls` those of each robot that had any.
     """
 
     t_ns: Ints
@@ -123,29 +171,42 @@ class History:
     e: Array
     z: Array
     Z: Array
+    kind: Texts
+    left_px: Array
+    true_id: Texts
+    late: Flags
+    noise: Array
+    seen_at: Array
+    candidate_row: Ints
+    candidate_landmark: Texts
+    candidate_d2: Array
+    candidate_place: Array
+    share_row: Ints
+    share_landmark: Texts
+    share_weight: Array
     maps: tuple[MapSnapshot, ...] = ()
+    controls: dict[str, Controlled] = field(default_factory=dict)
+    changes: tuple[Change, ...] = ()
+    fixes: tuple[UsedFix, ...] = ()
     starts: tuple[Start, ...] = ()
-    inputs: Inputs = field(default_factory=Inputs)
-    kind: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
-    left_px: Array = field(default_factory=lambda: np.empty(0))
     cameras: tuple[Camera, ...] = ()
     mounts: tuple[Mounted, ...] = ()
     biases: tuple[Biased, ...] = ()
-    true_id: Texts = field(default_factory=lambda: np.empty(0, dtype=np.str_))
-    decisions: Decisions = field(default_factory=Decisions)
-    late: Flags = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
-    noise: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def fused(self) -> Flags:
         """Which observations (O,) have corrected or started what is in the map."""
-        late = self.late if len(self.late) else np.zeros(len(self.outcome), dtype=np.bool_)
-        return np.isin(self.outcome, ("associated", "new")) | late
+        return np.isin(self.outcome, ("associated", "new")) | self.late
 
     @property
     def in_space(self) -> bool:
         """Whether the robots move in space."""
         return self.mean.shape[1] > 3
+
+    @property
+    def d(self) -> int:
+        """The dimensions of the robots' world, 2 or 3."""
+        return 3 if self.in_space else 2
 
     @property
     def poses(self) -> Array:
@@ -158,79 +219,62 @@ class History:
         q = 6 if self.in_space else 3
         return self.covariance[:, :q, :q]
 
-    def map_at(self, step: int) -> MapSnapshot:
-        """Return the last map that was kept up to a step; before the first there is nothing in it."""
-        d = 3 if self.in_space else 2
-        nothing = MapSnapshot(step, 0, (), np.empty((0, d)), np.empty((0, d, d)))
-        return next((m for m in reversed(self.maps) if m.step <= step), nothing)
+    @property
+    def t_s(self) -> Array:
+        """The times (S,) of the steps in seconds since the first."""
+        return (self.t_ns - self.t_ns[:1].sum()) * 1e-9
 
     @property
     def robots(self) -> tuple[str, ...]:
         """The robots in the order of their starts, then of their first scans."""
         return tuple(dict.fromkeys([s.robot for s in self.starts] + self.robot.tolist()))
 
+    def map_at(self, step: int) -> MapSnapshot:
+        """Return the last map that was kept up to a step; before the first there is nothing in it."""
+        nothing = MapSnapshot(step, 0, (), np.empty((0, self.d)), np.empty((0, self.d, self.d)), ())
+        return next((m for m in reversed(self.maps) if m.step <= step), nothing)
+
     def arrays(self) -> Arrays:
         """Return everything as named arrays, those of the contract among them (t in seconds)."""
         named: Arrays = {"t": self.t_ns * 1e-9}
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        named |= {key: value for key, value in values.items() if isinstance(value, np.ndarray)}
-        named |= self.decisions.arrays() | self.inputs.arrays() | _map_arrays(self.maps)
-        named |= columns("start", Start, self.starts) | columns("camera", Camera, self.cameras, joined=True)
-        named |= columns("mount", Mounted, self.mounts, joined=True)
-        named |= columns("bias", Biased, self.biases, joined=True)
+        named |= {name: vars(self)[name] for name in _array_fields()}
+        blocks = [m.covariances for m in self.maps]
+        width = max((block.shape[1] for block in blocks), default=2)
+        named |= {
+            "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
+            "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
+            "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
+            "map_landmark": texts([i for m in self.maps for i in m.ids]),
+            "map_kind": texts([kind for m in self.maps for kind in m.kinds]),
+            "map_mean": padded_all([mean for m in self.maps for mean in m.means]),
+            "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
+        }
+        named["control_robot"] = texts(list(self.controls))
+        named["control_span"] = np.array(list(self.controls.values()), dtype=np.int64).reshape(-1, 3)
+        for name, (prefix, cls, joined) in ROWS.items():
+            named |= columns(prefix, cls, vars(self)[name], joined)
         return named
 
     @classmethod
     def from_arrays(cls, named: Named) -> History:
-        """Return the history that `arrays` gave; the first versions saved fewer arrays."""
-        count, numbers = named["z"].shape[:2]
-        given: dict[str, Any] = {
-            "kind": np.full(count, "", dtype=np.str_),
-            "left_px": np.full(count, np.nan),
-            "true_id": named["id"],
-        }
-        given |= {"late": np.zeros(count, dtype=np.bool_), "noise": np.full((count, numbers), np.nan)}
-        given |= {f.name: named[f.name] for f in fields(cls) if f.name in named}
-        return cls(
-            **given,
-            maps=_maps(named),
-            starts=rows_of("start", Start, named),
-            inputs=Inputs.from_arrays(named),
-            decisions=Decisions.from_arrays(named),
-            cameras=rows_of("camera", Camera, named, joined=True),
-            mounts=rows_of("mount", Mounted, named, joined=True),
-            biases=rows_of("bias", Biased, named, joined=True),
+        """Return the history that `arrays` gave.  Raises KeyError if one is missing."""
+        given: dict[str, Any] = {name: named[name] for name in _array_fields()}
+        given |= {name: rows_of(prefix, kind, named, joined) for name, (prefix, kind, joined) in ROWS.items()}
+        ends, keys = np.cumsum(named["map_size"])[:-1], ("mean", "covariance", "landmark", "kind")
+        parts = zip(*(np.split(named[f"map_{key}"], ends) for key in keys), strict=True)
+        times = zip(
+            named["map_step"].tolist(), named["map_t_ns"].tolist(), parts, strict=False
+        )  # no map: one empty part
+        given["maps"] = tuple(
+            MapSnapshot(step, t_ns, tuple(map(as_id, names.tolist())), means, covariances, tuple(kinds.tolist()))
+            for step, t_ns, (means, covariances, names, kinds) in times
         )
+        spans = zip(named["control_robot"].tolist(), named["control_span"].tolist(), strict=True)
+        return cls(**given, controls={robot: Controlled(*span) for robot, span in spans})
 
 
-def _map_arrays(maps: tuple[MapSnapshot, ...]) -> Arrays:
-    blocks = [m.covariances for m in maps]
-    width = max((block.shape[1] for block in blocks), default=2)
-    return {
-        "map_step": np.array([m.step for m in maps], dtype=np.int64),
-        "map_t_ns": np.array([m.t_ns for m in maps], dtype=np.int64),
-        "map_size": np.array([len(m.ids) for m in maps], dtype=np.int64),
-        "map_landmark": texts([i for m in maps for i in m.ids]),
-        "map_kind": texts([kind for m in maps for kind in m.kinds]),
-        "map_mean": padded_all([mean for m in maps for mean in m.means]),
-        "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
-    }
-
-
-def _maps(named: Named) -> tuple[MapSnapshot, ...]:
-    ends = np.cumsum(named["map_size"])
-    kinds = named.get("map_kind", np.empty(0, dtype=np.str_))
-    return tuple(
-        MapSnapshot(
-            int(named["map_step"][i]),
-            int(named["map_t_ns"][i]),
-            tuple(as_id(text) for text in named["map_landmark"][end - size : end].tolist()),
-            named["map_mean"][end - size : end],
-            named["map_covariance"][end - size : end],
-            tuple(kinds[end - size : end].tolist()),
-        )
-        for i, (end, size) in enumerate(zip(ends, named["map_size"], strict=True))
-    )
+def _array_fields() -> list[str]:
+    return [f.name for f in fields(History) if f.name not in ("maps", "controls", *ROWS)]
 
 
 def as_id(text: str) -> Id:
@@ -240,3 +284,70 @@ def as_id(text: str) -> Id:
     except ValueError:
         return text
     return number if str(number) == text else text
+
+
+def columns(prefix: str, cls: type[R], rows: Sequence[R], joined: bool = False) -> Arrays:
+    """Return the fields of named tuples as arrays "prefix_field".
+
+    With `joined` their texts are one array "prefix", the texts of a row on lines, names of a tuple with commas between.
+    """
+    named: Arrays = {}
+    lines: list[list[str]] = [[] for _ in rows]
+    for k, (name, hint) in enumerate(get_type_hints(cls, include_extras=True).items()):
+        values = [row[k] for row in rows]
+        if joined and hint in (str, Names):
+            for line, value in zip(lines, values, strict=True):
+                line.append(value if hint is str else ",".join(value))
+        elif hint in TYPES:
+            named[f"{prefix}_{name}"] = np.array(values, dtype=TYPES[hint])
+        else:
+            dimensions = 1 if hint == Size else hint.__metadata__[0]
+            named[f"{prefix}_{name}"] = padded_all([np.asarray(v, dtype=np.float64) for v in values], dimensions)
+    return named | ({prefix: texts(["\n".join(line) for line in lines])} if joined else {})
+
+
+def rows_of(prefix: str, cls: type[R], named: Named, joined: bool = False) -> tuple[R, ...]:
+    """Return the rows that `columns` gave."""
+    told: list[list[Any]] = []
+    lines = iter(zip(*(text.split("\n") for text in named[prefix].tolist()), strict=True)) if joined else iter(())
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        if joined and hint in (str, Names):
+            values: list[Any] = list(next(lines, ()))
+            told.append([tuple(text.split(",")) for text in values] if hint == Names else values)
+        elif hint in TYPES:
+            told.append(named[f"{prefix}_{name}"].tolist())
+        else:
+            values = [_cut(value) for value in named[f"{prefix}_{name}"]]
+            told.append([tuple(value.tolist()) for value in values] if hint == Size else values)
+    return tuple(cls(*row) for row in zip(*told, strict=True))
+
+
+def texts(values: list[Any]) -> Texts:
+    """Return ids or names as an array of texts (N,), "" for None."""
+    return np.array(["" if value is None else str(value) for value in values], dtype=np.str_)
+
+
+def padded(blocks: list[Array], counts: list[int], width: int, matrices: bool = False) -> Array:
+    """Stack blocks (K, m) or (K, m, m) of several sizes m, K by `counts`, padded with NaN; an empty one is all NaN."""
+    out = np.full((sum(counts), width, width) if matrices else (sum(counts), width), np.nan)
+    at = 0
+    for block, count in zip(blocks, counts, strict=True):
+        if len(block) == count and block.size:
+            out[(slice(at, at + count), *(slice(m) for m in block.shape[1:]))] = block
+        at += count
+    return out
+
+
+def padded_all(values: Sequence[Array], dimensions: int = 1) -> Array:
+    """Stack vectors or matrices of several sizes to (N, n) or (N, n, n), padded with NaN."""
+    shape = [max(sizes) for sizes in zip(*(value.shape for value in values), strict=True)] or [2] * dimensions
+    out = np.full((len(values), *shape), np.nan)
+    for k, value in enumerate(values):
+        out[k][tuple(slice(m) for m in value.shape)] = value
+    return out
+
+
+def _cut(value: Array) -> Array:
+    """Return a vector or a matrix without the NaN it was padded with."""
+    known = ~np.isnan(value)
+    return value[known] if value.ndim == 1 else value[np.ix_(known.any(axis=1), known.any(axis=0))]

@@ -1,4 +1,18 @@
-"""The map a run ends with, and ``landmarks.csv``."""
+"""The places that landmarks are at: Euclidean points, the endpoints of lines, the poses of tags, with covariances.
+
+A place is a row of numbers, and its covariance that of its error:
+
+==========  ==============================  ==========================  =====
+kind        place                           error                       sizes
+==========  ==============================  ==========================  =====
+point       x y z                           x y z                       3, 3
+line        both endpoints, x y z x2 y2 z2  the same                    6, 6
+tag         x y z qx qy qz qw               x y z, rotation vector      7, 6
+==========  ==============================  ==========================  =====
+
+Whatever else a landmark is in the map (inverse depth, homogeneous, Pluecker), its model says where that is: by `place`,
+lines by `endpoints` at the abscissas of their ends (`kalmark.models.protocols.Placed`, `Segmented`).
+"""
 
 from __future__ import annotations
 
@@ -8,24 +22,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from kalmark.declare import is_own
 from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
-from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
-from kalmark.results.columns import padded_all
-from kalmark.results.history import as_id
-from kalmark.results.shapes import LINE, POINT, TAG, place
+from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
+from kalmark.models.landmarks import PointSignature2D
+from kalmark.models.protocols import Landmark, Segmented, place_of
+from kalmark.results.history import Array, Ints, as_id, padded_all
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
-Array = npt.NDArray[np.float64]
-
+POINT, LINE, TAG = 3, 6, 7
+EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
+# kinds whose state is their place; what is not (inverse depth, say) is not well known yet
+EUCLIDEAN = ("", "point", "point3", "point_signature", "tag")
 _PLANE = {"point_signature": ("x_m", "y_m", "signature")}
 _POINT = ("x_m", "y_m", "z_m")
 _LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
@@ -34,12 +49,69 @@ _SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
 _ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
 
 
+def place(
+    model: Landmark | None, mean: Array, covariance: Array, ends: Array | None = None
+) -> tuple[Array, Array] | None:
+    """Return the place and covariance of one landmark's state; `ends` (2,) are the abscissas of a line's ends.
+
+    The pose of a tag and a point with its signature are their own places.  None if a model does not say where it is.
+    """
+    mean, covariance = np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
+    if model is None or model.space.kinds == SE3.kinds or isinstance(model, PointSignature2D):
+        return mean, covariance
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if isinstance(model, Segmented):
+            p, P_l = model.endpoints(mean[None], np.array(model.first_ends if ends is None else ends)[None])
+            p, P_l = p.reshape(1, LINE), P_l.reshape(1, LINE, -1)
+        elif (found := place_of(model, mean[None])) is not None:
+            p, P_l = found
+        else:
+            return None
+        covariance = P_l[0] @ covariance @ P_l[0].T
+    at_infinity = ~np.isfinite(p[0])
+    return np.where(at_infinity, np.inf, p[0]), np.where(np.isfinite(covariance), covariance, np.inf)
+
+
+class Shapes(NamedTuple):
+    """What is to be drawn of a map: Gaussian points (of lines both endpoints), `lines` (L, 2, 3) and `tags` (T, 7).
+
+    Of the points: which landmark each belongs to (K,), `means` (K, d), `covariances` (K, d, d), and as its `group`
+    whether it is of a Euclidean landmark (0), another (1) or a line (2).
+    """
+
+    row: Ints
+    means: Array
+    covariances: Array
+    lines: Array
+    tags: Array
+    group: Ints
+
+
+def shapes(means: Array, covariances: Array, kinds: Sequence[str], d: int = 3) -> Shapes:
+    """Sort the places (K, n) of landmarks, in space padded with NaN, and covariances (K, q, q), by what they are.
+
+    In the plane (d = 2) all are points.
+    """
+    size = (~np.isnan(means)).sum(axis=1)
+    lines, tags = np.flatnonzero(size == LINE), np.flatnonzero(size == TAG)
+    row = np.concatenate([np.arange(len(means)), lines])
+    ends, P = means[lines, :LINE].reshape(-1, 2, 3), covariances[lines, 3:LINE, 3:LINE].reshape(-1, d, d)
+    return Shapes(
+        row,
+        np.concatenate([means[:, :d].reshape(-1, d), ends[:, 1, :d]]),
+        np.concatenate([covariances[:, :d, :d].reshape(-1, d, d), P]),
+        ends,
+        means[tags, :TAG].reshape(-1, TAG),
+        np.where(np.isin(row, lines), LINES, np.where(np.isin(kinds, EUCLIDEAN), EUCLIDEANS, OTHERS)[row]),
+    )
+
+
 @dataclass(frozen=True)
 class MapLandmarks:
     """The landmarks of a map: ids, kinds, places with covariances and how often each was observed.
 
     The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
-    in the map is (`kalmark.results.shapes`); NaN if its model does not say where it is.
+    in the map is (`kalmark.results.landmarks`); NaN if its model does not say where it is.
     """
 
     ids: list[Id]
@@ -56,19 +128,13 @@ class MapLandmarks:
     def of(cls, slam: Slam) -> MapLandmarks:
         """Return the places of the landmarks of a filter's map."""
         table = slam.landmarks()
-        rows = zip(table.ids, table.means, table.covariances, strict=True)
         in_space = any(robot.motion.space.world == "space" for robot in slam.robots.values())
         d = 3 if in_space else 2
         nowhere = np.full(d, np.nan), np.full((d, d), np.nan)
-        places = [place(slam.landmark_model(i), mean, P, slam.segment_ends(i)) or nowhere for i, mean, P in rows]
-        return cls(
-            list(table.ids),
-            list(table.kinds),
-            [mean for mean, _ in places],
-            [cov for _, cov in places],
-            [int(count) for count in table.observations],
-            in_space,
-        )
+        places = [place(slam.landmark_model(i), mean, P, slam.segment_ends(i)) or nowhere for i, _, mean, P, _ in table]
+        means, covariances = ([one[k] for one in places] for k in (0, 1))
+        observations = [int(count) for count in table.observations]
+        return cls(list(table.ids), list(table.kinds), means, covariances, observations, in_space)
 
     def positions(self) -> tuple[Array, Array]:
         """Return the positions (K, d) and their covariances (K, d, d), of lines their first endpoints."""
@@ -84,10 +150,15 @@ class MapLandmarks:
 
     def to_csv(self) -> str:
         """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations."""
-        axes = [self._axes(kind, len(mean)) for kind, mean in zip(self.kinds, self.means, strict=True)]
+        axes = [
+            _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
+            for kind, mean in zip(self.kinds, self.means, strict=True)
+        ]
         columns = list(dict.fromkeys(name for names in axes for name in names))
         columns = columns or list(_POINT if self.in_space else _POINT[:2])
-        pairs = _pairs({_errors(names) for names in axes} or {_errors(columns)})
+        errors = {_errors(names) for names in axes} or {_errors(columns)}
+        used = {pair for names in errors for pair in combinations_with_replacement(names, 2)}
+        pairs = [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations"])
@@ -98,9 +169,6 @@ class MapLandmarks:
             writer.writerow([self.ids[i], self.kinds[i], *mean, *cov, self.observations[i]])
         return out.getvalue()
 
-    def _axes(self, kind: str, n: int) -> tuple[str, ...]:
-        return _SPACE.get(n, _POINT) if self.in_space else _PLANE.get(kind, _POINT)[:n]
-
     @classmethod
     def read(cls, path: Path) -> MapLandmarks:
         """Read a ``landmarks.csv``.  Raises RunError naming file and line."""
@@ -109,22 +177,19 @@ class MapLandmarks:
             table = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ()))
             for number, row in enumerate(rows, start=2):
                 try:
-                    table._append(row)
+                    names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
+                    errors = _errors(names)
+                    cov = np.empty((len(errors), len(errors)))
+                    for (i, a), (j, b) in combinations_with_replacement(enumerate(errors), 2):
+                        cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
+                    table.ids.append(as_id(row["id"]))
+                    table.kinds.append(row["kind"])
+                    table.means.append(np.array([float(row[name]) for name in names]))
+                    table.covariances.append(cov)
+                    table.observations.append(int(row["observations"]))
                 except (KeyError, TypeError, ValueError) as error:
                     raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
         return table
-
-    def _append(self, row: dict[str, str]) -> None:
-        names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
-        errors = _errors(names)
-        cov = np.empty((len(errors), len(errors)))
-        for (i, a), (j, b) in combinations_with_replacement(enumerate(errors), 2):
-            cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
-        self.ids.append(as_id(row["id"]))
-        self.kinds.append(row["kind"])
-        self.means.append(np.array([float(row[name]) for name in names]))
-        self.covariances.append(cov)
-        self.observations.append(int(row["observations"]))
 
 
 def refuse_other_than_points(slam: Slam, what: str) -> None:
@@ -133,12 +198,6 @@ def refuse_other_than_points(slam: Slam, what: str) -> None:
         first, *others = track.model.space.kinds
         if not is_own(type(track.model)) and (first not in (VECTOR, VECTOR3) or {*others} - {SCALAR}):
             raise KalmarkError(f"{what}: landmark {track.id!r} is a {track.model.kind}, expected points")
-
-
-def _pairs(errors: set[tuple[str, ...]]) -> list[tuple[str, str]]:
-    """Return the pairs of error components that some landmark has the covariance of, in the order of their columns."""
-    used = {pair for names in errors for pair in combinations_with_replacement(names, 2)}
-    return [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
 
 
 def _errors(names: Sequence[str]) -> tuple[str, ...]:

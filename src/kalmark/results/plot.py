@@ -15,11 +15,11 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
-from kalmark.results.columns import Array
-from kalmark.results.headline import headline
+from kalmark.results.evaluate import headline
+from kalmark.results.history import Array
+from kalmark.results.landmarks import LINES, TAG
 from kalmark.results.recording import Recording
-from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, contours, joined, squares
-from kalmark.results.shapes import LINES, TAG
+from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares
 
 VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "front": (0.0, 0.0)}
 LANDMARK_COLOUR = "#d2691e"
@@ -51,11 +51,15 @@ class Stroke(NamedTuple):
     sample: dict[str, Any] | None = None
 
 
+def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, **how: Any) -> None:
+    """Write a figure as a PNG, by default with a narrow rim."""
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=dpi, format="png", **(how or {"bbox_inches": "tight", "pad_inches": 0.15}))
+
+
 def save_map(run: Recording, path: str | PathLike[str]) -> None:
     """Draw the map of a run and write it as a PNG."""
-    figure = draw_map(run)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=130, format="png", bbox_inches="tight", pad_inches=0.15)
+    save_figure(draw_map(run), path)
 
 
 def draw_map(run: Recording, step: int | None = None, view: str | tuple[float, float] = "normal") -> Figure:
@@ -132,7 +136,7 @@ def strokes(scene: Scene) -> list[Stroke]:
         out.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
     truth = {"color": TRUTH_COLOUR, "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
     label = "true paths" if several else "true path"
-    out += [Stroke(scene.true_path(robot), truth, label, truth) for robot in scene.truth]
+    out += [Stroke(broken(scene.truth[robot], scene.stretches[robot]), truth, label, truth) for robot in scene.truth]
     small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
     aligned = "position fixes (aligned, not used)"
     out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
@@ -154,21 +158,20 @@ def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[St
 
 
 def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
-    points, group, out = scene.shapes.points, scene.shapes.group, []
+    shapes, out = scene.shapes, []
     for k, (colour, label) in enumerate(GROUPS[scene.d]):
-        mine = group == k
+        mine = shapes.group == k
         if not mine.any():
             continue
-        rings = contours(points.means[mine], points.covariances[mine])
-        rings = rings.reshape(-1, *rings.shape[-2:])
+        rings = np.concatenate(contours(shapes.means[mine], shapes.covariances[mine]))
         width, alpha = (0.9, 1.0) if scene.d == 2 else (0.7, 0.55)
         thin = {"linewidth": 0.5 * width, "alpha": 0.75 * alpha} if crowded else {"linewidth": width, "alpha": alpha}
         sample = {"color": colour, "marker": "."}
         out.append(Stroke(joined(rings, scene.d), {"color": colour, "zorder": 4, **thin}, label, sample))
-        out.append(Stroke(points.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
+        out.append(Stroke(shapes.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
     if scene.d == 3:
-        out.append(Stroke(joined(scene.shapes.lines), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
-        tags = joined(squares(scene.shapes.tags, scene.size))
+        out.append(Stroke(joined(shapes.lines), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
+        tags = joined(squares(shapes.tags, scene.size))
         out.append(Stroke(tags, {"color": EUCLIDEAN_COLOUR, "linewidth": 1.4, "zorder": 5}))
     return out
 
@@ -215,7 +218,7 @@ def _labels(scene: Scene) -> list[tuple[str, Array]]:
     """Return the names of the landmarks of space, if they are few, and their places."""
     if scene.d == 2 or len(scene.ids) > FEW:
         return []
-    places = scene.shapes.points.means[: len(scene.ids)]
+    places = scene.shapes.means[: len(scene.ids)]
     inside = ((places >= scene.low) & (places <= scene.high)).all(axis=1)
     return [(str(scene.ids[k]), places[k]) for k in np.flatnonzero(inside).tolist()]
 
@@ -252,10 +255,10 @@ def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
     """Draw a scene in perspective above a grid on the ground, with the shadows of paths and of few landmarks."""
     axes.set_axis_off()
     axes.set_aspect("equal", adjustable="box")
-    floor = ground(scene)
+    floor = scene.ground
     shadows = [np.column_stack([line[:, :2], np.full(len(line), floor)]) for line in map(scene.line, scene.paths)]
     if len(scene.ids) <= CROWD:
-        standing = scene.shapes.points.means[scene.shapes.group != LINES]
+        standing = scene.shapes.means[scene.shapes.group != LINES]
         shadows += [np.array([point, [*point[:2], floor]]) for point in standing]
     drawn = [Stroke(scene.inside(joined(shadows)), {"color": SHADOW, "linewidth": 0.7, "zorder": 1})]
     drawn += [Stroke(scene.inside(stroke.points), stroke.style) for stroke in strokes(scene)]
@@ -279,14 +282,9 @@ def spacing(size: float) -> float:
     return float(power * next(m for m in (1, 2, 5, 10) if size / (m * power) <= 14))
 
 
-def ground(scene: Scene) -> float:
-    """Return the height of the ground: 0, or the lowest there is."""
-    return 0.0 if scene.low[2] <= 0.0 <= scene.high[2] else float(scene.low[2])
-
-
 def _ground(axes: Axes, scene: Scene, projection: Projection) -> list[Stroke]:
     """Return the grid on the ground and a scale of heights at a corner; draw ticks at the edges that face the eye."""
-    low, high, eye, z = scene.low, scene.high, projection.axes[2], ground(scene)
+    low, high, eye, z = scene.low, scene.high, projection.axes[2], scene.ground
     step = spacing(float((high - low)[:2].max()))
     xs, ys = (np.arange(np.ceil(low[i] / step), np.floor(high[i] / step) + 1) * step for i in (0, 1))
     lines = [np.array([[x, low[1], z], [x, high[1], z]]) for x in xs]

@@ -1,20 +1,24 @@
-"""``scan_<t>.png``: one scan's observations in the map, the landmarks each was compared with, and what was decided."""
+"""Pictures of one scan: ``scan_<robot>_<t>.png``, in the map, ``sensor_<robot>_<sensor>.png``, in a camera's images.
+
+The first has the observations, the landmarks each was compared with, and what was decided; the second what a camera saw
+on what the filter expected it to see.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections import Counter
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from kalmark.results.columns import Array
+from kalmark.errors import RunError
 from kalmark.results.explain import Explanation, Fate
+from kalmark.results.history import Array
 from kalmark.results.recording import Recording
-from kalmark.results.scene import INK, contours, joined
+from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
 from kalmark.results.words import figure as figure_of
 
 OUTCOME = {
@@ -27,13 +31,7 @@ LEAST_M = 1.0
 PAPER = 490.0  # width of the axes in points, about
 MARK = 6.0  # half a cross or a square, in points
 ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
-
-
-def save_scan(run: Recording, told: Explanation, path: str | Path) -> None:
-    """Draw one scan of a run and write it as a PNG."""
-    figure = draw_scan(run, told)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=130, format="png", bbox_inches="tight", pad_inches=0.15)
+MEASURED, NAME = "#7d838d", "#1e4d2b"
 
 
 def draw_scan(run: Recording, told: Explanation) -> Figure:
@@ -46,9 +44,15 @@ def draw_scan(run: Recording, told: Explanation) -> Figure:
     """
     figure = Figure(figsize=(9.5, 8.5), layout="constrained", facecolor="white")
     axes = figure.subplots()
-    _robot(axes, run, told)
-    low, high = _extent(told)
-    _landmarks(axes, run, told, low, high)
+    mine = np.flatnonzero(run.history.robot[: told.step + 1] == told.robot)[-PATH:]
+    axes.plot(*run.history.poses[mine, :2].T, color=ROBOT, lw=1)
+    axes.plot(*contours(told.pose[None, :2], told.covariance[None, :2, :2])[0, 0].T, color=ROBOT, lw=1)
+    axes.plot(*told.pose[:2], "o", color=ROBOT, ms=7)
+    (low, high), kept = _extent(told), run.history.map_at(told.step)
+    inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
+    means, covariances = kept.means[inside, :2], kept.covariances[inside, :2, :2]
+    axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
+    axes.plot(*joined(contours(means, covariances)[:, 0], 2).T, color=FAINT, lw=0.8)
     _observations(axes, told, low, high)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -66,7 +70,7 @@ def draw_scan(run: Recording, told: Explanation) -> Figure:
 def _observations(axes: Axes, told: Explanation, low: Array, high: Array) -> None:
     """Draw the marks of observations and landmarks, and the lines between; then their texts, each where it has room."""
     fates = [fate for fate in told.fates if np.isfinite(fate.seen_at[:2]).all()]
-    squares = {other.landmark: other.place[:2] for fate in fates for other in fate.near}
+    squares = {str(other.landmark): other.place[:2] for fate in fates for other in fate.near}
     labels = _Labels(axes, low, high, [*squares.values(), *(fate.seen_at[:2] for fate in fates)])
     for place in squares.values():
         axes.plot(*place, "s", color=INK, mfc="none", ms=8, zorder=4)
@@ -139,23 +143,6 @@ def _label(fate: Fate) -> str:
     return str(fate.index) if d2 is None else f"{fate.index}: {figure_of(d2, 2)}"
 
 
-def _robot(axes: Axes, run: Recording, told: Explanation) -> None:
-    history = run.history
-    mine = np.flatnonzero(history.robot[: told.step + 1] == told.robot)[-PATH:]
-    axes.plot(*history.poses[mine, :2].T, color=ROBOT, lw=1)
-    axes.plot(*contours(told.pose[None, :2], told.covariance[None, :2, :2])[0, 0].T, color=ROBOT, lw=1)
-    axes.plot(*told.pose[:2], "o", color=ROBOT, ms=7)
-
-
-def _landmarks(axes: Axes, run: Recording, told: Explanation, low: Array, high: Array) -> None:
-    """Draw the map as it was kept last before the scan, and later if it was not kept before."""
-    kept = run.history.map_at(told.step)
-    inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
-    means, covariances = kept.means[inside, :2], kept.covariances[inside, :2, :2]
-    axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
-    axes.plot(*joined(contours(means, covariances)[:, 0], 2).T, color=FAINT, lw=0.8)
-
-
 def _extent(told: Explanation) -> tuple[Array, Array]:
     """Return the corners (2,) of what is drawn."""
     points = [told.pose[:2], *(f.seen_at[:2] for f in told.fates)]
@@ -176,3 +163,105 @@ def _legend(told: Explanation) -> list[Line2D]:
         Line2D([], [], ls="", marker=".", color=FAINT, label="other landmarks, as kept last"),
         *marks,
     ]
+
+
+def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> Figure:
+    """Return the figure of a camera's last scan, or of that at a step, or of the last up to a time.
+
+    Pixels, v downwards; measurements are grey crosses or thick lines, expectations 3-sigma ellipses of Z around e or
+    thin lines.  `t_s`, and the time in the title, are seconds since the first scan, as in the report.  Raises RunError
+    if there is no such camera or scan.
+    """
+    history, cameras = run.history, {(camera.robot, camera.sensor): camera for camera in run.history.cameras}
+    if (robot, sensor) not in cameras:
+        names = ", ".join(map(".".join, cameras)) or "none"
+        raise RunError(f"camera {robot}.{sensor} is not in this run, expected one of: {names}")
+    camera = cameras[robot, sensor]
+    steps = steps_of(history, camera)
+    if t_s is not None:
+        steps = steps[history.t_ns[steps] - history.t_ns[0] <= round(t_s * 1e9)]
+    if step is not None:
+        steps = steps[steps <= step]
+    if len(steps) == 0:
+        raise RunError(f"camera {robot}.{sensor} saw nothing until then, expected a scan with an observation")
+    seen = images(history, camera, int(steps[-1]))
+    shape = camera.size[1] / camera.size[0]
+    width = 9.0 if len(seen) == 1 else 14.0
+    figure = Figure(figsize=(width, (width - 1.0) / len(seen) * shape + 1.5), layout="constrained", facecolor="white")
+    grid = figure.subplots(1, len(seen), squeeze=False)[0]
+    for axes, image in zip(grid, seen, strict=True):
+        draw_image(axes, image, camera.size)
+    outcomes = Counter(s.outcome for s in seen[0].sightings)
+    said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
+    title = f"{robot} · {sensor} · t = {history.t_s[steps[-1]]:.3f} s · {said}"
+    figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
+    figure.legend(handles=legend(seen), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+def draw_image(axes: Axes, image: Image, size: tuple[float, float]) -> None:
+    """Draw what one image of a camera shows of a scan: u to the right, v down."""
+    axes.set_xlim(0, size[0])
+    axes.set_ylim(size[1], 0)
+    axes.set_aspect("equal", adjustable="box")
+    axes.set_xlabel("u (px)", color=INK)
+    axes.set_ylabel("v (px)", color=INK)
+    axes.tick_params(colors="#555b66", labelsize=8)
+    if image.side:
+        axes.set_title(f"{image.side} image", fontsize=10, color="#555b66")
+    for sighting in image.sightings:
+        _draw(axes, sighting, size)
+
+
+def _draw(axes: Axes, s: Sighting, size: tuple[float, float]) -> None:
+    colour, _ = colour_of(s)
+    expected, single = np.isfinite(s.expected).all(), len(s.measured) == 1
+    closed = np.vstack([s.measured, s.measured[:1]]) if len(s.measured) > 2 else s.measured
+    rejected, new = s.outcome == "rejected", s.outcome == "new"
+    if single:
+        axes.plot(*s.measured.T, "+", color=MEASURED, markersize=8, markeredgewidth=1.1, zorder=3)
+    else:
+        axes.plot(*closed.T, "-", color="#3a68c8" if not new else MEASURED, linewidth=3.0, alpha=0.55, zorder=2)
+    if new:
+        axes.plot(*s.measured.T, "s", markerfacecolor="none", color=NAME, markersize=9, markeredgewidth=0.9, zorder=3)
+    if rejected:
+        axes.plot(*s.measured.T, "x", color=INK, markersize=8, markeredgewidth=1.4, zorder=6)
+    if expected:
+        _draw_expected(axes, s, size, colour, rejected)
+    if s.outcome != "ignored" and s.name:
+        at = s.expected.mean(axis=0) if expected and single else s.measured.mean(axis=0)
+        text: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 7, "color": NAME, "clip_on": True}
+        axes.text(at[0], at[1] - 15.0, s.name, zorder=7, **text)
+
+
+def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: str, rejected: bool) -> None:
+    style: dict[str, Any] = {"color": colour, "linewidth": 1.1, "linestyle": "--" if rejected else "-", "zorder": 5}
+    if len(s.expected) == 1:
+        axes.plot(*s.expected.T, ".", color=colour, markersize=3, zorder=5)
+        if np.isfinite(s.Z).all():
+            axes.plot(*contours(s.expected, s.Z[None])[0, 0].T, **style)
+        if rejected:
+            axes.plot(*np.vstack([s.measured, s.expected]).T, ":", color=INK, linewidth=0.8, zorder=4)
+    elif len(s.expected) == 2:
+        line = trimmed(s.expected[0], s.expected[1], size)
+        if line is not None:
+            axes.plot(*line.T, **style)
+    else:
+        axes.plot(*np.vstack([s.expected, s.expected[:1]]).T, **style)
+
+
+def legend(seen: list[Image]) -> list[Line2D]:
+    """Return the entries of the legend: only what there is."""
+    sightings = [s for image in seen for s in image.sightings]
+    out = [Line2D([], [], color=MEASURED, marker="+", linestyle="", label="measured")]
+    if any(len(s.measured) > 1 for s in sightings):
+        out = [Line2D([], [], color="#3a68c8", linewidth=3, alpha=0.55, label="measured")]
+    found = dict.fromkeys(colour_of(s) for s in sightings if np.isfinite(s.expected).all())
+    lines = any(len(s.measured) > 1 for s in sightings)
+    out += [Line2D([], [], color=c, label=label if lines else rf"{label}, $3\sigma$") for c, label in sorted(found)]
+    if any(s.outcome == "new" for s in sightings):
+        square: dict[str, Any] = {"marker": "s", "markerfacecolor": "none", "linestyle": ""}
+        out.append(Line2D([], [], color=NAME, label="new landmark", **square))
+    if any(s.outcome == "rejected" for s in sightings):
+        out.append(Line2D([], [], color=INK, marker="x", linestyle="", label="rejected"))
+    return out

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
-from typing import TypeVar
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 
@@ -18,35 +17,29 @@ def track(
         yield from items
         return
     start = shown = time.perf_counter()
-    done, advance_to = 0, None
-    with ExitStack() as closing:
+    done, bar = -1, None
+    try:
         for done, item in enumerate(items):
             now = time.perf_counter()
-            if advance_to is None and now - start > delay_s:
-                advance_to = closing.enter_context(_bar(what, total))
-            if advance_to is not None and now - shown > 0.1:
-                advance_to(done)
-                shown = now
+            if now - start > delay_s and (bar is None or now - shown > 0.1):
+                bar, shown = bar or _bar(what, total), now
+                bar.update(bar.task_ids[0], completed=done, refresh=True)
             yield item
-        if advance_to is not None:
-            advance_to(done + 1)
+        if bar is not None:
+            bar.update(bar.task_ids[0], completed=done + 1, refresh=True)
+    finally:
+        if bar is not None:
+            bar.stop()
 
 
-@contextmanager
-def _bar(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show one rich progress bar on standard error; yield what moves it."""
-    from rich.console import Console  # most runs are over before a bar is needed
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+def _bar(what: str, total: int | None) -> Any:
+    """Return a rich progress bar that is shown on standard error; most runs are over before one is needed."""
+    from rich import progress as rich
+    from rich.console import Console
 
-    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    times = (TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*parts, *times, console=Console(stderr=True), auto_refresh=False) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda done: progress.update(task, completed=done, refresh=True)
+    parts = (rich.TextColumn("{task.description}"), rich.BarColumn(), rich.MofNCompleteColumn())
+    times = (rich.TimeElapsedColumn(), rich.TimeRemainingColumn())
+    bar = rich.Progress(*parts, *times, console=Console(stderr=True), auto_refresh=False)
+    bar.add_task(what, total=total)
+    bar.start()
+    return bar

@@ -5,34 +5,27 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from numba.core import event as numba_event
 
-from kalmark.errors import DivergedError, EventError
-from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.declare import is_own, registered_name
+from kalmark.errors import DivergedError, EventError, LogError
+from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log
+from kalmark.logs.source import nearest
 from kalmark.logs.start import begins_at
-from kalmark.results.advice import stated_noise
-from kalmark.results.cameras import biases, cameras, mounts
-from kalmark.results.columns import Array, Texts, padded, texts
-from kalmark.results.corners import left_px
-from kalmark.results.decisions import Decisions
-from kalmark.results.describe import describe, plain
-from kalmark.results.fitting import refuse_other_columns
-from kalmark.results.history import History, MapSnapshot, Start
-from kalmark.results.inputs import Controlled, Inputs, UsedFix
+from kalmark.results.history import Array, Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
+from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, stated_noise
 from kalmark.results.recording import LogReference
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
 
 if TYPE_CHECKING:
-    from kalmark.report import Observation, Report
+    from kalmark.report import Report
     from kalmark.slam.slam import Slam
 
 SNAPSHOTS = 60
@@ -58,14 +51,11 @@ def record(
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
     log = log if isinstance(log, Log) else Log("", tuple(slam.robots), list(log), format="")
     refuse_other_columns(slam, log)
-    events = log.events
-    slam.reserve(name for event in events if type(event) is Scan for name in event.ids or ())
-    recorder = _Recorder(slam, np.linspace(0, sum(type(e) is Scan for e in events) - 1, SNAPSHOTS))
-    recorder.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in events)
-    recorder.starts = _starts(slam, events)
+    slam.reserve(name for event in log.events if type(event) is Scan for name in event.ids or ())
+    recorder = _Recorder(slam, log)
     begin = time.perf_counter()
     with numba_event.install_listener("numba:compiler_lock", recorder.compiler):
-        for event in track(events, log.name or "log", len(events), show=progress):
+        for event in track(log.events, log.name or "log", len(log.events), show=progress):
             try:
                 recorder.process(event)
             except EventError as error:
@@ -75,17 +65,7 @@ def record(
             except DivergedError as error:
                 recorder.stopped = str(error)
                 break
-    wall_s = time.perf_counter() - begin
-    return recorder.run(log, config, wall_s)
-
-
-def _starts(slam: Slam, events: list[Event]) -> tuple[Start, ...]:
-    begins = {name: begins_at(events, name, robot.motion.held) for name, robot in slam.robots.items()}
-    return tuple(
-        Start(name, np.array(slam.mean(name)), np.array(slam.covariance(name)), t_ns)
-        for name, t_ns in begins.items()
-        if t_ns is not None
-    )
+    return recorder.run(config, time.perf_counter() - begin)
 
 
 class _Compiler(numba_event.Listener):  # type: ignore[misc, unused-ignore]
@@ -100,28 +80,32 @@ class _Compiler(numba_event.Listener):  # type: ignore[misc, unused-ignore]
         pass
 
 
-@dataclass
 class _Recorder:
     """Gathers one run; `process` is the hot path, everything is put in order afterwards by `run`."""
 
-    slam: Slam
-    snapshot_at: npt.NDArray[np.float64]
-    anchored: bool = False
-    starts: tuple[Start, ...] = ()
-    controls: dict[str, Controlled] = field(default_factory=dict)
-    fixes: list[UsedFix] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
-    stopped: str = ""
-    reports: list[Report] = field(default_factory=list)
-    scans: list[Scan] = field(default_factory=list)
-    means: list[Array] = field(default_factory=list)
-    covariances: list[Array] = field(default_factory=list)
-    step_ns: list[float] = field(default_factory=list)
-    kinds: list[str] = field(default_factory=list)
-    left: list[Array] = field(default_factory=list)
-    maps: list[MapSnapshot] = field(default_factory=list)
-    compiler: _Compiler = field(default_factory=_Compiler)
-    _spent_ns: int = 0
+    def __init__(self, slam: Slam, log: Log) -> None:
+        self.slam, self.log = slam, log
+        self.snapshot_at = np.linspace(0, sum(type(e) is Scan for e in log.events) - 1, SNAPSHOTS)
+        self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
+        begins = {name: begins_at(log.events, name, robot.motion.held) for name, robot in slam.robots.items()}
+        self.starts = tuple(
+            Start(name, np.array(slam.mean(name)), np.array(slam.covariance(name)), t_ns)
+            for name, t_ns in begins.items()
+            if t_ns is not None
+        )
+        self.controls: dict[str, Controlled] = {}
+        self.fixes: list[UsedFix] = []
+        self.skipped: list[str] = []
+        self.stopped = ""
+        self.scans: list[Scan] = []
+        self.reports: list[Report] = []
+        self.states: list[tuple[Array, Array]] = []
+        self.step_ns: list[float] = []
+        self.kinds: list[str] = []
+        self.left = [np.empty(0)]
+        self.maps: list[MapSnapshot] = []
+        self.compiler = _Compiler()
+        self.spent_ns = 0
 
     def process(self, event: Event) -> None:
         """Feed one event and, if it is a scan, keep the step that ends with it."""
@@ -129,108 +113,155 @@ class _Recorder:
         try:
             report = self.slam.process(event)
         finally:
-            self._spent_ns += time.perf_counter_ns() - start
+            self.spent_ns += time.perf_counter_ns() - start
+        if type(event) is Control:
+            number, first_ns, _ = self.controls.get(event.robot, (0, event.t_ns, 0))
+            self.controls[event.robot] = Controlled(number + 1, first_ns, event.t_ns)
+        elif type(event) is Fix:
+            used = all(o.outcome == "associated" for o in report.observations)
+            self.fixes.append(UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0]))
         if type(event) is not Scan:
-            if type(event) is Control:
-                before = self.controls.get(event.robot) or Controlled(0, event.t_ns, event.t_ns)
-                self.controls[event.robot] = Controlled(before.number + 1, before.first_ns, event.t_ns)
-            elif type(event) is Fix:
-                used = all(o.outcome == "associated" for o in report.observations)
-                self.fixes.append(UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0]))
             return
-        self.step_ns.append(math.nan if self.compiler.was_busy else self._spent_ns)
-        self._spent_ns, self.compiler.was_busy = 0, False
+        self.step_ns.append(math.nan if self.compiler.was_busy else self.spent_ns)
+        self.spent_ns, self.compiler.was_busy = 0, False
         self.scans.append(event)
         self.reports.append(report)
-        self.means.append(self.slam.mean(event.robot))
-        self.covariances.append(self.slam.covariance(event.robot))
-        self.kinds += [self._kind(o.landmark) for o in report.observations]
+        self.states.append((self.slam.mean(event.robot), self.slam.covariance(event.robot)))
+        models = [
+            o.landmark if o.landmark is None else self.slam.landmark_model(o.landmark) for o in report.observations
+        ]
+        self.kinds += ["" if model is None else model.kind for model in models]
         self.left.append(left_px(self.slam, event, report))
         if len(self.maps) < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[len(self.maps)]:
             self.maps.append(self._snapshot())
-
-    def _kind(self, name: Id | None) -> str:
-        model = self.slam.landmark_model(name) if name is not None else None
-        return "" if model is None else model.kind
 
     def _snapshot(self) -> MapSnapshot:
         landmarks = MapLandmarks.of(self.slam)
         ids, kinds = tuple(landmarks.ids), tuple(landmarks.kinds)
         return MapSnapshot(len(self.reports) - 1, self.reports[-1].t_ns, ids, *landmarks.places(), kinds)
 
-    def run(self, log: Log, config: Mapping[str, Any] | None, wall_s: float) -> Run:
+    def run(self, config: Mapping[str, Any] | None, wall_s: float) -> Run:
         """Return the run made of what was gathered."""
+        log, slam = self.log, self.slam
         if self.reports and (not self.maps or self.maps[-1].step < len(self.reports) - 1):
             self.maps.append(self._snapshot())
-        history = self._history(log)
+        history = self._history()
         return Run(
             history=history,
-            config=dict(config) if config is not None else describe(self.slam, log),
-            landmarks=MapLandmarks.of(self.slam),
+            config=dict(config) if config is not None else describe(slam, log),
+            landmarks=MapLandmarks.of(slam),
             truth=Truth.of(log, history, self.anchored),
             log=LogReference(log.name, log.format, None if log.path is None else str(log.path), tuple(log.robots)),
-            coordinates=self.slam.estimator.coordinates,
-            controls=sum(c.number for c in self.controls.values()),
-            fixes=len(self.fixes),
-            fixes_rejected=sum(not fix.used for fix in self.fixes),
+            coordinates=slam.estimator.coordinates,
             wall_s=wall_s,
             skipped=[*log.skipped, *self.skipped],
             stopped=self.stopped,
-            slam=self.slam,
+            slam=slam,
             source=log,
             reference=plain(log.reference),
         )
 
-    def _true_ids(self, log: Log) -> Texts:
-        """Return the id the log has of each observation, whether the filter was told or not; "" where it has none."""
-        told = [log.true_ids.get(scan, scan.ids) for scan in self.scans]
-        pairs = zip(told, self.reports, strict=True)
-        return texts([None if ids is None else ids[o.index] for ids, report in pairs for o in report.observations])
-
-    def _late(self, seen: list[tuple[int, Scan, Observation]]) -> npt.NDArray[np.bool_]:
-        """Return which observations were fused after their scan."""
-        told = {one for report in self.reports for one in report.late}
-        return np.array([(scan.t_ns, scan.robot, scan.sensor, o.index) in told for _, scan, o in seen], dtype=np.bool_)
-
-    def _history(self, log: Log) -> History:
-        steps = self.reports
-        seen = [
-            (s, scan, o)
-            for s, (scan, report) in enumerate(zip(self.scans, steps, strict=True))
-            for o in report.observations
-        ]
-        counts = [len(report.observations) for report in steps]
-        widths = [max((getattr(r, key).shape[1] for r in steps if r.observations), default=2) for key in "yz"]
+    def _history(self) -> History:
+        reports = self.reports
+        rows = [(s, scan, o) for s, scan in enumerate(self.scans) for o in reports[s].observations]
+        seen = [o for _, _, o in rows]
+        counts = [len(report.observations) for report in reports]
+        m, p = (max((getattr(r, key).shape[1] for r in reports if r.observations), default=2) for key in "yz")
         spaces = [robot.motion.space for robot in self.slam.robots.values()]
         n, q = max(space.size for space in spaces), max(space.dof for space in spaces)
+        late = {one for report in reports for one in report.late}
+        known = [self.log.true_ids.get(scan, scan.ids) for scan in self.scans]  # whether the filter was told or not
+        ones = [1] * len(reports)
         return History(
-            t_ns=np.array([r.t_ns for r in steps], dtype=np.int64),
-            robot=texts([r.robot for r in steps]),
-            mean=padded([m[None] for m in self.means], [1] * len(steps), n),
-            covariance=padded([P[None] for P in self.covariances], [1] * len(steps), q, matrices=True),
+            t_ns=np.array([r.t_ns for r in reports], dtype=np.int64),
+            robot=texts([r.robot for r in reports]),
+            mean=padded([mean[None] for mean, _ in self.states], ones, n),
+            covariance=padded([P[None] for _, P in self.states], ones, q, matrices=True),
             step_us=np.array(self.step_ns, dtype=np.float64) * 1e-3,
-            step=np.array([s for s, _, _ in seen], dtype=np.int64),
-            sensor=texts([scan.sensor for _, scan, _ in seen]),
-            index=np.array([o.index for _, _, o in seen], dtype=np.int64),
-            id=texts([None if scan.ids is None else scan.ids[o.index] for _, scan, o in seen]),
-            outcome=texts([o.outcome for _, _, o in seen]),
-            landmark=texts([o.landmark for _, _, o in seen]),
-            d2=np.array([np.nan if o.d2 is None else o.d2 for _, _, o in seen], dtype=np.float64),
-            reason=texts([o.reason for _, _, o in seen]),
-            y=padded([r.y for r in steps], counts, widths[0]),
-            e=padded([r.e for r in steps], counts, widths[0]),
-            z=padded([r.z for r in steps], counts, widths[1]),
-            Z=padded([r.Z for r in steps], counts, widths[1], matrices=True),
-            maps=tuple(self.maps),
-            starts=self.starts,
-            inputs=Inputs(self.controls, tuple(self.fixes)),
+            step=np.array([s for s, _, _ in rows], dtype=np.int64),
+            sensor=texts([scan.sensor for _, scan, _ in rows]),
+            index=np.array([o.index for o in seen], dtype=np.int64),
+            id=texts([None if scan.ids is None else scan.ids[o.index] for _, scan, o in rows]),
+            outcome=texts([o.outcome for o in seen]),
+            landmark=texts([o.landmark for o in seen]),
+            d2=np.array([np.nan if o.d2 is None else o.d2 for o in seen], dtype=np.float64),
+            reason=texts([o.reason for o in seen]),
+            y=padded([r.y for r in reports], counts, m),
+            e=padded([r.e for r in reports], counts, m),
+            z=padded([r.z for r in reports], counts, p),
+            Z=padded([r.Z for r in reports], counts, p, matrices=True),
             kind=texts(list(self.kinds)),
-            late=self._late(seen),
-            noise=padded([stated_noise(self.slam, r) for r in steps], counts, widths[1]),
-            left_px=np.concatenate([np.empty(0), *self.left]),
+            left_px=np.concatenate(self.left),
+            true_id=texts([None if (ids := known[s]) is None else ids[o.index] for s, _, o in rows]),
+            late=np.array(
+                [(scan.t_ns, scan.robot, scan.sensor, o.index) in late for _, scan, o in rows], dtype=np.bool_
+            ),
+            noise=padded([stated_noise(self.slam, r) for r in reports], counts, p),
+            maps=tuple(self.maps),
+            controls=self.controls,
+            fixes=tuple(self.fixes),
+            starts=self.starts,
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),
             biases=biases(self.slam),
-            true_id=self._true_ids(log),
-            decisions=Decisions.of(steps, 3 if n > 3 else 2),
+            **decisions(reports, 3 if n > 3 else 2),
         )
+
+
+def decisions(reports: list[Report], d: int) -> dict[str, Any]:
+    """Return fields of a history: the landmarks that observations were compared with, and what became of landmarks."""
+    counts = [len(report.observations) for report in reports]
+    first = np.cumsum([0, *counts]).tolist()
+    told = list(zip(first, reports, strict=False))
+    seen = [(start + c.index, c) for start, report in told for c in report.candidates]
+    shares = [
+        (start + k, name, weight)
+        for start, report in told
+        for k, o in enumerate(report.observations)
+        for name, weight in o.shares
+    ]
+    changes = [
+        change
+        for step, report in enumerate(reports)
+        for change in (
+            *(Change(step, str(gone), "merged", str(kept), why) for gone, kept, why in report.merged),
+            *(Change(step, str(gone), "removed", "", why) for gone, why in report.removed),
+        )
+    ]
+    return {
+        "candidate_row": np.array([row for row, _ in seen], dtype=np.int64),
+        "candidate_landmark": texts([c.landmark for _, c in seen]),
+        "candidate_d2": np.array([c.d2 for _, c in seen], dtype=np.float64),
+        "candidate_place": np.array([c.place for _, c in seen], dtype=np.float64).reshape(-1, d),
+        "seen_at": padded([report.seen_at for report in reports], counts, d),
+        "changes": tuple(changes),
+        "share_row": np.array([row for row, _, _ in shares], dtype=np.int64),
+        "share_landmark": texts([name for _, name, _ in shares]),
+        "share_weight": np.array([weight for _, _, weight in shares], dtype=np.float64),
+    }
+
+
+def refuse_other_columns(slam: Slam, log: Log) -> None:
+    """Refuse a log whose columns are others than those of kalmark's own motions and sensors.
+
+    Columns that are not known come last, in the file's order: a misspelt one would be taken for another number.
+    Raises LogError.
+    """
+    taken: list[tuple[str, str, str, Any, Any]] = [
+        (robot, "", f"the controls of {robot}", given, slam.robots[robot].motion)
+        for robot, given in log.control_columns.items()
+        if robot in slam.robots
+    ]
+    for (robot, sensor), given in log.sensor_columns.items():
+        mount = slam.robots[robot].sensors.get(sensor) if robot in slam.robots else None
+        if mount is not None and mount.detector is None:
+            taken.append((robot, sensor, f"the scans of {robot} by {sensor}", given, mount.sensor))
+    for robot, sensor, what, given, model in taken:
+        columns = tuple(model.columns)
+        if is_own(type(model)) and registered_name(type(model)) and tuple(given) != columns:
+            missing = [name for name in columns if name not in given]
+            hint = next(filter(None, (nearest(name, missing) for name in given if name not in columns)), "")
+            place = log.places.get((robot, sensor))
+            where = f"{place[0]}:1" if place is not None else log.path or "log"
+            wanted = f"{', '.join(columns)} of its {type(model).__name__}"
+            raise LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}{hint}")

@@ -1,27 +1,131 @@
-"""`Recording`: what was recorded of one log through one filter, and how that is read from a run folder."""
+"""`Recording`: what was recorded of one log through one filter, how it is read from a run folder, and its plain files.
+
+Those are TUM trajectories, ``associations.csv``, ``changes.csv`` and ``config.yaml``.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
+import math
+import os
+import shutil
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
 from kalmark.logs.source import LeftOut, records_of
-from kalmark.results.files import read_yaml, replace_file
 from kalmark.results.history import History
 from kalmark.results.landmarks import MapLandmarks
-from kalmark.results.truth import Truth
+from kalmark.results.readings import plain
+from kalmark.results.truth import Truth, fitted
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.slam.slam import Slam
 
+ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
+CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
 NEEDED = ("summary.json", "config.yaml", "history.npz", "landmarks.csv")
+
+
+def seconds(t_ns: int) -> str:
+    """Return nanoseconds as seconds with nine decimals, exactly (a float would lose up to 256 ns)."""
+    whole, rest = divmod(abs(int(t_ns)), 1_000_000_000)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def tum(history: History, robot: str) -> str:
+    """Return a robot's path after each of its scans as TUM lines: t x y z qx qy qz qw."""
+    mine = history.robot == robot
+    lines = ["# t_s x_m y_m z_m qx qy qz qw"]
+    poses = fitted(history.poses[mine], 7).tolist()
+    for t_ns, (x, y, z, *q) in zip(history.t_ns[mine].tolist(), poses, strict=True):
+        lines.append(f"{seconds(t_ns)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
+    return "\n".join(lines) + "\n"
+
+
+def associations_csv(history: History) -> str:
+    """Return one row an observation: when, who, with what, and what became of it.
+
+    Of an observation that was averaged over landmarks, one row each with its weight, which is then a column more.
+    """
+    times, robots = [seconds(t_ns) for t_ns in history.t_ns.tolist()], history.robot.tolist()
+    shares, soft = defaultdict(list), (history.share_row, history.share_landmark, history.share_weight)
+    for row, name, weight in zip(*(column.tolist() for column in soft), strict=True):
+        shares[row].append((name, weight))
+    columns = (history.step, history.sensor, history.index, history.id, history.outcome, history.landmark)
+    told = zip(*(column.tolist() for column in (*columns, history.d2, history.reason)), strict=True)
+    rows = []
+    for k, (step, *seen, landmark, d2, reason) in enumerate(told):
+        for name, weight in shares.get(k, [(landmark, 1.0)]):
+            number = "" if math.isnan(d2) or name != landmark else repr(d2)
+            rows.append([times[step], robots[step], *seen, name, number, reason, repr(weight)])
+    return _csv((*ASSOCIATIONS, "weight"), rows) if shares else _csv(ASSOCIATIONS, [row[:-1] for row in rows])
+
+
+def changes_csv(history: History) -> str:
+    """Return one row for each landmark that was removed or merged with another: after which scan, and why."""
+    rows = [
+        [seconds(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
+        for c in history.changes
+    ]
+    return _csv(CHANGES, rows)
+
+
+def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([header, *rows])
+    return out.getvalue()
+
+
+def config_yaml(config: dict[str, Any]) -> str:
+    """Return the text of ``config.yaml``: everything that was in force, headed by version and seed."""
+    out = io.StringIO()
+    head = {"version": version("kalmark"), "seed": config.get("seed")}
+    yaml = YAML()
+    yaml.default_flow_style = False
+    yaml.representer.add_representer(type(None), lambda to, _: to.represent_scalar("tag:yaml.org,2002:null", "null"))
+    yaml.dump(plain(head | {key: value for key, value in config.items() if key not in head}), out)
+    return out.getvalue()
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a saved configuration.  Raises RunError if it is not a mapping."""
+    config = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    if not isinstance(config, dict):
+        raise RunError(f"{path}: got {type(config).__name__}, expected a mapping of keys")
+    return config
+
+
+def file_name(robot: str) -> str:
+    """Return a robot's name as part of a file's name."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in robot)
+
+
+def write(path: Path, text: str) -> None:
+    """Write a text file so that it is there completely or not at all."""
+    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def replace_file(path: Path, writer: Callable[[Path], Any]) -> None:
+    """Let `writer` write a temporary file beside `path`, then put it in its place."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        writer(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -35,7 +139,7 @@ class LogReference:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the reference as it stands in ``summary.json``."""
-        return {"name": self.name, "format": self.format, "path": self.path, "robots": list(self.robots)}
+        return vars(self) | {"robots": list(self.robots)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +157,6 @@ class Recording:
     truth: Truth
     log: LogReference = LogReference()
     coordinates: str = "world"
-    controls: int = 0
-    fixes: int = 0
-    fixes_rejected: int = 0
     wall_s: float = 0.0
     skipped: list[str] = field(default_factory=list)
     stopped: str = ""
@@ -118,36 +219,41 @@ class Recording:
                 landmarks=MapLandmarks.read(folder / "landmarks.csv"),
                 truth=Truth.from_arrays(named),
                 log=LogReference(log["name"], log["format"], log["path"], tuple(log["robots"])),
-                **{key: summary[key] for key in ("coordinates", "controls", "fixes", "fixes_rejected", "wall_s")},
-                skipped=_skipped(named),
+                coordinates=summary["coordinates"],
+                wall_s=summary["wall_s"],
+                skipped=[
+                    line if n == 1 else LeftOut(line, n)
+                    for line, n in zip(named["skipped"].tolist(), named["skipped_records"].tolist(), strict=True)
+                ],
                 stopped=summary.get("stopped", ""),
                 folder=folder,
                 summary=summary,
-                reference={name: summary[name] for name in named.get("reference", np.empty(0)).tolist()},
+                reference={name: summary[name] for name in named["reference"].tolist()},
             )
         except (KeyError, ValueError, OSError) as error:
             raise RunError(f"{folder}: not a run that this version reads: {error}") from None
 
-    def save_arrays(self, path: Path) -> None:
-        """Write ``history.npz``."""
+    def save_files(self, folder: Path) -> None:
+        """Write all files of the run into a folder but its figures, its pictures and its page."""
+        for robot in self.history.robots:
+            write(folder / f"trajectory_{file_name(robot)}.tum", tum(self.history, robot))
+        write(folder / "config.yaml", config_yaml(self.config))
+        write(folder / "landmarks.csv", self.landmarks.to_csv())
+        write(folder / "associations.csv", associations_csv(self.history))
+        (folder / "changes.csv").unlink(missing_ok=True)
+        if self.history.changes:
+            write(folder / "changes.csv", changes_csv(self.history))
+        replace_file(folder / "history.npz", self._save_arrays)
+        saved = None if self.folder is None else self.folder / "map.kmk"
+        if self.slam is not None:
+            replace_file(folder / "map.kmk", self.slam.save)
+        elif saved is not None and saved.is_file() and saved.parent.resolve() != folder.resolve():
+            replace_file(folder / "map.kmk", partial(shutil.copyfile, saved))
+
+    def _save_arrays(self, path: Path) -> None:
         arrays: dict[str, Any] = {**self.history.arrays(), **self.truth.arrays()}
         arrays["skipped"] = np.array(self.skipped, dtype=np.str_)
         arrays["skipped_records"] = np.array([records_of(line) for line in self.skipped], dtype=np.int64)
         arrays["reference"] = np.array(list(self.reference), dtype=np.str_)
         with path.open("wb") as file:
             np.savez_compressed(file, **arrays)
-
-    def save_map(self, folder: Path) -> None:
-        """Write ``map.kmk`` into a folder: the filter, or what the run was loaded with."""
-        if self.slam is not None:
-            replace_file(folder / "map.kmk", self.slam.save)
-        elif self.folder is not None and self.folder.resolve() != folder.resolve():
-            source = self.folder / "map.kmk"
-            if source.is_file():
-                replace_file(folder / "map.kmk", lambda path: path.write_bytes(source.read_bytes()))
-
-
-def _skipped(named: dict[str, Any]) -> list[str]:
-    lines = named["skipped"].tolist()
-    records = named["skipped_records"].tolist() if "skipped_records" in named else [1] * len(lines)
-    return [line if n == 1 else LeftOut(line, n) for line, n in zip(lines, records, strict=True)]

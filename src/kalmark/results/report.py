@@ -1,20 +1,52 @@
-"""``report.html``: one file that shows a run, with everything it needs inside."""
+"""``report.html``: one file that shows a run, with everything it needs inside.
+
+Its pictures are drawn from data: the scene at each position of the slider, and curves thinned to some 2,000 points.
+"""
 
 from __future__ import annotations
 
 import html
 import json
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from importlib import resources
+from itertools import combinations_with_replacement
 from typing import Any
 
+import numpy as np
+
+from kalmark.report import OUTCOMES
 from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
-from kalmark.results.evaluate import summary_of
-from kalmark.results.files import config_yaml
-from kalmark.results.headline import headline
-from kalmark.results.recording import Recording
-from kalmark.results.series import change_rows, reasons, series
+from kalmark.results.evaluate import headline, summary_of
+from kalmark.results.explain import Explanation, Fate, explained
+from kalmark.results.history import Array, Camera, Change, History, Ints, MapSnapshot
+from kalmark.results.landmarks import shapes
+from kalmark.results.measures import anees_interval, nees, nis, pose_error
+from kalmark.results.recording import Recording, config_yaml
+from kalmark.results.scene import (
+    Scene,
+    Sighting,
+    broken,
+    colour_of,
+    grouped,
+    images,
+    joined,
+    squares,
+    steps_of,
+    stretches_of,
+)
 from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words
 
+BINS = 120
+POINTS = 2000  # of a curve
+LANDMARKS = 40_000  # in all the maps of a page together
+SCANS = 60  # drawn at most, the most ambiguous ones
+CHANGES = 200  # in the table
+MARKS = 2000  # in the timeline
+TENTATIVE = "tentative: "  # how the reasons of those begin that never were landmarks
+UNSURE = ("between ", "its nearest ", "it does not fit", "cliques as large")  # how reasons of ambiguity begin
 _ROBOT = (
     ("scans", "scans", ""),
     ("path_m", "path", "m"),
@@ -23,8 +55,6 @@ _ROBOT = (
     *(row for row in TOTALS if row[0] in ("fix_median_m", "fix_rms_10m", "fix_within_10m")),
     ("diverged", "diverged", ""),
 )
-
-
 _HINTS = {
     False: "3-sigma ellipses; drag the slider through time",
     True: "3-sigma ellipsoids; drag to turn, scroll to come closer, drag the slider through time",
@@ -33,6 +63,8 @@ _HINTS = {
 
 def report_html(run: Recording) -> str:
     """Return the page: the map over time, errors, NEES and NIS, associations, figures and configuration."""
+    from plotly.offline import get_plotlyjs  # slow to import
+
     title, figures = headline(run)
     summary = summary_of(run)
     return _resource("report.html").format(
@@ -43,12 +75,12 @@ def report_html(run: Recording) -> str:
         summary=summary_table(summary),
         warnings="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("warnings", ())),
         advice="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("advice", ())),
-        mounts=_mounts(summary),
+        mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),
-        changes=_changes(run),
+        changes=_section("Landmarks merged and removed", [*change_rows(run)], ("t (s)", "landmark", "", "why")),
         skipped=_skipped(run, summary),
         config=html.escape(config_yaml(run.config)),
-        plotly=_plotly(),
+        plotly=get_plotlyjs(),
         data=json.dumps(series(run), allow_nan=False, separators=(",", ":")).replace("</", "<\\/"),
         scene=_resource("scene.js"),
         script=_resource("report.js"),
@@ -109,15 +141,8 @@ def _table(rows: list[Any], head: tuple[str, ...] = ()) -> str:
     return f"<table>{top}{body}</table>"
 
 
-def _mounts(summary: dict[str, Any]) -> str:
-    rows = mount_rows(summary)
-    return f"<h2>Mounts that calibrate themselves</h2>{_table(rows, MOUNT_COLUMNS)}" if rows else ""
-
-
-def _changes(run: Recording) -> str:
-    rows = [*change_rows(run)]
-    head = ("t (s)", "landmark", "", "why")
-    return f"<h2>Landmarks merged and removed</h2>{_table(rows, head)}" if rows else ""
+def _section(title: str, rows: list[Any], head: tuple[str, ...]) -> str:
+    return f"<h2>{title}</h2>{_table(rows, head)}" if rows else ""
 
 
 def _skipped(run: Recording, summary: dict[str, Any]) -> str:
@@ -132,7 +157,247 @@ def _resource(name: str) -> str:
     return (resources.files("kalmark.results") / "page" / name).read_text(encoding="utf-8")
 
 
-def _plotly() -> str:
-    from plotly.offline import get_plotlyjs  # slow to import
+def series(run: Recording) -> dict[str, Any]:
+    """Return all that the pictures of a report need; times in seconds since the first step."""
+    scene, t = Scene.of(run), run.history.t_s
+    dof, maps = (3, 6)[scene.d - 2], run.history.maps
+    stride = max(1, -(-sum(len(m.ids) for m in maps) // LANDMARKS))  # the page stays of a size to open
+    maps = maps[::-1][::stride][::-1]  # the last among them
+    true = scene.true_points()
+    return {
+        "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
+        "maps": [_map(m, float(t[m.step]), scene) for m in maps],
+        "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
+        "trueLines": xy(joined(scene.true_lines())),
+        "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
+        "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.used.items()},
+        "bodies": {robot: xy(joined(scene.body(robot))) for robot in scene.paths if scene.d == 3},
+        "cameras": [_camera(run, camera, maps, t) for camera in run.history.cameras],
+        "robots": [_robot(run, scene, robot, t) for robot in scene.paths],
+        "innovations": _innovations(run, scene),
+        "nis": _nis(run, t),
+        "dof": dof,
+        "neesBounds": anees_interval(dof),
+        "outcomes": _outcomes(run, t),
+        "association": _association(run, t),
+    }
 
-    return str(get_plotlyjs())
+
+def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
+    """Return a map: all points, in space the endpoints of lines last, with the group that each is drawn in."""
+    drawn = shapes(m.means, m.covariances, m.kinds, scene.d)
+    lines = {"lines": xy(joined(drawn.lines)), "tags": xy(joined(squares(drawn.tags, scene.size)))}
+    head = {"t": round(t_s, 3), "id": [str(m.ids[row]) for row in drawn.row], "group": drawn.group.tolist()}
+    more = lines if scene.d == 3 else {}
+    return {**head, "count": len(m.ids), **more, **gaussians(drawn.means, drawn.covariances)}
+
+
+def _camera(run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array) -> dict[str, Any]:
+    """Return what a camera saw last at each of the maps: `frames` are indices of its `scans`, None before the first."""
+    steps = steps_of(run.history, camera)
+    last = np.searchsorted(steps, [m.step for m in maps], side="right") - 1
+    used = np.unique(last[last >= 0])
+    scans = []
+    for step in steps[used].tolist():
+        sides = images(run.history, camera, step)
+        seen = [{"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]} for image in sides]
+        scans.append({"t": round(float(t[step]), 3), "images": seen})
+    frames = [int(np.searchsorted(used, k)) if k >= 0 else None for k in last]
+    size = [float(side) for side in camera.size]
+    return {"name": f"{camera.robot} · {camera.sensor}", "size": size, "scans": scans, "frames": frames}
+
+
+def _seen(s: Sighting) -> dict[str, Any]:
+    colour, meaning = colour_of(s)
+    out: dict[str, Any] = {"name": s.name, "outcome": s.outcome, "y": [rounded(p, 2) for p in s.measured]}
+    if np.isfinite(s.expected).all():
+        out |= {"e": [rounded(p, 2) for p in s.expected], "colour": colour, "meaning": meaning}
+    if np.isfinite(s.Z).all():
+        out["Z"] = rounded(np.array([s.Z[0, 0], s.Z[0, 1], s.Z[1, 1]]), 3)
+    return out
+
+
+def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]:
+    rows = np.flatnonzero(run.history.robot == robot)
+    rows = rows[thin(len(rows))]
+    mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
+    out: dict[str, Any] = {"name": robot, "colour": scene.colour(robot), "t": significant(t[rows], 7)}
+    d = scene.d
+    out |= gaussians(mean[:, :d], P[:, :d, :d])
+    stretches = scene.stretches[robot][thin(len(scene.stretches[robot]))]
+    out["gaps"] = _gaps(stretches)
+    out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
+    if robot in scene.truth:
+        true = scene.truth[robot]
+        out["truth"] = xy(broken(true[thin(len(true))], stretches))
+        out |= _errors(run, rows)
+    return out
+
+
+def _errors(run: Recording, rows: Ints) -> dict[str, Any]:
+    """Return errors (estimate less truth) and sigmas in m and degrees, and the NEES in the estimator's coordinates."""
+    mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
+    truth = run.truth.poses_in_map()[rows]
+    metres, turns = (3, 3) if run.history.in_space else (2, 1)
+    scale = np.repeat([1.0, 180.0 / np.pi], [metres, turns])
+    error = -pose_error(mean, truth) * scale
+    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", P), 0.0)) * scale
+    return {
+        "error": [significant(column) for column in error.T],
+        "sigma": [significant(column) for column in sigma.T],
+        "nees": significant(nees(pose_error(mean, truth, run.coordinates), P)),
+    }
+
+
+def _nis(run: Recording, t: Array) -> dict[str, Any]:
+    """Return NIS per degree of freedom over windows of steps, the 95 % bounds of each, and where gaps in time are."""
+    history = run.history
+    used = history.outcome == "associated"
+    value, dof = nis(history.z[used], history.Z[used])
+    steps, at = np.unique(history.step[used][dof > 0], return_inverse=True)
+    window = max(1, -(-len(t) // (POINTS // 4)))
+    groups, gaps = grouped(steps, history.t_ns[steps], window)
+    total = np.bincount(groups[at], value[dof > 0])
+    degrees = np.bincount(groups[at], dof[dof > 0]).astype(int)
+    bounds = {n: anees_interval(n) for n in np.unique(degrees).tolist()}
+    return {
+        "t": significant(np.bincount(groups, t[steps]) / np.bincount(groups), 7),
+        "value": significant(total / degrees),
+        "low": significant(np.array([bounds[n][0] / n for n in degrees.tolist()])),
+        "high": significant(np.array([bounds[n][1] / n for n in degrees.tolist()])),
+        "gaps": gaps.tolist(),
+        "window": window,
+    }
+
+
+def _outcomes(run: Recording, t: Array) -> dict[str, Any]:
+    """Return how many observations had which outcome in each of some 120 stretches of time."""
+    history = run.history
+    edges = np.linspace(0.0, max(float(t[-1]), 1e-9) if len(t) else 1.0, BINS + 1)
+    when = t[history.step]
+    counts = {name: np.histogram(when[history.outcome == name], edges)[0].tolist() for name in OUTCOMES}
+    return {
+        "t": significant((edges[:-1] + edges[1:]) / 2, 7),
+        "counts": {name: column for name, column in counts.items() if any(column)},
+    }
+
+
+def _innovations(run: Recording, scene: Scene) -> list[dict[str, Any]]:
+    """Return each robot's innovations of fixes and their sigmas in m, thinned, and by themselves those rejected."""
+    begin_ns, out = int(run.history.t_ns[:1].sum()), []
+    for robot in scene.paths:
+        fixes = [fix for fix in run.history.fixes if fix.robot == robot]
+        if not fixes:
+            continue
+        t_ns, used = np.array([fix.t_ns for fix in fixes]), np.array([fix.used for fix in fixes])
+        t, z = (t_ns - begin_ns) * 1e-9, np.array([fix.z for fix in fixes])
+        sigma = np.sqrt(np.maximum([np.diagonal(fix.Z) for fix in fixes], 0.0))
+        rows, bad = thin(len(fixes)), np.flatnonzero(~used)
+        bad = bad[thin(len(bad))]
+        curves = {key: [significant(c) for c in x[rows].T] for key, x in (("z", z), ("sigma", sigma))}
+        rejected = {"t": significant(t[bad], 7), "z": [significant(column) for column in z[bad].T]}
+        head = {"name": robot, "colour": scene.colour(robot), "t": significant(t[rows], 7)}
+        out.append({**head, **curves, "gaps": _gaps(stretches_of(t_ns)[rows]), "rejected": rejected})
+    return out
+
+
+def _gaps(stretches: Ints) -> list[int]:
+    """Return before which of the points with these numbers of gaps there is one."""
+    return (np.flatnonzero(np.diff(stretches)) + 1).tolist()
+
+
+def reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
+    """Return the commonest (outcome, reason, count); of too many, those that differ in a number only count as one."""
+    pairs = zip(run.history.outcome.tolist(), run.history.reason.tolist(), strict=True)
+    said = Counter((outcome, reason) for outcome, reason in pairs if reason)
+    if len(said) > most:
+        merged: Counter[tuple[str, str]] = Counter()
+        for (outcome, reason), count in said.items():
+            merged[outcome, re.sub(r"(?<!\bd)\d+(\.\d+)?(e[+-]?\d+)?", "…", reason)] += count
+        said = merged
+    return [(outcome, reason, count) for (outcome, reason), count in said.most_common(most)]
+
+
+def _association(run: Recording, t: Array) -> dict[str, Any]:
+    """Return ambiguous scans in the order of time, and when landmarks were merged or removed."""
+    changes = _told_changes(run.history)
+    return {
+        "scans": [_ambiguous(explained(run, step)) for step in ambiguous(run.history).tolist()],
+        "changes": {
+            what: significant(np.array([t[c.step] for c in changes if c.what == what][:MARKS]), 7)
+            for what in dict.fromkeys(c.what for c in changes)
+        },
+    }
+
+
+def ambiguous(history: History) -> Ints:
+    """Return the steps of the most ambiguous scans, in the order of time: those with most observations in doubt."""
+    if not len(history.candidate_row):
+        return np.zeros(0, dtype=np.int64)
+    doubt = (history.outcome == "deferred").astype(np.int64)
+    doubt += np.logical_or.reduce([np.char.startswith(history.reason, start) for start in UNSURE])
+    shown = np.zeros(len(history.step), dtype=np.bool_)
+    shown[history.candidate_row] = True
+    score = np.bincount(history.step[shown], doubt[shown], len(history.t_ns))
+    best = np.argsort(-score, kind="stable")[:SCANS]
+    return np.sort(best[score[best] > 0])
+
+
+def _told_changes(history: History) -> list[Change]:
+    return [c for c in history.changes if not c.reason.startswith(TENTATIVE)]
+
+
+def change_rows(run: Recording) -> Iterator[tuple[str, str, str, str]]:
+    """Return rows of what became of landmarks: when, which, what, why; tentative ones that went are not among them."""
+    history = run.history
+    told = _told_changes(history)
+    for c in told[:CHANGES]:
+        yield f"{history.t_s[c.step]:.1f}", c.landmark, c.what, c.reason
+    if len(told) > CHANGES:
+        yield "", "", "", f"and {len(told) - CHANGES} more: see associations.csv"
+
+
+def _ambiguous(told: Explanation) -> dict[str, Any]:
+    pose = gaussians(told.pose[None, :2], told.covariance[None, :2, :2])
+    out = {"t": round(told.t_s, 3), "in_log": told.in_log, "robot": told.robot, "sensor": told.sensor, "pose": pose}
+    return out | {"seen": [_fate(fate) for fate in told.fates]}
+
+
+def _fate(fate: Fate) -> dict[str, Any]:
+    x, y = rounded(fate.seen_at[:2], 4)
+    near = [
+        {"name": str(c.landmark), "d2": float(f"{c.d2:.3g}")} | dict(zip("xy", rounded(c.place[:2], 4), strict=True))
+        for c in fate.near
+    ]
+    text = f"{fate.outcome}{' ' + fate.landmark if fate.landmark else ''}{': ' if fate.reason else ''}{fate.reason}"
+    return {
+        "x": x, "y": y, "k": fate.index, "outcome": fate.outcome, "landmark": fate.landmark, "text": text, "near": near,
+    }  # fmt: skip
+
+
+def xy(points: Array) -> dict[str, Any]:
+    """Return points (N, 2 or 3) to a tenth of a millimetre."""
+    return {axis: rounded(column, 4) for axis, column in zip("xyz", points.T, strict=False)}
+
+
+def gaussians(means: Array, covariances: Array) -> dict[str, Any]:
+    """Return means (N, d) and covariances (N, d, d) column by column: x, y, pxx, pxy, pyy, in space more."""
+    pairs = combinations_with_replacement(range(means.shape[1]), 2)
+    return xy(means) | {f"p{'xyz'[i]}{'xyz'[j]}": significant(covariances[:, i, j]) for i, j in pairs}
+
+
+def thin(count: int) -> Ints:
+    """Return at most about 2,000 evenly spread indices, the last one among them."""
+    stride = max(1, -(-count // POINTS))
+    indices = np.arange(0, count, stride)
+    return np.append(indices, count - 1) if count and indices[-1] != count - 1 else indices
+
+
+def rounded(values: Array, digits: int) -> list[float | None]:
+    """Return values to so many decimals, None for NaN and infinity."""
+    return [value if math.isfinite(value) else None for value in np.round(values, digits).tolist()]
+
+
+def significant(values: Array, digits: int = 4) -> list[float | None]:
+    """Return values to so many significant digits, None for NaN and infinity."""
+    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values.tolist()]

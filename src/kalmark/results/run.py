@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.results.evaluate import evaluate
-from kalmark.results.files import associations_csv, changes_csv, config_yaml, file_name, replace_file, tum, write
-from kalmark.results.images import cameras_that_saw
-from kalmark.results.recording import Recording
+from kalmark.results.recording import Recording, file_name, replace_file, write
+from kalmark.results.scene import steps_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,36 +39,23 @@ class Run(Recording):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "summary.json").unlink(missing_ok=True)
         summary = self.summary or self.evaluate()
-        for robot in self.history.robots:
-            write(folder / f"trajectory_{file_name(robot)}.tum", tum(self.history, robot))
-        write(folder / "config.yaml", config_yaml(self.config))
-        write(folder / "landmarks.csv", self.landmarks.to_csv())
-        write(folder / "associations.csv", associations_csv(self.history))
-        (folder / "changes.csv").unlink(missing_ok=True)
-        if self.history.decisions.changes:
-            write(folder / "changes.csv", changes_csv(self.history))
-        replace_file(folder / "history.npz", self.save_arrays)
-        self.save_map(folder)
+        self.save_files(folder)
         self.report(folder)
         write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
         return folder
 
     def report(self, folder: str | Path) -> list[Path]:
         """Write ``map.png``, ``report.html`` and each camera's last scan into a folder; return their paths."""
-        from kalmark.results.plot import save_map  # matplotlib is slow to import
-        from kalmark.results.plot_sensor import save_sensor
+        from kalmark.results.plot import save_figure, save_map  # matplotlib is slow to import
+        from kalmark.results.plot_scan import draw_sensor
         from kalmark.results.report import report_html
 
         folder = Path(folder)
         replace_file(folder / "map.png", lambda path: save_map(self, path))
         written = [folder / "map.png", folder / "report.html"]
-        for robot, sensor in cameras_that_saw(self.history):
+        for robot, sensor, *_ in (camera for camera in self.history.cameras if len(steps_of(self.history, camera))):
             written.append(folder / f"sensor_{file_name(robot)}_{file_name(sensor)}.png")
-            replace_file(written[-1], partial(save_sensor, self, robot, sensor))
+            picture = draw_sensor(self, robot, sensor)
+            replace_file(written[-1], partial(save_figure, picture, dpi=110, bbox_inches=None))
         write(folder / "report.html", report_html(self))
         return written
-
-
-def load_run(folder: str | Path) -> Run:
-    """Read a run folder.  Raises RunError naming the file that is missing or cannot be read."""
-    return Run.load(folder)

@@ -1,27 +1,40 @@
-"""What the pictures of a run show at one step, in the frame of the map: paths, landmarks, truth, fixes, cameras.
+"""What the pictures of a run show: at one step, in the frame of the map; and scan by scan, in the images of cameras.
 
-One description for robots in the plane (d = 2) and in space (d = 3); `kalmark.results.plot` draws it for ``map.png``,
-`kalmark.results.series` writes it into the page.
+A `Scene` has paths, landmarks, truth, fixes and cameras, for robots in the plane (d = 2) and in space (d = 3) alike;
+`kalmark.results.plot` draws it for ``map.png``, `kalmark.results.report` writes it into the page.
+
+The columns of a camera's measurements say what they are: `u_px, v_px` is a point; `u1_px, v1_px, u2_px, v2_px` are the
+ends of a segment, four of them the corners of a tag; `ul_px, vl_px, ur_px, vr_px` is a point in a left and a right
+image.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
-from kalmark.results.align import Rigid, rigid, rigid_robust
-from kalmark.results.columns import Array, Ints
-from kalmark.results.evaluate import FIX_GAP_S, antenna_path
-from kalmark.results.history import Camera
+from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
+from kalmark.results.history import Array, Camera, Flags, History, Ints
+from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, LINE, Shapes, shapes
+from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording
-from kalmark.results.shapes import EUCLIDEANS, LINE, Shapes, shapes
 from kalmark.results.truth import moved
 
+COLUMN = re.compile(r"([uv])([lr]?)(\d*)_px")
+EXPECTED = {  # colours and their meaning, by whether the landmark is Euclidean, then whether it was used
+    (True, True): ("#0aa5b5", "Euclidean, used"),
+    (True, False): ("#1f3fd0", "Euclidean, predicted only"),
+    (False, True): ("#d81b1b", "not Euclidean, used"),
+    (False, False): ("#c218c2", "not Euclidean, predicted only"),
+}
+SIDES = {"": "", "l": "left", "r": "right"}
 COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b0457a", "#6b6f2a")
 SPACE_COLOURS = ("#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#6b6f2a", "#b0457a")  # landmarks are blue or red
 TRUTH_COLOUR, FIX_COLOUR, INK = "#8b929c", "#7a3fa0", "#2b2f36"
@@ -62,44 +75,46 @@ class Scene:
     @classmethod
     def of(cls, run: Recording, step: int | None = None) -> Scene:
         """Return what to draw of a run after a step, by default the last; the box is that of the whole run."""
-        history, d = run.history, 3 if run.history.in_space else 2
-        to_map = _truth_to_map(run, d)
+        history, d = run.history, run.history.d
+        known = np.isfinite(run.truth.poses).all(axis=1)
+        if run.truth.frame == "truth":
+            to_map = run.truth.to_map()
+        else:  # they share no frame
+            to_map = rigid(run.truth.poses[known][:, :d], history.mean[known][:, :d])
         mine = {robot: history.robot == robot for robot in history.robots}
         truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
         scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
-        moved_truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
+        truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
         landmarks = {i: l if d == 3 else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()}
         used, last = _used_fixes(run, d), run.landmarks
         whole = shapes(*last.places(), last.kinds, d)
         now, ids = whole, tuple(last.ids)
         if step is not None:
-            _, _, ids, means, covariances, kinds = history.map_at(step)
-            now = shapes(means, covariances, kinds or [""] * len(ids), d)
+            kept = history.map_at(step)
+            now, ids = shapes(kept.means, kept.covariances, kept.kinds, d), kept.ids
         until = slice(None) if step is None else slice(step + 1)
         poses, P = history.poses, history.pose_covariances
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
         true = [l.reshape(-1, d) if len(l) == LINE else l[None, :d] for l in landmarks.values()]
-        low, high = _box(poses[:, :d], ends, whole, [*moved_truth.values(), *used.values(), *true])
-        return cls(
-            d,
-            {robot: poses[until][rows[until]] for robot, rows in mine.items()},
-            {robot: P[until][rows[until]] for robot, rows in mine.items()},
-            {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()},
-            moved_truth,
-            {robot: _fixes_in_map(run, robot) for robot in scored},
-            used,
-            landmarks,
-            ids,
-            now,
-            history.cameras,
-            low,
-            high,
-        )
+        low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true])
+        paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
+        stretches = {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()}
+        fixes = {}
+        for robot in scored:  # the antenna's offset is taken off
+            to_fixes, _, offset, xy = aligned_fixes(run, robot)
+            fixes[robot] = to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
+        cameras = history.cameras
+        return cls(d, paths, covariances, stretches, truth, fixes, used, landmarks, ids, now, cameras, low, high)
 
     @property
     def size(self) -> float:
         """The longest side of the box."""
         return float((self.high - self.low).max())
+
+    @property
+    def ground(self) -> float:
+        """The height of the ground: 0, or the lowest there is."""
+        return 0.0 if self.low[2] <= 0.0 <= self.high[2] else float(self.low[2])
 
     def colour(self, robot: str) -> str:
         """Return the robot's colour."""
@@ -109,10 +124,6 @@ class Scene:
     def line(self, robot: str) -> Array:
         """Return a robot's path (N, d), NaN in gaps of time."""
         return broken(self.paths[robot][:, : self.d], self.stretches[robot])
-
-    def true_path(self, robot: str) -> Array:
-        """Return a robot's true path (N, d), NaN in gaps of time."""
-        return broken(self.truth[robot], self.stretches[robot])
 
     def inside(self, lines: Array) -> Array:
         """Return polylines (..., d) with NaN where they leave the box."""
@@ -126,10 +137,14 @@ class Scene:
         return [_placed(pose, line) for pose in path[at[: len(path)]] for line in body]
 
     def body(self, robot: str) -> list[Array]:
-        """Return what is drawn of a robot in space as polylines (P, 3) in its own frame."""
-        size = 0.03 * self.size
-        mine = [_pyramid(camera, size) for camera in self.cameras if camera.robot == robot]
-        return mine or [0.6 * size * BODY]
+        """Return what is drawn of a robot in space as polylines (P, 3) in its own frame: pyramids, or a dart."""
+        size, lines = 0.03 * self.size, []
+        for camera in self.cameras:
+            if camera.robot == robot:
+                a, b, c, d = size * camera.corners
+                top = np.zeros(3)  # one polyline passes all edges
+                lines.append(_placed(camera.mount, np.array([a, b, top, a, d, top, c, d, c, b])))
+        return lines or [0.6 * size * BODY]
 
     def true_lines(self) -> list[Array]:
         """Return the true lines (2, 3)."""
@@ -155,11 +170,15 @@ def contours(means: Array, covariances: Array, sigmas: float = 3.0) -> Array:
     circles = np.zeros((d * (d - 1) // 2, d, len(alpha)))
     for circle, (i, j) in zip(circles, combinations(range(d), 2), strict=True):
         circle[i], circle[j] = np.cos(alpha), np.sin(alpha)
-    known = np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    known = _known(means, covariances)
     values, axes = np.linalg.eigh(np.where(known[:, None, None], covariances, 0.0))
     half = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     out = means[:, None, None, :] + sigmas * np.einsum("kij,cjp->kcpi", half, circles)
     return np.where(known[:, None, None, None], out, np.nan)
+
+
+def _known(means: Array, covariances: Array) -> Flags:
+    return np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
 
 
 def joined(lines: Sequence[Array] | Array, d: int = 3) -> Array:
@@ -194,39 +213,13 @@ def grouped(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
 
 def _used_fixes(run: Recording, d: int) -> dict[str, Array]:
     """Return the fixes (N, d) of each robot that the filter used; they are in the frame of the map."""
-    used = [fix for fix in run.history.inputs.fixes if fix.used]
+    used = [fix for fix in run.history.fixes if fix.used]
     rows = {name: np.array([fix.y for fix in used if fix.robot == name]) for name in sorted({f.robot for f in used})}
     return {name: np.pad(y, ((0, 0), (0, d - y.shape[1]))) for name, y in rows.items()}
 
 
-def _truth_to_map(run: Recording, d: int) -> Rigid:
-    """Return what brings the truth into the map: nothing if they share a frame, else the best rigid alignment."""
-    truth = run.truth
-    if truth.frame == "truth":
-        return truth.to_map()
-    known = np.isfinite(truth.poses).all(axis=1)
-    return rigid(truth.poses[known][:, :d], run.history.mean[known][:, :d])
-
-
-def _fixes_in_map(run: Recording, robot: str) -> Array:
-    """Return where the robot was (N, 2) by each fix: aligned robustly, the antenna's offset taken off."""
-    fixes = run.truth.fixes[robot]
-    antenna, offset = antenna_path(run.history, robot, fixes)
-    known = np.isfinite(antenna).all(axis=1)
-    if known.sum() < 2:
-        return np.empty((0, 2))
-    return rigid_robust(antenna[known], fixes.xy[known]).inverse()(fixes.xy[known]) - offset[known]
-
-
 def _placed(pose: Array, points: Array) -> Array:
     return points @ matrix(np.ascontiguousarray(pose[3:7])).T + pose[:3]
-
-
-def _pyramid(camera: Camera, depth: float) -> Array:
-    """Return a camera's pyramid, `depth` long, as one polyline in its robot's frame that passes all its edges."""
-    a, b, c, d = depth * camera.corners
-    top = np.zeros(3)
-    return _placed(camera.mount, np.array([a, b, top, a, d, top, c, d, c, b]))
 
 
 def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:
@@ -235,13 +228,12 @@ def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, mo
     Contours reach out of it where they are huge.
     """
     d = path.shape[1]
-    means, covariances = drawn.points.means, drawn.points.covariances
-    known = np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    means, covariances = drawn.means, drawn.covariances
+    known = _known(means, covariances)
     sigma = np.sqrt(np.maximum(np.einsum("kii->ki", np.where(known[:, None, None], covariances, 0.0)), 0.0))
     middle = path.mean(axis=0) if len(path) else np.zeros(d)
     distance = np.linalg.norm(np.where(known[:, None], means, np.inf) - middle, axis=1)
-    near = np.logical_or(drawn.group == EUCLIDEANS, sigma.max(axis=1, initial=0.0) < CLEAR * distance)
-    clear = np.logical_and(known, near)
+    clear = known & ((drawn.group == EUCLIDEANS) | (sigma.max(axis=1, initial=0.0) < CLEAR * distance))
     last = np.array([pose[:d] for pose, _ in ends.values()]).reshape(-1, d)
     spread = np.array([np.sqrt(np.maximum(np.diagonal(P)[:d], 0.0)) for _, P in ends.values()]).reshape(-1, d)
     points = np.concatenate([path, means[clear], *more])
@@ -256,3 +248,83 @@ def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, mo
     half += max(2 * PAD * float(half.max()), PAD_M)
     half[:2] = np.maximum(half[:2], NARROW * half.max())
     return middle - half, middle + half
+
+
+class Sighting(NamedTuple):
+    """One observation in one image: its name, what became of it, what was measured and what was expected.
+
+    `measured` and `expected` (V, 2) are pixels, one row a point; without an expectation the latter is NaN.  `Z` (2, 2)
+    is the covariance of the innovation of a single point, NaN of what has several.
+    """
+
+    name: str
+    outcome: str
+    euclidean: bool
+    measured: Array
+    expected: Array
+    Z: Array
+
+
+class Image(NamedTuple):
+    """One image of a scan: "left", "right" or "" for the only one, and all that was seen in it."""
+
+    side: str
+    sightings: list[Sighting]
+
+
+def images(history: History, camera: Camera, step: int) -> list[Image]:
+    """Return the images of the scan that a camera made at a step."""
+    points = _points(camera)
+    found = [Image(SIDES[side], []) for side in points]
+    for row in np.flatnonzero(history.step == step):
+        y, e, z, Z = history.y[row], history.e[row], history.z[row], history.Z[row]
+        whole = np.isfinite(z).sum() == np.isfinite(y).sum()
+        name, outcome = str(history.landmark[row]) or str(history.id[row]), str(history.outcome[row])
+        for image, at in zip(found, points.values(), strict=True):
+            Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
+            euclidean = str(history.kind[row]) in EUCLIDEAN
+            image.sightings.append(Sighting(name, outcome, euclidean, y[at], e[at], Z_at))
+    return found
+
+
+def colour_of(sighting: Sighting) -> tuple[str, str]:
+    """Return the colour of an expectation and what it means."""
+    return EXPECTED[sighting.euclidean, sighting.outcome == "associated"]
+
+
+def steps_of(history: History, camera: Camera) -> Ints:
+    """Return the steps at which a camera saw something."""
+    mine = (history.sensor == camera.sensor) & (history.robot[history.step] == camera.robot)
+    return np.unique(history.step[mine])
+
+
+def _points(camera: Camera) -> dict[str, Ints]:
+    """Return the columns (V, 2) of u and v of the points in each image."""
+    found: dict[str, dict[str, dict[str, int]]] = {}
+    for k, name in enumerate(camera.columns):
+        match = COLUMN.fullmatch(name)
+        if match is not None:
+            axis, side, number = match.groups()
+            found.setdefault(side, {}).setdefault(number, {})[axis] = k
+    # a stereo pair without the right image's v has it from the left one: the pair is rectified
+    left = found.get("l", {}).get("", {})
+    return {
+        side: np.array([[at["u"], at.get("v", left.get("v", 0))] for at in points.values()], dtype=np.int64)
+        for side, points in found.items()
+    }
+
+
+def trimmed(a: Array, b: Array, size: tuple[float, float]) -> Array | None:
+    """Return the part (2, 2) of the straight line through two pixels that lies in an image, None if there is none."""
+    d = b - a
+    if not (np.isfinite(d).all() and d.any()):
+        return None
+    first, last = -np.inf, np.inf
+    for k in (0, 1):
+        if d[k] == 0:
+            if not 0 <= a[k] <= size[k]:
+                return None
+            continue
+        near, far = sorted((-a[k] / d[k], (size[k] - a[k]) / d[k]))
+        first, last = max(first, near), min(last, far)
+    return np.array([a + first * d, a + last * d]) if first < last else None

@@ -7,29 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
-from kalmark.logs.log import Log
-from kalmark.results.align import Rigid
-from kalmark.results.columns import Array, Arrays, Named, padded_all, texts
-from kalmark.results.consistency import pose_error
-from kalmark.results.history import History, Start, as_id
-from kalmark.results.shapes import LINE, TAG
+from kalmark.logs.log import Log, PositionTrack
+from kalmark.results.history import Array, Arrays, History, Named, Start, as_id, padded_all, texts
+from kalmark.results.landmarks import LINE, TAG
+from kalmark.results.measures import Rigid, pose_error
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 SAME_FRAME_M, SAME_FRAME_RAD, SAME_FRAME_SIGMAS = 0.05, 0.02, 4.0
-
-
-@dataclass(frozen=True, eq=False)
-class Fixes:
-    """Position fixes of one robot used only for scoring: times, positions (N, 2), antenna (2,) in the robot's frame."""
-
-    t_ns: npt.NDArray[np.int64]
-    xy: Array
-    antenna: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +27,12 @@ class Truth:
     `landmarks` are true places: positions (2,) or (3,), endpoints of a line (6,), the pose of a tag (7,). `offset`
     is the pose of the truth's frame in the map's. It is the origin when the robots started at the truth (or the map
     is `anchored`: tied to the world otherwise, by known landmarks or fixes); else it is what brings the first
-    robot's true start to its start. `robots` are those whose truth the log has.
+    robot's true start to its start. `fixes` are used only for scoring, `robots` are those whose truth the log has.
     """
 
     poses: Array
     landmarks: dict[Id, Array] = field(default_factory=dict)
-    fixes: dict[str, Fixes] = field(default_factory=dict)
+    fixes: dict[str, PositionTrack] = field(default_factory=dict)
     offset: Array = field(default_factory=lambda: ORIGIN[3])
     anchored: bool = False
     robots: tuple[str, ...] = ()
@@ -58,15 +46,11 @@ class Truth:
             mine = history.robot == robot
             if mine.any():
                 poses[mine] = fitted(trajectory.at(history.t_ns[mine]), size)
-        fixes = {
-            robot: Fixes(track.t_ns, np.asarray(track.xy), np.asarray(track.antenna))
-            for robot, track in log.gps.items()
-        }
         offset = ORIGIN[size] if anchored else _offset(log.truth, history.starts, size)
         landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in log.landmarks.items()}
         if size == 7:
             landmarks = {i: np.append(l, 0.0) if len(l) == 2 else l for i, l in landmarks.items()}
-        return cls(poses, landmarks, fixes, offset, anchored, tuple(log.truth))
+        return cls(poses, landmarks, dict(log.gps), offset, anchored, tuple(log.truth))
 
     def __bool__(self) -> bool:
         return bool(self.landmarks) or bool(np.isfinite(self.poses).any())
@@ -112,14 +96,12 @@ class Truth:
             as_id(text): mean[~np.isnan(mean)]
             for text, mean in zip(named["truth_landmark"].tolist(), named["truth_landmark_mean"], strict=True)
         }
-        ends = np.cumsum(named["fix_size"])
-        fixes = {
-            str(robot): Fixes(named["fix_t_ns"][end - size : end], named["fix_mean"][end - size : end], antenna)
-            for robot, size, end, antenna in zip(
-                named["fix_robot"], named["fix_size"], ends, named["fix_antenna"], strict=True
-            )
-        }
-        robots = tuple(named["truth_robot"].tolist()) if "truth_robot" in named else ()
+        parts = (np.split(named[key], np.cumsum(named["fix_size"])[:-1]) for key in ("fix_t_ns", "fix_mean"))
+        tracks = zip(
+            named["fix_robot"].tolist(), *parts, named["fix_antenna"], strict=False
+        )  # no robot: one empty part
+        fixes = {robot: PositionTrack(t_ns, xy, antenna) for robot, t_ns, xy, antenna in tracks}
+        robots = tuple(named["truth_robot"].tolist())
         return cls(named["truth"], landmarks, fixes, named["truth_offset"], bool(named["truth_anchored"]), robots)
 
 
@@ -128,15 +110,11 @@ def fitted(poses: Array, size: int) -> Array:
     if poses.shape[1] == size:
         return poses
     if size == 3:
-        return np.column_stack([poses[:, :2], yaw(poses[:, 3:])])
+        x, y, z, w = poses[:, 3:].T
+        yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))  # where their x points
+        return np.column_stack([poses[:, :2], yaw])
     flat, half = np.zeros(len(poses)), poses[:, 2] / 2
     return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
-
-
-def yaw(q: Array) -> Array:
-    """Return the headings (N,) of orientations (N, 4): where their x points as seen from above."""
-    x, y, z, w = np.moveaxis(q, -1, 0)
-    return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
 
 
 def as_rigid(pose: Array) -> Rigid:

@@ -15,14 +15,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from kalmark.errors import RunError
-from kalmark.results.files import replace_file
-from kalmark.results.headline import headline
-from kalmark.results.images import images, steps_of
+from kalmark.results.evaluate import headline
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
-from kalmark.results.plot_sensor import draw_image
+from kalmark.results.plot_scan import draw_image
 from kalmark.results.progress import track
-from kalmark.results.recording import Recording
-from kalmark.results.scene import INK, Scene
+from kalmark.results.recording import Recording, replace_file
+from kalmark.results.scene import INK, Scene, images, steps_of
 
 INCHES, DPI = (12.8, 7.2), 80
 MOST_IMAGES = 3  # beside the map
@@ -58,16 +56,11 @@ def write_video(
 
 
 def _mp4(drawn: Iterator[Figure], fps: float, path: Path) -> None:
-    writer: Any = None
-    try:
-        for figure in drawn:
-            if writer is None:
-                writer = FFMpegWriter(fps=fps)  # type: ignore[arg-type]
-                writer.setup(figure, str(path), DPI)
+    writer: Any = FFMpegWriter(fps=fps)  # type: ignore[arg-type]
+    with writer.saving(next(drawn), str(path), DPI):
+        writer.grab_frame()
+        for _ in drawn:  # the same figure, drawn anew
             writer.grab_frame()
-    finally:
-        if writer is not None:
-            writer.finish()
 
 
 def _gif(drawn: Iterator[Figure], fps: float, path: Path) -> None:
@@ -86,14 +79,12 @@ def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool) 
     """Yield one figure again and again, drawn anew after each of the steps."""
     figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    first, title = run.history.t_ns[0], headline(run)[0]
+    t_s, title = run.history.t_s, headline(run)[0]
     for k, step in enumerate(track(steps, "video", len(steps), show=progress)):
         figure.clear()
-        turned = orbit_deg * k / max(len(steps) - 1, 1)
-        _draw(figure, run, step, turned)
-        t = (run.history.t_ns[step] - first) * 1e-9
+        _draw(figure, run, step, orbit_deg * k / max(len(steps) - 1, 1))
         figure.text(0.02, 0.955, title, fontsize=12, fontweight="bold", color=INK)
-        figure.text(0.98, 0.955, f"{t:.1f} s", fontsize=12, ha="right", color=INK)
+        figure.text(0.98, 0.955, f"{t_s[step]:.1f} s", fontsize=12, ha="right", color=INK)
         yield figure
 
 
@@ -117,11 +108,9 @@ def _draw(figure: Figure, run: Recording, step: int, turned: float) -> None:
 
 def _last_images(run: Recording, step: int) -> list[tuple[str, Any, tuple[float, float]]]:
     """Return the images of what each camera saw last up to a step, with titles."""
-    out = []
+    out: list[tuple[str, Any, tuple[float, float]]] = []
     for camera in run.history.cameras:
         steps = steps_of(run.history, camera)
-        steps = steps[steps <= step]
-        if len(steps):
-            for image in images(run.history, camera, int(steps[-1])):
-                out.append((f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size))
+        last = images(run.history, camera, int(steps[steps <= step][-1])) if (steps <= step).any() else []
+        out += [(f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size) for image in last]
     return out[:MOST_IMAGES]

@@ -1,23 +1,47 @@
-"""What is worth a second look before a run's figures are believed, one line each."""
+"""What is worth a second look before a run's figures are believed, and what noise is stated too large: a line each.
+
+Is the map wrong from some time on?  A filter on a wrong map contradicts itself: innovations that are too large or keep
+their signs, and observations that fit nothing.  So NIS, observations left out and the whiteness of innovations are
+taken in windows of time.  Bar-Shalom, Li, Kirubarajan 2001, section 5.4: time-average NIS and autocorrelation of the
+innovations.
+
+Is a noise too large?  An innovation has the noise of its measurement in it, and the uncertainty of pose and map on top:
+E[z z'] = H P H' + R is at least R, whatever P the filter believes in.  Squares of z that add up to far less than R
+therefore say that R is too large, and by how much at least.  They do not say it of errors that last from one sighting
+to the next: the map takes those in, and a larger white noise is a fair price for them.  So nothing is said where the
+truth shows the filter to be too sure of itself already.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2
 
-from kalmark.results.by_position import LEAST, no_ids
+from kalmark.declare import registered_name
+from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
-from kalmark.results.inputs import UsedFix
+from kalmark.results.history import Array, History, Ints, UsedFix
+from kalmark.results.matching import LEAST, no_ids
+from kalmark.results.measures import nis
 from kalmark.results.recording import Recording
-from kalmark.results.windows import window_warnings
 from kalmark.results.words import count, figure
 
+DEGREES = 100  # of freedom in a window, at least
+OBSERVATIONS = 60  # in a window of those left out, at least
+CHANCE = 1e-6  # with which a consistent run would raise a flag
+TIMES = 3.0  # a window's NIS over the median window's
+LEFT_OUT = 0.5  # share of a window's observations that fit nothing, where the median window has less than half of it
+CORRELATED = 0.5  # by which a window's autocorrelation of innovations exceeds the median window's
+PAIRS = 60  # of successive innovations in a window
+WINDOW_SCANS = 10  # at least, as good as, in a window: the observations of one share the error of the pose
+SCANS_PAIRED = 30  # in a window of pairs
+MOST_GAP_STEPS = 5
 NO_ID = "no id in the log"  # the reason that association by identity gives
 POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
 NIS_HIGH = 3.0  # per degree of freedom
@@ -27,12 +51,155 @@ BEARINGS = ("range_bearing", "range_bearing_3d")
 ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
 MARGIN = 0.1  # of an image, by which its measurements may lie outside it
 FEW_FIXES = 5  # fewer say little of the noise
+LOW = 0.5  # squares of innovations over those of the stated noise: it is 1.4 times too large
+TINY_NIS = 0.1
+TINY = 1e-6  # of those squares, where a log has no noise
+NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
+COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch of time: when it begins and ends, in seconds since the first step, and its figure."""
+
+    start_s: float
+    end_s: float
+    value: float
+    number: int
+
+
+def window_figures(history: History) -> dict[str, Any]:
+    """Return the figures of ``summary.json`` that windows of time have; absent where there is too little."""
+    out: dict[str, Any] = {}
+    for name, windows in (("nis", nis_windows(history)), ("left_out", left_out_windows(history))):
+        if len(windows) > 1:
+            worst = max(windows, key=lambda w: w.value)
+            out |= {f"{name}_window_max": worst.value, f"{name}_window_max_s": [worst.start_s, worst.end_s]}
+            out[f"{name}_window_median"] = float(np.median([w.value for w in windows]))
+    correlations = autocorrelations(history)
+    if correlations:
+        out["innovation_autocorrelation"] = float(np.median([w.value for w in correlations]))
+    return out
+
+
+def nis_windows(history: History) -> list[Window]:
+    """Return the NIS per degree of freedom of windows of at least so many degrees, one after the other."""
+    used = history.outcome == "associated"
+    value, dof = nis(history.z[used], history.Z[used])
+    return _windows(history, history.step[used], np.nan_to_num(value), dof, DEGREES, WINDOW_SCANS)
+
+
+def left_out_windows(history: History) -> list[Window]:
+    """Return the share of observations that were rejected, or ignored because they fit nothing, window by window."""
+    mine = history.outcome != "tentative"
+    out = np.isin(history.outcome[mine], ["rejected", "ignored", "deferred"]) & (history.d2[mine] > 0)
+    told = [np.char.startswith(history.reason[mine], start) for start in ("between ", "it does not")]
+    wrong = np.logical_or.reduce([out, *told]).astype(np.float64)
+    return _windows(history, history.step[mine], wrong, np.ones(len(wrong), dtype=np.int64), OBSERVATIONS, WINDOW_SCANS)
+
+
+def autocorrelations(history: History) -> list[Window]:
+    """Return the correlation of successive whitened innovations of the same landmark, window by window."""
+    rows = np.flatnonzero((history.outcome == "associated") & np.isfinite(history.z).any(axis=1))
+    white = _whitened(history, rows)
+    robots = history.robot[history.step[rows]]
+    order = np.lexsort((history.step[rows], history.landmark[rows], history.sensor[rows], robots))
+    one, two = order[:-1], order[1:]
+    same = history.step[rows[two]] - history.step[rows[one]] <= MOST_GAP_STEPS
+    for of in (history.landmark[rows], history.sensor[rows], robots):
+        same &= of[one] == of[two]
+    one, two = one[same], two[same]
+    turn = np.argsort(history.step[rows[two]], kind="stable")
+    a, b, step = white[one[turn]], white[two[turn]], history.step[rows[two[turn]]]
+    both = np.nansum(a * b, axis=1)
+    size = np.sqrt(np.nansum(a**2, axis=1) * np.nansum(b**2, axis=1))
+    ones = np.ones(len(both), dtype=np.int64)
+    products, sizes = (_windows(history, step, value, ones, PAIRS, SCANS_PAIRED) for value in (both, size))
+    return [
+        Window(p.start_s, p.end_s, p.value / max(s.value, 1e-300), p.number)
+        for p, s in zip(products, sizes, strict=True)
+    ]
+
+
+def _whitened(history: History, rows: Ints) -> Array:
+    """Return L^-1 z (K, p), L the factor of Z, NaN where there is none."""
+    out = np.full((len(rows), history.z.shape[1]), np.nan)
+    sizes = np.isfinite(history.z[rows]).sum(axis=1)
+    for m in np.unique(sizes[sizes > 0]):
+        mine = np.flatnonzero(sizes == m)
+        L = np.linalg.cholesky(history.Z[rows[mine], :m, :m])
+        out[mine, :m] = np.linalg.solve(L, history.z[rows[mine], :m, None])[..., 0]
+    return out
+
+
+def _windows(history: History, step: Ints, value: Array, weight: Ints, least: int, scans: int) -> list[Window]:
+    """Return sums of values over sums of weights, cut each time the weights add up to so much.
+
+    A scan counts for no more than one of so many `scans` of a window.
+    """
+    if not len(step):
+        return []
+    _, scan = np.unique(step, return_inverse=True)
+    counts = weight * np.minimum(1.0, least / scans / np.maximum(np.bincount(scan, weight), 1.0))[scan]
+    number = ((np.cumsum(counts) - counts) / least + 1e-9).astype(np.int64)
+    t, out = history.t_s, []
+    for i in range(int(number[-1]) + 1):
+        mine = number == i
+        if counts[mine].sum() >= 0.9 * least:
+            first, last = step[mine][0], step[mine][-1]
+            share = float(value[mine].sum() / weight[mine].sum())
+            out.append(Window(float(t[first]), float(t[last]), share, round(counts[mine].sum())))
+    return out
+
+
+def window_warnings(run: Recording, _: Any = None) -> Iterator[str]:
+    """Return a line for each sign that the map is wrong."""
+    history = run.history
+    begin_s = float(history.t_ns[0]) * 1e-9 if len(history.t_ns) else 0.0
+    signs = ((nis_windows, _high_nis), (left_out_windows, _left_out), (autocorrelations, _correlated))
+    for windows, told in ((of(history), told) for of, told in signs):
+        if len(windows) < 3:
+            continue
+        worst = max(windows, key=lambda w: w.value)
+        line = told(worst, float(np.median([w.value for w in windows])), len(windows))
+        if line:
+            when = f"from t={worst.start_s:.1f} to {worst.end_s:.1f} s"
+            if begin_s:
+                when += f" ({begin_s + worst.start_s:.1f} to {begin_s + worst.end_s:.1f} s in the log)"
+            yield f"{line} {when}: the map may be wrong from there on"
+
+
+def _high_nis(worst: Window, median: float, count: int) -> str:
+    bound = float(chi2.ppf(1 - CHANCE / count, worst.number)) / worst.number
+    if worst.value <= max(bound, TIMES * median):
+        return ""
+    return f"NIS per degree of freedom rises to {figure(worst.value, 2)}, median {figure(median, 2)},"
+
+
+def _correlated(worst: Window, median: float, count: int) -> str:
+    if worst.value - max(median, 0.0) < CORRELATED:
+        return ""
+    return f"successive innovations are correlated by {figure(worst.value, 2)}, median {figure(median, 2)},"
+
+
+def _left_out(worst: Window, median: float, count: int) -> str:
+    if worst.value < LEFT_OUT or median > LEFT_OUT / 2:
+        return ""
+    return f"{worst.value:.0%} of the observations fit nothing, median {median:.0%},"
 
 
 def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
-    parts = (_lost, _windows, _observations, _robots, _sensors, _truth, _fixes, _noise)
-    return [line for part in parts for line in part(run, summary)] + list(mount_warnings(summary))
+    parts = (_lost, window_warnings, _observations, _robots, _sensors, _truth, _fixes, _noise, mount_warnings)
+    return [line for part in parts for line in part(run, summary)]
+
+
+def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
+    """Return a line for each sensor whose noise is stated far too large; one if the NIS is tiny for another reason."""
+    lines, nis_ = list(_stated_too_large(run, summary)), summary["nis_per_dof"]
+    if not lines and nis_ is not None and nis_ < TINY_NIS and summary["associated"] >= NUMBER // 2:
+        lines = [f"NIS per degree of freedom {figure(nis_, 2)} where 1 is consistent: the noise is set too large"]
+    return lines
 
 
 def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
@@ -44,14 +211,11 @@ def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"DIVERGED: the error of {names} exceeds 10 of its own sigmas and 5 % of the path; do not use this map"
 
 
-def _windows(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
-    yield from window_warnings(run.history)
-
-
 def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history, total = run.history, int(summary["observations"])
+    by_design = np.logical_or.reduce([np.char.startswith(history.reason, start) for start in ATTENTION])
     for outcome in ("ignored", "rejected"):
-        mine = (history.outcome == outcome) & ~_by_design(run)
+        mine = (history.outcome == outcome) & ~by_design
         if 2 * int(mine.sum()) <= total:
             continue
         reason, number = Counter(history.reason[mine].tolist()).most_common(1)[0]
@@ -63,17 +227,13 @@ def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         yield "no observation was made: there is nothing to map"
     elif not summary["landmarks"]:
         yield "no landmark was mapped"
-    angles = history.y[_has_bearing(run)][:, 1:]
+    seen = list(zip(history.robot[history.step].tolist(), history.sensor.tolist(), strict=True))
+    bearing = {pair for pair in set(seen) if run.section(*pair).get("type") in BEARINGS}
+    angles = history.y[[pair in bearing for pair in seen]][:, 1:]  # all but the first column are bearings
     turns = (np.abs(angles) > 2 * np.pi).any(axis=1)  # NaN, where a sensor has less numbers, is not
     if turns.any():
         yield f"{int(turns.sum())} bearings beyond 2 pi rad: are they in degrees?"
     yield from _images(run)
-
-
-def _by_design(run: Recording) -> npt.NDArray[np.bool_]:
-    """Tell which observations were left alone because a sensor's attention is set so."""
-    reasons = run.history.reason
-    return np.logical_or.reduce([np.char.startswith(reasons, start) for start in ATTENTION])
 
 
 def _images(run: Recording) -> Iterator[str]:
@@ -95,18 +255,11 @@ def _images(run: Recording) -> Iterator[str]:
             )
 
 
-def _has_bearing(run: Recording) -> npt.NDArray[np.bool_]:
-    """Tell of each observation whether all but its first column are bearings, by the type of its sensor."""
-    pairs = list(zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True))
-    found = {pair: run.section(*pair).get("type") in BEARINGS for pair in set(pairs)}
-    return np.array([found[pair] for pair in pairs], dtype=np.bool_)
-
-
 def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history = run.history
     for name in history.robots:
         mine = history.robot == name
-        scans, controls = history.t_ns[mine], history.inputs.controls.get(name)
+        scans, controls = history.t_ns[mine], history.controls.get(name)
         coasts = np.isfinite(history.mean[mine]).sum(axis=1).max(initial=0) > 7  # its velocity is estimated
         if len(scans) and controls is None and not coasts:
             yield f"robot {name} has {count(len(scans), 'scan')} but no controls: it is taken to stand still"
@@ -160,7 +313,7 @@ def _some(names: set[str]) -> str:
 
 
 def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
-    fixes = run.history.inputs.fixes
+    fixes = run.history.fixes
     starts = {start.robot: start for start in run.history.starts}
     for name in dict.fromkeys(fix.robot for fix in fixes):
         first = next(fix for fix in fixes if fix.robot == name)
@@ -202,3 +355,38 @@ def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     value = summary["nis_per_dof"]
     if value is not None and value > NIS_HIGH and summary["associated"] >= 50:
         yield f"NIS per degree of freedom {figure(value, 2)} where 1 is consistent: the noise is set too small"
+
+
+def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+    history = run.history
+    nees = [figures["pose_nees"] for figures in summary["robots"].values() if figures.get("pose_nees") is not None]
+    if summary["diverged"] or (nees and float(np.mean(nees)) > POSE_NEES[summary["pose_dof"]]):
+        return
+    for sensor in dict.fromkeys(history.sensor.tolist()):
+        mine = (history.outcome == "associated") & (history.sensor == sensor) & np.isfinite(history.noise).any(axis=1)
+        if mine.sum() >= NUMBER and len(set(history.step[mine].tolist())) >= SCANS:
+            sections = [run.section(robot, sensor) for robot in run.config.get("robots") or {}]
+            columns = next((COLUMNS.get(str(section.get("type")), ()) for section in sections if section), ())
+            yield from _compared(history, sensor, mine, columns)
+
+
+def _compared(history: History, sensor: str, mine: Any, columns: tuple[str, ...]) -> Iterator[str]:
+    size = int(np.isfinite(history.noise[mine]).sum(axis=1).max())  # the padding after its numbers is that of others
+    z, sigma = history.z[mine], history.noise[mine]
+    squares = np.nanmean((z[:, :size] / sigma[:, :size]) ** 2, axis=0)
+    low = np.flatnonzero(squares < LOW)
+    if not len(low):
+        return
+    value, dof = nis(z, history.Z[mine])
+    factors = 1.0 / np.sqrt(np.maximum(squares, TINY))
+    if len(columns) == size:
+        told = "sigma is", ", ".join(f"{figure(factors[k], 2)} times ({columns[k]})" for k in low)
+    elif len(low) == size:
+        told = "sigmas are", f"{figure(float(1.0 / np.sqrt(np.mean(np.maximum(squares, TINY)))), 2)} times"
+    else:
+        return
+    share = figure(float(np.nansum(value) / dof.sum()), 2)
+    yield (
+        f"sensor {sensor}: NIS {share} where 1 is expected: its {told[0]} stated about {told[1]} too large, "
+        "unless its errors last from one sighting to the next"
+    )

@@ -15,14 +15,11 @@ from typing import Any
 Words = tuple[tuple[str, str, str], ...]
 
 
-def _words() -> Iterator[Words]:
-    text = (resources.files("kalmark.results") / "figures.csv").read_text(encoding="utf-8")
-    rows = list(csv.DictReader(text.splitlines()))
-    for part in ("totals", "more", "robot", "batch"):
-        yield tuple((row["key"], row["label"], row["unit"]) for row in rows if row["part"] == part)
-
-
-TOTALS, MORE, ROBOT, BATCH = _words()
+_ROWS = [*csv.DictReader((resources.files("kalmark.results") / "figures.csv").read_text("utf-8").splitlines())]
+TOTALS, MORE, ROBOT, BATCH = (
+    tuple((row["key"], row["label"], row["unit"]) for row in _ROWS if row["part"] == part)
+    for part in ("totals", "more", "robot", "batch")
+)
 
 
 def in_words(figures: Mapping[str, Any], words: Words) -> Iterator[tuple[str, str, Any, str]]:

@@ -1,25 +1,98 @@
-"""Does an estimate err as much as it says?  NEES in the estimator's coordinates, NIS, and their chi-square bounds.
+"""Errors of an estimate and whether it says so itself: rigid alignment, RMSE, NEES, NIS and their chi-square bounds.
 
-Bar-Shalom, Li, Kirubarajan 2001, section 5.4; Bailey et al. 2006 for the use in SLAM.  In the plane poses are
-(x, y, theta) and the error of a heading is a number; in space poses are (x, y, z, qx, qy, qz, qw), and the error of an
-orientation is the rotation vector in the world's frame that turns the estimate into the truth.
+Alignment (rotation and shift, no scale): Kabsch 1976 / Umeyama 1991, equations (39-42) of the latter with unit scale.
+Consistency: Bar-Shalom, Li, Kirubarajan 2001, section 5.4; Bailey et al. 2006 for the use in SLAM.  In the plane poses
+are (x, y, theta) and the error of a heading is a number; in space poses are (x, y, z, qx, qy, qz, qw), and the error of
+an orientation is the rotation vector in the world's frame that turns the estimate into the truth.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2
 
 from kalmark.geometry.angles import wrap
-
-Array = npt.NDArray[np.float64]
+from kalmark.geometry.rotations import from_matrix, multiply
+from kalmark.results.history import Array, Ints
 
 SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix that still counts as regular
 DIVERGED_SIGMAS = 10.0
 DIVERGED_PATH = 0.05
+
+
+class Rigid(NamedTuple):
+    """A rotation (d, d) followed by a shift (d,): what takes one set of positions onto another."""
+
+    rotation: Array
+    shift: Array
+
+    def __call__(self, points: Array) -> Array:
+        """Return the points (..., d) rotated and shifted."""
+        return points @ self.rotation.T + self.shift
+
+    def inverse(self) -> Rigid:
+        """Return the alignment that undoes this one."""
+        return Rigid(self.rotation.T, -self.rotation.T @ self.shift)
+
+    def poses(self, poses: Array) -> Array:
+        """Return poses (N, 3) = (x, y, theta) or (N, 7) = (x, y, z, qx, qy, qz, qw) rotated and shifted."""
+        if poses.shape[1] == 7:
+            turn = from_matrix(np.ascontiguousarray(self.rotation))
+            turned = np.array([multiply(turn, q) for q in np.ascontiguousarray(poses[:, 3:])])
+            return np.column_stack([self(poses[:, :3]), turned.reshape(-1, 4)])
+        angle = np.arctan2(self.rotation[1, 0], self.rotation[0, 0])
+        return np.column_stack([self(poses[:, :2]), poses[:, 2] + angle])
+
+
+def identity(d: int = 2) -> Rigid:
+    """Return the alignment in `d` dimensions that changes nothing."""
+    return Rigid(np.eye(d), np.zeros(d))
+
+
+def rigid(source: Array, target: Array, weights: Array | None = None) -> Rigid:
+    """Fit the rotation and shift that take `source` (N, d) onto `target` (N, d) with least squares, d = 2 or 3.
+
+    Optional `weights` (N,) multiply the squared distances.  No points give the identity, one point a shift.
+    """
+    d = source.shape[1]
+    w = np.ones(len(source)) if weights is None else weights
+    if len(source) == 0 or w.sum() <= 0:
+        return identity(d)
+    mean_s, mean_t = w @ source / w.sum(), w @ target / w.sum()
+    cross = (target - mean_t).T @ ((source - mean_s) * w[:, None])
+    u, _, vt = np.linalg.svd(cross)
+    mirror = np.ones(d)
+    mirror[-1] = np.sign(np.linalg.det(u) * np.linalg.det(vt))  # a rotation, never a reflection
+    rotation = (u * mirror) @ vt
+    return Rigid(rotation, mean_t - rotation @ mean_s)
+
+
+def rigid_robust(source: Array, target: Array, floor_m: float = 0.1, iterations: int = 200) -> Rigid:
+    """Fit the alignment of points (N, d) that minimises the sum of the *distances*, which limits outliers.
+
+    Iteratively reweighted least squares with weights 1 / max(distance, `floor_m`), until the fit stands still.
+    """
+    fit = rigid(source, target)
+    for _ in range(iterations):
+        distance = np.linalg.norm(fit(source) - target, axis=1)
+        new = rigid(source, target, 1.0 / np.maximum(distance, floor_m))
+        change = max(np.abs(new.rotation - fit.rotation).max(), np.abs(new(source) - fit(source)).max(initial=0.0))
+        fit = new
+        if change < 1e-9:
+            break
+    return fit
+
+
+def rmse(errors: Array) -> float:
+    """Return the root of the mean squared length of the errors (N, d), NaN if there are none."""
+    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else float("nan")
+
+
+def path_m(positions: Array) -> float:
+    """Return the length of a path of positions (N, d) in metres."""
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
 def left_jacobian_inverse(a: Any) -> Array:
@@ -104,7 +177,7 @@ def nees(d: Array, P: Array) -> Array:
     return np.where(regular, value, np.nan)
 
 
-def nis(z: Array, Z: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+def nis(z: Array, Z: Array) -> tuple[Array, Ints]:
     """Return z^T Z^-1 z (K,) and its degrees of freedom (K,) for innovations (K, m) padded with NaN."""
     dof = np.isfinite(z).sum(axis=1)
     value = np.full(len(z), np.nan)
@@ -120,11 +193,11 @@ def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tu
     return float(chi2.ppf(tail, dof * runs)) / runs, float(chi2.ppf(1.0 - tail, dof * runs)) / runs
 
 
-def diverged(d: Array, P: Array, error_m: Array, path_m: float) -> bool:
+def diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:
     """Tell whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
 
     `d` (N, 2 or 3) is the position error in the estimator's coordinates, `P` its covariance, `error_m` (N,) its
-    length in metres.  Sigmas are counted as the Mahalanobis distance.
+    length in metres, `truth` (N, 2 or 3) the true path.  Sigmas are counted as the Mahalanobis distance.
     """
     far = np.sqrt(nees(d, P)) > DIVERGED_SIGMAS
-    return bool(np.any(far & (error_m > DIVERGED_PATH * path_m)))
+    return bool(np.any(far & (error_m > DIVERGED_PATH * path_m(truth))))

@@ -1,20 +1,64 @@
-"""Figures as tables on standard output."""
+"""What several verbs share: arguments and options, and figures as tables on standard output."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
+from kalmark.errors import KalmarkError
 from kalmark.results.words import BATCH, ROBOT, TOTALS, header, in_words
 
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
+]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that `kalmark run` wrote.")]
 _SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
+
+
+@contextmanager
+def computing() -> Iterator[None]:
+    """Keep BLAS to one thread.
+
+    The matrices of a scan are small: with more threads, they only wait for each other.
+    """
+    from threadpoolctl import threadpool_limits
+
+    import kalmark.filter.kernels  # noqa: F401 - loads the BLAS, so that the limit takes hold of it
+
+    with threadpool_limits(1):
+        yield
+
+
+def announce_compilation_elsewhere() -> None:
+    """Say on stderr that other processes will compile the inner loops, as far as can be known: nothing is there yet."""
+    from kalmark.compiled import SOURCES, cache_folder, say_compiling
+
+    if not all(Path(cache_folder(part)).exists() for part in SOURCES):
+        say_compiling()
+
+
+def writable(folder: Path) -> Path:
+    """Return a folder that can be made or written to, without making it: found out before the work, not after."""
+    import os
+
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise KalmarkError(f"--out {folder}: {existing} is a file, expected a folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise KalmarkError(f"--out {folder}: {existing} cannot be written to")
+    return folder
 
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
     from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
+    from kalmark.results.warnings import POSE_NEES
 
     rows = [
         (label, number(summary[key], unit), unit)
@@ -32,7 +76,9 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         table = [(name, *(number(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
         print_table("", columns, table, align="<" + ">" * len(shown))
         if any(key == "pose_nees" for key, _, _ in shown):
-            typer.echo(nees_expected(summary) + "\n")
+            dof = summary.get("pose_dof", 3)
+            several = f"{dof} averaged over many runs, up to {POSE_NEES[dof]:g} in a single one"
+            typer.echo(f"consistent pose NEES: {several}\n")
     mounts = mount_rows(summary)
     if mounts:
         print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")
@@ -40,18 +86,9 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     if batch:
         table = [(label, number(value), unit) for _, label, value, unit in in_words(batch, BATCH)]
         print_table("against the batch solution", ("", "", ""), table, align="<><")
-    for line in summary.get("warnings", ()):
-        typer.echo(f"warning: {line}")
-    for line in summary.get("advice", ()):
-        typer.echo(f"advice: {line}")
-
-
-def nees_expected(summary: Mapping[str, Any]) -> str:
-    """Return what the pose NEES of a consistent filter is, over many runs and in one."""
-    from kalmark.results.warnings import POSE_NEES
-
-    dof = summary.get("pose_dof", 3)
-    return f"consistent pose NEES: {dof} averaged over many runs, up to {POSE_NEES[dof]:g} in a single one"
+    for kind, key in (("warning", "warnings"), ("advice", "advice")):
+        for line in summary.get(key, ()):
+            typer.echo(f"{kind}: {line}")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:

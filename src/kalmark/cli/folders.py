@@ -1,0 +1,79 @@
+"""What reads a run folder: `kalmark evaluate`, `report` and `explain`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kalmark.cli.shared import RunFolder, computing, print_summary
+
+
+def evaluate(
+    run: RunFolder,
+    truth: Annotated[Path | None, typer.Option(metavar="LOG", help="Judge by the truth of this log.")] = None,
+    batch: Annotated[
+        bool, typer.Option("--batch", help="Compare with the batch solution, and keep that in the run.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
+) -> None:
+    """Print the figures of a run."""
+    from kalmark.logs import open_log
+    from kalmark.results.recording import write
+    from kalmark.results.run import Run
+
+    with computing():
+        loaded = Run.load(run)
+        if truth is not None:
+            loaded = loaded.with_truth(open_log(truth))
+        summary = loaded.evaluate(batch=batch)
+        if batch and truth is None:
+            write(run / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    if as_json:
+        typer.echo(json.dumps(summary, indent=2))
+    else:
+        print_summary(str(run), summary)
+
+
+def report(
+    run: RunFolder,
+    video: Annotated[
+        bool, typer.Option("--video", help="Also write video.mp4 (video.gif where ffmpeg is not installed).")
+    ] = False,
+    fps: Annotated[float, typer.Option(help="Frames a second of the video.")] = 10.0,
+) -> None:
+    """Write map.png, report.html and a figure of each camera's last scan again."""
+    from kalmark.results.run import Run
+
+    loaded = Run.load(run)
+    for path in loaded.report(run):
+        typer.echo(str(path))
+    if video:
+        from kalmark.results.video import write_video
+
+        typer.echo(str(write_video(loaded, run / "video.mp4", fps)))
+
+
+def explain(
+    run: RunFolder,
+    scan: Annotated[
+        float, typer.Option(metavar="T", help="The log's time in s, as in associations.csv; else since the first scan.")
+    ],
+    robot: Annotated[str | None, typer.Option(help="Of this robot. (default: the nearest scan of any)")] = None,
+) -> None:
+    """Say why one scan's observations became what they did, and draw it: what each was compared with, d2, gates."""
+    from kalmark.results.explain import explain as explanation_of
+    from kalmark.results.plot import save_figure
+    from kalmark.results.plot_scan import draw_scan
+    from kalmark.results.recording import file_name, replace_file
+    from kalmark.results.run import Run
+
+    loaded = Run.load(run)
+    told = explanation_of(loaded, scan, robot)
+    for line in told.lines():
+        typer.echo(line)
+    path = run / f"scan_{file_name(told.robot)}_{told.in_log}.png"
+    replace_file(path, lambda temporary: save_figure(draw_scan(loaded, told), temporary))
+    typer.echo(str(path))

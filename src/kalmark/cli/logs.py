@@ -1,0 +1,104 @@
+"""What makes logs, `kalmark simulate`, `convert` and `data`, and configurations to start from, `kalmark config`."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kalmark.cli.shared import Overrides, print_table, writable
+
+if TYPE_CHECKING:
+    from kalmark.simulate import World
+
+data = typer.Typer(help="List and fetch datasets.", no_args_is_help=True)
+
+
+def simulate(
+    world: Annotated[str, typer.Argument(metavar="WORLD", help="A YAML file or a shipped name.")],
+    out: Annotated[Path, typer.Option(metavar="LOG", help="The folder of the log to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 1,
+    overrides: Overrides = None,
+) -> None:
+    """Simulate a world and write a native log with its truth, and the configuration of the filter that fits it."""
+    from kalmark import simulate as sim
+    from kalmark.logs import write_native
+
+    writable(out)
+    loaded = sim.load_world(world, overrides or ())
+    log = sim.simulate(loaded, seed)
+    write_native(log, out)
+    (out / "config.yaml").write_text(fitting_config(loaded, seed), encoding="utf-8")
+    typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}; map them with")
+    typer.echo(f"kalmark run {shlex.quote(str(out / 'config.yaml'))}")
+
+
+def fitting_config(world: World, seed: int) -> str:
+    """Return the text of a configuration of the filter that fits a world, for a log in its own folder."""
+    from kalmark.config import config_dict
+    from kalmark.results.recording import config_yaml
+
+    config = world.config()
+    log = config.log.model_copy(update={"path": ".", "format": "native"})
+    values = config_dict(config.model_copy(update={"log": log, "seed": seed}))
+    chosen = config.estimator.model_dump(exclude_defaults=True)  # so that --set estimator.type=ekf is enough
+    return config_yaml(values | {"estimator": {"type": config.estimator.type, **chosen}})
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="A log in any format kalmark reads.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder of the native log to write.")],
+    log_format: Annotated[str | None, typer.Option("--format", help="Format of IN, if not recognised.")] = None,
+) -> None:
+    """Write a log as a native one: a folder of CSV files."""
+    from kalmark.logs import open_log, write_native
+
+    writable(out)
+    log = open_log(source, log_format)
+    write_native(log, out)
+    typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}, read as {log.format}")
+
+
+@data.command("list")
+def list_() -> None:
+    """List the datasets that can be fetched, and those of which a copy of your own is read."""
+    from kalmark.logs.download import OWN_COPIES, list_data
+
+    rows = [(d.name, f"{d.bytes / 1e6:.1f} MB", d.what, d.licence) for d in list_data()]
+    print_table("", ("name", "size", "what", "licence"), rows, align="<><<")
+    typer.echo("\nNot fetched; put a copy of your own where it is found:\n")
+    print_table("", ("name", "what", "put"), [(d.name, d.what, d.put) for d in OWN_COPIES], align="<<<")
+
+
+@data.command()
+def fetch(name: Annotated[str, typer.Argument(help="A dataset, or a group like mrclam.")]) -> None:
+    """Download a dataset into the cache, every file checked by its hash; what KALMARK_DATA has is used from there."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from kalmark.logs.download import fetch as fetch_data
+
+    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn()
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task(name, total=None)
+
+    def show(file: str, done: int, total: int) -> None:
+        bar.start()
+        bar.update(task, description=file, completed=done, total=total)
+
+    try:
+        typer.echo(str(fetch_data(name, show)))
+    finally:
+        if bar.live.is_started:
+            bar.stop()
+
+
+def config(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A shipped configuration, like native.")],
+) -> None:
+    """Print a shipped configuration, to start your own: kalmark config native > mine.yaml."""
+    from kalmark.config import resolve_config
+
+    typer.echo(resolve_config(name).read_text(encoding="utf-8"), nl=False)
