@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.config.building import build_slam
-from kalmark.config.choices import section_of
 from kalmark.config.schema import Config
+from kalmark.config.sections import section_of
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.logs.log import Log

@@ -18,9 +18,8 @@ from numpy.random import Generator, SeedSequence
 
 from kalmark.campaign.recorded import Look, Recorded, Steer, recorded
 from kalmark.config.building import build_robot, config_dict
-from kalmark.config.mounting import StartConfig
 from kalmark.config.opening import described
-from kalmark.config.schema import Config
+from kalmark.config.schema import Config, StartConfig
 from kalmark.config.tree import name_on
 from kalmark.events import Control, Event, Fix, Id
 from kalmark.geometry.angles import wrap

@@ -14,8 +14,7 @@ from numba.core import event as numba_event
 
 from kalmark.errors import DivergedError, EventError
 from kalmark.events import Control, Event, Fix, Id, Scan
-from kalmark.logs.log import Log
-from kalmark.logs.start import begins_at
+from kalmark.logs.log import Log, begins_at
 from kalmark.results.advice import stated_noise
 from kalmark.results.cameras import biases, cameras, mounts
 from kalmark.results.columns import Array, Texts, padded, texts
