@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.config import Config, build_slam, config_dict, load_config, open_config_log, slam_from_config
-from kalmark.config.choices import section_of
+from kalmark.config.sections import section_of
 from kalmark.declare import classes, parameters
 from kalmark.errors import ConfigError
 from kalmark.logs import Log, Trajectory

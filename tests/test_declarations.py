@@ -247,7 +247,7 @@ def test_a_name_of_kalmark_s_cannot_be_taken() -> None:
 
 
 def test_every_registered_model_has_a_section_that_makes_it_again(tmp_path: Path) -> None:
-    from kalmark.config.choices import model_of, section_of
+    from kalmark.config.sections import model_of, section_of
     from kalmark.declare import built_in, registered_name, world_of_class
 
     for role in ("motion", "sensor", "landmark", "association", "estimator", "detector", "initialization"):

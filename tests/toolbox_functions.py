@@ -11,8 +11,7 @@ from kalmark import geometry
 from kalmark.geometry import directions, frames3d, rotations
 from kalmark.models import cameras
 from kalmark.models import landmarks3d as lm
-from kalmark.simulate.layouts import cloister
-from kalmark.simulate.layouts3d import house, thick_cloister
+from kalmark.simulate.layouts import Cloister, House, ThickCloister
 from toolbox import (
     TURNED,
     Case,
@@ -288,19 +287,23 @@ def ellipse(i: Case, o: Case) -> list[Pair]:
     return [(at, np.full(len(at), i["ns"][0])), (contour.shape, theirs.shape)]
 
 
-def cloister_walk(i: Case, o: Case) -> list[Pair]:
+def placed(kind: Any, i: Case) -> Any:
     *limits, n = i["args"]
-    return [(cloister(*[*limits, int(n)]).T, o["world"])]
+    names = ("x_min_m", "x_max_m", "y_min_m", "y_max_m", "height_m")
+    return kind.model_construct(**dict(zip(names, limits, strict=False)), n=int(n)).place(np.random.default_rng()).T
+
+
+def cloister_walk(i: Case, o: Case) -> list[Pair]:
+    return [(placed(Cloister, i), o["world"])]
 
 
 def two_storeys(i: Case, o: Case) -> list[Pair]:
-    *limits, n = i["args"]
-    return [(thick_cloister(*[*limits, int(n)]).T, o["world"])]
+    return [(placed(ThickCloister, i), o["world"])]
 
 
 def house_of_segments(i: Case, o: Case) -> list[Pair]:
     x, y, z = i["args"].tolist()
-    return [(house((x, y, z)).T, o["world"])]
+    return [(House(x_m=x, y_m=y, z_m=z).scenery(np.random.default_rng()).segments.T, o["world"])]
 
 
 COUNTERPARTS: dict[str, Callable[[Case, Case], list[Pair]]] = {

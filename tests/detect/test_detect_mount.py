@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from kalmark.results.describe import describe
-from kalmark.results.files import config_yaml
+from kalmark.results.readings import describe
+from kalmark.results.recording import config_yaml
 
 import kalmark as km
 from kalmark.cli.run import run_log

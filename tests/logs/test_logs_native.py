@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
-from kalmark.logs.text import nanoseconds, seconds
+from kalmark.logs.source import nanoseconds, seconds
 from native_logs import GOOD, HEAD, native
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from kalmark.events import Control, Event, Scan
 from kalmark.logs import Log, Trajectory
-from kalmark.logs.start import begins_at, true_start
+from kalmark.logs.log import begins_at, true_start
 
 SECOND = 1_000_000_000
 INCREMENTS: list[Event] = [Control(1.0, "r", (2.0, 0.0, np.pi / 2)), Control(2.0, "r", (1.0, 0.0, 0.0))]

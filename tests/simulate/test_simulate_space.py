@@ -18,7 +18,7 @@ from kalmark.logs import write_native
 from kalmark.logs.log import Log
 from kalmark.models.observe import expectation
 from kalmark.simulate import load_world, simulate
-from kalmark.simulate.layouts3d import RandomBox, TagRoom
+from kalmark.simulate.layouts import RandomBox, TagRoom
 from kalmark.simulate.robots import simulation
 from kalmark.simulate.routes import control_in_space
 from space_worlds import assert_sigma, faulty, scans, world

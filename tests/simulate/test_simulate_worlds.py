@@ -11,11 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kalmark.config.merging import merged
+from kalmark.config.opening import merged
 from kalmark.errors import ConfigError
 from kalmark.simulate import World, load_world, shipped_worlds, simulate
-from kalmark.simulate.layouts import Cloister, Loop, RandomField, cloister
-from kalmark.simulate.layouts3d import House, Listed, ListedTag, RandomBox, TagRoom, ThickCloister
+from kalmark.simulate.layouts import (
+    Cloister,
+    House,
+    Listed,
+    ListedTag,
+    Loop,
+    RandomBox,
+    RandomField,
+    TagRoom,
+    ThickCloister,
+)
 from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control
 from kalmark.simulate.sights import Sensing
 from kalmark.simulate.worlds import SimulatedRobot
@@ -43,7 +52,8 @@ steps: 5
 
 def test_the_cloister_has_the_recorded_landmarks_in_the_recorded_order(oracle: Callable[[str], Path]) -> None:
     recorded = json.loads(gzip.decompress(oracle("course2d.json.gz").read_bytes()))
-    assert np.abs(cloister(-4, 4, -4, 4, 7) - np.array(recorded["W"]).T).max() < 1e-14
+    points = Cloister(x_min_m=-4, x_max_m=4, y_min_m=-4, y_max_m=4, n=7).floor()
+    assert np.abs(points - np.array(recorded["W"]).T).max() < 1e-14
     log = simulate(load_world("cloister"), 1)
     assert np.abs(np.array(list(log.landmarks.values())) - np.array(recorded["W"]).T).max() < 1e-14
     true = np.array([step["R"] for step in recorded["steps"]])
@@ -51,7 +61,7 @@ def test_the_cloister_has_the_recorded_landmarks_in_the_recorded_order(oracle: C
 
 
 def test_a_cloister_is_symmetric_and_fills_its_limits() -> None:
-    points = cloister(-3, 5, 0, 2, 9)
+    points = Cloister(x_min_m=-3, x_max_m=5, y_min_m=0, y_max_m=2, n=9).floor()
     assert len(points) == 4 * (2 * 9 - 5)
     assert points.min(axis=0) == pytest.approx([-3, 0])
     assert points.max(axis=0) == pytest.approx([5, 2])

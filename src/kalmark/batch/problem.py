@@ -1,20 +1,135 @@
-"""The least-squares problem of a whole log: motion between poses, and what the factors say of the state.
+"""The least-squares problem of a whole log: what sensors, surveys and the motion between poses say of the state.
 
-The motion is carried as constraints with a covariance that may be singular: a held control has two errors for the three
-coordinates of a pose, an exact start has none.
+Everything is vectorised over the whole log: one factor holds all the observations of one mounted sensor.  The motion is
+carried as constraints with a covariance that may be singular: a held control has two errors for the three coordinates
+of a pose, an exact start has none.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
-from kalmark.batch.factors import Block, Factor, Term
-from kalmark.batch.state import ORIGIN, POSE_SPACES, POSES, Array, Flags, Ints, State, beyond
+from kalmark.batch.state import ORIGIN, POSE_SPACES, POSES, Array, Flags, Ints, State, beyond, looked, plus
 from kalmark.events import Id
+from kalmark.geometry.spaces import POINT2, POINT3, Space
+
+DIFFERENCE = 1e-5  # m and rad
+
+
+class Block(NamedTuple):
+    """An argument of K residuals: the `rows` (K,) of a group, or of them the leading numbers that are of `space`."""
+
+    group: int
+    rows: Ints
+    space: Space
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """K residuals z (K, p) of `blocks`, and E (K, p, .): errors dx of the blocks leave z - E dx.
+
+    `residuals` returns both for the values (K, size) of each block.
+    """
+
+    residuals: Callable[..., tuple[Array, Array]]
+    blocks: tuple[Block, ...]
+
+    def at(self, state: State) -> tuple[Array, Array]:
+        """Return the residuals and E at a state; NaN where a sensor does not see its target."""
+        return self.residuals(*self._values(state))
+
+    def jacobian(self, E: Array, state: State) -> sp.csr_array:
+        """Return E (K, p, .) as a sparse matrix (K p, size of a step)."""
+        k, p, _ = E.shape
+        return _sparse(E, np.arange(k * p).reshape(k, p), self._columns(state), (k * p, state.ends[-1]))
+
+    def hessian(self, state: State, weighed: Callable[[Array], Array]) -> sp.csr_array:
+        """Return the derivative of the gradient -E' weighed(z), by central differences; symmetric, as turns are not."""
+        values, columns = self._values(state), []
+        for k, (x, block) in enumerate(zip(values, self.blocks, strict=True)):
+            for step in DIFFERENCE * np.eye(block.space.dof):
+                gradients = []
+                for d in (step, -step):
+                    moved = plus(block.space, x, np.tile(d, (len(x), 1)), np.zeros((len(x), 0)))
+                    z, E = self.residuals(*values[:k], moved, *values[k + 1 :])
+                    gradients.append(-np.einsum("kij,ki->kj", E, weighed(z)))
+                columns.append((gradients[0] - gradients[1]) / (2 * DIFFERENCE))
+        C, at = np.stack(columns, axis=2), self._columns(state)
+        return _sparse(0.5 * (C + C.swapaxes(1, 2)), at, at, (state.ends[-1],) * 2)
+
+    def _values(self, state: State) -> list[Array]:
+        return [state.groups[group][rows, : space.size] for group, rows, space in self.blocks]
+
+    def _columns(self, state: State) -> Ints:
+        """Return where in a step the errors (K, .) of all blocks are."""
+        return np.concatenate(
+            [state.columns(b.group, b.rows)[:, None] + np.arange(b.space.dof) for b in self.blocks], 1
+        )
+
+
+class Rows(NamedTuple):
+    """Whitened residuals z (k,), their Jacobian H (k, size of a step), and the sum of z^2, robust if the factor is."""
+
+    z: Array
+    H: sp.csr_array
+    chi2: float
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """A term with independent noise `R` (K, p, p); residuals that are longer than `huber` when whitened count less."""
+
+    term: Term
+    R: Array
+    huber: float = np.inf
+    sensor: str = ""
+
+    def rows(self, state: State) -> Rows:
+        """Return the whitened residuals and what they sum up to."""
+        z, E = self.term.at(state)
+        L_inverse = np.linalg.inv(np.linalg.cholesky(self.R))
+        z, E = np.einsum("kij,kj->ki", L_inverse, z), L_inverse @ E
+        length = np.sqrt(np.sum(z**2, axis=1))
+        inside = np.minimum(length, self.huber)
+        if (length > self.huber).any():
+            root = np.sqrt(inside / np.maximum(length, self.huber))[:, None]
+            z, E = root * z, root[:, :, None] * E
+        return Rows(z.ravel(), self.term.jacobian(E, state), float(inside @ (2 * length - inside)))
+
+    def hessian(self, state: State) -> sp.csr_array:
+        """Return the second derivative of |z|^2 / 2, not robust."""
+        weights = np.asarray(np.linalg.inv(self.R), dtype=np.float64)
+        return self.term.hessian(state, lambda z: np.einsum("kij,kj->ki", weights, z))
+
+
+def sightings(view: Any, blocks: tuple[Block, ...], y: Array, R: Array, huber: float, sensor: str) -> Factor:
+    """Return what a mounted sensor measured, y (K, m) with noise R (K, p, p).  [S] (63).
+
+    `view` is how it sees landmarks (`kalmark.models.observe`); the blocks are the poses, its mount if that is unknown,
+    and the targets, landmarks or the positions of other poses.
+    """
+
+    def residuals(*values: Array) -> tuple[Array, Array]:
+        return looked(view, np.concatenate(values[:-1], axis=1), values[-1], y)
+
+    return Factor(Term(residuals, blocks), R, huber, sensor)
+
+
+def positions(group: int, rows: Ints, y: Array, R: Array) -> Factor:
+    """Return absolute positions y (K, d) with noise R (K, d, d) of rows (K,) of a group."""
+    E, space = np.tile(np.eye(y.shape[1]), (len(y), 1, 1)), POINT2 if y.shape[1] == 2 else POINT3
+    return Factor(Term(lambda p: (y - p, E), (Block(group, rows, space),)), R)
+
+
+def _sparse(E: Array, row: Ints, column: Ints, shape: tuple[int, int]) -> sp.csr_array:
+    """Return the sparse sum of the matrices E (K, p, q) at rows (K, p) and columns (K, q)."""
+    at = np.broadcast_to(row[:, :, None], E.shape).ravel(), np.broadcast_to(column[:, None, :], E.shape).ravel()
+    return sp.csr_array(sp.coo_array((E.ravel(), at), shape=shape))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from kalmark.compiled import compiled
+from kalmark.errors import KalmarkError
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian_inverse
@@ -25,6 +26,11 @@ Flags = npt.NDArray[np.bool_]
 POSES, LANDMARKS, FIRST_MOUNT = range(3)  # the first two groups; from the third on each group is one mount
 POSE_SPACES: dict[int, Space] = {3: SE2, 7: SE3}  # by their numbers
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+
+
+def unsolved(what: str) -> KalmarkError:
+    """Return the error of a problem that cannot be stated or solved."""
+    return KalmarkError(f"batch solution: {what}")
 
 
 class State(NamedTuple):

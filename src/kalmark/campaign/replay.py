@@ -19,10 +19,9 @@ import numpy as np
 from numpy.random import Generator, SeedSequence
 
 from kalmark.config.building import build_robot, build_slam, config_dict
-from kalmark.config.choices import section_of
-from kalmark.config.mounting import StartConfig
 from kalmark.config.opening import described
-from kalmark.config.schema import Config
+from kalmark.config.schema import Config, StartConfig
+from kalmark.config.sections import section_of
 from kalmark.config.tree import name_on
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Control, Event, Fix, Id, Scan

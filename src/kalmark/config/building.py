@@ -1,22 +1,23 @@
-"""From a configuration to the robots and the filter that it describes."""
+"""From a configuration to the robots and the filter that it describes, and whether the log is what they take."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
-from kalmark.config.choices import ModelSection, model_of
-from kalmark.config.misfit import refuse_controls, refuse_scans
-from kalmark.config.mounting import covariance_of, pose_of, velocity_of
 from kalmark.config.opening import described, open_run
 from kalmark.config.reading import did_you_mean, load_config
-from kalmark.config.schema import Config
-from kalmark.errors import ModelError
-from kalmark.logs.log import Log
-from kalmark.logs.start import true_start
+from kalmark.config.schema import VELOCITY, Config, covariance_of, pose_of
+from kalmark.config.sections import model_of
+from kalmark.declare import built_in, registered_name
+from kalmark.detect.scan import RAW, Laser
+from kalmark.errors import LogError, ModelError
+from kalmark.events import Scan
+from kalmark.logs.log import Log, true_start
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
@@ -29,17 +30,14 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
     """
     config = config if log is None else described(config, log)
     robots = [build_robot(config, name, log) for name in _names(config, log)]
+    m, kept = config.map, model_of(config.upkeep)
     types = {
-        "association": _build(config, ("association",), config.association),
-        "estimator": _build(config, ("estimator",), config.estimator),
-        "landmarks": _build(config, ("landmarks",), config.landmarks, robots[0].motion.space.world),
+        "association": _made(config, ("association",), model_of, config.association),
+        "estimator": _made(config, ("estimator",), model_of, config.estimator),
+        "landmarks": _made(config, ("landmarks",), model_of, config.landmarks, robots[0].motion.space.world),
     }
-    try:
-        m = config.map
-        kept = model_of(config.upkeep)
-        return Slam(robots, **types, map=m.type, numbers=m.numbers, reparametrize=m.linearity, upkeep=kept)
-    except ModelError as error:
-        raise config.error(("robots",), str(error)) from None
+    kept_map = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
+    return _made(config, ("robots",), Slam, robots, **types, **kept_map, upkeep=kept)
 
 
 def slam_from_config(path_or_name: str | Path) -> Slam:
@@ -73,7 +71,7 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
         near = did_you_mean(name, [*config.robots])
         raise config.error(("robots",), f"got {', '.join(config.robots)}, expected {name!r} of the log, or each{near}")
     robot, path = config.robots[key], ("robots", key)
-    moves = _build(config, (*path, "motion"), robot.motion)
+    moves = _made(config, (*path, "motion"), model_of, robot.motion)
     start, cov = _start(robot.start, name, log, moves)
     world = moves.space.world
     if log is not None:
@@ -81,10 +79,7 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
     if log is not None:
         refuse_scans(config, key, name, mounts, log)
-    try:
-        return Robot(name, moves, start=start, sensors=mounts, cov=cov)
-    except ModelError as error:
-        raise config.error(path, str(error)) from None
+    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov)
 
 
 def _names(config: Config, log: Log | None) -> list[str]:
@@ -103,7 +98,7 @@ def _start(section: Any, name: str, log: Log | None, moves: MotionModel) -> tupl
     space = moves.space
     if section is not None:
         pose = pose_of(section)
-        start = pose if space.size == len(pose) else [*pose, *velocity_of(section)]
+        start = pose if space.size == len(pose) else [*pose, *(getattr(section, key) for key in VELOCITY[:6])]
         return start, covariance_of(section, space.dof)
     true = None if log is None else true_start(log, name, moves.held)
     return (true if true is not None and (len(true) == 3) == (space.size == 3) else None), None
@@ -111,32 +106,78 @@ def _start(section: Any, name: str, log: Log | None, moves: MotionModel) -> tupl
 
 def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mount:
     own = {
-        "landmark": _build(config, (*path, "landmark"), sensor.landmark, world),
-        "association": _build(config, (*path, "association"), sensor.association),
+        "landmark": _made(config, (*path, "landmark"), model_of, sensor.landmark, world),
+        "association": _made(config, (*path, "association"), model_of, sensor.association),
         "cov": covariance_of(sensor.mount, 3 if world == "plane" else 6),
     }
     if sensor.detector is not None:
         found, chooses = sensor.detector, "signature" in type(sensor.detector).model_fields
         if chooses and found.signature is None:
             found = found.model_copy(update={"signature": "signature" in sensor.type})
-        own["detector"] = _build(config, (*path, "detector"), found)
-    if sensor.attention is not None:
-        own["attention"] = model_of(sensor.attention)
-    if sensor.upkeep is not None:
-        own["upkeep"] = model_of(sensor.upkeep)
+        own["detector"] = _made(config, (*path, "detector"), model_of, found)
+    own |= {key: model_of(part) for key in ("attention", "upkeep") if (part := getattr(sensor, key)) is not None}
     if world == "plane" and sensor.initialization.type != "immediate":
-        own["initialization"] = _build(config, (*path, "initialization"), sensor.initialization)
+        own["initialization"] = _made(config, (*path, "initialization"), model_of, sensor.initialization)
+    model = _made(config, path, model_of, sensor)
+    return _made(config, path, Mount, model, at=pose_of(sensor.mount), **own)
+
+
+def _made(config: Config, path: tuple[str, ...], make: Callable[..., Any], *args: Any, **keys: Any) -> Any:
+    """Return what `make` makes of these; what it refuses is told with the place of the section at `path`."""
     try:
-        return Mount(_build(config, path, sensor), at=pose_of(sensor.mount), **own)
+        return make(*args, **keys)
     except ModelError as error:
         raise config.error(path, str(error)) from None
 
 
-def _build(config: Config, path: tuple[str, ...], section: ModelSection | None, world: str = "plane") -> Any:
-    """Return the model that a section describes; what the model itself refuses is told with the section's place."""
-    if section is None:
-        return None
-    try:
-        return model_of(section, world)
-    except ModelError as error:
-        raise config.error(path, str(error)) from None
+def refuse_controls(config: Config, key: str, name: str, columns: tuple[str, ...], log: Log) -> None:
+    """Refuse controls that the motion of a robot does not take."""
+    given = tuple(log.control_columns.get(name, columns))
+    if given != columns:
+        wanted = f"{', '.join(columns)} of its motion {config.robots[key].motion.type}"
+        raise _other_columns(log, name, "", given, wanted, _fitting("motion", given), f"{key}.motion", columns)
+
+
+def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], log: Log) -> None:
+    """Refuse observations that a sensor does not take and, unless bad input is skipped, sensors not configured."""
+    for (robot, sensor), given in log.sensor_columns.items():
+        if robot != name or sensor not in mounts or not isinstance(mounts[sensor].detector, Laser | None):
+            continue
+        raw = mounts[sensor].detector is not None
+        columns = RAW[: max(len(given), 2)] if raw else mounts[sensor].sensor.columns
+        if given != columns:
+            kind = "its beams" if raw else f"its type {config.robots[key].sensors[sensor].type}"
+            fitting, wanted = [] if raw else _fitting("sensor", given), f"{', '.join(columns)} of {kind}"
+            raise _other_columns(log, name, sensor, given, wanted, fitting, f"{key}.sensors.{sensor}", columns)
+    used = {event.sensor: None for event in log.events if isinstance(event, Scan) and event.robot == name}
+    other = next((sensor for sensor in used if sensor not in mounts), None)
+    if other is None or config.log.on_error == "skip":
+        return
+    file, line = log.places.get((name, other), (log.path, 0))
+    where, idle = f"{file}{f':{line}' if line else ''}", [sensor for sensor in mounts if sensor not in used]
+    if idle and not did_you_mean(other, [sensor for sensor in mounts if sensor in used]):  # it has another name
+        meant = next((each for each in idle if did_you_mean(other, [each])), idle[0])
+        what = f"the log has no scans by it, expected {other!r} as in {where}"
+        hint = f"if that is another sensor, add robots.{key}.sensors.{other}"
+        raise config.error(("robots", key, "sensors", meant), f"{what}; {hint}")
+    known = f"one of {', '.join(mounts)}" if mounts else "none, as none is configured"
+    what = f"{name} has scans of the sensor {other!r}, expected {known}"
+    raise LogError(f"{where}: {what}; if it is another one, add robots.{key}.sensors.{other}")
+
+
+def _other_columns(
+    log: Log, robot: str, sensor: str, given: tuple[str, ...], wanted: str, fitting: list[Any], key: str,
+    columns: tuple[str, ...],
+) -> LogError:  # fmt: skip
+    """Return the error of columns other than those wanted, with a type that has them or the column that was meant."""
+    where = f"{log.places[robot, sensor][0]}:1" if (robot, sensor) in log.places else log.path
+    missing = [name for name in columns if name not in given]
+    meant = next(filter(None, (did_you_mean(name, missing) for name in given if name not in columns)), "")
+    hint = f"; try --set robots.{key}.type={fitting[0]}" if fitting else meant
+    what = f"the scans of {robot} by {sensor}" if sensor else f"the controls of {robot}"
+    return LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}{hint}")
+
+
+def _fitting(role: str, columns: tuple[str, ...]) -> list[str | None]:
+    """Return the types of kalmark's own models that take these columns."""
+    return [registered_name(model) for model in built_in(role) if model.columns == columns]

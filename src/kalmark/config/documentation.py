@@ -10,9 +10,9 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from kalmark.config import mounting, schema
-from kalmark.config.choices import BASES, section_of
-from kalmark.config.sections import LATER, Section
+from kalmark.config import schema
+from kalmark.config.reading import shipped_configs
+from kalmark.config.sections import BASES, LATER, Section, section_of
 from kalmark.declare import classes, is_own, unit_of
 
 HEAD = """\
@@ -59,33 +59,28 @@ no gate).
 
 def page() -> str:
     """Return the page as Markdown."""
-    names = ", ".join(f"`{name}`" for name in _shipped())
-    parts = [HEAD.format(names=names), _section("The file", schema.Config)]
+    of_sensor, parts = (
+        "`robots.NAME.sensors.SENSOR",
+        [HEAD.format(names=", ".join(f"`{n}`" for n in shipped_configs()))],
+    )
+    parts += [_section("The file", schema.Config)]
     parts += [_section("`log`", schema.LogConfig), _section("`robots.NAME`", schema.RobotConfig)]
-    parts += [_section("`robots.NAME.start`, in the plane", mounting.StartConfig)]
-    parts += [_section("`robots.NAME.start`, in space", mounting.SpaceStartConfig)]
-    parts += [_choice("`robots.NAME.motion`", "motion")]
-    parts += [_section("`robots.NAME.sensors.SENSOR`", mounting.Mounted)]
-    parts += [_section("`robots.NAME.sensors.SENSOR`, in the plane, too", mounting.PlaneMounted, mounting.Mounted)]
-    parts += [_choice("`robots.NAME.sensors.SENSOR`, in the plane", "sensor", "plane")]
-    parts += [_choice("`robots.NAME.sensors.SENSOR`, in space", "sensor", "space")]
-    parts += [_choice("`robots.NAME.sensors.SENSOR.detector`", "detector")]
-    parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in the plane", mounting.MountConfig)]
-    parts += [_choice("`robots.NAME.sensors.SENSOR.initialization`, in the plane", "initialization")]
-    parts += [_section("`robots.NAME.sensors.SENSOR.mount`, in space", mounting.SpaceMountConfig)]
-    parts += [_section("`robots.NAME.sensors.SENSOR.attention`", section_of("attention", "attention"))]
+    parts += [_section("`robots.NAME.start`, in the plane", schema.StartConfig)]
+    parts += [_section("`robots.NAME.start`, in space", schema.SpaceStartConfig)]
+    parts += [_choice("`robots.NAME.motion`", "motion"), _section(f"{of_sensor}`", schema.Mounted)]
+    parts += [_section(f"{of_sensor}`, in the plane, too", schema.PlaneMounted, schema.Mounted)]
+    parts += [
+        _choice(f"{of_sensor}`, in {there}", "sensor", w) for there, w in (("the plane", "plane"), ("space",) * 2)
+    ]
+    parts += [_choice(f"{of_sensor}.detector`", "detector")]
+    parts += [_section(f"{of_sensor}.mount`, in the plane", schema.MountConfig)]
+    parts += [_choice(f"{of_sensor}.initialization`, in the plane", "initialization")]
+    parts += [_section(f"{of_sensor}.mount`, in space", schema.SpaceMountConfig)]
+    parts += [_section(f"{of_sensor}.attention`", section_of("attention", "attention"))]
     parts += [_choice("`landmarks`, and `landmark` of a sensor", "landmark")]
     parts += [_choice("`association`, also of a sensor", "association")]
     parts += [_section("`upkeep`, also of a sensor", section_of("upkeep", "upkeep"))]
-    parts += [_choice("`estimator`", "estimator")]
-    parts += [_section("`map`", schema.MapConfig) + _later("map")]
-    return "\n".join(parts)
-
-
-def _shipped() -> list[str]:
-    from kalmark.config.reading import shipped_configs
-
-    return [*shipped_configs()]
+    return "\n".join([*parts, _choice("`estimator`", "estimator"), _section("`map`", schema.MapConfig)])
 
 
 def _section(title: str, model: type[BaseModel], common: type[BaseModel] = Section) -> str:
@@ -100,12 +95,8 @@ def _choice(title: str, role: str, world: str = "") -> str:
             model = section_of(role, name, world)
             table = _table(model, BASES.get((role, world), Section))
             parts.append(f"**`type: {name}`**  {inspect.getdoc(model)}\n" + (f"\n{table}\n" if table else ""))
-    return "\n".join(parts) + ("" if world == "plane" else _later(role))
-
-
-def _later(kind: str) -> str:
-    names = ", ".join(f"`{name}`" for name in LATER.get(kind, ()))
-    return f"\nNot available yet: {names}.\n" if names else ""
+    later = ", ".join(f"`{name}`" for name in LATER.get(role, ()) if world != "plane")
+    return "\n".join(parts) + (f"\nNot available yet: {later}.\n" if later else "")
 
 
 def _table(model: type[BaseModel], common: type[BaseModel] = Section) -> str:

@@ -1,18 +1,21 @@
-"""From a configuration to its log, and to what is in force once the log has said what it knows of itself."""
+"""From a configuration to its log, and to what is in force: what the user wrote over what the log says of itself."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
-from kalmark.config.locate import check_format, find_log
-from kalmark.config.merging import laid_over
-from kalmark.config.misfit import refuse_idle
-from kalmark.config.reading import config_of, resolve_config
+from kalmark.config.reading import config_of, did_you_mean, resolve_config, shipped_configs
 from kalmark.config.schema import Config
-from kalmark.config.tree import Tree, read_tree
-from kalmark.logs import open_log
+from kalmark.config.tree import OVERRIDE, Tree, read_tree
+from kalmark.errors import ConfigError, LogError
+from kalmark.logs import FORMATS, find_data, open_log
+from kalmark.logs.formats import recognise
 from kalmark.logs.log import Log
+
+EACH = "each"
 
 
 def open_run(
@@ -50,13 +53,98 @@ def open_config_log(config: Config, log_path: str | Path | None = None) -> Log:
     """Return the log that a configuration names, or the one at `log_path` read in the same way."""
     log, path = config.log, find_log(config, log_path)
     check_format(config, path)
-    return open_log(
-        path,
-        log.format,
-        robots=None if log.robots is None else list(log.robots),
-        from_s=log.from_s,
-        to_s=log.to_s,
-        on_error=log.on_error,
-        ids=log.ids,
-        **log.options(),
-    )
+    common = log.model_dump(include={"robots", "from_s", "to_s", "on_error", "ids"})
+    return open_log(path, log.format, **common, **log.options())
+
+
+def find_log(config: Config, log_path: str | Path | None = None) -> Path:
+    """Return where the log is: beside the configuration, in ``KALMARK_DATA``, or in the download cache.
+
+    A path given from outside (`log_path`, an override) is looked for in the working directory instead of beside the
+    configuration.  Raises ConfigError or LogError, naming all places.
+    """
+    if log_path is not None:
+        return find_data(log_path).resolve()
+    if config.log.path is None:
+        raise config.error(("log", "path"), "got nothing, expected the path of a log: here, or with --log PATH")
+    own = config.file is not None and config.file not in shipped_configs().values()
+    beside = config.file.resolve().parent if config.file and own and not config.overridden("log", "path") else None
+    try:
+        return find_data(config.log.path, beside).resolve()
+    except LogError as error:
+        raise config.error(("log", "path"), str(error)) from None
+
+
+def check_format(config: Config, path: Path) -> None:
+    """Refuse a format that does not exist and options that the log's format does not have."""
+    name = config.log.format
+    if name is not None and name not in FORMATS:
+        message = f"got {name!r}, expected one of {', '.join(FORMATS)}{did_you_mean(name, [*FORMATS])}"
+        raise config.error(("log", "format"), message)
+    entry, _ = recognise(path, name)
+    for key, value in config.log.options().items():
+        if key not in entry.options:
+            known = f"one of {', '.join(entry.options)}" if entry.options else "none"
+            message = f"got {value!r}, which logs of format {entry.name} do not take, expected {known} of their options"
+            raise config.error(("log", key), message)
+
+
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Return `below` with `above` laid over it, key by key; another `type` replaces its section, but for a mount."""
+    other = "type" in above and above["type"] != below.get("type", above["type"])
+    result = {key: value for key, value in below.items() if not other or key == "mount"}
+    for key, value in above.items():
+        old = result.get(key)
+        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return result
+
+
+def laid_over(tree: Tree, log: Log) -> Tree:
+    """Return a configuration laid over what its log describes: what the user wrote wins, key by key.
+
+    Each robot of the log has its own entry then; `each` of the user stands for the robots that he does not name, `each`
+    of the log for all.  A value of the log's has the log's path for its place.
+    """
+    if not log.describes:
+        return tree
+    below, above = deepcopy(log.describes), deepcopy(tree.values)
+    out = Tree(keys=dict(tree.keys), places=dict(tree.places))
+    theirs, mine = below.pop("robots", {}), above.get("robots", {})
+    below["robots"] = {name: merged(theirs.get(EACH, {}), theirs.get(name, {})) for name in log.robots}
+    if isinstance(mine, dict):
+        for name in log.robots:
+            if name not in mine:
+                mine[name] = deepcopy(mine.get(EACH, {}))
+                for table in (out.keys, out.places):  # it was written there
+                    table |= {("robots", name, *p[2:]): at for p, at in table.items() if p[:2] == ("robots", EACH)}
+        above["robots"] = {name: value for name, value in mine.items() if name != EACH}
+    out.values = merged(below, above)
+    _place(out, out.values, (), str(log.path or log.name))
+    return out
+
+
+def _place(tree: Tree, values: dict[str, Any], path: tuple[str, ...], log: str) -> None:
+    """Note that what was not written by the user comes from the log."""
+    for key, value in values.items():
+        here = (*path, key)
+        if here not in tree.places:
+            tree.places[here] = tree.keys[here] = log
+        if isinstance(value, dict):
+            _place(tree, value, here, log)
+
+
+def refuse_idle(tree: Tree, log: Log) -> None:
+    """Refuse what was set on the command line for robots of which the log has none."""
+    named: Any = tree.values.get("robots")
+    for path, place in tree.places.items() if isinstance(named, dict) else ():
+        if path[:1] != ("robots",) or len(path) < 2 or path[1] in log.robots or not place.startswith(OVERRIDE):
+            continue
+        if path[1] != EACH:
+            near = did_you_mean(path[1], log.robots)
+            wanted = f"one of {', '.join(log.robots)}{near}"
+            raise ConfigError(
+                f"{place}: robots.{path[1]}: got a robot that is not in this log or run, expected {wanted}"
+            )
+        if all(name in named for name in log.robots):
+            names = " or ".join(f"robots.{name}" for name in log.robots)
+            raise ConfigError(f"{place}: robots.each: no robot takes it, as each one is named, expected {names}")

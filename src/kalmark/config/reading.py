@@ -70,14 +70,9 @@ def run_plugins(tree: Tree, path: Path | None) -> None:
         tree.values["plugins"][n] = str((beside / str(plugin)).resolve())
 
 
-def shipped_configs() -> dict[str, Path]:
-    """Return the configurations that come with kalmark, by name."""
-    return {path.stem: path for path in _shipped_folder()}
-
-
-def _shipped_folder() -> list[Path]:
-    folder = Path(str(resources.files("kalmark"))) / "configs"
-    return sorted(path for path in folder.glob("*.yaml"))
+def shipped_configs(folder: str = "configs") -> dict[str, Path]:
+    """Return the configurations that come with kalmark, by name, or what another folder of it has."""
+    return {path.stem: path for path in sorted((Path(str(resources.files("kalmark"))) / folder).glob("*.yaml"))}
 
 
 def resolve_config(path_or_name: str | Path) -> Path:
@@ -132,9 +127,9 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
     value = _at(tree.values, path)
     if kind == "union_tag_invalid":
         path = (*path, "type")
-        message = _not_one_of(value.get("type"), context.get("types") or _quoted(context["expected_tags"]), path)
+        message = _not_one_of(value.get("type"), context["types"], path)
     elif kind == "literal_error":
-        message = _not_one_of(value, _quoted(context["expected"]), path)
+        message = _not_one_of(value, re.findall(r"'([^']+)'", context["expected"]), path)
     elif kind == "union_tag_not_found":
         names = f": {_one_of(context['types'])}" if "types" in context else ""
         message = f"got {show(value)}, expected a mapping with a type{names}"
@@ -188,10 +183,6 @@ def _kind(path: tuple[str, ...]) -> str:
     if len(path) > 1 and path[-2] == "sensors":
         return "sensor"
     return "landmark" if path[-1:] == ("landmarks",) else path[-1] if path else ""
-
-
-def _quoted(words: str) -> list[str]:
-    return re.findall(r"'([^']+)'", words)
 
 
 def _one_of(words: Sequence[str]) -> str:

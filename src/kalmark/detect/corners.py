@@ -1,17 +1,25 @@
-"""Walls, and the corners in which they meet."""
+"""Walls, and the corners in which they meet.
+
+Surfaces are cut into straight pieces, and a line is fitted through each.  A line at distance p from the laser whose
+normal has the direction n is hit by the beam at angle a at p / cos(a - n).
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
 
+from kalmark.compiled import compiled
 from kalmark.declare import Count, NotNegative, Positive, register
-from kalmark.detect.lines import grown, lines, straight_pieces
-from kalmark.detect.scan import Acute, Array, Detections, Laser
+from kalmark.detect.scan import Acute, Array, Detections, Index, Laser
 from kalmark.geometry.gaussian import gate
 
+STEPS = 10
+CORE = 8  # the part of a piece, at each end, that does not say where its line is
+NEAR2 = 16.0  # a beam within 4 sigma of a line is on it
 TRIM = 2  # beams at the ends of a wall that are left out of the fit: which of two walls they hit is not sure
 PROBABILITY = 0.9999  # with which a straight wall passes for one
 
@@ -49,10 +57,7 @@ class Walls(Laser):
 
     def _widened(self, found: Detections) -> Detections:
         """Return the walls with the noise that is not in the beams."""
-        cov = found.cov.copy()
-        cov[:, 0, 0] += self.sigma_position_m**2
-        cov[:, 1, 1] += self.sigma_bearing_rad**2
-        return Detections(found.columns, found.y, cov, found.beams, found.attributes)
+        return replace(found, cov=found.cov + np.diag([self.sigma_position_m**2, self.sigma_bearing_rad**2]))
 
 
 @register("detector", "corners")
@@ -78,7 +83,7 @@ class Corners(Walls):
         first, second, p1, n1, p2, n2, turn = (v[bent] for v in (first, second, p1, n1, p2, n2, turn))
         c = np.stack([p1 * np.sin(n2) - p2 * np.sin(n1), p2 * np.cos(n1) - p1 * np.cos(n2)], axis=1) / turn[:, None]
         gaps = np.linalg.norm(np.stack([ends[first, 1], ends[second, 0]]) - c, axis=2)
-        Y = _jacobian(c, n1, n2, turn, p1, p2)
+        Y = _jacobian(c, n1, n2, turn)
         N = np.zeros((len(c), 4, 4))
         N[:, :2, :2], N[:, 2:, 2:] = walls.cov[first], walls.cov[second]
         along1, along2 = ends[first, 0] - c, ends[second, 1] - c
@@ -94,22 +99,132 @@ class Corners(Walls):
         return Laser._widened(self, found)
 
 
-def _jacobian(c: Array, n1: Array, n2: Array, turn: Array, p1: Array, p2: Array) -> Array:
+def _jacobian(c: Array, n1: Array, n2: Array, turn: Array) -> Array:
     """Return Y (K, 3, 4) of range, bearing and opening with respect to p1, n1, p2, n2.
 
     c solves c . (cos n, sin n) = p for both lines; d(opening) = d(n1 - n2).
     """
     C = np.zeros((len(c), 2, 4))
-    t = turn[:, None]
-    to1 = np.stack([np.sin(n2), -np.cos(n2)], axis=1) / t
-    to2 = np.stack([-np.sin(n1), np.cos(n1)], axis=1) / t
-    along1 = c[:, 0] * np.sin(n1) - c[:, 1] * np.cos(n1)  # - c . d(cos n, sin n) / dn
-    along2 = c[:, 0] * np.sin(n2) - c[:, 1] * np.cos(n2)
-    C[:, :, 0], C[:, :, 1] = to1, to1 * along1[:, None]
-    C[:, :, 2], C[:, :, 3] = to2, to2 * along2[:, None]
+    for k, sign, n, other in ((0, 1, n1, n2), (2, -1, n2, n1)):
+        C[:, :, k] = sign * np.stack([np.sin(other), -np.cos(other)], axis=1) / turn[:, None]
+        along = c[:, 0] * np.sin(n) - c[:, 1] * np.cos(n)  # - c . d(cos n, sin n) / dn
+        C[:, :, k + 1] = C[:, :, k] * along[:, None]
     d = np.maximum(np.hypot(c[:, 0], c[:, 1]), 1e-9)[:, None]
     Y = np.zeros((len(c), 3, 4))
     Y[:, 0] = np.einsum("ki,kij->kj", c / d, C)
     Y[:, 1] = np.einsum("ki,kij->kj", np.stack([-c[:, 1], c[:, 0]], axis=1) / d**2, C)
     Y[:, 2, 1], Y[:, 2, 3] = 1.0, -1.0
     return Y
+
+
+@compiled
+def farthest(x: Array, y: Array, i: int, j: int) -> tuple[int, float]:
+    """Return which of the points i to j of x, y (N,) is farthest from the chord between these two, and its distance."""
+    dx, dy = x[j] - x[i], y[j] - y[i]
+    length, at, most = math.hypot(dx, dy), i, 0.0
+    for k in range(i + 1, j):
+        if length > 0.0:
+            off = abs(dx * (y[k] - y[i]) - dy * (x[k] - x[i])) / length
+        else:
+            off = math.hypot(x[k] - x[i], y[k] - y[i])
+        if off > most:
+            at, most = k, off
+    return at, most
+
+
+@compiled
+def straight_pieces(r: Array, a: Array, pieces: Index, split_m: float, beams: int) -> Index:
+    """Return the pieces (S, 2) cut where they bend: at the point farthest from the chord, if it is beyond `split_m`.
+
+    The cut belongs to both halves.  Those of fewer than `beams` beams are left out.  Iterative end point fit.
+    """
+    x, y = r * np.cos(a), r * np.sin(a)
+    out, count = np.empty((2 * len(r) + 1, 2), np.int64), 0
+    stack = np.empty((len(r) + 1, 2), np.int64)
+    for s in range(len(pieces)):
+        stack[0], depth = pieces[s], 1
+        while depth > 0:
+            depth -= 1
+            i, j = stack[depth, 0], stack[depth, 1]
+            k, off = farthest(x, y, i, j)
+            if off > split_m:
+                stack[depth, 0] = k  # the left half is looked at first: the order is that of the beams
+                stack[depth + 1, 0], stack[depth + 1, 1] = i, k
+                depth += 2
+            elif j - i + 1 >= beams:
+                out[count, 0], out[count, 1] = i, j
+                count += 1
+    return out[:count].copy()
+
+
+@compiled
+def fit_line(r: Array, a: Array, variance: float) -> tuple[Array, Array, float]:
+    """Return (p, n) of the line that beams r (n,) at a (n,) hit, its covariance (2, 2), chi-square; NaN if none."""
+    u, P, chi2 = np.empty(2), np.empty((2, 2)), np.inf
+    last = len(r) - 1
+    dx = r[last] * math.cos(a[last]) - r[0] * math.cos(a[0])
+    dy = r[last] * math.sin(a[last]) - r[0] * math.sin(a[0])
+    u[1] = math.atan2(dx, -dy)
+    u[0] = r[0] * math.cos(a[0] - u[1])
+    if u[0] < 0.0:
+        u[0], u[1] = -u[0], u[1] + math.pi
+    for _ in range(STEPS):
+        A, B, C, g0, g1, chi2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(len(r)):
+            c = math.cos(a[i] - u[1])
+            if c < 1e-3:
+                return np.full(2, np.nan), P, np.inf
+            J0, J1 = 1.0 / c, -u[0] * math.sin(a[i] - u[1]) / (c * c)
+            z = r[i] - u[0] / c
+            A, B, C = A + J0 * J0, B + J0 * J1, C + J1 * J1
+            g0, g1, chi2 = g0 + J0 * z, g1 + J1 * z, chi2 + z * z
+        det = A * C - B * B
+        if not det > 0.0:
+            return np.full(2, np.nan), P, np.inf
+        P[0, 0], P[0, 1], P[1, 0], P[1, 1] = C / det, -B / det, -B / det, A / det
+        step0, step1 = (C * g0 - B * g1) / det, (A * g1 - B * g0) / det
+        u[0], u[1] = u[0] + step0, u[1] + step1
+        if abs(step0) + abs(step1) < 1e-9:
+            break
+    u[1] = (u[1] + math.pi) % (2 * math.pi) - math.pi
+    return u, P * variance, chi2 / variance
+
+
+@compiled
+def grown(r: Array, a: Array, pieces: Index, variance: float, beams: int) -> Index:
+    """Return the pieces (S, 2) with their ends put right, in the order of the beams: a cut is rarely at the corner.
+
+    The longest first, the line through the middle of each takes the beams beside it as far as they lie on it.
+    """
+    taken, out, count = np.zeros(len(r), np.bool_), np.empty_like(pieces), 0
+    for s in np.argsort(pieces[:, 0] - pieces[:, 1], kind="mergesort"):
+        i, j = pieces[s]
+        while i < j and taken[i]:
+            i += 1
+        while j > i and taken[j]:
+            j -= 1
+        off = max((j - i + 1) // CORE, 1)
+        i, j = i + off, j - off
+        if j - i < 2:
+            continue
+        u, _, _ = fit_line(r[i : j + 1], a[i : j + 1], variance)
+        for side in (-1, 1):
+            k = (i if side < 0 else j) + side
+            while 0 <= k < len(r) and not taken[k] and (r[k] - u[0] / math.cos(a[k] - u[1])) ** 2 <= NEAR2 * variance:
+                k += side
+            i, j = (k + 1, j) if side < 0 else (i, k - 1)
+        if j - i + 1 >= beams:
+            taken[i : j + 1] = True
+            out[count, 0], out[count, 1] = i, j
+            count += 1
+    return out[np.argsort(out[:count, 0])].copy()
+
+
+@compiled
+def lines(r: Array, a: Array, pieces: Index, variance: float, trim: int) -> tuple[Array, Array, Array]:
+    """Return (p, n) (S, 2), covariances (S, 2, 2) and chi-squares (S,) of the pieces, each end `trim` beams short."""
+    u, P, chi2 = np.empty((len(pieces), 2)), np.empty((len(pieces), 2, 2)), np.empty(len(pieces))
+    for s in range(len(pieces)):
+        i, j = pieces[s, 0] + trim, pieces[s, 1] - trim + 1
+        u[s], P[s], chi2[s] = fit_line(r[i:j], a[i:j], variance)
+    return u, P, chi2

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.compiled import compiled
 from kalmark.declare import Limit, NotNegative, Within, declared
-from kalmark.detect.circles import segments
 from kalmark.errors import EventError
 from kalmark.events import Scan, when
 
@@ -109,7 +109,7 @@ class Laser:
         cov, d = found.cov.copy(), np.maximum(found.y[:, 0], 1e-3)
         cov[:, 0, 0] += self.sigma_position_m**2
         cov[:, 1, 1] += (self.sigma_position_m / d) ** 2 + self.sigma_bearing_rad**2
-        return Detections(found.columns, found.y, cov, found.beams, found.attributes)
+        return replace(found, cov=cov)
 
     def pieces(self, r: Array, a: Array) -> tuple[Index, float]:
         """Return the first and last beam (S, 2) of each piece of surface, and the least step between beams, rad.
@@ -121,6 +121,29 @@ class Laser:
         if step >= least:  # neighbours that no surface joins
             return np.empty((0, 2), np.int64), step
         return segments(r, a, step, least, self.jump_m), step
+
+
+@compiled
+def segments(r: Array, a: Array, step: float, slope: float, jump_m: float) -> Index:
+    """Return the first and last beam (S, 2) of each piece of surface in a scan of ranges r (N,) at angles a (N,).
+
+    Ranges that are not finite are no returns.  Neighbours, at most 1.5 steps apart, belong together unless their ranges
+    differ by more than on a surface that is hit under an angle of at least `slope`:
+    r sin(step) / sin(slope - step) + jump_m.  Borges and Aldon 2004.
+    """
+    n, count = len(r), 0
+    out = np.empty((n, 2), np.int64)
+    rate = math.sin(step) / math.sin(slope - step)
+    for i in range(n):
+        if not math.isfinite(r[i]):
+            continue
+        joined = count > 0 and out[count - 1, 1] == i - 1 and a[i] - a[i - 1] <= 1.5 * step
+        if joined and abs(r[i] - r[i - 1]) <= min(r[i], r[i - 1]) * rate + jump_m:
+            out[count - 1, 1] = i
+        else:
+            out[count, 0] = out[count, 1] = i
+            count += 1
+    return out[:count].copy()
 
 
 def _beams(ranges: Any, angles: Any, intensities: Any) -> tuple[Array, Array, Array | None]:

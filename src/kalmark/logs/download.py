@@ -11,7 +11,6 @@ import bz2
 import gzip
 import hashlib
 import json
-import logging
 import os
 import shutil
 import tempfile
@@ -22,7 +21,7 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote, urlsplit
 
 import platformdirs
@@ -66,8 +65,7 @@ class Dataset:
         return sum(file.bytes for file in self.files)
 
 
-@dataclass(frozen=True)
-class OwnCopy:
+class OwnCopy(NamedTuple):
     """Describe a dataset that kalmark reads and does not fetch: `put` says where a copy of one's own belongs."""
 
     name: str
@@ -76,22 +74,13 @@ class OwnCopy:
 
 
 OWN_COPIES = (
-    OwnCopy(
-        "plaza1",
-        "a robot lawn mower ranging to four radio beacons, true path and beacons",
-        "Plaza1_DR.txt, Plaza1_TD.txt and Plaza1_.mat of the package gtsam (gtsam/Data) into KALMARK_DATA/plaza1",
-    ),
-    OwnCopy(
-        "starry_night",
-        "a stereo camera above 20 reflectors, rates, known ids, true poses and map",
-        "vincentive_dataset3.mat into KALMARK_DATA/starry_night (docs/datasets3d.md says where it is from)",
-    ),
-    OwnCopy(
-        "slamtb",
-        "recordings of the Matlab SLAM toolbox: cameras seeing points or segments, its own figures",
-        "NAME.json.gz and NAME.npz into KALMARK_ORACLE (docs/datasets3d.md)",
-    ),
-)
+    OwnCopy("plaza1", "a robot lawn mower ranging to four radio beacons, true path and beacons",
+            "Plaza1_DR.txt, Plaza1_TD.txt and Plaza1_.mat of the package gtsam (gtsam/Data) into KALMARK_DATA/plaza1"),
+    OwnCopy("starry_night", "a stereo camera above 20 reflectors, rates, known ids, true poses and map",
+            "vincentive_dataset3.mat into KALMARK_DATA/starry_night (docs/datasets3d.md says where it is from)"),
+    OwnCopy("slamtb", "recordings of the Matlab SLAM toolbox: cameras seeing points or segments, its own figures",
+            "NAME.json.gz and NAME.npz into KALMARK_ORACLE (docs/datasets3d.md)"),
+)  # fmt: skip
 
 
 @cache
@@ -114,21 +103,21 @@ def fetch(name: str, progress: Progress | None = None) -> Path:
     Files in `KALMARK_DATA` are used without the network.  A dataset appears in the cache only once all its files
     have come and fit their hashes.  Raises DataError.
     """
-    wanted = [dataset for dataset in list_data() if f"{dataset.name}/".startswith(f"{name.strip('/')}/")]
-    own = next((copy for copy in OWN_COPIES if copy.name == name.strip("/")), None)
-    if own is not None and not wanted:
-        raise DataError(f"dataset {own.name!r} cannot be fetched, expected a copy of your own: put {own.put}")
+    plain = name.strip("/")
+    wanted = [dataset for dataset in list_data() if f"{dataset.name}/".startswith(f"{plain}/")]
     if not wanted:
-        raise _unknown(name)
+        raise _not_fetched(name)
     roots = {fetch_one(dataset, progress) for dataset in wanted}
     root = roots.pop() if len(roots) == 1 else cache_folder()
-    return root / (wanted[0].log if len(wanted) == 1 else name.strip("/"))
+    return root / (wanted[0].log if len(wanted) == 1 else plain)
 
 
-def _unknown(name: str) -> DataError:
+def _not_fetched(name: str) -> DataError:
     """Return the error of a name that no dataset has, naming those that begin like it, or else the nearest."""
-    names, own = [dataset.name for dataset in list_data()], [copy.name for copy in OWN_COPIES]
-    near = [one for one in (*names, *own) if name and one.lower().startswith(name.strip("/").lower())]
+    plain, names, own = name.strip("/"), [dataset.name for dataset in list_data()], {o.name: o.put for o in OWN_COPIES}
+    if plain in own:
+        return DataError(f"dataset {plain!r} cannot be fetched, expected a copy of your own: put {own[plain]}")
+    near = [one for one in (*names, *own) if name and one.lower().startswith(plain.lower())]
     hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else nearest(name, (*names, *own))
     known = f"one of {', '.join(names)}, or, as a copy of your own, {', '.join(own)}"
     return DataError(f"dataset {name!r} is unknown, expected {known}{hint}")
@@ -142,7 +131,8 @@ def fetch_one(dataset: Dataset, progress: Progress | None) -> Path:
             check(Path(provided) / file.file, file)
         return Path(provided)
     root = cache_folder()
-    if not all(intact(root / file.file, file) for file in dataset.files):
+    there = ((root / file.file, file.sha256) for file in dataset.files)
+    if not all(path.is_file() and sha256(path) == wanted for path, wanted in there):
         download(dataset, root, progress)
     return root
 
@@ -154,42 +144,33 @@ def download(dataset: Dataset, root: Path, progress: Progress | None) -> None:
         with tempfile.TemporaryDirectory(dir=root, prefix=".fetching-") as aside:
             done = 0
             for file in dataset.files:
-                retrieve(file, Path(aside), Transfer(file, done, dataset.bytes, progress))
+                retrieve(file, Path(aside) / file.file, Transfer(file, done, dataset.bytes, progress))
                 done += file.bytes
                 if file.unpack:
                     unpack(Path(aside) / file.file)
             target = root / dataset.log
-            if target.exists():
-                shutil.rmtree(target)
+            shutil.rmtree(target, ignore_errors=True)
             target.parent.mkdir(parents=True, exist_ok=True)
             (Path(aside) / dataset.log).rename(target)
     except OSError as error:
         raise DataError(f"{root}: {error.strerror or error}, expected a cache that can be written") from None
 
 
-def retrieve(file: DataFile, folder: Path, transfer: Transfer) -> None:
-    """Download one file below `folder` and check its hash.  Raises DataError and leaves no file behind."""
+def retrieve(file: DataFile, place: Path, transfer: Transfer) -> None:
+    """Download one file to its place and check its hash.  Raises DataError."""
     import pooch
     import requests
 
-    def checked(url: str, target: Any, source: Any) -> None:
-        pooch.HTTPDownloader(progressbar=transfer, timeout=30)(url, target, source)
-        check(Path(target), file)
-
-    logger = pooch.get_logger()
-    level = logger.level
-    logger.setLevel(logging.WARNING)
     where = url_of(file)
+    place.parent.mkdir(parents=True, exist_ok=True)
     try:
-        place = folder / file.file
-        pooch.retrieve(where, f"sha256:{file.sha256}", fname=place.name, path=place.parent, downloader=checked)
+        pooch.HTTPDownloader(progressbar=transfer, timeout=30)(where, str(place), None)
     except (requests.ConnectionError, requests.Timeout) as error:
         raise DataError(f"cannot reach {urlsplit(where).netloc} ({innermost(error)}); {ELSEWHERE}") from None
     except (requests.RequestException, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{file.file}: cannot be fetched ({reason}), expected it at {where}") from None
-    finally:
-        logger.setLevel(level)
+    check(place, file)
 
 
 def innermost(error: BaseException) -> str:
@@ -239,21 +220,15 @@ class Transfer:
             self.progress(self.file.file, self.before + self.here, self.dataset_bytes)
 
     def reset(self) -> None:
-        """Do nothing: the end of a file, told once more."""
+        """Do nothing at the end of a file: the dataset may go on."""
 
-    def close(self) -> None:
-        """Do nothing at the end: the dataset may go on."""
+    close = reset
 
 
 def sha256(path: Path) -> str:
     """Return the hash of a file as hexadecimal text."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def intact(path: Path, file: DataFile) -> bool:
-    """Return whether a file is there with the right hash."""
-    return path.is_file() and sha256(path) == file.sha256
 
 
 def check(path: Path, file: DataFile) -> None:
@@ -285,22 +260,14 @@ def find_data(path: Path | str, base: Path | str | None = None) -> Path:
     `KALMARK_ORACLE` that ends in /oracle.
     """
     path = Path(path).expanduser()
-    folders: list[Path | str | None] = [
-        base or Path(),
-        os.environ.get("KALMARK_DATA"),
-        os.environ.get("KALMARK_ORACLE"),
-    ]
-    places = [path] if path.is_absolute() else [Path(folder) / path for folder in (*folders, cache_folder()) if folder]
-    if not path.is_absolute():
-        named = [Path(folder) for folder in folders[1:] if folder]
-        places += [folder.parent / path for folder in named if path.parts[:1] == (folder.name,)]
+    named = [Path(os.environ[name]) for name in ("KALMARK_DATA", "KALMARK_ORACLE") if os.environ.get(name)]
+    places = [folder / path for folder in (Path(base or ""), *named, cache_folder())]  # an absolute path stays as it is
+    places += [folder.parent / path for folder in named if path.parts[:1] == (folder.name,)]
     for place in places:
         if place.exists():
             return place
-    looked = " or ".join(str(place.absolute()) for place in places)
-    known = [
-        dataset.name for dataset in list_data() if f"{path.as_posix()}/".startswith(f"{dataset.name.split('/')[0]}/")
-    ]
+    looked = " or ".join(dict.fromkeys(str(place.absolute()) for place in places))
+    known = [one.name for one in list_data() if f"{path.as_posix()}/".startswith(f"{one.name.split('/')[0]}/")]
     own = next((copy for copy in OWN_COPIES if path.parts[:1] == (copy.name,)), None)
     hint = f"; `kalmark data fetch {known[0]}` downloads it" if known else f"; put {own.put}" if own else ""
     if own is None and not os.environ.get("KALMARK_DATA"):

@@ -12,39 +12,22 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.events import Event, Scan
-from kalmark.logs.dlr import DLR
 from kalmark.logs.download import find_data
-from kalmark.logs.freiburg import FREIBURG
-from kalmark.logs.hidden import hide_ids
-from kalmark.logs.kitti_stereo import KITTI_STEREO
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
-from kalmark.logs.mrclam import MRCLAM
+from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
 from kalmark.logs.native import NATIVE
 from kalmark.logs.plaza import PLAZA
 from kalmark.logs.slamtb import SLAMTB
-from kalmark.logs.source import Format, Request, choice, nearest, quantity
-from kalmark.logs.starry_night import STARRY_NIGHT
+from kalmark.logs.source import Format, Request, choice, nearest, quantity, raising
+from kalmark.logs.steps import DLR, FREIBURG
+from kalmark.logs.stereo import KITTI_STEREO, STARRY_NIGHT
 from kalmark.logs.tagslam import TAGSLAM
-from kalmark.logs.text import raising
 from kalmark.logs.victoria_park import VICTORIA_PARK
 
-FORMATS: dict[str, Format] = {
-    entry.name: entry
-    for entry in (
-        NATIVE,
-        MRCLAM,
-        VICTORIA_PARK,
-        LOST_IN_THE_WOODS,
-        DLR,
-        FREIBURG,
-        STARRY_NIGHT,
-        SLAMTB,
-        TAGSLAM,
-        KITTI_STEREO,
-        PLAZA,
-    )
-}
+FORMATS: dict[str, Format] = {entry.name: entry for entry in (
+    NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB, TAGSLAM, KITTI_STEREO, PLAZA,
+)}  # fmt: skip
 
 
 def open_log(
@@ -71,10 +54,8 @@ def open_log(
     entry, found = recognise(find_data(path), format)
     for name in options:
         if name not in entry.options:
-            known = ", ".join(entry.options) or "none"
-            raise LogError(
-                f"log option {name!r} is unknown to {entry.name}, expected {known}{nearest(name, entry.options)}"
-            )
+            wanted = f"{', '.join(entry.options) or 'none'}{nearest(name, entry.options)}"
+            raise LogError(f"log option {name!r} is unknown to {entry.name}, expected {wanted}")
     request = Request(robot_names(robots, entry), refuse, skipped)
     log = entry.read(found, request, **options)
     log = between(keep_robots(log, request), from_s, to_s)
@@ -119,30 +100,26 @@ def keep_robots(log: Log, request: Request) -> Log:
         if robot not in log.robots:
             hint = nearest(robot, log.robots)
             raise LogError(f"{log.path}: no robot {robot!r}, expected one of {', '.join(log.robots)}{hint}")
-    others = {f"{MRCLAM.robot_prefix}{n}" for n in range(1, 6)} if log.format == MRCLAM.name else set(log.robots)
-    others -= set(request.robots)
+    others = set(MRCLAM_ROBOTS if log.format == MRCLAM.name else log.robots) - set(request.robots)
     left_out: Counter[str] = Counter()
     kept = (without(event, others, left_out) for event in log if event.robot in request.robots)
     events = [event for event in kept if event is not None]
     for robot, count in sorted(left_out.items()):
         request.leave_out(count, f"{log.path}: {count} sightings of {robot}, which was not asked for")
-    return replace(
-        log,
-        robots=tuple(robot for robot in log.robots if robot in request.robots),
-        events=events,
-        truth={robot: value for robot, value in log.truth.items() if robot in request.robots},
-        gps={robot: value for robot, value in log.gps.items() if robot in request.robots},
-        control_columns={key: value for key, value in log.control_columns.items() if key in request.robots},
-        sensor_columns={key: value for key, value in log.sensor_columns.items() if key[0] in request.robots},
-        describes=described(log.describes, (*request.robots, "each")),
-    )
+    names, rig = request.robots, log.describes
+    if "robots" in rig:
+        rig = rig | {"robots": kept_of(rig["robots"], (*names, "each"))}
+    by_robot: dict[str, Any] = {
+        field: kept_of(getattr(log, field), names) for field in ("truth", "gps", "control_columns")
+    }
+    sensors = {key: value for key, value in log.sensor_columns.items() if key[0] in names}
+    robots = tuple(robot for robot in log.robots if robot in names)
+    return replace(log, robots=robots, events=events, sensor_columns=sensors, describes=rig, **by_robot)
 
 
-def described(rig: dict[str, Any], robots: Sequence[str]) -> dict[str, Any]:
-    """Return what a log describes of these robots."""
-    if "robots" not in rig:
-        return rig
-    return rig | {"robots": {name: robot for name, robot in rig["robots"].items() if name in robots}}
+def kept_of(table: dict[str, Any], robots: Sequence[str]) -> dict[str, Any]:
+    """Return what a table by robot has of these robots."""
+    return {name: value for name, value in table.items() if name in robots}
 
 
 def without(event: Event, others: set[str], left_out: Counter[str]) -> Event | None:
@@ -172,3 +149,14 @@ def between(log: Log, from_s: float | None, to_s: float | None) -> Log:
         length = (log.events[-1].t_ns - start) * 1e-9
         raise LogError(f"{log.path}: no event from {from_s} to {to_s} s, expected times within 0 to {length:.9g} s")
     return replace(log, events=events)
+
+
+def hide_ids(log: Log) -> Log:
+    """Return the log without the ids of landmarks; `true_ids` has those of every scan.  Robots keep their names."""
+    true_ids, events = {}, log.events.copy()
+    for n, event in enumerate(events):
+        if isinstance(event, Scan) and event.ids is not None:
+            ids = [i if i in log.robots else None for i in event.ids]
+            hidden = Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor, y=event.y, ids=ids, cov=event.cov)
+            events[n], true_ids[hidden] = hidden, event.ids
+    return replace(log, events=events, true_ids=true_ids)

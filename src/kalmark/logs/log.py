@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.errors import LogError
-from kalmark.events import Event, Id, Scan
+from kalmark.events import Control, Event, Id, Scan
 from kalmark.geometry.angles import wrap
 
 Array = npt.NDArray[np.float64]
@@ -32,9 +32,8 @@ class Trajectory:
     def __post_init__(self) -> None:
         t_ns, poses = np.asarray(self.t_ns, dtype=np.int64), np.asarray(self.poses, dtype=np.float64)
         if poses.ndim != 2 or poses.shape[1] not in (3, 7) or t_ns.shape != poses.shape[:1] or len(t_ns) == 0:
-            raise LogError(
-                f"trajectory: t_ns has shape {t_ns.shape} and poses {poses.shape}, expected (N,) and (N, 3|7)"
-            )
+            shapes = f"t_ns has shape {t_ns.shape} and poses {poses.shape}"
+            raise LogError(f"trajectory: {shapes}, expected (N,) and (N, 3|7)")
         if not np.isfinite(poses).all():
             raise LogError("trajectory: poses hold a value that is not finite, expected finite numbers")
         if not (np.diff(t_ns) > 0).all():
@@ -145,3 +144,40 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.events)
+
+
+def begins_at(events: Iterable[Event], robot: str, held: bool) -> int | None:
+    """Return the time (ns) at which a robot's first event begins, None if it has none.
+
+    An increment is the motion that ended at its time, and began one interval (that to the next) before it.
+    """
+    mine = (event for event in events if event.robot == robot)
+    first = next(mine, None)
+    if first is None or held or not isinstance(first, Control):
+        return None if first is None else first.t_ns
+    second = next((event.t_ns for event in mine if isinstance(event, Control)), first.t_ns)
+    return 2 * first.t_ns - second
+
+
+def true_start(log: Log, robot: str, held: bool) -> Array | None:
+    """Return the true pose (3,) or (7,) of a robot when its first event begins, None if the log does not have it.
+
+    Where the truth begins only after a first increment, it is taken back by that increment.
+    """
+    truth, begin = log.truth.get(robot), begins_at(log.events, robot, held)
+    if truth is None or begin is None:
+        return None
+    pose: Array = truth.at(begin)
+    if np.isfinite(pose).all():
+        return pose
+    return None if held else _before(truth, next(event for event in log.events if event.robot == robot))
+
+
+def _before(truth: Trajectory, event: Event) -> Array | None:
+    """Return the true pose (3,) before an increment u that ended at a known one: r = r2 - R(r) u."""
+    after: Array = truth.at(event.t_ns)
+    if not isinstance(event, Control) or after.shape != (3,) or event.u.shape != (3,) or np.isnan(after).any():
+        return None
+    theta = wrap(after[2] - event.u[2])
+    c, s = np.cos(theta), np.sin(theta)
+    return np.append(after[:2] - np.array([[c, -s], [s, c]]) @ event.u[:2], theta)

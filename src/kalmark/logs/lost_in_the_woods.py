@@ -5,26 +5,20 @@ The laser sits `d` = 0.219 m ahead of the robot's centre: give its mount in the 
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Scan, order
+from kalmark.logs.arrays import arrays, events_of, find_variables, times
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.matlab import arrays, column, variables
-from kalmark.logs.source import Format, Request, quantity
+from kalmark.logs.source import Format, Request, one_robot, quantity
 
 ROBOT, SENSOR, FILE = "robot", "laser", "dataset2.mat"
 COLUMNS = {"range_bearing": ("range_m", "bearing_rad"), "bearing": ("bearing_rad",)}
 NAMES = ("t", "v", "om", "r", "b", "l", "x_true", "y_true", "th_true", "true_valid")
-
-
-def find(path: Path) -> Path | None:
-    """Return the MATLAB file, given it or its folder."""
-    file = path / FILE if path.is_dir() else path
-    return file if file.suffix == ".mat" and variables(file) >= set(NAMES) else None
 
 
 def read(path: Path, request: Request, r_max: Any = None, measured: Any = "range_bearing") -> Log:
@@ -39,38 +33,32 @@ def read(path: Path, request: Request, r_max: Any = None, measured: Any = "range
         raise LogError(f"{path}: measured is {measured!r}, expected {' or '.join(COLUMNS)}")
     limit = float("inf") if r_max is None else quantity(r_max, "r_max", 0.0)
     data = arrays(path, NAMES)
-    t_ns = np.rint(column(data["t"]) * 1e9).astype(np.int64)
-    count = len(t_ns)
+    count = data["t"].size
     for name, value in data.items():
         if name != "l" and len(value) != count:
             raise LogError(f"{path}: {name} has {len(value)} rows, expected {count} as t has")
-    if not (np.diff(t_ns) > 0).all():
-        row = int(np.argmin(np.diff(t_ns) > 0)) + 2
-        raise LogError(f"{path}: t row {row} is not after row {row - 1}, expected increasing times")
-    if (data["r"] < 0).any():
-        row, landmark = (int(i) + 1 for i in np.argwhere(data["r"] < 0)[0])
+    t_ns = times(path, data["t"], "t row {row} is not after row {before}, expected increasing times")
+    r, b = data["r"], data["b"]
+    if (r < 0).any():
+        row, landmark = (int(i) + 1 for i in np.argwhere(r < 0)[0])
         raise LogError(f"{path}: r row {row}, column {landmark} is negative, expected ranges of at least 0")
-    controls = np.column_stack([column(data["v"]), column(data["om"])])
-    poses = np.column_stack([column(data[name]) for name in ("x_true", "y_true", "th_true")])
-    valid = column(data["true_valid"]) == 1
-    events: list[Event] = []
-    for t, u, r, b in zip(t_ns.tolist(), controls, data["r"], data["b"], strict=True):
-        events.append(Control(t_ns=t, robot=ROBOT, u=u))
-        seen = np.flatnonzero((r > 0) & (r <= limit))
-        y = np.column_stack([r[seen], b[seen]])[:, -len(COLUMNS[measured]) :]
-        events.append(Scan(t_ns=t, robot=ROBOT, sensor=SENSOR, y=y, ids=(seen + 1).tolist()))
-    return Log(
-        name="lost_in_the_woods",
-        format="lost_in_the_woods",
-        path=path,
-        robots=(ROBOT,),
-        events=sorted(events, key=order),
+    u, poses = (np.column_stack([data[name].reshape(-1) for name in names]) for names in (("v", "om"), NAMES[6:9]))
+    seen = [np.flatnonzero((row > 0) & (row <= limit)) for row in r]
+    y = [np.column_stack([r[k, i], b[k, i]])[:, -len(COLUMNS[measured]) :] for k, i in enumerate(seen)]
+    events = events_of(ROBOT, SENSOR, t_ns, u, zip(y, [(i + 1).tolist() for i in seen], strict=True))
+    valid = data["true_valid"].reshape(-1) == 1
+    return one_robot(
+        "lost_in_the_woods",
+        path,
+        request,
+        ROBOT,
+        events,
+        ("v_mps", "w_radps"),
+        {SENSOR: COLUMNS[measured]},
         truth={ROBOT: Trajectory(t_ns[valid], poses[valid])} if valid.any() else {},
         landmarks={i + 1: position for i, position in enumerate(data["l"])},
-        skipped=request.skipped,
-        control_columns={ROBOT: ("v_mps", "w_radps")},
-        sensor_columns={(ROBOT, SENSOR): COLUMNS[measured]},
     )
 
 
+find = partial(find_variables, FILE, NAMES)
 LOST_IN_THE_WOODS = Format("lost_in_the_woods", f"{FILE} or its folder", find, read, options=("r_max", "measured"))

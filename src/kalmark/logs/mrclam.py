@@ -6,7 +6,6 @@ K. Leung et al., "The UTIAS multi-robot cooperative localization and mapping dat
 from __future__ import annotations
 
 import re
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,12 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order
-from kalmark.logs.log import Array, Log, Trajectory
-from kalmark.logs.source import Format, Request, nearest, quantity
-from kalmark.logs.text import rows, timed_rows
+from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.source import Format, Request, nearest, quantity, read_points, rows, timed_rows
 
 SENSOR = "camera"
-LAST_ROBOT = 5
-"""Subjects 1 to 5 are robots, the others landmarks."""
+MRCLAM_ROBOTS = tuple(f"robot{n}" for n in range(1, 6))
+"""Subjects 1 to 5, the others are landmarks."""
 _ROBOT_FILE = re.compile(r"Robot([1-5])_(Odometry|Measurement|Groundtruth)\.dat")
 
 
@@ -53,29 +51,29 @@ def read(path: Path, request: Request, bearing_shift_s: Any = 0.0, robot_sightin
             raise LogError(f"{path}: no robot {robot!r}, expected one of {', '.join(present)}{nearest(robot, present)}")
     shift_ns = round(quantity(bearing_shift_s, "bearing_shift_s") * 1e9)
     subjects = read_barcodes(path / "Barcodes.dat", request)
-    ignored = () if robot_sightings else tuple(f"robot{n}" for n in range(1, LAST_ROBOT + 1))
+    ignored = () if robot_sightings else MRCLAM_ROBOTS
     robots = tuple(robot for robot in present if request.wants(robot))
     events: list[Event] = []
     truth = {}
     for robot in robots:
         stem = robot.replace("robot", "Robot")
-        events += read_odometry(path / f"{stem}_Odometry.dat", robot, request)
-        if (path / f"{stem}_Measurement.dat").is_file():
-            events += read_measurements(path / f"{stem}_Measurement.dat", robot, subjects, shift_ns, request, ignored)
-        if (path / f"{stem}_Groundtruth.dat").is_file():
-            truth[robot] = read_truth(path / f"{stem}_Groundtruth.dat", request)
+        moved, seen, true = (path / f"{stem}_{what}.dat" for what in ("Odometry", "Measurement", "Groundtruth"))
+        if moved.is_file():
+            table = timed_rows(moved, ("v_mps", "w_radps"), request.refuse)
+            events += [Control(t_ns=t_ns, robot=robot, u=u) for _, t_ns, u in table]
+        else:
+            request.refuse(f"{moved}: no such file, expected the odometry of {robot} (a set of measurements only?)")
+        if seen.is_file():
+            events += read_measurements(seen, robot, subjects, shift_ns, request, ignored)
+        if true.is_file():
+            truth[robot] = read_truth(true, request)
+    landmarks = path / "Landmark_Groundtruth.dat"
     return Log(
-        name=path.name,
-        format="mrclam",
-        path=path,
-        robots=robots,
-        events=sorted(events, key=order),
-        truth=truth,
-        landmarks=read_landmarks(path / "Landmark_Groundtruth.dat", request),
-        skipped=request.skipped,
-        control_columns=dict.fromkeys(robots, ("v_mps", "w_radps")),
+        path.name, robots, sorted(events, key=order), "mrclam", path, truth,
+        read_points(landmarks, request.refuse, int, (3, 4, 5), "subject, x, y and their deviations"),
+        skipped=request.skipped, control_columns=dict.fromkeys(robots, ("v_mps", "w_radps")),
         sensor_columns={(robot, SENSOR): ("range_m", "bearing_rad") for robot in robots},
-    )
+    )  # fmt: skip
 
 
 def read_barcodes(path: Path, request: Request) -> dict[int, Id]:
@@ -83,21 +81,11 @@ def read_barcodes(path: Path, request: Request) -> dict[int, Id]:
     subjects: dict[int, Id] = {}
     for line, cells in rows(path):
         try:
-            subject, barcode = (int(cell) for cell in cells)
+            subject, barcode = map(int, cells)
+            subjects[barcode] = f"robot{subject}" if subject <= len(MRCLAM_ROBOTS) else subject
         except ValueError:
             request.refuse(f"{path}:{line}: {' '.join(cells)!r}, expected a subject and its barcode")
-            continue
-        subjects[barcode] = f"robot{subject}" if subject <= LAST_ROBOT else subject
     return subjects
-
-
-def read_odometry(path: Path, robot: str, request: Request) -> list[Event]:
-    """Return the velocities of one robot, each held until the next."""
-    if not path.is_file():
-        request.refuse(f"{path}: no such file, expected the odometry of {robot} (a set of measurements only?)")
-        return []
-    table = timed_rows(path, ("v_mps", "w_radps"), request.refuse)
-    return [Control(t_ns=t_ns, robot=robot, u=u) for _, t_ns, u in table]
 
 
 def read_measurements(
@@ -105,69 +93,41 @@ def read_measurements(
 ) -> list[Event]:
     """Return the scans of one robot: the measurements of one stamp are one scan."""
     scans: dict[int, dict[Id, list[float]]] = {}
-    unknown: Counter[int] = Counter()
-    first: dict[int, int] = {}
+    unknown: dict[int, list[int]] = {}  # lines by barcode
     sightings = 0
     for line, t_ns, (barcode, *y) in timed_rows(path, ("barcode", "range_m", "bearing_rad"), request.refuse):
         subject = subjects.get(int(barcode))
         if y[0] < 0:
             request.refuse(f"{path}:{line}: range_m is {y[0]}, expected a range of at least 0")
         elif subject is None:
-            unknown[int(barcode)] += 1
-            first.setdefault(int(barcode), line)
+            unknown.setdefault(int(barcode), []).append(line)
         elif subject in ignored:
             sightings += 1
         elif subject in scans.setdefault(t_ns + shift_ns, {}):
             request.refuse(f"{path}:{line}: subject {subject} twice at one time, expected each once in a scan")
         else:
             scans[t_ns + shift_ns][subject] = y
-    for barcode, count in sorted(unknown.items()):
-        told = f"{path}:{first[barcode]}: {count} of barcode {barcode}, which no subject carries"
-        request.leave_out(count, told)
+    for code, lines in sorted(unknown.items()):
+        told = f"{path}:{lines[0]}: {len(lines)} of barcode {code}, which no subject carries"
+        request.leave_out(len(lines), told)
     if sightings:
         request.leave_out(sightings, f"{path}: {sightings} sightings of robots (robot_sightings is false)")
-    return [
-        Scan(t_ns=t_ns, robot=robot, sensor=SENSOR, y=list(seen.values()), ids=list(seen))
-        for t_ns, seen in scans.items()
-        if seen
-    ]
+    made = ((t_ns, list(seen), list(seen.values())) for t_ns, seen in scans.items() if seen)
+    return [Scan(t_ns=t_ns, robot=robot, sensor=SENSOR, y=y, ids=ids) for t_ns, ids, y in made]
 
 
 def read_truth(path: Path, request: Request) -> Trajectory:
     """Return the true poses of one robot; rows of a repeated time are refused."""
-    times: list[int] = []
-    poses: list[list[float]] = []
+    poses: dict[int, list[float]] = {}
     for line, t_ns, pose in timed_rows(path, ("x_m", "y_m", "theta_rad"), request.refuse):
-        if times and t_ns == times[-1]:
+        if t_ns in poses:
             request.refuse(f"{path}:{line}: time twice, expected increasing times")
-            continue
-        times.append(t_ns)
-        poses.append(pose)
-    if not times:
+        else:
+            poses[t_ns] = pose
+    if not poses:
         raise LogError(f"{path}: no row that can be used, expected true poses")
-    return Trajectory(np.array(times), np.array(poses))
+    return Trajectory(np.array([*poses]), np.array([*poses.values()]))
 
 
-def read_landmarks(path: Path, request: Request) -> dict[Id, Array]:
-    """Return the true landmark positions by subject, or {} without the file."""
-    landmarks: dict[Id, Array] = {}
-    if not path.is_file():
-        return landmarks
-    for line, cells in rows(path):
-        try:
-            subject, x, y = int(cells[0]), float(cells[1]), float(cells[2])
-        except (ValueError, IndexError):
-            request.refuse(f"{path}:{line}: {' '.join(cells)!r}, expected subject, x, y and their deviations")
-            continue
-        landmarks[subject] = np.array([x, y])
-    return landmarks
-
-
-MRCLAM = Format(
-    "mrclam",
-    "a folder with Barcodes.dat and RobotN_Odometry.dat, RobotN_Measurement.dat",
-    find,
-    read,
-    options=("bearing_shift_s", "robot_sightings"),
-    robot_prefix="robot",
-)
+MRCLAM = Format("mrclam", "a folder with Barcodes.dat and RobotN_Odometry.dat, RobotN_Measurement.dat", find, read,
+                options=("bearing_shift_s", "robot_sightings"), robot_prefix="robot")  # fmt: skip

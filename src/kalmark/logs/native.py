@@ -16,22 +16,19 @@ numbered in the order of the columns (`cov_xx, cov_xy, cov_yy, ...` where they a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Id, Scan, order
 from kalmark.logs.log import Array, Log, PositionTrack, Trajectory
-from kalmark.logs.rig import mapping
-from kalmark.logs.source import Format, Request, folder_of, nearest
-from kalmark.logs.stray import Places, refuse_misspelt
-from kalmark.logs.table import CONTROL, OBSERVATION, Row, Table, read_table
-from kalmark.logs.text import landmark_id, seconds
+from kalmark.logs.source import Format, Request, folder_of, landmark_id, mapping, nearest, seconds
+from kalmark.logs.table import CONTROL, OBSERVATION, Refused, Row, read_table
 
 RIG = "rig.yaml"
 FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv")
@@ -39,6 +36,11 @@ LANDMARK3 = ("x_m", "y_m", "z_m", "x2_m", "y2_m", "z2_m", "qx", "qy", "qz", "qw"
 POSE2, POSE3 = ("x_m", "y_m", "theta_rad"), ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 LANDMARKS = (LANDMARK3[:2], LANDMARK3[:3], LANDMARK3[:6], POSE3)
 """The columns of a point of the plane, of one of space, of a line and of a tag, as `Log.landmarks` has them."""
+
+Places = dict[tuple[Path, str, str], int]
+"""The line where a robot's controls and fixes (sensor "") and its scans by each sensor begin in a file."""
+
+NEAR = 0.65  # of difflib's ratio
 
 
 def read(path: Path, request: Request) -> Log:
@@ -50,59 +52,28 @@ def read(path: Path, request: Request) -> Log:
         near = [] if (path / name).is_file() else get_close_matches(name, others, n=1, cutoff=0.85)
         if near:
             raise LogError(f"{path / near[0]}: a file of this name is not read, expected {name}")
-    events: list[Event] = []
-    control_columns: dict[str, tuple[str, ...]] = {}
-    sensor_columns: dict[tuple[str, str], tuple[str, ...]] = {}
-    places: Places = {}
-    if (path / "controls.csv").is_file():
-        events += read_controls(path / "controls.csv", request, control_columns, places)
-    if (path / "scans.csv").is_file():
-        events += read_scans(path / "scans.csv", request, sensor_columns, places)
-    if (path / "fixes.csv").is_file():
-        events += read_fixes(path / "fixes.csv", request, places)
-    truth = optional(path / "truth.csv", read_truth, request)
+    reader = _Reader(request)
+    for name, read_file in zip(FILES, reader.readers, strict=True):
+        if (path / name).is_file():
+            read_file(path / name)
     describes = mapping(path / RIG) if (path / RIG).is_file() else {}
-    seen = {name for event in events if isinstance(event, Scan) for name in event.ids or ()}
-    strays = refuse_misspelt(places, {*truth, *describes.get("robots", ()), *map(str, seen)}, request)
-    events = [event for event in events if event.robot not in strays]
-    robots = tuple(dict.fromkeys(event.robot for event in events))
+    seen = {name for event in reader.events if isinstance(event, Scan) for name in event.ids or ()}
+    known = {*reader.truth, *describes.get("robots", ()), *map(str, seen)}
+    strays = refuse_misspelt(reader.places, known, request)
+    events = [event for event in reader.events if event.robot not in strays]
+    columns = {key: names for key, names in reader.columns.items() if key[0] not in strays}
     return Log(
-        name=path.name,
-        path=path,
-        robots=robots,
-        events=sorted(events, key=order),
-        truth=truth,
-        landmarks=optional(path / "landmarks.csv", read_landmarks, request),
-        gps=optional(path / "gps.csv", read_gps, request),
-        skipped=request.skipped,
-        control_columns={robot: names for robot, names in control_columns.items() if robot not in strays},
-        sensor_columns={key: names for key, names in sensor_columns.items() if key[0] not in strays},
-        places={(robot, sensor): (file, line) for (file, robot, sensor), line in reversed(places.items())},
-        describes=describes,
-    )
-
-
-def optional(path: Path, reader: Callable[[Path, Request], dict[Any, Any]], request: Request) -> dict[Any, Any]:
-    """Return what a file holds, or {} if the log does not have it."""
-    return reader(path, request) if path.is_file() else {}
-
-
-def read_controls(path: Path, request: Request, columns: dict[str, tuple[str, ...]], places: Places) -> list[Event]:
-    """Return the controls of `controls.csv` and note the columns of each robot's and where they begin."""
-    events: list[Event] = []
-    for row in timed(read_table(path, ("t_s", "robot"), known=CONTROL), request):
-        places.setdefault((path, row.robot, ""), row.line)
-        u = row.values(columns, row.robot, request)
-        if u is None:
-            continue
-        cov = row.own_noise(columns[row.robot], request, definite=False)
-        if cov is not False:
-            events.append(Control(t_ns=row.t_ns, robot=row.robot, u=u, cov=cov))
-    return events
+        name=path.name, path=path, robots=tuple(dict.fromkeys(event.robot for event in events)),
+        events=sorted(events, key=order), truth=reader.truth, landmarks=reader.landmarks, gps=reader.gps,
+        skipped=request.skipped, describes=describes,
+        control_columns={robot: names for (robot, sensor), names in columns.items() if not sensor},
+        sensor_columns={key: names for key, names in columns.items() if key[1]},
+        places={(robot, sensor): (file, line) for (file, robot, sensor), line in reversed(reader.places.items())},
+    )  # fmt: skip
 
 
 @dataclass
-class Rows:
+class _Rows:
     """Gather the observations of one scan; a bad row refuses the whole scan, an empty one says it saw nothing."""
 
     y: list[list[float]] = field(default_factory=list)
@@ -113,156 +84,188 @@ class Rows:
     empty: bool = False
 
 
-def read_scans(path: Path, request: Request, columns: dict[Any, tuple[str, ...]], places: Places) -> list[Event]:
-    """Return the scans of `scans.csv`, one a robot, sensor and time; note each sensor's columns and where it begins."""
-    scans: dict[tuple[int, str, str], Rows] = {}
-    table = read_table(path, ("t_s", "robot", "sensor", "id"), known=OBSERVATION)
-    for row in timed(table, request, by_sensor=True):
-        places.setdefault((path, row.robot, row.sensor), row.line)
-        rows = scans.setdefault((row.t_ns, row.robot, row.sensor), Rows())
-        rows.bad |= not add_row(rows, row, request, columns)
-    events: list[Event] = []
-    for (t_ns, robot, sensor), rows in scans.items():
-        if rows.bad:
-            request.leave_out(len(rows.lines), f"{path}: scan of {robot} by {sensor} at t={seconds(t_ns)} s, all of it")
-            continue
-        covs = [cov for cov in rows.covs if cov is not None]
-        cov = np.array(covs) if covs else None
-        events.append(Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov))
-    return events
+class _Reader:
+    """Reads the files of a log, one method each, and gathers what is in them.
+
+    `columns` are those of each robot's controls (sensor "") and of each sensor, `places` where they begin.
+    """
+
+    def __init__(self, request: Request) -> None:
+        self.request = request
+        self.events: list[Event] = []
+        self.columns: dict[tuple[str, str], tuple[str, ...]] = {}
+        self.places: Places = {}
+        self.truth: dict[str, Trajectory] = {}
+        self.landmarks: dict[Id, Array] = {}
+        self.gps: dict[str, PositionTrack] = {}
+        self.readers = (self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps)
+
+    def note(self, row: Row) -> None:
+        """Note where the controls, fixes or scans of a row begin."""
+        self.places.setdefault((row.table.path, *row.key), row.line)
+
+    def controls(self, path: Path) -> None:
+        """Read `controls.csv`."""
+
+        def take(row: Row) -> None:
+            self.note(row)
+            u = row.values(self.columns)
+            cov = row.own_noise(self.columns[row.key], definite=False)
+            self.events.append(Control(t_ns=row.t_ns, robot=row.robot, u=u, cov=cov))
+
+        read_table(path, ("t_s", "robot"), known=CONTROL).each(self.request, take)
+
+    def scans(self, path: Path) -> None:
+        """Read `scans.csv`: one scan a robot, sensor and time."""
+        scans: dict[tuple[int, str, str], _Rows] = {}
+
+        def take(row: Row) -> None:
+            self.note(row)
+            rows = scans.setdefault((row.t_ns, *row.key), _Rows())
+            try:
+                self.add(rows, row)
+            except Refused:
+                rows.bad = True
+                raise
+
+        table = read_table(path, ("t_s", "robot", "sensor", "id"), known=OBSERVATION)
+        table.each(self.request, take, by_sensor=True)
+        for (t_ns, robot, sensor), rows in scans.items():
+            if rows.bad:
+                line = f"{path}: scan of {robot} by {sensor} at t={seconds(t_ns)} s, all of it"
+                self.request.leave_out(len(rows.lines), line)
+                continue
+            covs = [cov for cov in rows.covs if cov is not None]
+            cov = np.array(covs) if covs else None
+            self.events.append(Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov))
+
+    def add(self, rows: _Rows, row: Row) -> None:
+        """Add one row of `scans.csv` to its scan.  Raises Refused."""
+        empty = not any(row.text(name) for name in ("id", *row.table.value_columns, *row.table.noise_columns))
+        if rows.empty or (empty and rows.y):
+            raise Refused("an empty row and others in one scan, expected it alone: the scan saw nothing")
+        rows.empty = empty
+        if empty:
+            return
+        y = row.values(self.columns)
+        cov, text = row.own_noise(self.columns[row.key], definite=True), row.text("id")
+        name = landmark_id(text) if text else None
+        if name is not None and name in rows.ids:
+            first = rows.lines[rows.ids.index(name)]
+            raise Refused(f"id {name!r} is in this scan already (line {first}), expected each landmark once")
+        if rows.covs and (rows.covs[0] is None) != (cov is None):
+            raise Refused("own noise in some rows of this scan only, expected it in all of them or in none")
+        rows.y.append(y)
+        rows.ids.append(name)
+        rows.covs.append(cov)
+        rows.lines.append(row.line)
+
+    def fixes(self, path: Path) -> None:
+        """Read `fixes.csv`: absolute positions."""
+        table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",))
+        if not table.noise_columns:
+            raise LogError(f"{path}:1: no column of noise, expected cov_xx, cov_xy, cov_yy or sigma_x_m, sigma_y_m")
+        columns: dict[tuple[str, str], tuple[str, ...]] = {}
+
+        def take(row: Row) -> None:
+            self.note(row)
+            y = row.values(columns)
+            cov = row.own_noise(columns[row.key], definite=True)
+            if cov is None:
+                raise Refused("the fix has no noise, expected a covariance in m^2")
+            self.events.append(Fix(t_ns=row.t_ns, robot=row.robot, y=y, cov=cov))
+
+        table.each(self.request, take)
+
+    def read_truth(self, path: Path) -> None:
+        """Read `truth.csv`: the true trajectory of each robot."""
+        table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3))
+        if set(table.value_columns) not in (set(POSE2), set(POSE3)):
+            odd = next((name for name in table.value_columns if name not in (*POSE2, *POSE3)), None)
+            hint = nearest(odd, (*POSE2, *POSE3)) if odd else ""
+            given = ", ".join(table.value_columns) or "of a pose: none"
+            wanted = f"either {', '.join(POSE2)} or {', '.join(POSE3)}"
+            raise LogError(f"{path}:1: columns {given}, expected {wanted}{hint}")
+        columns = POSE2 if "theta_rad" in table.value_columns else POSE3
+        paths: dict[str, dict[int, list[float]]] = {}
+
+        def take(row: Row) -> None:
+            pose = row.numbers(columns)
+            if len(pose) == 7 and abs(np.linalg.norm(pose[3:]) - 1) > 1e-6:
+                raise Refused(f"quaternion has norm {np.linalg.norm(pose[3:]):.9g}, expected 1")
+            paths.setdefault(row.robot, {})[row.t_ns] = pose
+
+        table.each(self.request, take, strictly=True)
+        self.truth = {robot: Trajectory(np.array([*p]), np.array([*p.values()])) for robot, p in paths.items()}
+
+    def read_landmarks(self, path: Path) -> None:
+        """Read `landmarks.csv`: true positions, both ends of lines (6,), poses of tags (7,)."""
+
+        def take(row: Row) -> None:
+            given = tuple(name for name in row.table.value_columns if row.text(name) or name in LANDMARK3[:2])
+            name, values = row.text("id"), row.numbers(given)
+            if not name:
+                raise Refused("id is empty, expected the landmark's id")
+            if landmark_id(name) in self.landmarks:
+                raise Refused(f"id {name} is in this file already, expected each landmark once")
+            if given not in LANDMARKS:
+                raise Refused(f"{', '.join(given)}, expected a point, both ends of a line or the pose of a tag")
+            self.landmarks[landmark_id(name)] = np.array(values)
+
+        read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:]).each(self.request, take, timed=False)
+
+    def read_gps(self, path: Path) -> None:
+        """Read `gps.csv`: position fixes that only score a run."""
+        columns = ("x_m", "y_m", "antenna_x_m", "antenna_y_m")
+        tracks: dict[str, tuple[list[int], list[list[float]]]] = {}
+
+        def take(row: Row) -> None:
+            values = row.numbers(columns)
+            times, rows = tracks.setdefault(row.robot, ([], []))
+            if rows and values[2:] != rows[0][2:]:
+                raise Refused(f"antenna is {values[2:]}, expected {rows[0][2:]} as in the robot's first row")
+            times.append(row.t_ns)
+            rows.append(values)
+
+        read_table(path, ("t_s", "robot", *columns), allowed=()).each(self.request, take)
+        for robot, (times, rows) in tracks.items():
+            track = np.array(rows)
+            self.gps[robot] = PositionTrack(np.array(times), track[:, :2], track[0, 2:])
 
 
-def add_row(rows: Rows, row: Row, request: Request, columns: dict[Any, tuple[str, ...]]) -> bool:
-    """Add one row of `scans.csv` to its scan; return False if it was refused."""
-    key = (row.robot, row.sensor)
-    empty = not any(row.text(name) for name in ("id", *row.table.value_columns, *row.table.noise_columns))
-    if rows.empty or (empty and rows.lines):
-        return row.refuse(request, "an empty row and others in one scan, expected it alone: the scan saw nothing")
-    if empty:
-        rows.empty = True
-        return True
-    y = row.values(columns, key, request)
-    if y is None:
-        return False
-    cov = row.own_noise(columns[key], request, definite=True)
-    if cov is False:
-        return False
-    text = row.text("id")
-    name = landmark_id(text) if text else None
-    if name is not None and name in rows.ids:
-        first = rows.lines[rows.ids.index(name)]
-        return row.refuse(request, f"id {name!r} is in this scan already (line {first}), expected each landmark once")
-    if rows.covs and (rows.covs[0] is None) != (cov is None):
-        return row.refuse(request, "own noise in some rows of this scan only, expected it in all of them or in none")
-    rows.y.append(y)
-    rows.ids.append(name)
-    rows.covs.append(cov)
-    rows.lines.append(row.line)
-    return True
+def refuse_misspelt(places: Places, known: Collection[str], request: Request) -> set[str]:
+    """Refuse the robots whose name seems misspelt, with file and line, and return them.
 
-
-def read_fixes(path: Path, request: Request, places: Places) -> list[Event]:
-    """Return the absolute position fixes of `fixes.csv`."""
-    table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",))
-    if not table.noise_columns:
-        raise LogError(f"{path}:1: no column of noise, expected cov_xx, cov_xy, cov_yy or sigma_x_m, sigma_y_m")
-    columns: dict[str, tuple[str, ...]] = {}
-    events: list[Event] = []
-    for row in timed(table, request):
-        places.setdefault((path, row.robot, ""), row.line)
-        y = row.values(columns, row.robot, request)
-        if y is None:
-            continue
-        cov = row.own_noise(columns[row.robot], request, definite=True)
-        if cov is None:
-            cov = row.refuse(request, "the fix has no noise, expected a covariance in m^2")
-        if cov is not False:
-            events.append(Fix(t_ns=row.t_ns, robot=row.robot, y=y, cov=cov))
-    return events
-
-
-def read_truth(path: Path, request: Request) -> dict[str, Trajectory]:
-    """Return the true trajectory of each robot in `truth.csv`."""
-    table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3))
-    if set(table.value_columns) not in (set(POSE2), set(POSE3)):
-        odd = next((name for name in table.value_columns if name not in (*POSE2, *POSE3)), None)
-        hint = nearest(odd, (*POSE2, *POSE3)) if odd else ""
-        given = ", ".join(table.value_columns) or "of a pose: none"
-        raise LogError(f"{path}:1: columns {given}, expected {pose_columns()}{hint}")
-    columns = POSE2 if "theta_rad" in table.value_columns else POSE3
-    paths: dict[str, tuple[list[int], list[list[float]]]] = {}
-    for row in timed(table, request, strictly=True):
-        pose = row.numbers(columns, request)
-        if pose is None:
-            continue
-        if len(pose) == 7 and abs(np.linalg.norm(pose[3:]) - 1) > 1e-6:
-            row.refuse(request, f"quaternion has norm {np.linalg.norm(pose[3:]):.9g}, expected 1")
-            continue
-        times, poses = paths.setdefault(row.robot, ([], []))
-        times.append(row.t_ns)
-        poses.append(pose)
-    return {robot: Trajectory(np.array(t), np.array(p)) for robot, (t, p) in paths.items()}
-
-
-def pose_columns() -> str:
-    """Say which columns a true pose may have."""
-    return f"either {', '.join(POSE2)} or {', '.join(POSE3)}"
-
-
-def read_landmarks(path: Path, request: Request) -> dict[Id, Array]:
-    """Return the true landmarks of `landmarks.csv`: positions, both ends of lines (6,), poses of tags (7,)."""
-    landmarks: dict[Id, Array] = {}
-    table = read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:])
-    for row in table.rows(request):
-        given = tuple(name for name in table.value_columns if row.text(name) or name in LANDMARK3[:2])
-        name, numbers = row.text("id"), row.numbers(given, request)
-        if numbers is None:
-            continue
-        if not name:
-            row.refuse(request, "id is empty, expected the landmark's id")
-        elif landmark_id(name) in landmarks:
-            row.refuse(request, f"id {name} is in this file already, expected each landmark once")
-        elif given not in LANDMARKS:
-            row.refuse(request, f"{', '.join(given)}, expected a point, both ends of a line or the pose of a tag")
-        else:
-            landmarks[landmark_id(name)] = np.array(numbers)
-    return landmarks
-
-
-def read_gps(path: Path, request: Request) -> dict[str, PositionTrack]:
-    """Return the position fixes of `gps.csv`, which only score a run."""
-    columns = ("x_m", "y_m", "antenna_x_m", "antenna_y_m")
-    table = read_table(path, ("t_s", "robot", *columns), allowed=())
-    tracks: dict[str, tuple[list[int], list[list[float]], list[float]]] = {}
-    for row in timed(table, request):
-        values = row.numbers(columns, request)
-        if values is None:
-            continue
-        times, xy, antenna = tracks.setdefault(row.robot, ([], [], values[2:]))
-        if values[2:] != antenna:
-            row.refuse(request, f"antenna is {values[2:]}, expected {antenna} as in the robot's first row")
-            continue
-        times.append(row.t_ns)
-        xy.append(values[:2])
-    return {robot: PositionTrack(np.array(t), np.array(p), np.array(a)) for robot, (t, p, a) in tracks.items()}
-
-
-def timed(table: Table, request: Request, *, by_sensor: bool = False, strictly: bool = False) -> Iterator[Row]:
-    """Yield the rows whose time does not run backwards within a robot (and sensor); refuse the others."""
-    last: dict[Any, Row] = {}
-    for row in table.rows(request):
-        if not row.read_time(request) or not row.read_names(request, by_sensor):
-            continue
-        key = (row.robot, row.sensor)
-        before = last.get(key)
-        if before is not None and row.t_ns < before.t_ns + strictly:
-            wanted = "increasing times" if strictly else "times that never run backwards"
-            row.refuse(
-                request, f"time {row.text('t_s')} s after {before.text('t_s')} s of {row.robot}, expected {wanted}"
+    Or that have nothing in common with the others: scans without controls, where another robot has controls.  Not those
+    asked for by name, those of `known` and those whose name differs by its digits: they are numbered.
+    """
+    files: dict[str, dict[Path, int]] = {}
+    for (path, robot, _), line in places.items():
+        files.setdefault(robot, {}).setdefault(path, line)
+    strays: set[str] = set()
+    for robot, lines in files.items() if request.robots is None else ():
+        meant = () if len(lines) > 1 or robot in known else _meant(robot, files, strays)
+        if meant:
+            (path, line), every = next(iter(lines.items())), "both" if len(meant) == 1 else "all"
+            request.refuse(
+                f"{path}:{line}: robot {robot!r} is in no other file of the log, "
+                f"expected {' or '.join(map(repr, meant))}; if {every} are robots, ask for them: "
+                f"log.robots=[{','.join([*meant, robot])}]"
             )
-            continue
-        last[key] = row
-        yield row
+            strays.add(robot)
+    return strays
+
+
+def _meant(robot: str, files: Mapping[str, Mapping[Path, int]], strays: set[str]) -> tuple[str, ...]:
+    """Return the robot of nearly this name that is in another file, or else all that are, unless they are numbered."""
+    there = [other for other, lines in files.items() if lines.keys() - files[robot].keys() and other not in strays]
+    others = [other for other in there if _letters(other) != _letters(robot)]
+    near = get_close_matches(robot, others, n=1, cutoff=NEAR)
+    return tuple(near) if near or len(others) < len(there) else tuple(others)
+
+
+def _letters(name: str) -> str:
+    return re.sub("[0-9]", "", name)
 
 
 NATIVE = Format("native", "a folder with controls.csv, scans.csv", lambda path: folder_of(path, FILES), read)

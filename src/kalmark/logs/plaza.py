@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, order
+from kalmark.events import Control, Event, Id, Scan
+from kalmark.logs.arrays import arrays
 from kalmark.logs.log import Array, Log, Trajectory
-from kalmark.logs.matlab import arrays
-from kalmark.logs.source import Format, Request
-from kalmark.logs.text import Refuse, nanoseconds, number, rows, timed_rows
+from kalmark.logs.source import Format, Refuse, Request, nanoseconds, number, one_robot, rows, timed_rows
 
 ROBOT, SENSOR = "robot", "radio"
 ODOMETRY, RANGES, TRUTH = "_DR.txt", "_TD.txt", "_.mat"
@@ -40,18 +39,9 @@ def read(path: Path, request: Request) -> Log:
     events: list[Event] = [Control(t_ns=t_ns, robot=ROBOT, u=increment(*u)) for _, t_ns, u in steps]
     events += scans(path.with_name(name + RANGES), request)
     truth, beacons = read_truth(path.with_name(name + TRUTH))
-    return Log(
-        name=name.lower(),
-        format="plaza",
-        path=path.parent,
-        robots=(ROBOT,),
-        events=sorted(events, key=order),
-        truth=truth,
-        landmarks=beacons,
-        skipped=request.skipped,
-        control_columns={ROBOT: ("dx_m", "dy_m", "dtheta_rad")},
-        sensor_columns={(ROBOT, SENSOR): ("range_m",)},
-    )
+    columns, sensors = ("dx_m", "dy_m", "dtheta_rad"), {SENSOR: ("range_m",)}
+    return one_robot("plaza", path.parent, request, ROBOT, events, columns, sensors,
+                     name=name.lower(), truth=truth, landmarks=beacons)  # fmt: skip
 
 
 def increment(distance: float, turn: float) -> Array:
@@ -72,8 +62,7 @@ def scans(path: Path, request: Request) -> Iterator[Scan]:
         for line, _, beacon, value in group:
             if beacon in seen:
                 request.skipped.append(f"{path}:{line}: beacon {beacon} twice at one time, expected it once")
-                continue
-            seen[beacon] = value
+            seen.setdefault(beacon, value)
         yield Scan(t_ns=t_ns, robot=ROBOT, sensor=SENSOR, y=[[r] for r in seen.values()], ids=list(seen))
 
 
@@ -89,8 +78,8 @@ def ranges(path: Path, refuse: Refuse) -> Iterator[tuple[int, int, int, float]]:
                 raise ValueError
         except ValueError:
             refuse(f"{path}:{line}: {' '.join(cells)!r}, expected time, receiver, beacon and a range of at least 0")
-            continue
-        yield row
+        else:
+            yield row
 
 
 def read_truth(path: Path) -> tuple[dict[str, Trajectory], dict[Id, Array]]:

@@ -10,6 +10,7 @@ import gzip
 import json
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,24 @@ import numpy as np
 from scipy.stats import chi2
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, order
+from kalmark.events import Control, Event, Scan, order
 from kalmark.logs.log import Array, Log, Trajectory
-from kalmark.logs.slamtb_rig import WXYZ_TO_XYZW, Part, described, is_lines, parts
-from kalmark.logs.source import Format, Request
+from kalmark.logs.source import Format, Request, placed
 
 NAME = "slamtb"
 CONTROLS = {
     "odometry": ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad"),
     "constVel": ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps"),
 }
+WXYZ_TO_XYZW = [0, 1, 2, 4, 5, 6, 3]
+LANDMARKS = {
+    "eucPnt": "point", "idpPnt": "inverse_depth", "ahmPnt": "anchored_homogeneous", "hmgPnt": "homogeneous",
+    "plkLin": "pluecker_line", "aplLin": "anchored_pluecker_line", "idpLin": "inverse_depth_line",
+    "ahmLin": "anchored_homogeneous_line", "hmgLin": "homogeneous_line",
+}  # fmt: skip
+PLUECKER = ("plkLin", "aplLin")
+BORDER = 25.0  # no landmark starts nearer to the image's border than its width / 25
+VELOCITY = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
 POINTS, SEGMENTS = ("u_px", "v_px"), ("u1_px", "v1_px", "u2_px", "v2_px")
 
 
@@ -61,8 +70,7 @@ def read(path: Path, request: Request) -> Log:
 
 def recording(path: Path, content: dict[str, Any], request: Request) -> Log:
     """Return the log of a recording that has been parsed."""
-    cfg = content["cfg"]
-    lines = is_lines(cfg)
+    cfg, lines = content["cfg"], is_lines(content["cfg"])
     robots = parts("robot", cfg["Robot"])
     step_ns = round(cfg["Time"]["dt"] * 1e9)
     events: list[Event] = [Control(t_ns=0, robot=robot.name, u=np.zeros(6), cov=np.zeros((6, 6)))
@@ -71,20 +79,16 @@ def recording(path: Path, content: dict[str, Any], request: Request) -> Log:
         events += frame_events(frame, frame["frame"] * step_ns, lines)
     seen = {(event.robot, event.sensor) for event in events if isinstance(event, Scan)}
     truth, reference = tracks(path, cfg, robots, step_ns)
+    things = cfg["SimLmk"]["segments" if lines else "points"]  # points (3,) or both ends of segments (6,)
+    gate = float(chi2.cdf(cfg["Opt"]["correct"]["MD2th"], 2))  # the toolbox's is on d^2 of two numbers
     return Log(
-        name=str(cfg["name"]),
-        format=NAME,
-        path=path,
-        robots=tuple(robot.name for robot in robots),
-        events=sorted(events, key=order),
-        truth=truth,
-        landmarks=true_landmarks(cfg["SimLmk"], lines),
-        skipped=request.skipped,
+        str(cfg["name"]), tuple(robot.name for robot in robots), sorted(events, key=order), NAME, path, truth,
+        landmarks=dict(zip(*numbered(things["id"], things["coord"], 6 if lines else 3), strict=True)),
+        skipped=request.skipped, reference=reference,
         control_columns={robot.name: CONTROLS[robot.settings["motion"]] for robot in robots},
         sensor_columns=dict.fromkeys(sorted(seen), SEGMENTS if lines else POINTS),
-        describes=described(cfg, robots) | {"association": {"type": "identity", "gate": gate(cfg)}},
-        reference=reference,
-    )
+        describes=described(cfg, robots) | {"association": {"type": "identity", "gate": gate}},
+    )  # fmt: skip
 
 
 def frame_events(frame: dict[str, Any], t_ns: int, lines: bool) -> Iterator[Event]:
@@ -93,22 +97,18 @@ def frame_events(frame: dict[str, Any], t_ns: int, lines: bool) -> Iterator[Even
         name = f"robot{robot['rob']}"
         yield Control(t_ns=t_ns, robot=name, u=robot["u"])
         for sensor in listed(robot["sen"]):
-            y, ids = observations(sensor, "seg" if lines else "pnt")
+            kind, size = ("seg", 4) if lines else ("pnt", 2)
+            ids, y = numbered(sensor[f"{kind}_ids"], sensor[kind], size)
             yield Scan(t_ns=t_ns, robot=name, sensor=f"camera{sensor['sen']}", y=y, ids=ids)
 
 
-def observations(sensor: dict[str, Any], kind: str) -> tuple[Array, list[int]]:
-    """Return the pixels (K, 2|4) of the points or segments in one image, and their ids."""
-    ids = np.atleast_1d(np.asarray(sensor[f"{kind}_ids"], dtype=np.int64)).tolist()
-    size = 4 if kind == "seg" else 2
-    return columns(sensor[kind], size), ids
+def numbered(ids: Any, matrix: Any, size: int) -> tuple[list[int], Array]:
+    """Return K ids and the columns of a recorded matrix (size, K) as (K, size).
 
-
-def true_landmarks(simulated: dict[str, Any], lines: bool) -> dict[Id, Array]:
-    """Return the true points (3,) or both ends of the true segments (6,), by id."""
-    things = simulated["segments" if lines else "points"]
-    ids = np.atleast_1d(np.asarray(things["id"], dtype=np.int64)).tolist()
-    return dict(zip(ids, columns(things["coord"], 6 if lines else 3), strict=True))
+    The recording has a bare number and a flat list for K = 1, [] for K = 0.
+    """
+    rows = np.asarray(matrix, dtype=np.float64).reshape(size, -1).T
+    return np.atleast_1d(np.asarray(ids, dtype=np.int64)).tolist(), rows
 
 
 def tracks(
@@ -126,7 +126,8 @@ def tracks(
     frames = truth.shape[1]
     t_ns = np.arange(frames + 1, dtype=np.int64) * step_ns
     paths, errors = {}, []
-    for robot, start, state in zip(robots, listed_rows(cfg["RobX0"]), listed_rows(cfg["RobRange"]), strict=True):
+    starts = (np.atleast_2d(np.asarray(cfg[key], dtype=np.float64)) for key in ("RobX0", "RobRange"))
+    for robot, start, state in zip(robots, *starts, strict=True):
         at = 13 * robot.index
         poses = np.column_stack([start[:7], truth[at : at + 7]]).T
         poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
@@ -137,24 +138,127 @@ def tracks(
     return paths, {NAME: figures | {"pose_nees_median": float(np.nanmedian(nees))}}
 
 
-def gate(cfg: dict[str, Any]) -> float:
-    """Return the probability inside the toolbox's gate on the squared Mahalanobis distance, of 2 numbers."""
-    return float(chi2.cdf(cfg["Opt"]["correct"]["MD2th"], 2))
-
-
-def columns(matrix: Any, rows: int) -> Array:
-    """Return a recorded matrix (rows, K) as (K, rows); the recording has [] for K = 0 and a flat list for K = 1."""
-    return np.asarray(matrix, dtype=np.float64).reshape(rows, -1).T
-
-
 def listed(value: Any) -> list[Any]:
     """Return a list; the recording may have its only element bare."""
     return value if isinstance(value, list) else [value]
 
 
-def listed_rows(value: Any) -> list[Array]:
-    """Return a list of vectors; the recording may have the only one bare."""
-    return list(np.atleast_2d(np.asarray(value, dtype=np.float64)))
+# ------------------------------------------------------------------ the settings in the words of a configuration
+@dataclass(frozen=True)
+class Part:
+    """Hold the settings of a robot or sensor, its name here and its index in the recording, from 0."""
+
+    name: str
+    index: int
+    settings: dict[str, Any]
+
+
+def parts(word: str, settings: Any) -> list[Part]:
+    """Return the robots or sensors of a recording, named by their numbers: robot1, robot2, ..."""
+    return [Part(f"{word}{i + 1}", i, one) for i, one in enumerate(listed(settings))]
+
+
+def is_lines(cfg: dict[str, Any]) -> bool:
+    """Return whether the recording maps lines, not points."""
+    return str(cfg["Opt"]["init"]["initType"]).endswith("Lin")
+
+
+def described(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
+    """Return the configuration with which kalmark repeats a recording, its landmark type included."""
+    opt, ends = cfg["Opt"], {}
+    if is_lines(cfg):  # what becomes of the segment that is kept beside a line
+        lines = opt["correct"]["lines"]
+        ends = {"extend": bool(lines["extPolicy"]), "switch_px": float(lines["extSwitch"])}
+    return {
+        "robots": {robot.name: described_robot(cfg, robot) for robot in robots},
+        "landmarks": landmark(opt["init"]) | ends,
+        "map": {"reparametrize": float(opt["correct"]["linTestIdp"]) if opt["correct"]["reparametrize"] else "off"},
+    }
+
+
+def landmark(init: dict[str, Any]) -> dict[str, Any]:
+    """Return the landmark type of a recording, with the prior of what one image does not tell."""
+    kind = init["initType"]
+    prior = init["plkLin" if kind in PLUECKER else "idpPnt"]
+    mean, sigma = numbers(prior["nonObsMean"]), numbers(prior["nonObsStd"])
+    section: dict[str, Any] = {"type": LANDMARKS[kind]}
+    if kind in PLUECKER:
+        names = ("prior_beta_1", "prior_beta_2", "sigma_beta_1", "sigma_beta_2")
+        return section | dict(zip(names, mean + sigma, strict=True))
+    return section if kind == "eucPnt" else section | {"prior_rho_per_m": mean[0], "sigma_rho_per_m": sigma[0]}
+
+
+def described_robot(cfg: dict[str, Any], robot: Part) -> dict[str, Any]:
+    """Return the section of one robot."""
+    sensors = [one for one in parts("camera", cfg["Sensor"]) if one.settings["robot"] == robot.index + 1]
+    return {
+        "motion": motion(robot.settings["motion"], np.array(cfg["RobU"][robot.index])),
+        "start": start(robot.settings, np.array(cfg["RobX0"][robot.index], dtype=np.float64)),
+        "sensors": {sensor.name: camera(cfg, sensor) for sensor in sensors},
+    }
+
+
+def motion(kind: str, noise: Array) -> dict[str, Any]:
+    """Return the motion model; `noise` (6, 6) is the covariance of one control."""
+    sigmas = np.sqrt(np.diag(noise)).tolist()
+    turn = root_mean_square(sigmas[3:])
+    if kind == "constVel":
+        return {"type": "constant_velocity_3d", "sigma_v_mps": root_mean_square(sigmas[:3]), "sigma_w_radps": turn}
+    along = dict(zip(("sigma_x_m", "sigma_y_m", "sigma_z_m"), sigmas, strict=False))
+    return {"type": "odometry_3d", **along, "sigma_rotation_rad": turn}
+
+
+def start(settings: dict[str, Any], state: Array) -> dict[str, Any]:
+    """Return where a robot starts; standard deviations of roll, pitch and yaw are taken about x, y and z."""
+    section: dict[str, Any] = placed(state[WXYZ_TO_XYZW]) | {
+        "sigma_position_m": numbers(settings["positionStd"]),
+        "sigma_rotation_deg": numbers(settings["orientationStd"]),
+    }
+    if len(state) == 13:
+        section |= dict(zip(VELOCITY, state[7:].tolist(), strict=True))
+        section |= {"sigma_v_mps": numbers(settings["velStd"])}
+        section |= {"sigma_w_radps": np.radians(settings["angVelStd"]).tolist()}
+    return section
+
+
+def camera(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
+    """Return the section of one camera: its model, mount, and which landmarks of an image it takes."""
+    settings, opt = sensor.settings, cfg["Opt"]
+    width, height = settings["imageSize"]
+    k = np.asarray(settings["intrinsic"], dtype=np.float64).tolist()
+    section: dict[str, Any] = {"type": "pinhole", "cx_px": k[0], "cy_px": k[1]}
+    if settings["type"] == "omniCam":
+        section |= {"type": "omnidirectional", "c": k[2], "d": k[3], "e": k[4]}
+        section["projection"] = numbers(settings["distortion"])
+        section["back_projection"] = numbers(settings["invDistortion"])
+    else:
+        section |= {"fx_px": k[2], "fy_px": k[3]}
+        if is_lines(cfg):
+            section |= {"type": "segments", "min_length_px": float(opt["obs"]["lines"]["minLength"])}
+        else:
+            section |= {"lens": "radial", "distortion": numbers(settings["distortion"])}
+    section |= {"width_px": int(width), "height_px": int(height), "sigma_px": float(settings["pixErrorStd"])}
+    mount: dict[str, Any] = placed(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
+    if settings["frameInMap"]:
+        mount |= {"sigma_position_m": numbers(settings["positionStd"])}
+        mount |= {"sigma_rotation_deg": numbers(settings["orientationStd"])}
+    first, later = opt["init"]["nbrInits"]
+    attention = {  # which landmarks of an image the toolbox corrects, starts and gives up
+        "updates": int(opt["correct"]["nUpdates"]), "starts": int(later), "first_starts": int(first),
+        "margin_px": 0.0 if is_lines(cfg) else float(width) / BORDER,
+        "searches": 10, "match_ratio": 0.1, "inlier_ratio": 0.5, "delete": True,
+    }  # fmt: skip
+    return section | {"mount": mount, "attention": attention}
+
+
+def numbers(value: Any) -> list[float]:
+    """Return a vector, which the recording has bare if it is of one element."""
+    return np.atleast_1d(np.asarray(value, dtype=np.float64)).tolist()
+
+
+def root_mean_square(sigmas: Any) -> float:
+    """Return the standard deviation of an axis, if the three differ that of the mean variance."""
+    return float(np.sqrt(np.mean(np.square(sigmas))))
 
 
 SLAMTB = Format(NAME, "a recording NAME.json.gz of the Matlab toolbox", find, read)

@@ -1,17 +1,31 @@
-"""What every importer shares: the door it is called through, and the log it gives back."""
+"""What every importer shares: the door it is called through, the log it gives back, exact times and rows of text."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from kalmark.errors import LogError
-from kalmark.logs.log import Log
-from kalmark.logs.text import Refuse
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
+from kalmark.errors import LogError
+from kalmark.events import Event, Id, order
+from kalmark.geometry import rotations
+from kalmark.logs.log import Array, Log
+
+Refuse = Callable[[str], None]
+"""Takes one line about a bad row: raises it as a LogError, or notes it and lets reading go on (`on_error`)."""
+
+_PLAIN_TIME = re.compile(r"(-?)([0-9]+)(?:\.([0-9]{0,9}))?")
+_INTEGER = re.compile(r"[+-]?[0-9]+")
+_T_MAX_NS = 2**63 - 1
 STEP_NS = 1_000_000_000
 """Formats whose steps carry no time get one second a step."""
 
@@ -65,6 +79,23 @@ class Format:
     robot_prefix: str = ""
 
 
+def one_robot(
+    format: str, path: Path, request: Request, robot: str, events: Iterable[Event], controls: tuple[str, ...],
+    sensors: Mapping[str, tuple[str, ...]], *, name: str = "", **rest: Any
+) -> Log:  # fmt: skip
+    """Return the log of one robot: its events in any order, the columns of its controls (none: ()) and sensors."""
+    return Log(
+        name=name or format, format=format, path=path, robots=(robot,), events=sorted(events, key=order),
+        skipped=request.skipped, control_columns={robot: controls} if controls else {},
+        sensor_columns={(robot, sensor): columns for sensor, columns in sensors.items()}, **rest,
+    )  # fmt: skip
+
+
+def file_in(path: Path, name: str) -> Path:
+    """Return the file of this name in a folder, or the path itself if it is not a folder."""
+    return path / name if path.is_dir() else path
+
+
 def folder_of(path: Path, names: Iterable[str]) -> Path | None:
     """Return the folder that `path` is, or is in as one of these files, if it holds at least one of them."""
     folder = path if path.is_dir() else path.parent
@@ -97,3 +128,155 @@ def quantity(value: Any, name: str, low: float = float("-inf")) -> float:
         wanted = "a finite number" if low == float("-inf") else f"a finite number of at least {low:g}"
         raise LogError(f"log option {name} is {value!r}, expected {wanted}")
     return number
+
+
+# ------------------------------------------------------------------ text, without losing a bit
+def raising(line: str) -> None:
+    """Refuse a bad row by raising LogError."""
+    raise LogError(line)
+
+
+def nanoseconds(text: str) -> int:
+    """Return the seconds in `text` as integer nanoseconds, exactly (nearest beyond nine decimals), or ValueError."""
+    plain = _PLAIN_TIME.fullmatch(text)
+    if plain:
+        sign, whole, fraction = plain.groups()
+        t_ns = int(whole) * 1_000_000_000 + int((fraction or "").ljust(9, "0"))
+        t_ns = -t_ns if sign else t_ns
+    else:
+        try:
+            t_ns = int((Decimal(text) * 1_000_000_000).to_integral_value())
+        except (InvalidOperation, OverflowError, ValueError):
+            raise ValueError(text) from None
+    if abs(t_ns) > _T_MAX_NS:
+        raise ValueError(text)
+    return t_ns
+
+
+def seconds(t_ns: int) -> str:
+    """Return integer nanoseconds as text in seconds, exactly, with nine decimals."""
+    whole, fraction = divmod(abs(t_ns), 1_000_000_000)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{fraction:09d}"
+
+
+def landmark_id(text: str) -> Id:
+    """Return an id from a file: int if the text is an integer, otherwise the text."""
+    return int(text) if _INTEGER.fullmatch(text) else text
+
+
+def number(text: str) -> float:
+    """Return a finite number, or ValueError."""
+    value = float(text)
+    if not math.isfinite(value) or "_" in text:
+        raise ValueError(text)
+    return value
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is a finite number."""
+    try:
+        number(text)
+    except ValueError:
+        return False
+    return True
+
+
+def read_text(path: Path) -> str:
+    """Return the content of a text file.  Raises LogError if it is missing, empty or not text."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror or error}, expected a readable file") from None
+    except UnicodeDecodeError as error:
+        raise LogError(f"{path}: byte {error.start} is not text, expected a text file in UTF-8") from None
+    if not text.strip():
+        raise LogError(f"{path}:1: the file is empty, expected rows of data")
+    return text
+
+
+def rows(path: Path, text: str | None = None) -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number, cells) of white-space separated text, without blank lines and `#` comments."""
+    text = read_text(path) if text is None else text
+    for line, content in enumerate(text.split("\n"), start=1):
+        cells = content.split()
+        if cells and not cells[0].startswith("#"):
+            yield line, cells
+
+
+def read_points(
+    path: Path, refuse: Refuse, id_of: Callable[[str], Id], sizes: tuple[int, ...], expected: str
+) -> dict[Id, Array]:
+    """Return the positions by id in rows `id x y` of so many cells, or {} without the file."""
+    points = {}
+    for line, cells in rows(path) if path.is_file() else ():
+        try:
+            if len(cells) not in sizes:
+                raise ValueError
+            points[id_of(cells[0])] = np.array([number(cell) for cell in cells[1:3]])
+        except ValueError:
+            refuse(f"{path}:{line}: {' '.join(cells)!r}, expected {expected}")
+    return points
+
+
+def timed_rows(
+    path: Path, names: tuple[str, ...], refuse: Refuse, text: str | None = None
+) -> Iterator[tuple[int, int, list[float]]]:
+    """Yield (line, t_ns, numbers) of rows `t_s, *names` whose time never runs back; bad rows go to `refuse`.
+
+    Raises LogError if the file is missing, empty or has no row at all.
+    """
+    last_ns, last_text, count = -_T_MAX_NS, "", 0
+    for line, cells in rows(path, text):
+        count += 1
+        if len(cells) != len(names) + 1:
+            columns = ", ".join(("t_s", *names))
+            refuse(f"{path}:{line}: {len(cells)} numbers in the row, expected {len(names) + 1}: {columns}")
+            continue
+        try:
+            t_ns, values = nanoseconds(cells[0]), [float(cell) for cell in cells[1:]]
+            if not all(map(math.isfinite, values)):
+                raise ValueError
+        except ValueError:
+            odd = next((n for n, cell in enumerate(cells) if not is_number(cell)), 0)
+            refuse(f"{path}:{line}: {('t_s', *names)[odd]} is {cells[odd]!r}, expected a finite number")
+            continue
+        if t_ns < last_ns:
+            refuse(f"{path}:{line}: time {cells[0]} s after {last_text} s, expected times that never run backwards")
+            continue
+        last_ns, last_text = t_ns, cells[0]
+        yield line, t_ns, values
+    if count == 0:
+        raise LogError(f"{path}:1: no rows of data, expected columns {', '.join(('t_s', *names))}")
+
+
+# ------------------------------------------------------------------ rigs: poses of other conventions, YAML files
+def frame(position: Any, matrix: Any) -> Array:
+    """Return the frame (7,), x y z qx qy qz qw, of a position (3,) and a rotation matrix (3, 3), local to global."""
+    turn = rotations.from_matrix(np.array(matrix, dtype=np.float64))
+    return np.append(np.asarray(position, dtype=np.float64).reshape(3), turn)
+
+
+def vector_frame(position: Any, vector: Any) -> Array:
+    """Return the frame (7,) of a position (3,) m and a rotation vector (3,) rad."""
+    turn = rotations.exp(np.array(vector, dtype=np.float64))
+    return np.append(np.asarray(position, dtype=np.float64).reshape(3), turn)
+
+
+def placed(pose: Array) -> dict[str, float]:
+    """Return a frame (7,) as a configuration gives mounts and starts: x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg."""
+    angles = np.degrees(rotations.to_euler(np.array(pose[3:], dtype=np.float64))[0]).round(12) + 0.0  # no -0
+    names = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
+    return dict(zip(names, [*map(float, pose[:3]), *map(float, angles)], strict=True))
+
+
+def mapping(path: Path) -> dict[str, Any]:
+    """Return the content of a YAML file.  Raises LogError if it is none."""
+    try:
+        content = YAML(typ="safe").load(read_text(path))
+    except YAMLError as error:
+        where = getattr(error, "problem_mark", None)
+        line = where.line + 1 if where is not None else 1
+        raise LogError(f"{path}:{line}: not YAML ({getattr(error, 'problem', error)}), expected a mapping") from None
+    if not isinstance(content, dict):
+        raise LogError(f"{path}:1: holds {type(content).__name__}, expected a mapping")
+    return content

@@ -1,52 +1,161 @@
-"""What the two step formats share: increments without a time, each followed by what was seen after it."""
+"""Read two sets of steps without times: the DLR Spatial Cognition set (U. Frese) and the Freiburg SLAM course's world.
+
+Step k ends at k seconds, and the scan of what was seen after it is of the same instant.
+
+DLR: metric steps and circular landmarks with covariances.  The file's robot frame has X to the right and -Y forward, so
+its third axis points down and its headings grow clockwise.  kalmark's frame is x forward, y left, z up:
+
+    x = -Y,  y = -X,  theta = -Phi          M = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+
+`M` carries increments (u = M u_file, C = M C_file M^T), its upper left block observations.  A path or map in the
+file's frame becomes one in kalmark's by the same exchange of axes.
+
+Freiburg: a simulated robot that rotates, translates, rotates; range and bearing, known ids.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan
-from kalmark.logs.log import Array
-from kalmark.logs.source import STEP_NS
-from kalmark.logs.text import Refuse
+from kalmark.logs.log import Array, Log
+from kalmark.logs.source import (
+    STEP_NS,
+    Format,
+    Request,
+    file_in,
+    landmark_id,
+    number,
+    one_robot,
+    quantity,
+    read_points,
+    rows,
+)
+
+ROBOT, INCREMENT = "robot", ("dx_m", "dy_m", "dtheta_rad")
+M = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+ORDER = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])  # of the file's cXX cXY cYY cXPhi cYPhi cPhiPhi in a covariance
+SPURIOUS = -1
 
 
-@dataclass
-class Steps:
-    """Gather steps and observations into events: step k ends at k seconds, its scan is of the same instant."""
+class Record(NamedTuple):
+    """One line: the increment of a step, or an observation `y` of the landmark `id` after it."""
 
-    robot: str
-    sensor: str
-    count: int = 0
+    is_step: bool
+    y: Any
+    cov: Array | None = None
+    id: Id | None = None
 
-    def __post_init__(self) -> None:
-        self.events: list[Event] = []
-        self._y: list[Any] = []
-        self._ids: list[Id | None] = []
-        self._covs: list[Array] = []
 
-    def step(self, u: Any, cov: Array | None = None) -> None:
-        """Add the next step, after the scan of the one before."""
-        self.close()
-        self.count += 1
-        self.events.append(Control(t_ns=self.count * STEP_NS, robot=self.robot, u=u, cov=cov))
+def find(path: Path, name: str, starts: tuple[bytes, ...]) -> Path | None:
+    """Return the file of this name, given it or its folder, if one of its first lines has one of these starts."""
+    file = file_in(path, name)
+    if not file.is_file():
+        return None
+    with file.open("rb") as stream:
+        begin = b"\n" + stream.read(8192)
+    return file if any(b"\n" + start in begin for start in starts) else None
 
-    def see(self, y: Any, id_: Id | None, refuse: Refuse, where: str, cov: Array | None = None) -> None:
-        """Add one observation to the scan of the step just made."""
-        if self.count == 0:
-            refuse(f"{where}: an observation before the first step, expected it after one")
-        elif id_ is not None and id_ in self._ids:
-            refuse(f"{where}: id {id_!r} twice after one step, expected each landmark once in a scan")
+
+def events_of(
+    path: Path, request: Request, sensor: str, read: Callable[[str, list[str]], Record | None], expected: str, step: str
+) -> list[Event]:
+    """Return the events of a file whose lines `read` turns into records (None: left out); ValueError refuses a line."""
+    steps: list[tuple[Record, list[Record]]] = []
+    for line, cells in rows(path):
+        where = f"{path}:{line}"
+        try:
+            record = read(where, cells)
+        except ValueError:
+            request.refuse(f"{where}: {' '.join(cells)!r}, expected {expected}")
+            continue
+        if record is None:
+            continue
+        if record.is_step:
+            steps.append((record, []))
+        elif not steps:
+            request.refuse(f"{where}: an observation before the first step, expected it after one")
+        elif record.id is not None and any(record.id == other.id for other in steps[-1][1]):
+            request.refuse(f"{where}: id {record.id!r} twice after one step, expected each landmark once in a scan")
         else:
-            self._y.append(y)
-            self._ids.append(id_)
-            if cov is not None:
-                self._covs.append(cov)
+            steps[-1][1].append(record)
+    if not steps:
+        raise LogError(f"{path}: no step that can be used, expected {step}")
+    events: list[Event] = []
+    for t_ns, (moved, seen) in enumerate(steps, 1):
+        events.append(Control(t_ns=t_ns * STEP_NS, robot=ROBOT, u=moved.y, cov=moved.cov))
+        if seen:
+            y, ids = [one.y for one in seen], [one.id for one in seen]
+            cov = None if seen[0].cov is None else [one.cov for one in seen]
+            events.append(Scan(t_ns=t_ns * STEP_NS, robot=ROBOT, sensor=sensor, y=y, ids=ids, cov=cov))
+    return events
 
-    def close(self) -> list[Event]:
-        """End the scan that is open and return all events."""
-        if self._y:
-            t_ns, cov = self.count * STEP_NS, self._covs or None
-            self.events.append(Scan(t_ns=t_ns, robot=self.robot, sensor=self.sensor, y=self._y, ids=self._ids, cov=cov))
-            self._y, self._ids, self._covs = [], [], []
-        return self.events
+
+def read_dlr(path: Path, request: Request, covariance_scale: Any = None) -> Log:
+    """Return the log; the id -1 (spurious) becomes None.
+
+    `covariance_scale` multiplies all covariances of the file (None: they stay as they are).
+    """
+    scale = 1.0 if covariance_scale is None else quantity(covariance_scale, "covariance_scale", 1e-9)
+    expected = (
+        "STEP image dX dY dPhi cXX cXY cYY cXPhi cYPhi cPhiPhi"
+        " or LANDMARK_C pX pY quality cXX cXY cYY id, with covariances that are positive definite"
+    )
+    events = events_of(path, request, "camera", partial(dlr_record, scale=scale), expected, "STEP lines")
+    return one_robot("dlr", path, request, ROBOT, events, INCREMENT, {"camera": ("x_m", "y_m")})
+
+
+def dlr_record(where: str, cells: list[str], scale: float) -> Record:
+    """Return one line of the DLR set, both sorts with three numbers and a covariance.  Raises ValueError."""
+    if cells[0] == "STEP" and len(cells) == 11:
+        n, values, id_ = 3, [number(cell) for cell in cells[2:]], None
+    elif cells[0] in ("LANDMARK_C", "LANDMARK") and len(cells) == 8:
+        n, values, id_ = 2, [number(cell) for cell in cells[1:7]], landmark_id(cells[7])
+    else:
+        raise ValueError
+    m, cov = M[:n, :n], np.array(values[3:])[ORDER[:n, :n]]
+    np.linalg.cholesky(cov)  # its LinAlgError is a ValueError
+    return Record(n == 3, m @ values[:n], scale * (m @ cov @ m.T), None if id_ == SPURIOUS else id_)
+
+
+def read_freiburg(path: Path, request: Request) -> Log:
+    """Return the log; each step is an increment in the frame of the pose before it.
+
+    The simulated noise makes a range negative where the robot passes over a landmark: those observations are left
+    out and always listed in `skipped`.
+    """
+    expected = "ODOMETRY r1 t r2 or SENSOR id range bearing"
+    record = partial(freiburg_record, request=request)
+    events = events_of(path, request, "sensor", record, expected, "ODOMETRY r1 t r2")
+    landmarks = read_points(path.parent / "world.dat", request.refuse, landmark_id, (3,), "id, x and y")
+    sensors = {"sensor": ("range_m", "bearing_rad")}
+    return one_robot("freiburg_course", path, request, ROBOT, events, INCREMENT, sensors, landmarks=landmarks)
+
+
+def freiburg_record(where: str, cells: list[str], request: Request) -> Record | None:
+    """Return one line of the course: turn by r1, drive t, turn by r2, or an observation.  Raises ValueError."""
+    kind, first, *rest = cells
+    if kind not in ("ODOMETRY", "SENSOR") or len(rest) != 2:
+        raise ValueError
+    a, b = map(number, rest)
+    if kind == "ODOMETRY":
+        r1 = number(first)
+        return Record(True, (a * math.cos(r1), a * math.sin(r1), r1 + b))
+    if a < 0:
+        request.skipped.append(f"{where}: range is {a}, expected a range of at least 0")
+        return None
+    return Record(False, (a, b), id=landmark_id(first))
+
+
+DLR = Format("dlr", "map.circles or its folder",
+             partial(find, name="map.circles", starts=(b"STEP ", b"LANDMARK_C ")), read_dlr,
+             options=("covariance_scale",))  # fmt: skip
+FREIBURG = Format("freiburg_course", "sensor_data.dat or its folder",
+                  partial(find, name="sensor_data.dat", starts=(b"ODOMETRY ", b"SENSOR ")), read_freiburg)  # fmt: skip

@@ -5,18 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.logs.log import Array
-from kalmark.logs.source import Request, nearest
-from kalmark.logs.text import nanoseconds, number, read_text
+from kalmark.logs.source import Request, nanoseconds, nearest, number, read_text
 
 NAMES = ("t_s", "robot", "sensor", "id")
 CONTROL = (
@@ -56,14 +54,31 @@ class Table:
     noise_columns: tuple[str, ...]
     content: list[tuple[int, list[str]]]
 
-    def rows(self, request: Request) -> Iterator[Row]:
-        """Yield the rows that have as many cells as the header; refuse the others."""
+    def each(
+        self, request: Request, take: Callable[[Row], None], timed: bool = True, by_sensor: bool = False,
+        strictly: bool = False,
+    ) -> None:  # fmt: skip
+        """Let `take` read every row; refuse those that it refuses, or with other cells than the header has.
+
+        If `timed`, refuse those whose time runs backwards, or `strictly` stands still, within a robot (and sensor).
+        """
+        last: dict[tuple[str, str], Row] = {}
         for line, cells in self.content:
-            if len(cells) != len(self.index):
-                names = ", ".join(self.index)
-                request.refuse(f"{self.path}:{line}: {len(cells)} cells, expected {len(self.index)}: {names}")
-                continue
-            yield Row(self, line, cells)
+            row = Row(self, line, cells)
+            try:
+                if len(cells) != len(self.index):
+                    raise Refused(f"{len(cells)} cells, expected {len(self.index)}: {', '.join(self.index)}")
+                if timed:
+                    row.read_start(by_sensor)
+                    before = last.get(row.key)
+                    if before is not None and row.t_ns < before.t_ns + strictly:
+                        wanted = "increasing times" if strictly else "times that never run backwards"
+                        at = f"time {row.text('t_s')} s after {before.text('t_s')} s of {row.robot}"
+                        raise Refused(f"{at}, expected {wanted}")
+                    last[row.key] = row
+                take(row)
+            except Refused as refused:
+                request.refuse(f"{self.path}:{line}: {refused}")
 
 
 def read_table(
@@ -80,35 +95,31 @@ def read_table(
         content = [(reader.line_num, cells) for cells in reader if cells]
     except csv.Error as error:
         raise LogError(f"{path}:{reader.line_num}: {error}, expected comma separated values") from None
-    start, header = content[0][0], [cell.strip() for cell in content[0][1]]
+    where, header = f"{path}:{content[0][0]}", [cell.strip() for cell in content[0][1]]
     separator = next((what for cut, what in SEPARATORS.items() if cut in header[0]), "")
     if len(header) == 1 and separator:
-        raise LogError(f"{path}:{start}: the cells seem to be separated by {separator}, expected commas")
+        raise LogError(f"{where}: the cells seem to be separated by {separator}, expected commas")
     known = (*required, *(allowed or ()), *known)
     for name in header:
-        refuse_unit(f"{path}:{start}", name, known)
-    wanted = ", ".join(required)
+        refuse_unit(where, name, known)
     for name in required:
         if name not in header:
             odd = get_close_matches(name, [other for other in header if other not in known], n=1)
-            what = f"column {odd[0]!r} is unknown" if odd else f"no column {name}"
-            hint = f"; did you mean {name!r}?" if odd else ""
-            raise LogError(f"{path}:{start}: {what}, expected {wanted}{hint}")
+            what, hint = (
+                (f"column {odd[0]!r} is unknown", f"; did you mean {name!r}?") if odd else (f"no column {name}", "")
+            )
+            raise LogError(f"{where}: {what}, expected {', '.join(required)}{hint}")
     for name in header:
         if header.count(name) > 1 or not name:
-            raise LogError(
-                f"{path}:{start}: column {name!r} appears {header.count(name)} times, expected named columns"
-            )
+            raise LogError(f"{where}: column {name!r} appears {header.count(name)} times, expected named columns")
     noise = tuple(name for name in header if name.startswith(("sigma_", "cov_")))
     values = [name for name in header if name not in NAMES and name not in noise]
     for name in values:
         if allowed is not None and name not in required and name not in allowed:
-            hint = nearest(name, allowed)
-            raise LogError(
-                f"{path}:{start}: column {name!r} is unknown, expected {', '.join((*required, *allowed))}{hint}"
-            )
+            wanted = f"{', '.join((*required, *allowed))}{nearest(name, allowed)}"
+            raise LogError(f"{where}: column {name!r} is unknown, expected {wanted}")
     if len(content) == 1:
-        raise LogError(f"{path}:{start}: no rows after the header, expected at least one")
+        raise LogError(f"{where}: no rows after the header, expected at least one")
     values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
     return Table(path, {name: i for i, name in enumerate(header)}, tuple(values), noise, content[1:])
 
@@ -125,6 +136,10 @@ def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
         raise LogError(f"{where}: column {name!r} is unknown, expected {closest}{f', in {measure}' if measure else ''}")
 
 
+class Refused(Exception):
+    """What is wrong with a row."""
+
+
 class Row:
     """One row of a table: its cells by column, its time and names once they have been read."""
 
@@ -134,98 +149,73 @@ class Row:
         self.table, self.line, self.cells = table, line, cells
         self.t_ns, self.robot, self.sensor = 0, "", ""
 
+    @property
+    def key(self) -> tuple[str, str]:
+        """Its robot and sensor."""
+        return self.robot, self.sensor
+
     def text(self, column: str) -> str:
         """Return the text of a cell."""
         return self.cells[self.table.index[column]].strip()
 
-    def refuse(self, request: Request, message: str) -> Literal[False]:
-        """Refuse this row with its file and line."""
-        request.refuse(f"{self.table.path}:{self.line}: {message}")
-        return False
-
-    def read_time(self, request: Request) -> bool:
-        """Read the column t_s exactly; return False if the row was refused."""
+    def read_start(self, with_sensor: bool) -> None:
+        """Read the column t_s exactly, the robot and, if asked, the sensor.  Raises Refused."""
         try:
             self.t_ns = nanoseconds(self.text("t_s"))
         except ValueError:
-            return self.refuse(request, f"t_s is {self.text('t_s')!r}, expected a finite number of seconds")
-        return True
-
-    def read_names(self, request: Request, with_sensor: bool) -> bool:
-        """Read the robot and, if asked, the sensor; return False if the row was refused."""
-        self.robot = self.text("robot")
-        if with_sensor:
-            self.sensor = self.text("sensor")
+            raise Refused(f"t_s is {self.text('t_s')!r}, expected a finite number of seconds") from None
+        self.robot, self.sensor = self.text("robot"), self.text("sensor") if with_sensor else ""
         if not self.robot or (with_sensor and not self.sensor):
-            return self.refuse(request, f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
-        return True
+            raise Refused(f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
 
-    def numbers(self, columns: tuple[str, ...], request: Request) -> list[float] | None:
-        """Return the finite numbers in these columns, or None if the row was refused."""
-        cells, index = self.cells, self.table.index
+    def numbers(self, columns: tuple[str, ...]) -> list[float]:
+        """Return the finite numbers in these columns.  Raises Refused."""
         values = []
         for column in columns:
             try:
-                value = number(cells[index[column]])
+                values.append(number(self.cells[self.table.index[column]]))
             except ValueError:
-                self.refuse(request, f"{column} is {self.text(column)!r}, expected a finite number")
-                return None
-            if value < 0 and column in NOT_NEGATIVE:
-                self.refuse(
-                    request, f"{column} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0"
-                )
-                return None
-            values.append(value)
+                raise Refused(f"{column} is {self.text(column)!r}, expected a finite number") from None
+            if values[-1] < 0 and column in NOT_NEGATIVE:
+                raise Refused(f"{column} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
         return values
 
-    def values(self, columns: dict[Any, tuple[str, ...]], key: Hashable, request: Request) -> list[float] | None:
-        """Return this row's values; the first row of `key` settles which columns it has, in `columns`."""
-        used = columns.get(key)
-        if used is None:
-            used = tuple(name for name in self.table.value_columns if self.text(name))
-            if not used:
-                names = ", ".join(self.table.value_columns) or "a column of values"
-                self.refuse(request, f"no value in the row, expected numbers in {names}")
-                return None
-        values = self.numbers(used, request)
-        if values is None:
-            return None
+    def values(self, columns: dict[tuple[str, str], tuple[str, ...]]) -> list[float]:
+        """Return this row's values; the first of its key settles in `columns` which these are.  Raises Refused."""
+        used = columns.get(self.key) or tuple(name for name in self.table.value_columns if self.text(name))
+        if not used:
+            names = ", ".join(self.table.value_columns) or "a column of values"
+            raise Refused(f"no value in the row, expected numbers in {names}")
+        values = self.numbers(used)
         for name in self.table.value_columns:
             if name not in used and self.text(name):
-                who = " ".join(key) if isinstance(key, tuple) else key
-                self.refuse(request, f"{name} is {self.text(name)}, expected an empty cell as in {who}'s first row")
-                return None
-        columns.setdefault(key, used)
+                who = " ".join(self.key).strip()
+                raise Refused(f"{name} is {self.text(name)}, expected an empty cell as in {who}'s first row")
+        columns.setdefault(self.key, used)
         return values
 
-    def own_noise(self, columns: tuple[str, ...], request: Request, *, definite: bool) -> Array | Literal[False] | None:
-        """Return the covariance (m, m) that this row gives for `columns`, None if none, False if it was refused."""
-        given = [name for name in self.table.noise_columns if self.text(name)]
+    def own_noise(self, columns: tuple[str, ...], *, definite: bool) -> Array | None:
+        """Return the covariance (m, m) that this row gives for `columns`, None if none.  Raises Refused."""
+        given = tuple(name for name in self.table.noise_columns if self.text(name))
         if not given:
             return None
-        numbers = self.numbers(tuple(given), request)
-        if numbers is None:
-            return False
-        try:
-            cov = covariance(dict(zip(given, numbers, strict=True)), columns)
-        except ValueError as error:
-            return self.refuse(request, str(error))
+        cov = covariance(dict(zip(given, self.numbers(given), strict=True)), columns)
         lowest = float(np.linalg.eigvalsh(cov)[0])
         if lowest < -1e-12 * float(np.abs(cov).max()) or (definite and lowest <= 0):
             wanted = "positive definite" if definite else "positive semidefinite"
-            return self.refuse(request, f"noise {cov.tolist()} has eigenvalue {lowest:.3g}, expected it {wanted}")
+            raise Refused(f"noise {cov.tolist()} has eigenvalue {lowest:.3g}, expected it {wanted}")
         return cov
 
 
 def covariance(given: dict[str, float], columns: tuple[str, ...]) -> Array:
-    """Return the covariance that `sigma_<column>` or `cov_ij` numbers describe.  Raises ValueError."""
+    """Return the covariance that `sigma_<column>` or `cov_ij` numbers describe.  Raises Refused."""
     size = len(columns)
     sigmas = [f"sigma_{name}" for name in columns]
     if any(name.startswith("sigma_") for name in given):
         if sorted(given) != sorted(sigmas):
-            raise ValueError(f"noise in {', '.join(given)}, expected {', '.join(sigmas)}")
+            raise Refused(f"noise in {', '.join(given)}, expected {', '.join(sigmas)}")
         if any(value < 0 for value in given.values()):
-            raise ValueError(f"noise {given}, expected standard deviations of at least 0")
+            raise Refused(f"noise {given}, expected standard deviations of at least 0")
         return np.diag([given[name] ** 2 for name in sigmas])
     axes = {**{str(i): i for i in range(size)}, **{name[0]: i for i, name in enumerate(columns) if name[1:] == "_m"}}
     cov = np.full((size, size), np.nan)
@@ -233,10 +223,10 @@ def covariance(given: dict[str, float], columns: tuple[str, ...]) -> Array:
         match = _COV.fullmatch(name)
         i, j = (axes.get(axis) for axis in match.groups()) if match else (None, None)
         if i is None or j is None or not np.isnan(cov[i, j]):
-            raise ValueError(f"noise in {', '.join(given)}, expected {', '.join(cov_columns(size))}")
+            break
         cov[i, j] = cov[j, i] = value
-    if np.isnan(cov).any():
-        raise ValueError(f"noise in {', '.join(given)}, expected {', '.join(cov_columns(size))}")
+    if np.isnan(cov).any() or len(given) != size * (size + 1) // 2:
+        raise Refused(f"noise in {', '.join(given)}, expected {', '.join(cov_columns(size))}")
     return cov
 
 

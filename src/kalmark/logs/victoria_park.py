@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Scan, order
+from kalmark.events import Control, Event, Scan
+from kalmark.logs.arrays import arrays, times
 from kalmark.logs.log import Array, Log, PositionTrack, Times
-from kalmark.logs.matlab import arrays, column
-from kalmark.logs.source import Format, Request, choice, folder_of
-from kalmark.logs.text import nanoseconds, read_text, timed_rows
+from kalmark.logs.source import Format, Request, choice, folder_of, nanoseconds, one_robot, read_text, timed_rows
 
 ROBOT, SENSOR = "car", "laser"
 ASCII_ZIP, ASCII_DR, MAT_DR, GPS = "victoria_park_ascii.zip", "DRS.txt", "aa3_dr.mat", "aa3_gpsx.mat"
@@ -52,17 +51,9 @@ def read(path: Path, request: Request, detections: Any = "slsjf", steering: Any 
         events += slsjf_scans(path / SLSJF, request)
     else:
         events += rfs_scans(path / RFS, request) if wanted == "rfs" else laser_scans(path)
-    return Log(
-        name="victoria_park",
-        format="victoria_park",
-        path=path,
-        robots=(ROBOT,),
-        events=sorted(events, key=order),
-        gps={ROBOT: read_gps(path / GPS)} if (path / GPS).is_file() else {},
-        skipped=request.skipped,
-        control_columns={ROBOT: ("v_mps", "steering_rad")},
-        sensor_columns={(ROBOT, SENSOR): RANGE_BEARING + (("signature",) if wanted == "rfs" else ())},
-    )
+    gps = {ROBOT: read_gps(path / GPS)} if (path / GPS).is_file() else {}
+    sensors = {SENSOR: RANGE_BEARING + (("signature",) if wanted == "rfs" else ())}
+    return one_robot("victoria_park", path, request, ROBOT, events, ("v_mps", "steering_rad"), sensors, gps=gps)
 
 
 def ascii_text(path: Path, name: str, otherwise: str) -> tuple[Path, str]:
@@ -87,8 +78,8 @@ def ascii_controls(path: Path, request: Request) -> list[Event]:
 def mat_controls(path: Path) -> list[Event]:
     """Return speed and steering of the .mat file."""
     data = arrays(path, ("time", "speed", "steering"))
-    t_ns = milliseconds(column(data["time"]), path, "time")
-    u = np.column_stack([column(data["speed"]), column(data["steering"])])
+    t_ns = milliseconds(data["time"], path, "time")
+    u = np.column_stack([data["speed"].ravel(), data["steering"].ravel()])
     return [Control(t_ns=t, robot=ROBOT, u=row) for t, row in zip(t_ns.tolist(), u, strict=True)]
 
 
@@ -131,50 +122,37 @@ def laser_scans(path: Path) -> list[Event]:
         raise LogError(f"{file}: scan {scan} beam {beam} has range {r[scan - 1, beam - 1]}, expected at least 0")
     if any(after < before for before, after in pairwise(t_ns)):
         raise LogError(f"{file}: times run backwards, expected times that never do")
-    scans: list[Event] = []
-    for t, ranges in zip(t_ns, r, strict=True):
-        scans.append(Scan(t_ns=t, robot=ROBOT, sensor=SENSOR, y=np.column_stack([ranges, ANGLES])))
-    return scans
+    beams = (np.column_stack([ranges, ANGLES]) for ranges in r)
+    return [Scan(t_ns=t, robot=ROBOT, sensor=SENSOR, y=y) for t, y in zip(t_ns, beams, strict=True)]
 
 
 def rfs_scans(path: Path, request: Request) -> list[Event]:
     """Return the scans of trees of unknown identity: range, bearing with 0 forward, and radius, half of column 4."""
     events: list[Event] = []
-    names = (*RANGE_BEARING, "diameter_m")
-    table = [(t, y) for line, t, y in timed_rows(path, names, request.refuse) if _is_tree(path, line, y, request)]
+    table = []
+    for line, t_ns, y in timed_rows(path, (*RANGE_BEARING, "diameter_m"), request.refuse):
+        if y[0] < 0 or y[2] < 0:
+            request.refuse(f"{path}:{line}: range {y[0]} m, diameter {y[2]} m, expected numbers of at least 0")
+        else:
+            table.append((t_ns, y))
     for t_ns, rows in groupby(table, key=lambda row: row[0]):
-        y = [[r, b - np.pi / 2, diameter / 2] for _, (r, b, diameter) in rows]
-        events.append(Scan(t_ns=t_ns + ASCII_BEHIND_NS, robot=ROBOT, sensor=SENSOR, y=y))
+        trees = [[r, b - np.pi / 2, diameter / 2] for _, (r, b, diameter) in rows]
+        events.append(Scan(t_ns=t_ns + ASCII_BEHIND_NS, robot=ROBOT, sensor=SENSOR, y=trees))
     return events
-
-
-def _is_tree(path: Path, line: int, y: list[float], request: Request) -> bool:
-    if y[0] < 0 or y[2] < 0:
-        request.refuse(f"{path}:{line}: range {y[0]} m, diameter {y[2]} m, expected numbers of at least 0")
-        return False
-    return True
 
 
 def read_gps(path: Path) -> PositionTrack:
     """Return the GPS fixes (x = Lo_m, y = La_m), which jump and drop out: for scoring only."""
     data = arrays(path, ("timeGps", "Lo_m", "La_m"))
-    xy = np.column_stack([column(data["Lo_m"]), column(data["La_m"])])
-    return PositionTrack(milliseconds(column(data["timeGps"]), path, "timeGps"), xy, ANTENNA)
+    xy = np.column_stack([data["Lo_m"].ravel(), data["La_m"].ravel()])
+    return PositionTrack(milliseconds(data["timeGps"], path, "timeGps"), xy, ANTENNA)
 
 
 def milliseconds(values: Array, path: Path, name: str) -> Times:
     """Return times in ms as integer ns.  Raises LogError if they run backwards."""
-    t_ns = np.rint(values * 1e6).astype(np.int64)
-    if (np.diff(t_ns) < 0).any():
-        row = int(np.argmax(np.diff(t_ns) < 0)) + 2
-        raise LogError(f"{path}: {name} row {row} is before row {row - 1}, expected times that never run backwards")
-    return t_ns
+    refused = f"{name} row {{row}} is before row {{before}}, expected times that never run backwards"
+    return times(path, values, refused, scale=1e6, strictly=False)
 
 
-VICTORIA_PARK = Format(
-    "victoria_park",
-    f"a folder with {ASCII_ZIP} or {MAT_DR}, and {SLSJF.as_posix()} or the zip's laser",
-    find,
-    read,
-    options=("detections", "steering"),
-)
+VICTORIA_PARK = Format("victoria_park", f"a folder with {ASCII_ZIP} or {MAT_DR}, and {SLSJF.as_posix()} or the zip's"
+                       " laser", find, read, options=("detections", "steering"))  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,14 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Fix, Id, Scan
+from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.logs.log import Array, Log
 from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
+from kalmark.logs.source import landmark_id, seconds
 from kalmark.logs.table import CANONICAL, cov_columns
-from kalmark.logs.text import landmark_id, seconds
 
-Table = tuple[list[str], list[list[str]]]
+Table = tuple[list[str], list[dict[str, str]]]
+POSITION = ("x_m", "y_m", "z_m")
 
 
 def write_native(log: Log, folder: Path | str) -> Path:
@@ -27,23 +28,15 @@ def write_native(log: Log, folder: Path | str) -> Path:
     unnamed column, two scans of one sensor at one time, an id that would be read as another).
     """
     folder = Path(folder)
-    tables = {
-        "controls.csv": controls_table(log),
-        "scans.csv": scans_table(log),
-        "fixes.csv": fixes_table(log),
-        "truth.csv": truth_table(log),
-        "landmarks.csv": landmarks_table(log),
-        "gps.csv": gps_table(log),
-    }
+    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log))
     folder.mkdir(parents=True, exist_ok=True)
-    for name in FILES:
-        header, rows = tables[name]
+    for file_name, (header, rows) in zip(FILES, tables, strict=True):
         if not rows:
-            (folder / name).unlink(missing_ok=True)
+            (folder / file_name).unlink(missing_ok=True)
             continue
-        with (folder / name).open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(header)
+        with (folder / file_name).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, header, lineterminator="\n")
+            writer.writeheader()
             writer.writerows(rows)
     (folder / RIG).unlink(missing_ok=True)
     if log.describes:
@@ -52,91 +45,87 @@ def write_native(log: Log, folder: Path | str) -> Path:
     return folder
 
 
-def controls_table(log: Log) -> Table:
+def controls(log: Log) -> Table:
     """Return header and rows of controls.csv."""
-    controls = [event for event in log if isinstance(event, Control)]
-    columns = union(checked(log.control_columns, c.robot, len(c.u)) for c in controls)
-    noise = noise_columns((len(c.u) for c in controls if c.cov is not None), columns)
-    rows = []
-    for c in controls:
-        used = log.control_columns[c.robot]
-        rows.append(
-            [seconds(c.t_ns), name(c.robot), *place(columns, used, c.u), *upper(c.cov, noise, f"control at {c.t_s} s")]
-        )
+    events = [event for event in log if isinstance(event, Control)]
+    columns = union(checked(log.control_columns, c.robot, len(c.u)) for c in events)
+    noise = cov_columns(max((len(c.cov) for c in events if c.cov is not None), default=0))
+    rows = [
+        start(c) | cells(columns, log.control_columns[c.robot], c.u) | upper(c.cov, f"control at {c.t_s} s")
+        for c in events
+    ]
     return ["t_s", "robot", *columns, *noise], rows
 
 
-def scans_table(log: Log) -> Table:
+def scans(log: Log) -> Table:
     """Return header and rows of scans.csv."""
-    scans = [event for event in log if isinstance(event, Scan)]
-    columns = union(checked(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in scans if len(s.y))
-    noise = noise_columns((s.y.shape[1] for s in scans if s.cov is not None), columns)
-    rows: list[list[str]] = []
+    events = [event for event in log if isinstance(event, Scan)]
+    columns = union(checked(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in events if len(s.y))
+    noise = cov_columns(max((s.y.shape[1] for s in events if s.cov is not None), default=0))
+    rows: list[dict[str, str]] = []
     seen: set[tuple[int, str, str]] = set()
-    for s in scans:
+    for s in events:
         key = (s.t_ns, s.robot, s.sensor)
         if key in seen:
             raise LogError(f"two scans of {s.robot!r} by {s.sensor!r} at t={seconds(s.t_ns)} s, expected one at a time")
         seen.add(key)
+        begin = start(s) | {"sensor": name(s.sensor)}
         if len(s.y) == 0:
-            rows.append([seconds(s.t_ns), name(s.robot), name(s.sensor), "", *[""] * (len(columns) + len(noise))])
+            rows.append(begin)
             continue
         used, size = log.sensor_columns[s.robot, s.sensor], s.y.shape[1]
         covs = [None] * len(s.y) if s.cov is None else np.broadcast_to(s.cov, (len(s.y), size, size))
-        start = [seconds(s.t_ns), name(s.robot), name(s.sensor)]
         for y, id_, cov in zip(s.y, s.ids or [None] * len(s.y), covs, strict=True):
-            noise_cells = upper(cov, noise, f"scan at {s.t_s} s")
-            rows.append([*start, "" if id_ is None else id_text(id_), *place(columns, used, y), *noise_cells])
+            told = {} if id_ is None else {"id": id_text(id_)}
+            rows.append(begin | told | cells(columns, used, y) | upper(cov, f"scan at {s.t_s} s"))
     return ["t_s", "robot", "sensor", "id", *columns, *noise], rows
 
 
-def fixes_table(log: Log) -> Table:
+def fixes(log: Log) -> Table:
     """Return header and rows of fixes.csv."""
-    fixes = [event for event in log if isinstance(event, Fix)]
-    size = max((len(f.y) for f in fixes), default=2)
-    columns = ("x_m", "y_m", "z_m")[:size]
-    noise = cov_columns(size, "xyz")
-    rows = []
-    for f in fixes:
-        used = columns[: len(f.y)]
-        cells = dict(zip(cov_columns(len(f.y), "xyz"), upper_numbers(f.cov, f"fix at {f.t_s} s"), strict=True))
-        rows.append([seconds(f.t_ns), name(f.robot), *place(columns, used, f.y), *(cells.get(n, "") for n in noise)])
-    return ["t_s", "robot", *columns, *noise], rows
+    events = [event for event in log if isinstance(event, Fix)]
+    size = max((len(f.y) for f in events), default=2)
+    rows = [start(f) | named(POSITION, f.y) | upper(f.cov, f"fix at {f.t_s} s", "xyz") for f in events]
+    return ["t_s", "robot", *POSITION[:size], *cov_columns(size, "xyz")], rows
 
 
-def truth_table(log: Log) -> Table:
+def truth(log: Log) -> Table:
     """Return header and rows of truth.csv."""
     sizes = {path.poses.shape[1] for path in log.truth.values()}
     if len(sizes) > 1:
         raise LogError("truth holds poses in the plane and in space, expected one kind")
     columns = POSE3 if sizes == {7} else POSE2
     rows = [
-        [seconds(int(t)), name(robot), *numbers(pose)]
-        for robot, path in log.truth.items()
-        for t, pose in zip(path.t_ns, path.poses, strict=True)
-    ]
+        {"t_s": seconds(int(t)), "robot": name(robot)} | named(columns, pose)
+        for robot, path in log.truth.items() for t, pose in zip(path.t_ns, path.poses, strict=True)
+    ]  # fmt: skip
     return ["t_s", "robot", *columns], rows
 
 
-def landmarks_table(log: Log) -> Table:
+def landmarks(log: Log) -> Table:
     """Return header and rows of landmarks.csv."""
     of_size = {len(names): names for names in LANDMARKS}
     sizes = {len(values) for values in log.landmarks.values()}
     if not sizes <= of_size.keys() or (2 in sizes and len(sizes) > 1):
         raise LogError(f"landmarks have {', '.join(map(str, sorted(sizes)))} numbers, expected all 2, or 3, 6 and 7")
     columns = union(of_size[size] for size in sorted(sizes)) or LANDMARKS[0]
-    rows = [[id_text(id_), *place(columns, of_size[len(l)], l)] for id_, l in log.landmarks.items()]
+    rows = [{"id": id_text(id_)} | cells(columns, of_size[len(l)], l) for id_, l in log.landmarks.items()]
     return ["id", *columns], rows
 
 
-def gps_table(log: Log) -> Table:
+def gps(log: Log) -> Table:
     """Return header and rows of gps.csv."""
+    columns = ["x_m", "y_m", "antenna_x_m", "antenna_y_m"]
     rows = [
-        [seconds(int(t)), name(robot), *numbers(xy), *numbers(track.antenna)]
-        for robot, track in log.gps.items()
-        for t, xy in zip(track.t_ns, track.xy, strict=True)
-    ]
-    return ["t_s", "robot", "x_m", "y_m", "antenna_x_m", "antenna_y_m"], rows
+        {"t_s": seconds(int(t)), "robot": name(robot)} | named(columns, [*xy, *track.antenna])
+        for robot, track in log.gps.items() for t, xy in zip(track.t_ns, track.xy, strict=True)
+    ]  # fmt: skip
+    return ["t_s", "robot", *columns], rows
+
+
+def start(event: Event) -> dict[str, str]:
+    """Return the cells of an event's time and robot."""
+    return {"t_s": seconds(event.t_ns), "robot": name(event.robot)}
 
 
 def checked(columns: dict[Any, tuple[str, ...]], key: Any, size: int) -> tuple[str, ...]:
@@ -154,39 +143,25 @@ def union(columns: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
     return (*known, *(name for name in names if name not in known))
 
 
-def noise_columns(sizes: Iterable[int], columns: tuple[str, ...]) -> list[str]:
-    """Return the names of the noise columns that hold every covariance of these sizes."""
-    return cov_columns(max(sizes, default=0))
-
-
-def place(columns: tuple[str, ...], used: tuple[str, ...], values: Array) -> list[str]:
-    """Return the cells of `values`, named by `used`, under `columns`; others stay empty."""
-    if columns == used:
-        return numbers(values)
-    if tuple(column for column in columns if column in used) != used:
+def cells(columns: tuple[str, ...], used: tuple[str, ...], values: Array) -> dict[str, str]:
+    """Return the cells of `values`, named by `used`, some of `columns`.  Raises LogError if their order is another."""
+    if columns != used and tuple(column for column in columns if column in used) != used:
         raise LogError(f"columns {', '.join(used)} would be read back in another order, expected that of {columns}")
-    cells = dict(zip(used, numbers(values), strict=True))
-    return [cells.get(column, "") for column in columns]
+    return named(used, values)
 
 
-def upper(cov: Array | None, noise: list[str], what: str) -> list[str]:
-    """Return the cells of a covariance under the columns `noise`."""
+def named(columns: Sequence[str], values: Any) -> dict[str, str]:
+    """Return numbers by column, as the shortest text that reads back as the same float."""
+    return {column: repr(float(value)) for column, value in zip(columns, values, strict=False)}
+
+
+def upper(cov: Array | None, what: str, axes: str = "0123456789") -> dict[str, str]:
+    """Return the cells of the upper triangle of a covariance, row by row.  Raises LogError if it is not symmetric."""
     if cov is None:
-        return [""] * len(noise)
-    cells = dict(zip(cov_columns(len(cov)), upper_numbers(cov, what), strict=True))
-    return [cells.get(column, "") for column in noise]
-
-
-def upper_numbers(cov: Array, what: str) -> list[str]:
-    """Return the upper triangle of a symmetric covariance, row by row."""
+        return {}
     if not np.array_equal(cov, cov.T):
         raise LogError(f"{what}: covariance {cov.tolist()} is not symmetric, expected a symmetric one")
-    return numbers(cov[np.triu_indices(len(cov))])
-
-
-def numbers(values: Any) -> list[str]:
-    """Return numbers as the shortest text that reads back as the same float."""
-    return [repr(float(value)) for value in values]
+    return named(cov_columns(len(cov), axes), cov[np.triu_indices(len(cov))])
 
 
 def name(text: str) -> str:

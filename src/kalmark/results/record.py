@@ -13,9 +13,8 @@ from numba.core import event as numba_event
 from kalmark.declare import is_own, registered_name
 from kalmark.errors import DivergedError, EventError, LogError
 from kalmark.events import Control, Event, Fix, Scan
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, begins_at
 from kalmark.logs.source import nearest
-from kalmark.logs.start import begins_at
 from kalmark.results.history import Array, Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track

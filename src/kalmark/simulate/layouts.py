@@ -1,23 +1,28 @@
 """Where the landmarks of a simulated world stand: Sola's cloister ([S] App. C), a loop, a random field, a list.
 
-Layouts of the plane serve robots of space as well: their landmarks are at z = 0.  Those of space are in `layouts3d`.
+Layouts of the plane serve robots of space as well: their landmarks are at z = 0.  Those of space are the toolbox's
+thick cloister and house ([TB] `thickCloister`, `house`), a random box and a room of tags.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from numpy.random import Generator
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from kalmark.config.sections import NotNegative, Number, Positive, Section, expected
+from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, expected
+from kalmark.geometry.frames3d import from_euler_pose
 
 Array = npt.NDArray[np.float64]
 Count = Annotated[int, Field(ge=1)]
+Segment = Annotated[tuple[Number, Number, Number, Number, Number, Number], Field(strict=False)]
+Triple = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 
 
 def _some(points: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
@@ -31,17 +36,6 @@ def _some(points: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...
 
 Point = Annotated[tuple[Number, ...], Field(strict=False)]
 Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)]
-
-
-def mapping_of(*types: str) -> BeforeValidator:
-    """Return the check that a section chosen by `type` is a mapping that names one."""
-
-    def check(value: Any) -> Any:
-        if not isinstance(value, Section) and not (isinstance(value, dict) and "type" in value):
-            raise expected("a mapping with a type: one of " + ", ".join(types))
-        return value
-
-    return BeforeValidator(check)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +88,15 @@ class Walls(OfPoints):
             raise expected("x_max_m above x_min_m and y_max_m above y_min_m")
         return self
 
+    def floor(self) -> Array:
+        """Return the points (4 (2 n - 5), 2) of one storey, in the guide's order.  [S] cloister.m."""
+        n, low, high = self.n, np.array([self.x_min_m, self.y_min_m]), np.array([self.x_max_m, self.y_max_m])
+        outer = np.arange(n - 2) - (n - 3) / 2
+        walls = (outer, (n - 1) / 2), (outer[:-1], (n - 3) / 2)
+        north = np.vstack([np.column_stack([along, np.full(len(along), off)]) for along, off in walls])
+        east = north @ np.array([[0.0, -1.0], [1.0, 0.0]]).T  # the guide's name: a quarter turn to the left
+        return np.vstack([north, east, -north, -east]) * (high - low) / (n - 1) + (low + high) / 2
+
 
 class Cloister(Walls):
     """Sola's cloister: a square walk, an outer wall and an inner row of columns.  [S] cloister.m."""
@@ -102,7 +105,7 @@ class Cloister(Walls):
 
     def place(self, rng: Generator) -> Array:
         """Return the landmarks (4 (2 n - 5), 2), always the same."""
-        return cloister(self.x_min_m, self.x_max_m, self.y_min_m, self.y_max_m, self.n)
+        return self.floor()
 
 
 class Loop(OfPoints):
@@ -155,13 +158,151 @@ class RandomField(OfPoints):
         return rng.uniform(0.0, self.size_m, (self.count, 2))
 
 
-def cloister(x_min: float, x_max: float, y_min: float, y_max: float, n: int = 9) -> Array:
-    """Return the points (4 (2 n - 5), 2) of a cloister within these limits, in the guide's order.  [S] cloister.m."""
-    outer = np.arange(n - 2) - (n - 3) / 2
-    inner = outer[:-1]
-    north = np.vstack(
-        [np.column_stack([outer, np.full(n - 2, (n - 1) / 2)]), np.column_stack([inner, np.full(n - 3, (n - 3) / 2)])]
-    )
-    east = north @ np.array([[0.0, -1.0], [1.0, 0.0]]).T  # the guide's name: a quarter turn to the left
-    points = np.vstack([north, east, -north, -east])
-    return points * np.array([x_max - x_min, y_max - y_min]) / (n - 1) + [(x_min + x_max) / 2, (y_min + y_max) / 2]
+class ThickCloister(Walls):
+    """A cloister of two storeys, at z = 0 and above.  [TB] `thickCloister`."""
+
+    type: Literal["thick_cloister"] = "thick_cloister"
+    height_m: Number = 1.0
+    """Height of the upper storey."""
+
+    def place(self, rng: Generator) -> Array:
+        """Return the landmarks (8 (2 n - 5), 3), the lower storey first."""
+        floor = self.floor()
+        return np.vstack([np.column_stack([floor, np.full(len(floor), z)]) for z in (0.0, self.height_m)])
+
+
+class House(Section):
+    """A house of 23 segments: walls, a roof, a door and a window in the western wall.  [TB] `house`."""
+
+    type: Literal["house"] = "house"
+    x_m: Number = 0.0
+    """South-western corner."""
+    y_m: Number = 0.0
+    """South-western corner."""
+    z_m: Number = 0.0
+    """South-western corner."""
+    length_m: Positive = 5.0
+    """From west to east."""
+    width_m: Positive = 5.0
+    """From south to north."""
+    height_m: Positive = 4.0
+    """Of the ridge; the walls are 0.65 of it."""
+
+    def scenery(self, rng: Generator) -> Scenery:
+        """Return the segments (23, 6), always the same."""
+        wall, top = 0.65, 1.0
+        ground = [(0, 0), (1, 0), (1, 1), (0, 1)]
+        columns = [((x, y, 0), (x, y, wall)) for x, y in ground]
+        floor = [((*ground[i], 0), (*ground[(i + 1) % 4], 0)) for i in range(4)]
+        gables = [((x, y, a), (x, y + 0.5, b)) for x in (0, 1) for y, a, b in ((0, wall, top), (0.5, top, wall))]
+        along = [((0, y, z), (1, y, z)) for y, z in ((0.5, top), (0, wall), (1, wall))]
+        door, window = [(0.6, 0), (0.8, 0), (0.8, 0.5), (0.6, 0.5)], [(0.2, 0.25), (0.4, 0.25), (0.4, 0.5), (0.2, 0.5)]
+        frames = [((0, *frame[i]), (0, *frame[(i + 1) % 4])) for frame in (door, window) for i in range(4)]
+        ends = np.array([*columns, *floor, *gables, *along, *frames]) * [self.length_m, self.width_m, self.height_m]
+        return Scenery(segments=(np.array([self.x_m, self.y_m, self.z_m]) + ends).reshape(-1, 6))
+
+
+class RandomBox(OfPoints):
+    """Landmarks spread uniformly over a box."""
+
+    type: Literal["random_box"] = "random_box"
+    count: Count = 100
+    """How many landmarks."""
+    min_m: Triple = (0.0, 0.0, 0.0)
+    """Lowest corner (x, y, z)."""
+    max_m: Triple = (20.0, 20.0, 4.0)
+    """Highest corner (x, y, z)."""
+
+    @model_validator(mode="after")
+    def _has_room(self) -> RandomBox:
+        if not all(low <= high for low, high in zip(self.min_m, self.max_m, strict=True)):
+            raise expected("max_m nowhere below min_m")
+        return self
+
+    def place(self, rng: Generator) -> Array:
+        """Return random landmarks (count, 3)."""
+        return rng.uniform(self.min_m, self.max_m, (self.count, 3))
+
+
+class TagRoom(Section):
+    """A room with tags on its four walls, all facing inwards; its south-western corner is the origin."""
+
+    type: Literal["tag_room"] = "tag_room"
+    length_m: Positive = 8.0
+    """From west to east."""
+    width_m: Positive = 6.0
+    """From south to north."""
+    heights_m: Annotated[tuple[Number, ...], Field(strict=False, min_length=1)] = (0.8, 1.8)
+    """Heights of the rows of tags."""
+    per_wall: Count = 4
+    """Tags in a row of a wall."""
+    size_m: Positive = 0.3
+    """Side of a tag."""
+
+    def scenery(self, rng: Generator) -> Scenery:
+        """Return the tags (4 per_wall heights, 7), always the same."""
+        middle = np.array([self.length_m, self.width_m]) / 2
+        across = 2 * np.arange(1, self.per_wall + 1) / (self.per_wall + 1) - 1
+        tags = []
+        for wall in range(4):  # west, north, east, south
+            reach, along = middle if wall % 2 == 0 else middle[::-1]
+            c, s = math.cos(-math.pi / 2 * wall), math.sin(-math.pi / 2 * wall)
+            for z, y in product(self.heights_m, along * across):
+                place = middle[0] - c * reach - s * y, middle[1] - s * reach + c * y, z
+                turns = -math.pi / 2, 0.0, math.pi / 2 * (1 - wall)
+                tags.append(from_euler_pose(np.array([*place, *turns]))[0])
+        return Scenery(tags=np.array(tags), tag_sizes=np.full(len(tags), self.size_m))
+
+
+class ListedTag(Section):
+    """A tag: x to the right of who looks at it, y down, z away from them, into what it is stuck to."""
+
+    x_m: Number = 0.0
+    """Its middle."""
+    y_m: Number = 0.0
+    """Its middle."""
+    z_m: Number = 0.0
+    """Its middle."""
+    roll_deg: Number = 0.0
+    """About x, first."""
+    pitch_deg: Number = 0.0
+    """About y, second."""
+    yaw_deg: Number = 0.0
+    """About z, third."""
+    size_m: Positive = 0.3
+    """Its side."""
+
+    def pose(self) -> Array:
+        """Return its pose (7,)."""
+        turns = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
+        return from_euler_pose(np.array([self.x_m, self.y_m, self.z_m, *turns]))[0]
+
+
+class Listed(Section):
+    """Landmarks at given places: points, segments, tags."""
+
+    type: Literal["list"] = "list"
+    points_m: Points = ()
+    """One (x, y) or (x, y, z) each; their ids are 1, 2, ..."""
+    segments_m: Annotated[tuple[Segment, ...], Field(strict=False)] = ()
+    """Both ends of each (x, y, z, x, y, z); their ids follow those of the points."""
+    tags: Annotated[tuple[ListedTag, ...], Field(strict=False)] = ()
+    """Poses and sizes; their ids follow those of the segments."""
+
+    @model_validator(mode="after")
+    def _has_something(self) -> Listed:
+        if not (self.points_m or self.segments_m or self.tags):
+            raise expected("points_m, segments_m or tags")
+        if self.points_m and len(self.points_m[0]) == 2 and (self.segments_m or self.tags):
+            raise expected("points [x, y, z] beside segments or tags")
+        return self
+
+    def scenery(self, rng: Generator) -> Scenery:
+        """Return what is listed."""
+        points = np.array(self.points_m, dtype=np.float64) if self.points_m else np.empty((0, 3))
+        segments = np.array(self.segments_m, dtype=np.float64).reshape(-1, 6)
+        tags = np.array([tag.pose() for tag in self.tags]).reshape(-1, 7)
+        return Scenery(points, segments, tags, np.array([tag.size_m for tag in self.tags]))
+
+
+Layout = Annotated[Any, OneOf(Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed)]

@@ -24,23 +24,9 @@ from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
 from kalmark.models.protocols import coasts, parameter_covariance, range_limit
+from kalmark.simulate import sights
 from kalmark.simulate.routes import Driver
-from kalmark.simulate.sights import (
-    POINTS,
-    Sensing,
-    Sighted,
-    Things,
-    centre,
-    chosen,
-    exact,
-    faulty,
-    gaussian,
-    in_frame,
-    looks_for,
-    noisy,
-    possible,
-    things_of,
-)
+from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
 
@@ -108,7 +94,8 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
     """Return one simulated run: its log, and what the log does not tell."""
     chance = Chance(seed)
     things = scenery_of(world, chance.layout)
-    area = area_of(things)
+    centres = np.concatenate([sort.centres() for sort in things.values() if len(sort.values)])
+    area = np.array([centres.min(axis=0), centres.max(axis=0)])
     robots = [sim_robot(world, name, area, chance) for name in world.robots]
     times = [round(k * world.dt_s * 1e9) for k in range(world.steps + 1)]
     events: list[Event] = []
@@ -126,33 +113,23 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
                 origins[now, scan.robot, scan.sensor] = real
     states = {r.name: np.array([*r.states, r.state]) for r in robots}
     log = Log(
-        name=world.name,
-        robots=tuple(world.robots),
-        events=sorted(events, key=order),
-        format="simulated",
+        world.name, tuple(world.robots), sorted(events, key=order), "simulated",
         truth={r.name: Trajectory(np.array(times), states[r.name][:, : len(r.pose)]) for r in robots},
         landmarks=true_landmarks(things),
         control_columns={r.name: r.motion.columns for r in robots},
         sensor_columns={(r.name, name): s.sensor.columns for r in robots for name, s in r.sensors.items()},
-    )
+    )  # fmt: skip
     return Simulation(log, states, {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}, origins)
 
 
 def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
     """Place what there is to see, points with a signature each if a sensor measures signatures."""
-    scenery = world.world.scenery(rng)
-    things = things_of(scenery, world.dimensions)
+    things = sights.things_of(world.world.scenery(rng), world.dimensions)
     if world.has_signatures:
         points = things[POINTS]
         signatures = rng.uniform(0.0, world.signature_max, len(points.values))
         points.values = np.column_stack([points.values, signatures])
     return things
-
-
-def area_of(things: dict[str, Things]) -> Array:
-    """Return the lowest and the highest corner (2, 2|3) of where things are."""
-    centres = np.concatenate([sort.centres() for sort in things.values() if len(sort.values)])
-    return np.array([centres.min(axis=0), centres.max(axis=0)])
 
 
 def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
@@ -187,18 +164,14 @@ def drawn_start(robot: Robot, rng: Generator) -> Array:
 
 def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
     """Return the true sensor and its true mount (3,) or (7,), drawn around the given ones if these have sigmas."""
-    at, cov = np.array(mount.at), mount.cov
-    if cov is not None:
-        at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(cov, rng))
-    return true_sensor(mount.sensor, rng), at
-
-
-def true_sensor(sensor: Any, rng: Generator) -> Any:
-    """Return a sensor whose own parameters are drawn around those that the estimator is given, if these have sigmas."""
+    sensor: Any = mount.sensor
+    at = np.array(mount.at)
+    if mount.cov is not None:
+        at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(mount.cov, rng))
     if parameter_covariance(sensor) is None:
-        return sensor
+        return sensor, at
     scale, bias_m = rng.normal([sensor.scale, sensor.bias_m], [sensor.sigma_scale, sensor.sigma_bias_m]).tolist()
-    return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0)
+    return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0), at
 
 
 def step(robot: SimRobot, world: World, rng: Generator) -> Array:
@@ -242,12 +215,12 @@ def scans(
     for name, carried in robot.sensors.items():
         if k % (carried.sensing.every or 1):
             continue
-        sensor, there = carried.sensor, things[looks_for(carried.sensor)]
+        sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
         sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight)
-        sighted, real = faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
-        y = noisy(sensor, sighted.e, chance.sight)
-        kept = possible(sensor, y)
+        sighted, real = sights.faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
+        y = sights.noisy(sensor, sighted.e, chance.sight)
+        kept = sights.possible(sensor, y)
         if len(kept):
             told = [sighted.ids[i] for i in kept] if world.ids else None
             scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=told)
@@ -258,16 +231,16 @@ def scans(
 def seen_by(sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator) -> Sighted:
     """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last."""
     near = things.near(T[: world.dimensions], range_limit(sensor))
-    v = things.seen_from(T, near)
-    inside, e = exact(sensor, v, things.sizes[near])
+    v = in_frame(things.sort, T, things.values[near])
+    inside, e = sights.exact(sensor, v, things.sizes[near])
     near, v, e = near[inside], v[inside], e[inside]
-    distance = np.linalg.norm(centre(things.sort, v, world.dimensions), axis=1)
-    rows = chosen(things, near, distance, world.new_per_step, world.max_per_scan, rng)
+    distance = np.linalg.norm(sights.centre(things.sort, v, world.dimensions), axis=1)
+    rows = sights.chosen(things, near, distance, world.new_per_step, world.max_per_scan, rng)
     ids: list[Id] = [int(i) + things.first for i in near[rows]]
     v, e, sizes = v[rows], e[rows], things.sizes[near[rows]]
     if others and things.sort == POINTS:
         w = in_frame(POINTS, T, np.array([pose[: world.dimensions] for pose in others.values()]))
-        inside, f = exact(sensor, w, np.zeros(len(w)))
+        inside, f = sights.exact(sensor, w, np.zeros(len(w)))
         v, e, sizes = np.concatenate([v, w[inside]]), np.concatenate([e, f[inside]]), np.append(sizes, 0 * f[inside, 0])
         ids += [name for name, seen in zip(others, inside, strict=True) if seen]
     return Sighted(v, e, sizes, ids)

@@ -10,13 +10,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 from numpy.random import Generator
-from pydantic import Discriminator, Field, Tag
+from pydantic import Field
 
-from kalmark.config.sections import Number, Positive, Section, type_or
+from kalmark.config.sections import Number, OneOf, Positive, Section
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian, matrix
 from kalmark.models.motion import Ackermann, Odometry2D, Odometry3D, Unicycle
-from kalmark.simulate.layouts import Points, mapping_of
+from kalmark.simulate.layouts import Points
 
 Array = npt.NDArray[np.float64]
 Driver = Callable[[Array], Array]  # true state -> control of the next step
@@ -103,16 +103,7 @@ class Lanes(Drive):
         yield from cycle(np.array(ends + ends[-2:0:-1]))
 
 
-Route = Annotated[
-    Annotated[
-        Annotated[Constant, Tag("constant")]
-        | Annotated[Waypoints, Tag("waypoints")]
-        | Annotated[Wander, Tag("wander")]
-        | Annotated[Lanes, Tag("lanes")],
-        Discriminator(type_or()),
-    ],
-    mapping_of("constant", "waypoints", "wander", "lanes"),
-]
+Route = Annotated[Any, OneOf(Constant, Waypoints, Wander, Lanes)]
 
 
 def steer_in_plane(motion: Any, pose: Array, target: Array, drive: Drive, dt_s: float) -> Array:

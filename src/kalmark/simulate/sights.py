@@ -114,19 +114,14 @@ class Things:
             return np.arange(len(self.values))
         return np.array(sorted(self.tree.query_ball_point(place, reach_m)), dtype=np.int64)
 
-    def seen_from(self, T: Array, index: Indices) -> Array:
-        """Return those of `index` (K,), in the frame T (3,) or (7,): (K, d)."""
-        return in_frame(self.sort, T, self.values[index])
-
 
 def things_of(scenery: Scenery, dimensions: int) -> dict[str, Things]:
     """Return what there is to see, by sort; ids are 1, 2, ... over points, then segments, then tags."""
     points = scenery.points
     if dimensions == 3 and points.shape[1] == 2:
         points = np.column_stack([points, np.zeros(len(points))])
-    values = {POINTS: points, SEGMENTS: scenery.segments, TAGS: scenery.tags}
     first, things = 1, {}
-    for sort, rows in values.items():
+    for sort, rows in ((POINTS, points), (SEGMENTS, scenery.segments), (TAGS, scenery.tags)):
         sizes = scenery.tag_sizes if sort == TAGS else np.zeros(len(rows))
         things[sort] = Things(sort, first, rows, sizes, dimensions=dimensions)
         first += len(rows)
@@ -268,10 +263,8 @@ def tags_seen(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
         return inside & sensor.sees(v), v.copy()
     e = np.full((len(v), 9), np.nan)
     for i in np.flatnonzero(inside):
-        at = corners(sizes[i]) @ matrix(v[i, 3:].copy()).T + v[i, :3]
-        inside[i] = sensor.sees(at).all()
+        inside[i] = sensor.sees(corners(sizes[i]) @ matrix(v[i, 3:].copy()).T + v[i, :3]).all()
     if inside.any():
-        known = np.zeros((int(inside.sum()), 9))
-        known[:, 8] = sizes[inside]
+        known = np.column_stack([np.zeros((int(inside.sum()), 8)), sizes[inside]])
         e[inside] = sensor.expect(v[inside], known)[0]
     return inside, e

@@ -5,22 +5,27 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from copy import deepcopy
-from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 from ruamel.yaml import YAML
 
-from kalmark.config.choices import model_of
-from kalmark.config.merging import merged
-from kalmark.config.mounting import Plugins, SpaceStartConfig, StartConfig
-from kalmark.config.reading import resolve_name, run_plugins, validate
-from kalmark.config.schema import Config, RobotConfig, SpaceRobotConfig, robot_world
-from kalmark.config.sections import Positive, Section, expected
+from kalmark.config.opening import merged
+from kalmark.config.reading import resolve_name, run_plugins, shipped_configs, validate
+from kalmark.config.schema import (
+    Config,
+    Plugins,
+    RobotConfig,
+    SpaceRobotConfig,
+    SpaceStartConfig,
+    StartConfig,
+    robot_world,
+)  # fmt: skip
+from kalmark.config.sections import Positive, Section, expected, model_of
 from kalmark.config.tree import Tree, name_of, read_tree
-from kalmark.simulate.layouts3d import Layout
+from kalmark.simulate.layouts import Layout
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import Sensing
 
@@ -33,17 +38,26 @@ class _Underway(Section):
     sensing: dict[str, Sensing] = Field(default_factory=dict)
     """By a sensor's name: its rate, and what is wrong with it."""
 
+    @model_validator(mode="after")
+    def _all_fits(self) -> Self:
+        """Refuse a constant control of another motion, and what is said of a sensor that the robot does not have."""
+        robot: Any = self
+        size, route = len(model_of(robot.motion).columns), self.route
+        if isinstance(route, Constant) and len(route.u) != size:
+            raise expected(f"a route whose u has the {size} numbers of {robot.motion.type}, not {len(route.u)}")
+        if isinstance(route, Waypoints) and isinstance(self, SimulatedRobot) and len(route.points_m[0]) != 2:
+            raise expected("a route whose points_m are [x, y]: the robot moves in the plane")
+        for name in self.sensing:
+            if name not in robot.sensors:
+                raise expected(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
+        return self
+
 
 class SimulatedRobot(_Underway, RobotConfig):
     """One robot of the plane: how it truly moves and measures, noise included, and where it goes."""
 
     start: StartConfig = StartConfig()
     """Start; with sigmas, the true start is drawn around it."""
-
-    @model_validator(mode="after")
-    def _all_fits(self) -> SimulatedRobot:
-        check_robot(self)
-        return self
 
 
 class SpaceSimulatedRobot(_Underway, SpaceRobotConfig):
@@ -52,28 +66,11 @@ class SpaceSimulatedRobot(_Underway, SpaceRobotConfig):
     start: SpaceStartConfig = SpaceStartConfig()
     """Start; with sigmas, the true start is drawn around it."""
 
-    @model_validator(mode="after")
-    def _all_fits(self) -> SpaceSimulatedRobot:
-        check_robot(self)
-        return self
-
 
 AnySimulatedRobot = Annotated[
     Annotated[SimulatedRobot, Tag("(plane)")] | Annotated[SpaceSimulatedRobot, Tag("(space)")],
     Discriminator(robot_world),
 ]
-
-
-def check_robot(robot: SimulatedRobot | SpaceSimulatedRobot) -> None:
-    """Refuse a constant control of another motion, and a rate or faults of a sensor that the robot does not have."""
-    size, route = len(model_of(robot.motion).columns), robot.route
-    if isinstance(route, Constant) and len(route.u) != size:
-        raise expected(f"a route whose u has the {size} numbers of {robot.motion.type}, not {len(route.u)}")
-    if isinstance(route, Waypoints) and isinstance(robot, SimulatedRobot) and len(route.points_m[0]) != 2:
-        raise expected("a route whose points_m are [x, y]: the robot moves in the plane")
-    for name in robot.sensing:
-        if name not in robot.sensors:
-            raise expected(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
 
 
 class World(Section):
@@ -181,8 +178,7 @@ class World(Section):
 
 def shipped_worlds() -> dict[str, Path]:
     """Return the worlds that come with kalmark, by name."""
-    folder = Path(str(resources.files("kalmark"))) / "configs" / "worlds"
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return shipped_configs("configs/worlds")
 
 
 def load_world(path_or_name: str | Path, overrides: Sequence[str] = ()) -> World:
