@@ -27,7 +27,7 @@ import kalmark as km
 from kalmark.filter import corrections, kernels
 from kalmark.filter.compressed.map import CompressedMap
 from kalmark.filter.estimators import Invariant
-from kalmark.models.motion2d import increment
+from kalmark.models.motion import increment
 
 SIGHTINGS, WARM_UP = 6, 101
 SIDE, IN_VIEW = 32, 10  # a field of 1,024 landmarks

@@ -15,7 +15,7 @@ from kalmark.geometry.frames3d import compose, move
 from kalmark.geometry.rotations import from_euler, multiply
 from kalmark.geometry.spaces import MOUNTS
 from kalmark.models.landmarks import BUILT_IN
-from kalmark.models.motion3d import coast
+from kalmark.models.motion import coast
 
 FORWARD = from_euler(np.radians([-90.0, 0.0, -90.0]))[0]  # a camera that looks along the robot's x
 AT = np.concatenate([[0.0, 0.0, 0.6], FORWARD])

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import types
 from numba.extending import overload
 
+from kalmark.arrays import Array, Flags
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
@@ -24,8 +24,7 @@ from kalmark.models.landmarks3d import chained
 from kalmark.models.protocols import Completing, FullSensor, Landmark, Parametrized, Sensor, finds_depth
 from kalmark.models.seen import EXPECT, LOOK, residual
 
-Array = npt.NDArray[np.float64]
-View = tuple[int, int, int, int, Array, Array, npt.NDArray[np.bool_]]
+View = tuple[int, int, int, int, Array, Array, Flags]
 # addresses of `linearize_built_in`, the landmark's `look`, the sensor's `expected`; its code, mount, parameters, angles
 VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
 LINEARIZE = signature_of(
@@ -78,7 +77,7 @@ class PythonView:
     sensor: Sensor
     landmark: Landmark
     mount: Array
-    angular: npt.NDArray[np.bool_]
+    angular: Flags
 
     def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Return e (K, m), z = y - e, E_h (K, m, 3 or more) and E_l (K, m, n)."""
@@ -101,7 +100,7 @@ def fix_view(antenna: Array) -> View:
 
 
 def built_in_view(
-    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: npt.NDArray[np.bool_]
+    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: Flags
 ) -> View:  # fmt: skip
     """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,)."""
     linearize_at = address_of(linearize_built_in, LINEARIZE)

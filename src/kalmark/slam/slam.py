@@ -23,7 +23,7 @@ import numpy.typing as npt
 from kalmark.association import Association, ByIdentity
 from kalmark.association.averaging import average, outcomes, refuse_averaging
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
-from kalmark.association.query import ScanQuery
+from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
@@ -31,7 +31,8 @@ from kalmark.filter.estimators import Averaging, Correction, Estimator, Invarian
 from kalmark.filter.map import Map
 from kalmark.filter.maps import DENSE, grown, new_map
 from kalmark.geometry.spaces import SE2, SE3, Rn
-from kalmark.management import budget, confirm, delayed, existence, far, merge, mirrored, reparametrize
+from kalmark.management import confirm, delayed, existence, merge, reparametrize, tags
+from kalmark.management.attention import chosen, left_out
 from kalmark.management.pending import Initialization, Step
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
@@ -233,7 +234,7 @@ class Slam:
     # ------------------------------------------------------------------ scans
     def _fuse(self, scan: ScanContext, policy: Policy) -> None:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
-        query = ScanQuery(scan)
+        query = Query(scan)
         decisions = policy.association.associate(query)
         if policy.holds_back:
             decisions = accepted(query, decisions, policy.upkeep.odds)
@@ -256,7 +257,7 @@ class Slam:
         groups = [(m, [known[i] for i in rows]) for m, rows in self.tracks.by_model(scan.channel, names)]
         report, found, most = scan.report, list[Observation](), policy.attention.updates
         if most is not None and len(known) > most:
-            groups, out = budget.chosen(scan, policy.attention, groups, decisions)
+            groups, out = chosen(scan, policy.attention, groups, decisions)
             why = f"not among the {most} of most information"
             found += [Observation(k, scan.ids[k], "ignored", decisions[k][0], None, why) for k in out]  # type: ignore[arg-type]
         if policy.attention.sequential:
@@ -268,7 +269,7 @@ class Slam:
                 continue
             names = [decisions[k][0] for k in rows]
             slots = self.tracks.slots_of(names)
-            if scan.channel.far is not None and (near := far.approach(scan, model, slots, rows)) is not None:
+            if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:
                 self.estimator.correct(self.map, near)
             done = self._corrected(scan.update(model, slots, rows), scan.event)
             report.fill(rows, done)
@@ -315,7 +316,7 @@ class Slam:
             for o in self._correct(scan, policy, list(confirmed), by_name):
                 seen[o.index] = o._replace(outcome="new", reason=by_name[o.index][1])
         new = [k for k in new if k not in seen]
-        reasons = budget.left_out(scan, policy.attention, policy.starts, new, known, decisions)
+        reasons = left_out(scan, policy.attention, policy.starts, new, known, decisions)
         for k in new:
             name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
             seen[k] = self._initialize(scan, policy, k, name, reason)
@@ -371,7 +372,7 @@ class Slam:
         if not scan.channel.is_ambiguous:
             why = f"a {sensor} measurement without an id cannot start a landmark"
             return Observation(k, id_, "ignored", None, None, why)
-        return None if mirrored.is_clear(scan, k) else Observation(k, id_, "deferred", None, None, mirrored.MIRRORED)
+        return None if tags.is_clear(scan, k) else Observation(k, id_, "deferred", None, None, tags.MIRRORED)
 
     # ------------------------------------------------------------------ pending landmarks
     def _defer(self, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:

@@ -8,8 +8,8 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.models.protocols import Landmark, Segmented
@@ -17,9 +17,6 @@ from kalmark.report import Observation
 from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
 from kalmark.tracks.clones import Measurement
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan
 ChannelKey = tuple[str, str]  # robot, sensor
 
