@@ -27,7 +27,7 @@ import kalmark as km
 from kalmark.filter import corrections, kernels
 from kalmark.filter.compressed.map import CompressedMap
 from kalmark.filter.estimators import Invariant
-from kalmark.models.motion2d import increment
+from kalmark.geometry.frames import compose
 
 SIGHTINGS, WARM_UP = 6, 101
 SIDE, IN_VIEW = 32, 10  # a field of 1,024 landmarks
@@ -66,7 +66,7 @@ class Kernels(Way):
         if control is self.first[0]:
             return
         m = self.map
-        m.x[:3], F, G = increment(m.x[:3], control.u)
+        m.x[:3], F, G = compose(m.x[:3], control.u)
         kernels.predict(m.P, m.n, self.index, F, G @ self.N @ G.T)
         slots = np.array([self.slam.slot(i) for i in scan.ids or ()])
         seen = (0, -1, slots, 2, scan.y, self.noise, np.inf)

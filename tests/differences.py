@@ -73,6 +73,19 @@ def rotation_vectors(rng: np.random.Generator, count: int = 200) -> Array:
     return v * angle[:, None]
 
 
+def batched(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function`, made for single rotations or frames, for K of them: arguments (K, n), outputs stacked."""
+
+    def over(*arguments: Any) -> Any:
+        rows = [np.ascontiguousarray(a, dtype=np.float64) for a in arguments]
+        outputs = [function(*one) for one in zip(*rows, strict=True)]
+        if outputs and isinstance(outputs[0], tuple):
+            return tuple(np.array(each) for each in zip(*outputs, strict=True))
+        return np.array(outputs)
+
+    return over
+
+
 def frames(rng: np.random.Generator, count: int = 200) -> Array:
     """Draw frames (count, 7), near-singular rotations among them."""
-    return np.hstack([rng.normal(size=(count, 3)) * 3, rotations.batched(rotations.exp)(rotation_vectors(rng, count))])
+    return np.hstack([rng.normal(size=(count, 3)) * 3, batched(rotations.exp)(rotation_vectors(rng, count))])

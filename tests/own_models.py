@@ -127,9 +127,9 @@ class Cautious:
     coordinates: ClassVar[str] = "world"
     default_gate: ClassVar[float] = 25.0
 
-    def predict(self, map_: Any, robot: int, index: Any, F: Array, Q: Array, moved: Array) -> None:
+    def predict(self, map_: Any, movement: Any) -> bool:
         """Move a robot."""
-        km.estimators.Ekf().predict(map_, robot, index, F, Q, moved)
+        return km.estimators.Ekf().predict(map_, movement)
 
     def correct(self, map_: Any, update: Any) -> Any:
         """Fuse a scan."""

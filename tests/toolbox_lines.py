@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from kalmark import geometry
 from kalmark.geometry import directions, frames3d, rotations
-from kalmark.models import cameras, lines, segments
+from kalmark.models import cameras, landmarks, lines
 from kalmark.models import landmarks3d as lm
 from toolbox import Array, Case, Pair, frame, frame_tangent, k_of, one
 
@@ -23,6 +24,11 @@ ORDER = {  # of the numbers: the toolbox's pitch, yaw are kalmark's elevation, a
     "anchored_homogeneous_line": list(range(11)),
     "homogeneous_line": list(range(8)),
 }
+
+
+def line(name: str) -> Any:
+    """Return the landmark model of a line."""
+    return next(model() for model in landmarks.LINES if model.kind in (name, f"{name}_line"))
 
 
 def pose(i: Case) -> tuple[Array, Array, Array]:
@@ -58,7 +64,7 @@ def line_innovation(i: Case, o: Case) -> list[Pair]:
 
 def pluecker_projection(name: str) -> Callable[[Case, Case], list[Pair]]:
     """Compare a line's image, normalised: its length has no meaning."""
-    seen_from = getattr(lines, f"{name}_seen_from")
+    seen_from = line(name).seen_from
 
     def compare(i: Case, o: Case) -> list[Pair]:
         T, T_r, T_s = pose(i)
@@ -99,7 +105,7 @@ def segment_projection(i: Case, o: Case) -> list[Pair]:
 
 def line_projection(name: str) -> Callable[[Case, Case], list[Pair]]:
     """Compare a line through two points: the pixels of both, and the image line through them."""
-    endpoints, seen_from = getattr(segments, f"{name}_endpoints"), getattr(lines, f"{name}_seen_from")
+    endpoints, seen_from = line(name).endpoints, line(name).seen_from
 
     def compare(i: Case, o: Case) -> list[Pair]:
         l = i["l"][ORDER[name]]
@@ -115,7 +121,7 @@ def line_projection(name: str) -> Callable[[Case, Case], list[Pair]]:
 
 def pluecker_start(name: str) -> Callable[[Case, Case], list[Pair]]:
     """Compare a new line seen as the image line hm: as the segment of which seg2hmgLin makes hm."""
-    from_view = getattr(lines, f"{name}_from_view")
+    from_view = line(name).of
 
     def compare(i: Case, o: Case) -> list[Pair]:
         a, b, c = i["hm"]
@@ -140,7 +146,7 @@ def line_start(name: str) -> Callable[[Case, Case], list[Pair]]:
     The recorded Jacobians of homogeneous ones lack the projection (I - m m') of the exact one.  Of the second end of
     anchored ones there is only that in u, in the place of that in v.
     """
-    from_view = getattr(lines, f"{name}_from_view")
+    from_view = line(name).of
     at = {"inverse_depth_line": (), "anchored_homogeneous_line": (3, 7), "homogeneous_line": (0, 4)}[name]
 
     def compare(i: Case, o: Case) -> list[Pair]:
@@ -162,7 +168,7 @@ def line_start(name: str) -> Callable[[Case, Case], list[Pair]]:
 
 def whole_segment(name: str) -> Callable[[Case, Case], list[Pair]]:
     """Compare the two points of a line through them, at abscissas 0 and 1 or others."""
-    endpoints = getattr(segments, f"{name}_endpoints")
+    endpoints = line(name).endpoints
 
     def compare(i: Case, o: Case) -> list[Pair]:
         p, P_l = one(endpoints, i["l"][ORDER[name]], i.get("t", WHOLE)[None])
@@ -173,7 +179,7 @@ def whole_segment(name: str) -> Callable[[Case, Case], list[Pair]]:
 
 
 def pluecker_ends(i: Case, o: Case) -> list[Pair]:
-    p, P_l = one(segments.pluecker_endpoints, i["l"], i["t"][None])
+    p, P_l = one(lines.pluecker_endpoints, i["l"], i["t"][None])
     along = (p[1] - p[0]) / (i["t"][1] - i["t"][0])
     pairs = [(p[0], o["e1"].ravel()), (p[1], o["e2"].ravel()), (P_l[0], o["E1_l"]), (P_l[1], o["E2_l"])]
     return [*pairs, (along, o["E1_t"].ravel()), (along, o["E2_t"].ravel())]
@@ -183,7 +189,7 @@ def anchored_pluecker_ends(i: Case, o: Case) -> list[Pair]:
     """The toolbox's abscissas count from the point closest to the origin, ours from that closest to the anchor."""
     anchor, v = i["l"][:3], i["l"][6:]
     u, U_v = one(directions.unit_many, v)
-    p, P_l = one(segments.anchored_pluecker_endpoints, i["l"], (i["t"] - anchor @ u)[None])
+    p, P_l = one(lines.anchored_pluecker_endpoints, i["l"], (i["t"] - anchor @ u)[None])
     slipped = np.outer(u, np.concatenate([-u, np.zeros(3), -(anchor @ U_v)]))
     return [(p.ravel(), o["seg"].ravel()), ((P_l + slipped).reshape(6, 9), o["SEG_l"])]
 
@@ -216,7 +222,7 @@ def with_anchor(i: Case, o: Case) -> list[Pair]:
 def visible(i: Case, s: Array, depths: Array, least: float) -> tuple[bool, Array]:
     """Return what is seen of a segment with the pixels s (4,) at these depths."""
     p = np.insert(s.reshape(2, 2), 2, 1.0, axis=1) * depths[:, None]
-    seen, e = segments.visible_segment(HERE, p[:1], p[1:], PIXELS, i["imSize"], least)
+    seen, e = lines.visible_segment(HERE, p[:1], p[1:], PIXELS, i["imSize"], least)
     return bool(seen[0]), e[0]
 
 

@@ -158,7 +158,7 @@ def _parameters(model: Any) -> tuple[Parameter, ...]:
         hints = get_type_hints(model, include_extras=True)
     except NameError:  # a user's own, whose types only a checker knows
         hints = {}
-    fields = [field for field in dataclasses.fields(model) if field.init]
+    fields = sorted((field for field in dataclasses.fields(model) if field.init), key=lambda field: bool(field.kw_only))
     return tuple(_parameter(field, hints.get(field.name, Any)) for field in fields)
 
 

@@ -13,11 +13,10 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError
 
-Array = npt.NDArray[np.float64]
 Id = int | str
 
 FLOAT = np.dtype(np.float64)

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from kalmark.models.sensors2d import Bearing, Range, RangeBearing
+from kalmark.models.sensors import Bearing, Range, RangeBearing
 
 HOKUYO = "Hokuyo, Communication Protocol Specification for SCIP2.0, C-42-03320B"
 WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat, a laser that sees cylinders"

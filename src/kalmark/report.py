@@ -9,12 +9,10 @@ from itertools import repeat
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.events import Event, Id, Scan, seconds
 from kalmark.filter.estimators import Correction
-
-Array = npt.NDArray[np.float64]
 
 Late = tuple[int, str, str, int]
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
@@ -52,8 +50,8 @@ class Compared(NamedTuple):
     `places` (L, 2 or 3) are those of the landmarks.
     """
 
-    rows: npt.NDArray[np.int64]
-    numbers: npt.NDArray[np.int64]
+    rows: Index
+    numbers: Index
     landmarks: list[Id]
     d2: Array
     places: Array

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.association.joint import best_matching
-from kalmark.association.matchings import Places, matchings
-from kalmark.association.query import ScanQuery
+from kalmark.association.matchings import Places, best_matching, matchings
+from kalmark.association.query import Query
 from kalmark.errors import EventError
 from kalmark.filter.compressed.map import CompressedMap
 from kalmark.geometry.gaussian import gate
@@ -129,7 +128,7 @@ def test_what_is_asked_jointly_is_the_same_of_a_postponed_map_and_of_a_dense_one
             slam.map, slam.tracks, slam.clones, slam.estimator, slam._channels["r", "l"], slam.slot("r"), scan,
             (None,) * 6, np.zeros((6, 2, 2)), km.Report(scan, scan.y),
         )  # fmt: skip
-        asked.append(ScanQuery(context).jointly(np.array([3, 3, 0]), [3, 4, 3]))
+        asked.append(Query(context).jointly(np.array([3, 3, 0]), [3, 4, 3]))
     np.testing.assert_allclose(asked[0][0], asked[1][0], atol=1e-12)
     np.testing.assert_allclose(asked[0][1], asked[1][1], atol=1e-12)
 

@@ -89,7 +89,7 @@ def scene(rng: np.random.Generator, poses: int = 40, count: int = 8) -> tuple[Se
 def project(camera: km.sensors.TagCorners, T: Array, l: Array, size: float) -> tuple[Array, Array, Array]:
     """Return the corners of one tag seen from T, E_T and E_l."""
     v, V_T, V_l = tags.tag_seen_from(T, l[None])
-    e, E_v = tags.project_corners(camera.lens_code, v, np.array([size]), np.array(camera.parameters))
+    e, E_v = tags.project_corners(camera.code, v, np.array([size]), np.array(camera.parameters))
     return e[0], E_v[0] @ V_T[0], E_v[0] @ V_l[0]
 
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from differences import agree, derivative, frames, rotation_vectors
+from differences import agree, batched, derivative, frames, rotation_vectors
 from kalmark.geometry import directions, frames3d, rotations
-from kalmark.geometry.rotations import batched
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -70,14 +69,6 @@ def test_the_left_jacobian_carries_a_points_way_along_a_turn(rng: np.random.Gene
         p = rng.normal(size=3)
         turned = rotations.matrix(rotations.exp(v)) @ p - p
         np.testing.assert_allclose(rotations.left_jacobian(v) @ np.cross(v, p), turned, atol=1e-14)
-
-
-def test_rotate_has_the_jacobians_of_its_differences(rng: np.random.Generator) -> None:
-    for v in rotation_vectors(rng):
-        q, p = rotations.exp(v), rng.normal(size=3)
-        _, PW_q, PW_p = rotations.rotate(q, p)
-        agree(PW_q, derivative(lambda x: rotations.rotate(x, p)[0], q, into="quaternion"))
-        agree(PW_p, derivative(lambda x: rotations.rotate(q, x)[0], p))
 
 
 def test_euler_angles_are_scipys_and_have_the_jacobians_of_their_differences(rng: np.random.Generator) -> None:

@@ -126,21 +126,14 @@ def test_omnidirectional_pixels_come_back_to_the_calibrations_accuracy(rng: np.r
     assert np.hypot(*(again - y).T).max() < 5  # the two polynomials are fitted separately, to a few pixels
 
 
-@pytest.mark.parametrize("columns", [3, 4])
-def test_stereo_has_the_jacobians_of_its_differences_and_finds_the_point_again(
-    columns: int, rng: np.random.Generator
-) -> None:
+def test_stereo_has_the_jacobians_of_its_differences_and_finds_the_point_again(rng: np.random.Generator) -> None:
     v = in_front(rng)
     e, E_v = cameras.project_stereo(v, K, 0.24)
-    y = np.ascontiguousarray(e[:, :columns])
-    again, V_y = cameras.back_project_stereo(y, K, 0.24)
-    np.testing.assert_allclose(again, v, rtol=1e-9, atol=1e-9 * abs(v).max())
+    again, V_y = cameras.back_project_stereo(e, K, 0.24)
+    np.testing.assert_allclose(again[:, :3] / again[:, 3:], v, rtol=1e-9, atol=1e-9 * abs(v).max())
     for i in range(len(v)):
         agree(E_v[i], derivative(one(cameras.project_stereo, K, 0.24), v[i], first=0.02 * v[i, 2]))
-        step = 0.1 * (y[i, 0] - y[i, 2])
-        assert step > 0
-        agree(V_y[i], derivative(one(cameras.back_project_stereo, K, 0.24), y[i], first=step))
-        np.testing.assert_allclose(V_y[i] @ E_v[i, :columns], np.eye(3), atol=1e-6)
+        agree(V_y[i], derivative(one(cameras.back_project_stereo, K, 0.24), e[i], first=1.0))
 
 
 def test_a_pixel_is_in_the_image_with_its_borders_and_before_the_camera() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from differences import agree, derivative
 from kalmark.errors import ModelError
-from kalmark.models import cameras, lenses
+from kalmark.models import cameras
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -60,7 +60,7 @@ def rng() -> np.random.Generator:
 
 def camera(name: str) -> tuple[int, Array, Array]:
     lens, k, d, size = CAMERAS[name]
-    return lenses.LENSES[lens], lenses.parameters(lens, k, d, size=size), size
+    return cameras.LENSES[lens], cameras.parameters(lens, k, d, size=size), size
 
 
 def pixels(rng: np.random.Generator, size: Array, centre: Array, count: int = 200) -> Array:
@@ -76,15 +76,15 @@ def pixels(rng: np.random.Generator, size: Array, centre: Array, count: int = 20
 def test_a_lens_has_the_jacobians_of_its_differences(name: str, rng: np.random.Generator) -> None:
     lens, par, size = camera(name)
     y = pixels(rng, size, par[2:4])
-    m, M_y = lenses.back_project(lens, y, par)
+    m, M_y = cameras.back_project(lens, y, par)
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), 1, atol=1e-15)
     v = m * 10 ** rng.uniform(-3, 3, (len(y), 1))
-    e, E_v = lenses.project(lens, v, par)
+    e, E_v = cameras.project(lens, v, par)
     for i in range(len(v)):
         step = 0.01 * np.linalg.norm(v[i])
-        agree(E_v[i], derivative(lambda x: lenses.project(lens, x[None], par)[0][0], v[i], first=step))
-        agree(M_y[i], derivative(lambda x: lenses.back_project(lens, x[None], par)[0][0], y[i], first=0.005 * size[0]))
-    np.testing.assert_allclose(lenses.project(lens, 7 * v, par)[0], e, atol=1e-9)  # the length does not matter
+        agree(E_v[i], derivative(lambda x: cameras.project(lens, x[None], par)[0][0], v[i], first=step))
+        agree(M_y[i], derivative(lambda x: cameras.back_project(lens, x[None], par)[0][0], y[i], first=0.005 * size[0]))
+    np.testing.assert_allclose(cameras.project(lens, 7 * v, par)[0], e, atol=1e-9)  # the length does not matter
 
 
 @pytest.mark.parametrize("name", EXACT)
@@ -92,22 +92,22 @@ def test_pixels_come_back_through_their_rays_over_the_whole_image(name: str) -> 
     lens, par, size = camera(name)
     u, v = np.meshgrid(np.linspace(0, size[0], 81), np.linspace(0, size[1], 61))
     y = np.stack([u.ravel(), v.ravel()], axis=1)
-    m, M_y = lenses.back_project(lens, y, par)
-    again, E_m = lenses.project(lens, m, par)
+    m, M_y = cameras.back_project(lens, y, par)
+    again, E_m = cameras.project(lens, m, par)
     np.testing.assert_allclose(again, y, atol=1e-10, rtol=0)
     np.testing.assert_allclose(E_m @ M_y, np.tile(np.eye(2), (len(y), 1, 1)), atol=1e-9)
-    assert lenses.in_view(lens, m, par, size + 1e-9)[(y > 0).all(axis=1)].all()
+    assert cameras.in_view(lens, m, par, size + 1e-9)[(y > 0).all(axis=1)].all()
 
 
 def test_the_lenses_agree_where_one_is_a_case_of_the_other(rng: np.random.Generator) -> None:
     v = rng.uniform([-1, -0.75, 1], [1, 0.75, 1], (50, 3))
-    radial = lenses.project(lenses.RADIAL, v, lenses.parameters("radial", K, (-0.2, 0.05, 0.01), (), SIZE))
-    radtan = lenses.project(lenses.RADTAN, v, lenses.parameters("radtan", K, (-0.2, 0.05, 0, 0, 0.01)))
+    radial = cameras.project(cameras.RADIAL, v, cameras.parameters("radial", K, (-0.2, 0.05, 0.01), (), SIZE))
+    radtan = cameras.project(cameras.RADTAN, v, cameras.parameters("radtan", K, (-0.2, 0.05, 0, 0, 0.01)))
     existing = cameras.project_pinhole(v, np.array(K), np.array([-0.2, 0.05, 0.01]))
     for one, other, third in zip(radial, radtan, existing, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-10)
         np.testing.assert_array_equal(one, third)
-    ideal = lenses.project(lenses.EQUIDISTANT, v, lenses.parameters("equidistant", K))[0]
+    ideal = cameras.project(cameras.EQUIDISTANT, v, cameras.parameters("equidistant", K))[0]
     angle = np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2])
     np.testing.assert_allclose(np.hypot(*((ideal - K[2:]) / K[:2]).T), angle, atol=1e-12)
 
@@ -118,13 +118,13 @@ def test_the_pixels_are_those_of_the_formulas_written_out() -> None:
     r2 = x * x + y * y
     s = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     xd = x * s + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * s + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    e, _ = lenses.project(
-        lenses.RADTAN, np.array([[0.6, -0.4, 2]]), lenses.parameters("radtan", K, (k1, k2, p1, p2, k3))
+    e, _ = cameras.project(
+        cameras.RADTAN, np.array([[0.6, -0.4, 2]]), cameras.parameters("radtan", K, (k1, k2, p1, p2, k3))
     )
     np.testing.assert_allclose(e[0], [K[2] + K[0] * xd[0], K[3] + K[1] * xd[1]], atol=1e-12)
     t, k = math.atan(math.hypot(x, y)), (-0.02, 0.016, -0.009, 0.0017)
     td = t * (1 + k[0] * t**2 + k[1] * t**4 + k[2] * t**6 + k[3] * t**8) / math.hypot(x, y)
-    e, _ = lenses.project(lenses.EQUIDISTANT, np.array([[0.6, -0.4, 2]]), lenses.parameters("equidistant", K, k))
+    e, _ = cameras.project(cameras.EQUIDISTANT, np.array([[0.6, -0.4, 2]]), cameras.parameters("equidistant", K, k))
     np.testing.assert_allclose(e[0], [K[2] + K[0] * td * x, K[3] + K[1] * td * y], atol=1e-12)
 
 
@@ -132,61 +132,62 @@ def test_nothing_is_seen_behind_a_pin_hole_and_in_the_plane_through_it() -> None
     v = np.array([[0.1, 0.2, -1.0], [0.1, 0.2, 0.0], [0.0, 0.0, 0.0], [0.1, 0.2, 1.0]])
     for name in ("no distortion", "radial", "radtan", "time of flight"):
         lens, par, size = camera(name)
-        e, E_v = lenses.project(lens, v, par)
+        e, E_v = cameras.project(lens, v, par)
         assert np.isnan(e[:3]).all() and np.isnan(E_v[:3]).all() and np.isfinite(e[3]).all()
-        np.testing.assert_array_equal(lenses.in_view(lens, v, par, size), [False, False, False, True])
+        np.testing.assert_array_equal(cameras.in_view(lens, v, par, size), [False, False, False, True])
 
 
 def test_a_fisheye_sees_behind_its_plane_up_to_where_its_image_folds() -> None:
     angle = np.array([0.5, math.pi / 2, 1.7, 2.0, 3.0])
     v = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
-    par = lenses.parameters("equidistant", (100, 100, 300, 300), (-0.1,))  # grows up to theta = sqrt(1 / 0.3)
-    e, _ = lenses.project(lenses.EQUIDISTANT, v, par)
+    par = cameras.parameters("equidistant", (100, 100, 300, 300), (-0.1,))  # grows up to theta = sqrt(1 / 0.3)
+    e, _ = cameras.project(cameras.EQUIDISTANT, v, par)
     np.testing.assert_allclose(e[:3, 0], 300 + 100 * angle[:3] * (1 - 0.1 * angle[:3] ** 2), atol=1e-11)
     assert np.isnan(e[3:]).all()
-    np.testing.assert_array_equal(lenses.in_view(lenses.EQUIDISTANT, v, par, np.array([600.0, 600])), [1, 1, 1, 0, 0])
-    rays, _ = lenses.back_project(lenses.EQUIDISTANT, np.array([[300 + 121.0, 300], [300 + 122.0, 300]]), par)
+    np.testing.assert_array_equal(cameras.in_view(cameras.EQUIDISTANT, v, par, np.array([600.0, 600])), [1, 1, 1, 0, 0])
+    rays, _ = cameras.back_project(cameras.EQUIDISTANT, np.array([[300 + 121.0, 300], [300 + 122.0, 300]]), par)
     assert np.isfinite(rays[0]).all() and np.isnan(rays[1]).all()  # r_d reaches 1.217
-    ahead, _ = lenses.project(lenses.EQUIDISTANT, np.array([[0.0, 0, 3]]), par)
+    ahead, _ = cameras.project(cameras.EQUIDISTANT, np.array([[0.0, 0, 3]]), par)
     np.testing.assert_array_equal(ahead, [[300, 300]])
 
 
 @pytest.mark.parametrize("lens", ["radial", "radtan"])
 def test_points_that_fold_back_into_the_image_are_not_in_view(lens: str) -> None:
     d = (-0.3,) if lens == "radial" else (-0.3, 0, 0, 0)  # grows up to r = 1.054, r_d = 0.703
-    par = lenses.parameters(lens, (400, 400, 320, 240), d, () if lens == "radial" else None)
+    par = cameras.parameters(lens, (400, 400, 320, 240), d, () if lens == "radial" else None)
     v = np.array([[1.0, 0, 1], [1.1, 0, 1], [1.7, 0, 1]])
     folded, _ = cameras.project_pinhole(v, np.array([400.0, 400, 320, 240]), np.array([-0.3]))
     assert cameras.in_image(folded, v, SIZE).all()
-    np.testing.assert_array_equal(lenses.in_view(lenses.LENSES[lens], v, par, SIZE), [True, False, False])
-    assert np.isnan(lenses.project(lenses.LENSES[lens], v, par)[0][1:]).all()
+    np.testing.assert_array_equal(cameras.in_view(cameras.LENSES[lens], v, par, SIZE), [True, False, False])
+    assert np.isnan(cameras.project(cameras.LENSES[lens], v, par)[0][1:]).all()
     if lens == "radtan":
-        rays, _ = lenses.back_project(lenses.RADTAN, np.array([[320 + 281.0, 240], [320 + 282.0, 240]]), par)
+        rays, _ = cameras.back_project(cameras.RADTAN, np.array([[320 + 281.0, 240], [320 + 282.0, 240]]), par)
         assert np.isfinite(rays[0]).all() and np.isnan(rays[1]).all()
 
 
 def test_borders_of_the_image_are_in_view() -> None:
-    par = lenses.parameters("radial", (100, 100, 50, 50), size=(100, 100))
+    par = cameras.parameters("radial", (100, 100, 50, 50), size=(100, 100))
     v = np.array([[-0.5, -0.5, 1], [0.5, 0.5, 1], [0.51, 0, 1], [0, -0.51, 1]])
-    np.testing.assert_array_equal(lenses.in_view(lenses.RADIAL, v, par, np.array([100.0, 100])), [1, 1, 0, 0])
+    np.testing.assert_array_equal(cameras.in_view(cameras.RADIAL, v, par, np.array([100.0, 100])), [1, 1, 0, 0])
 
 
 def test_the_omnidirectional_lens_is_the_existing_camera(rng: np.random.Generator) -> None:
-    par, size = lenses.parameters("omnidirectional", OMNI_K, OMNI, OMNI_BACK), np.array([1280.0, 800.0])
+    par, size = cameras.parameters("omnidirectional", OMNI_K, OMNI, OMNI_BACK), np.array([1280.0, 800.0])
     y = rng.uniform(0, size, (100, 2))
     k, a, b = (np.array(x, dtype=float) for x in (OMNI_K, OMNI, OMNI_BACK))
-    rays = lenses.back_project(lenses.OMNI, y, par)
+    rays = cameras.back_project(cameras.OMNI, y, par)
     for one, other in zip(rays, cameras.back_project_omni(y, k, b), strict=True):
         np.testing.assert_array_equal(one, other)
-    for one, other in zip(lenses.project(lenses.OMNI, rays[0], par), cameras.project_omni(rays[0], k, a), strict=True):
+    pixels = cameras.project(cameras.OMNI, rays[0], par), cameras.project_omni(rays[0], k, a)
+    for one, other in zip(*pixels, strict=True):
         np.testing.assert_array_equal(one, other)
-    inside = (np.abs(lenses.project(lenses.OMNI, rays[0], par)[0] / size - 0.5) <= 0.5).all(axis=1)
-    np.testing.assert_array_equal(lenses.in_view(lenses.OMNI, rays[0], par, size), inside)
-    assert not lenses.in_view(lenses.OMNI, np.array([[0.01, 0, -1.0]]), par, size)[0]
+    inside = (np.abs(cameras.project(cameras.OMNI, rays[0], par)[0] / size - 0.5) <= 0.5).all(axis=1)
+    np.testing.assert_array_equal(cameras.in_view(cameras.OMNI, rays[0], par, size), inside)
+    assert not cameras.in_view(cameras.OMNI, np.array([[0.01, 0, -1.0]]), par, size)[0]
 
 
 def test_a_lens_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ModelError, match=r"lens 'fisheye': expected one of radial, radtan, equidistant"):
-        lenses.parameters("fisheye", K)
+        cameras.parameters("fisheye", K)
     with pytest.raises(ModelError, match=r"distortion \[0\.1, 0\.2, 0\.3\]: radtan expects k1, k2, p1, p2"):
-        lenses.parameters("radtan", K, (0.1, 0.2, 0.3))
+        cameras.parameters("radtan", K, (0.1, 0.2, 0.3))

@@ -11,7 +11,7 @@ import pytest
 
 from differences import agree, derivative, frames
 from kalmark.geometry import directions, frames3d, rotations
-from kalmark.models import cameras, lines, segments
+from kalmark.models import cameras, landmarks, lines
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -38,15 +38,13 @@ class Kind:
     abscissas: Callable[..., Any]
 
 
-KINDS = {
-    name: Kind(
-        getattr(lines, f"{name}_seen_from"),
-        getattr(lines, f"{name}_from_view"),
-        getattr(segments, f"{name}_endpoints"),
-        getattr(segments, f"{name}_abscissas"),
-    )
-    for name in PIECES
-}
+def kind(name: str) -> Kind:
+    """Return what there is of a line, `from_view` with rays and prior apart."""
+    line: Any = next(line() for line in landmarks.LINES if line.kind in (name, f"{name}_line"))
+    return Kind(line.seen_from, line.of, line.endpoints, line.abscissas)
+
+
+KINDS = {name: kind(name) for name in PIECES}
 
 
 @pytest.fixture
@@ -311,31 +309,31 @@ def test_rays_to_points_of_a_line_pass_it_at_their_abscissas(name: str, rng: np.
         assert np.isnan(kind.abscissas(S, l, -seen.reshape(1, 6))).all()
         u = p[0, 1] - p[0, 0]
         cos = abs((p[0] - S[:3]) @ u) / np.linalg.norm(p[0] - S[:3], axis=1) / np.linalg.norm(u)
-        np.testing.assert_allclose(np.cos(segments.crossing_angles(S, p, seen.reshape(1, 6)))[0], cos, atol=1e-9)
+        np.testing.assert_allclose(np.cos(lines.crossing_angles(S, p, seen.reshape(1, 6)))[0], cos, atol=1e-9)
 
 
 def test_a_ray_beside_a_line_counts_at_the_nearest_point_and_one_along_it_nowhere() -> None:
     l = np.array([[0.0, -6, 0, 0, 0, 3]])  # parallel to z, through (2, 0, 0)
     T = np.array([0.0, 1, 0, 0, 0, 0, 1])
-    np.testing.assert_allclose(segments.pluecker_endpoints(l, np.array([[-1.0, 4]]))[0], [[[2, 0, -1], [2, 0, 4]]])
-    t = segments.pluecker_abscissas(T, l, np.array([[1.0, 0, 1, 0, 0, 5]]))
+    np.testing.assert_allclose(lines.pluecker_endpoints(l, np.array([[-1.0, 4]]))[0], [[[2, 0, -1], [2, 0, 4]]])
+    t = KINDS["pluecker"].abscissas(T, l, np.array([[1.0, 0, 1, 0, 0, 5]]))
     np.testing.assert_allclose(t, [[2, np.nan]])
 
 
 def test_segments_grow_unless_their_ends_are_uncertain_or_seen_along_the_line() -> None:
     old, seen = np.array([[0.0, 1]] * 4), np.array([[0.5, -1], [1.5, 0.5], [0.2, 0.8], [np.nan, 9]])
     grown = [[-1, 1], [0, 1.5], [0, 1], [0, 1]]
-    np.testing.assert_allclose(segments.extended(old, seen), grown)
+    np.testing.assert_allclose(lines.extended(old, seen), grown)
     sigma_px = np.array([12.0, 8, 12, 12])
-    np.testing.assert_allclose(segments.extended(old, seen, sigma_px), [[-1, 0.5], [0, 1.5], [0.2, 0.8], [0, 1]])
-    np.testing.assert_allclose(segments.extended(old, seen, sigma_px, switch_px=20), grown)
+    np.testing.assert_allclose(lines.extended(old, seen, sigma_px), [[-1, 0.5], [0, 1.5], [0.2, 0.8], [0, 1]])
+    np.testing.assert_allclose(lines.extended(old, seen, sigma_px, switch_px=20), grown)
     angles = np.radians([[50.0, 80], [50, 40], [90, 90], [90, 90]])
-    np.testing.assert_allclose(segments.extended(old, seen, angles=angles), [[-1, 1], [0, 1], [0, 1], [0, 1]])
+    np.testing.assert_allclose(lines.extended(old, seen, angles=angles), [[-1, 1], [0, 1], [0, 1], [0, 1]])
 
 
 def seen(p1: Any, p2: Any, least: float = 10.0, T: Array = LOOKING_ALONG_X) -> tuple[bool, Array]:
     points = np.array([p1, p2], dtype=float)
-    visible, pixels = segments.visible_segment(T, points[:1], points[1:], K, SIZE, least)
+    visible, pixels = lines.visible_segment(T, points[:1], points[1:], K, SIZE, least)
     return bool(visible[0]), pixels[0]
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from kalmark.geometry import frames3d, rotations
-from kalmark.models import cameras, lines, segments
+from kalmark.models import cameras, lines
 from toolbox import Array, frame, k_of, recorded
-from toolbox_lines import ORDER
+from toolbox_lines import ORDER, line
 
 RUNS = {"c_idpLin_small": "inverse_depth_line", "c_plkLin_small": "pluecker", "c_hmgLin_small": "homogeneous_line"}
 
@@ -39,7 +39,7 @@ def test_lines_start_and_are_seen_and_measured_as_recorded(run: str, name: str, 
         robot, seen = listed(now["rob"])[0], listed(listed(now["rob"])[0]["sen"])[0]
         for new in listed(seen["log"]["init"]):
             ends = cameras.back_project_pinhole(np.reshape(new["y"], (2, 2)), k, np.zeros(0))[0].reshape(1, 6)
-            l = getattr(lines, f"{name}_from_view")(camera_pose(seen["x_corr"], mount), ends, np.array(prior))[0]
+            l = line(name).of(camera_pose(seen["x_corr"], mount), ends, np.array(prior))[0]
             np.testing.assert_allclose(l[0, ORDER[name]], new["l"], atol=1e-11)
             started += 1
         if before is None:
@@ -47,11 +47,11 @@ def test_lines_start_and_are_seen_and_measured_as_recorded(run: str, name: str, 
         T, ids = camera_pose(robot["x_pred"], mount), np.atleast_1d(before["lmks"]["lmk"])
         at, t = np.reshape(before["lmks"]["range"], (len(ids), -1)), np.reshape(before["lmks"]["t"], (len(ids), 2))
         l = X[at - 1, now["frame"] - 2][:, ORDER[name]]
-        p = getattr(segments, f"{name}_endpoints")(l, t.astype(float))[0]
-        visible = segments.visible_segment(T, p[:, 0].copy(), p[:, 1].copy(), k, size, least)[0]
+        p = line(name).endpoints(l, t.astype(float))[0]
+        visible = lines.visible_segment(T, p[:, 0].copy(), p[:, 1].copy(), k, size, least)[0]
         np.testing.assert_array_equal(np.sort(ids[visible]), np.sort(np.atleast_1d(seen["log"]["vis"])))
         first = listed(seen["log"]["corr"])[0]  # the others are taken at states that are not recorded
-        v = getattr(lines, f"{name}_seen_from")(T, l[ids == first["lmk"]])[0]
+        v = line(name).seen_from(T, l[ids == first["lmk"]])[0]
         z = lines.segment_innovation(v, np.array(first["y"])[None], k)[1][0]
         np.testing.assert_allclose(-z, first["z"], atol=1e-11)
         measured, looked = measured + 1, looked + len(ids)

@@ -15,7 +15,7 @@ from kalmark.geometry.frames3d import compose, move
 from kalmark.geometry.rotations import from_euler, multiply
 from kalmark.geometry.spaces import MOUNTS
 from kalmark.models.landmarks import BUILT_IN, LINES
-from kalmark.models.motion3d import coast
+from kalmark.models.motion import coast
 from kalmark.models.pointwise import jacobian
 
 FORWARD = from_euler(np.radians([-90.0, 0.0, -90.0]))[0]  # a camera that looks along the robot's x
@@ -222,7 +222,9 @@ def test_a_robot_at_constant_velocity_coasts_from_scan_to_scan() -> None:
         v = POINT.seen_from(truth[:7], RING)[0]
         y = lidar.sensor.expect(v)[0] + rng.normal(size=v.shape) * [0.1, 0.02, 0.02]
         slam.process(km.Scan(0.1 * t, "r", "eye", y, range(len(RING))))
-        truth = coast(truth, np.append(rng.normal(size=3), rng.normal(size=3)) * 0.02 * np.sqrt(0.1), 0.1)[0]
+        truth = coast(truth, np.append(rng.normal(size=3), rng.normal(size=3)) * 0.02 * np.sqrt(0.1), np.zeros(0), 0.1)[
+            0
+        ]
     assert slam.mean("r").shape == (13,) and slam.covariance("r").shape == (12, 12)
     assert np.linalg.norm(slam.mean("r")[7:10] - truth[7:10]) < 0.15
     slam.process(km.Control(6.0, "r", np.array([0.3, 0, 0, 0, 0, 0])))

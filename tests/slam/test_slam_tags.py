@@ -15,9 +15,8 @@ from kalmark.errors import DivergedError, KalmarkError
 from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import from_euler, multiply
-from kalmark.management import far
-from kalmark.management.mirrored import AGAIN, settle
-from kalmark.models.sensors_camera import TELLING
+from kalmark.management.tags import AGAIN, settle
+from kalmark.models.sensors import TELLING
 from kalmark.results.batch import tag_problem
 from kalmark.tracks.track import Pending
 
@@ -107,7 +106,7 @@ def back_from(seed: int) -> float:
 def test_tags_far_from_where_they_are_expected_bring_the_robot_back(monkeypatch: pytest.MonkeyPatch) -> None:
     nees = [back_from(seed) for seed in range(40)]
     assert max(nees) < 30 and 4 < np.mean(nees) < 8  # six degrees of freedom
-    monkeypatch.setattr(far, "approach", lambda *_: None)
+    monkeypatch.setattr("kalmark.management.tags.approach", lambda *_: None)
     assert any(back_from(seed) > 100 for seed in range(40)), "the slopes of the pixels lead astray"
 
 

@@ -80,8 +80,9 @@ def test_robots_in_mid_interval_removed_slots_and_new_names_resume_bit_for_bit(
 
 
 def test_limits_and_parameters_survive_whether_finite_or_not(tmp_path: Path) -> None:
+    laser = km.sensors.RangeBearing(0.1, 0.02, sigma_range_rel=0.01, range_min_m=0.5, range_max_m=7.5, fov_rad=1.25)
     sensors = {
-        "near": km.Mount(km.sensors.RangeBearing(0.1, 0.02, 0.01, 0.5, 7.5, 1.25), at=(0.1, 0.2, 0.3)),
+        "near": km.Mount(laser, at=(0.1, 0.2, 0.3)),
         "far": km.Mount(km.sensors.Range(np.float64(0.3), range_min_m=1.5)),
     }
     motion = km.motion.Ackermann(2.5, 0.4, sigma_along_m_per_sqrt_s=0.01)

@@ -5,9 +5,9 @@ What an association may ask and answer is in `protocol`; a user's own one needs 
 
 from __future__ import annotations
 
-from kalmark.association.gated import GlobalAssignment, JointCompatibility, NearestNeighbour
-from kalmark.association.identity import ByIdentity
-from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Association, Decision, Query
+from kalmark.association.gated import ByIdentity, GlobalAssignment, JointCompatibility, NearestNeighbour
+from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Association, Decision
+from kalmark.association.query import Query
 from kalmark.association.weighing import Automatic, Averaged, Cliques, Sampled
 
 __all__ = [

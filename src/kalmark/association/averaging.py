@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.association.protocol import Decision, Mixture
 from kalmark.errors import EventError
 from kalmark.events import Id, Scan, when
@@ -15,9 +15,6 @@ from kalmark.filter.estimators import Averaging, Estimator, Update
 from kalmark.filter.map import Map
 from kalmark.report import Observation
 from kalmark.tracks.scan import ScanContext
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
 MOST = 20  # matchings
 WORTH = 1e-3  # of the likeliest one's weight

@@ -1,24 +1,24 @@
-"""Associations that pair what fits one by one: individual gates, then each for itself, as an assignment, or jointly."""
+"""Associations by the ids of the log, or by what fits: each for itself, as an assignment, or jointly."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
-from kalmark.association.joint import best_matching
-from kalmark.association.protocol import NEW, Answer, Decision, Matched, Mixture, Query
-from kalmark.declare import Count, Probability, declared, register
+from kalmark.arrays import Array, Index
+from kalmark.association.matchings import best_matching
+from kalmark.association.protocol import NEW, Answer, Decision, Matched, Mixture
+from kalmark.association.query import Query
+from kalmark.declare import Count, Probability, Within, declared, register
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-
 FORBIDDEN = 1e6  # times the gate: a pair outside
+
+Gate = float | Literal["off", "default"]
 
 
 @declared
@@ -51,11 +51,6 @@ class Gated:
             query.learn(0.0, float(len(open_)))
             return answers
         pairs, reasons, mixed, known = self.match(query, open_, names, d2, gate)
-        if known is None and pairs.min() >= 0:
-            for row, (k, pair) in enumerate(zip(open_.tolist(), pairs.tolist(), strict=True)):
-                answers[k] = names[pair], reasons.get(row, "")
-            query.learn(float(len(open_)), 0.0)
-            return answers
         mixture = None if mixed is None else Mixture(open_, names, mixed)
         nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
         for row, (k, pair, d) in enumerate(zip(open_.tolist(), pairs.tolist(), least.tolist(), strict=True)):
@@ -76,19 +71,25 @@ class Gated:
         query.learn(float(told.sum()), float((1.0 - told).sum()))
         return answers
 
-    def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
+    def near(self, query: Query, open_: Index, gate: float, nearest: int = 0) -> tuple[list[Id], Array]:
         """Return the candidates and their squared distances d2 (K, L) from the observations `open_`."""
-        return self._near(query, open_, self.nearest)
-
-    def _near(self, query: Query, open_: Index, nearest: int) -> tuple[list[Id], Array]:
         named = set(query.ids)
-        names = [c for c in query.candidates(nearest, self.farther) if c not in named]
+        names = [c for c in query.candidates(nearest or self.nearest, self.farther) if c not in named]
         d2 = query.distances(names) if names else np.zeros((len(query.ids), 0))
         return names, np.fmin(d2 if len(open_) == len(d2) else d2[open_], np.inf)  # NaN is as far as can be
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Return the number of the name paired with each row of d2 (K, L), -1 for none or its like, and why."""
         raise NotImplementedError
+
+
+def assigned(d2: Array, gate: float) -> Index:
+    """Return the column for each row of d2 (K, L) whose sum is least, -1 for none, which counts as the gate."""
+    count = d2.shape[1]
+    cost = np.full((len(d2), count + len(d2)), gate)
+    cost[:, :count] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
+    columns = linear_sum_assignment(cost)[1]
+    return np.where(columns < count, columns, -1)
 
 
 @register("association", "nearest")
@@ -125,11 +126,7 @@ class GlobalAssignment(Gated):
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair by the linear assignment of the whole scan, of d2 (K, L)."""
-        count = len(names)
-        cost = np.full((len(d2), count + len(d2)), gate)
-        cost[:, :count] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
-        columns = linear_sum_assignment(cost)[1]
-        return Matched(np.where(columns < count, columns, -1), {})
+        return Matched(assigned(d2, gate), {})
 
 
 @register("association", "jcbb")
@@ -160,3 +157,28 @@ class JointCompatibility(Gated):
         pairs[order] = np.where(chosen >= 0, columns[chosen], -1)
         why = "it does not fit with the others" + ("" if finished else f", as far as {self.most_nodes} nodes tell")
         return Matched(pairs, dict.fromkeys(range(len(d2)), why))
+
+
+@register("association", "identity")
+class ByIdentity:
+    """Trust the ids of the log.
+
+    An id that is not in the map yet is a new landmark.
+
+    `gate` is the probability with which a right pair is let through; "off" fuses all; "default" is the estimator's own:
+    the guide's 3 sigma for `Ekf`, off for the others.
+    """
+
+    gate: Annotated[Gate, Within(gt=0, lt=1), "Refuse observations outside this probability; or off, or default."] = (
+        "default"
+    )
+
+    def threshold(self, m: int, default: float) -> float:
+        """Return the gate as a squared Mahalanobis distance."""
+        if self.gate == "default":
+            return default
+        return math.inf if self.gate == "off" else chi2_gate(float(self.gate), m)
+
+    def associate(self, query: Query) -> list[Decision]:
+        """Answer with the ids as they are; the slam knows which are new."""
+        return [(i, "") if i is not None else (None, "no id in the log") for i in query.ids]

@@ -10,35 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from kalmark.association.matchings import Places, matchings
+from kalmark.arrays import Array, Flags, Index
+from kalmark.association.matchings import matchings
+from kalmark.association.query import Candidates
 from kalmark.geometry.gaussian import gate as chi2_gate
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 Experience = tuple[float, float]
 
 WELL_KNOWN = math.log(16.0)  # |Z| / |R| up to which the robot knows where a landmark is
 SLACK = 1  # pairs that a matching may have less than the largest
 KEEP = 200  # matchings to look at
-
-
-class Together(Protocol):
-    """Landmarks asked about jointly."""
-
-    def places(self) -> Places:
-        """Return where all observations and all landmarks are, with covariances."""
-
-    def fit(self, rows: Index, columns: Index) -> tuple[float, float]:
-        """Return the joint d2 and log |Z| of pairs of an observation `rows` (M,) and a landmark `columns` (M,)."""
-
-    def log_volume_ratio(self, rows: Index, columns: Index) -> Array:
-        """Return log |Z| / |R| (M,) of each pair: twice the information gain of the measurement."""
 
 
 class Posterior(NamedTuple):
@@ -69,11 +54,6 @@ class Posterior(NamedTuple):
         return f"ambiguous: {said}" + ("" if self.finished else ", and the search was not finished")
 
 
-def log_volume_ratio(Z: Array, R: Array) -> Array:
-    """Return log |Z| / |R| (M,): twice the information that a measurement gives."""
-    return np.asarray(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(R)[1])
-
-
 def expected_in_gate(d2: Array, gate: float, p: int) -> Array:
     """Return how many landmarks there are to each observation in a volume as large as its gate.  d2 is (K, L)."""
     known = np.isfinite(d2)
@@ -82,7 +62,7 @@ def expected_in_gate(d2: Array, gate: float, p: int) -> Array:
 
 
 def agreeing(
-    together: Together, open_: Index, d2: Array, near: Flags, gate: float, most: int
+    together: Candidates, open_: Index, d2: Array, near: Flags, gate: float, most: int
 ) -> tuple[Index, bool]:  # fmt: skip
     """Return the largest matchings (N, K) whose pairs agree with each other, and whether the search was finished."""
     order = np.argsort(near.sum(axis=1), kind="stable")
@@ -99,7 +79,7 @@ def agreeing(
 
 
 def posterior(
-    together: Together, open_: Index, d2: Array, near: Flags, p: int, gate: float, most: int, experience: Experience
+    together: Candidates, open_: Index, d2: Array, near: Flags, p: int, gate: float, most: int, experience: Experience
 ) -> Posterior:
     """Return what is known of the matchings of the observations `open_` with the landmarks.
 
@@ -125,7 +105,7 @@ def posterior(
 
 
 def _score(
-    together: Together, open_: Index, pairs: Index, density: Array, p: int, gate: float, experience: Experience
+    together: Candidates, open_: Index, pairs: Index, density: Array, p: int, gate: float, experience: Experience
 ) -> float:
     """Return the logarithm of how likely a matching (K,) is, up to a constant."""
     rows = np.flatnonzero(pairs >= 0)
@@ -144,7 +124,7 @@ def _log_share(count: int, of: int, experience: Experience) -> float:
     return math.lgamma(count + a + 0.5) + math.lgamma(of - count + b + 0.5)
 
 
-def added(together: Together, open_: Index, pairs: Index, row: int, columns: Index) -> float:
+def added(together: Candidates, open_: Index, pairs: Index, row: int, columns: Index) -> float:
     """Return the least that a pair of the observation `row` adds to the d2 of a matching (K,)."""
     rows = np.flatnonzero(pairs >= 0)
     before = together.fit(open_[rows], pairs[rows])[0]
@@ -154,7 +134,7 @@ def added(together: Together, open_: Index, pairs: Index, row: int, columns: Ind
     return min(d2, default=np.inf) - before
 
 
-def _log_density(together: Together, open_: Index, d2: Array, near: Flags, p: int) -> Array:
+def _log_density(together: Candidates, open_: Index, d2: Array, near: Flags, p: int) -> Array:
     """Return the logarithm of the density of landmarks about each observation, in its units."""
     from scipy.special import gammaln
 

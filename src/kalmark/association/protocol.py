@@ -9,14 +9,10 @@ from __future__ import annotations
 from enum import Enum
 from typing import NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
-import numpy.typing as npt
-
-from kalmark.association.posterior import Posterior, Together
+from kalmark.arrays import Array, Index
+from kalmark.association.posterior import Posterior
+from kalmark.association.query import Query
 from kalmark.events import Id
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
 
 class Answer(Enum):
@@ -50,36 +46,6 @@ class Mixture:
 Decision = tuple[Id | Answer | Mixture | None, str]
 
 
-class Query(Protocol):
-    """What an association may ask about a scan."""
-
-    ids: tuple[Id | None, ...]
-
-    def candidates(self, nearest: int = 4, farther: float = 10.0) -> list[Id]:
-        """Return the landmarks this sensor could have seen: of each place the nearest ones, none so much farther."""
-
-    def distances(self, candidates: list[Id]) -> Array:
-        """Return the squared Mahalanobis distances (K, L) of the observations from the candidates."""
-
-    def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
-        """Return the innovations z (M, p) of pairs of an observation and a landmark, and their Z (M p, M p)."""
-
-    def together(self, names: list[Id]) -> Together | None:
-        """Return landmarks to be asked about jointly, None where that cannot be."""
-
-    def dof(self) -> int:
-        """Return the size m of one measurement."""
-
-    def experience(self) -> tuple[float, float]:
-        """Return how many of the last observations without ids were of landmarks of the map, and how many were not."""
-
-    def learn(self, known: float, unknown: float) -> None:
-        """Remember how many observations without ids are likely of landmarks of the map, and how many are not."""
-
-    def key(self) -> tuple[int, ...]:
-        """Return numbers, at least 0, that tell this scan from all others."""
-
-
 class Matched(NamedTuple):
     """The number of the landmark paired with each observation (K,), or the value of an `Answer`; some with reasons.
 
@@ -105,42 +71,30 @@ class Association(Protocol):
 
 
 @runtime_checkable
-class WeighsMatchings(Protocol):
-    """An association that may weigh matchings of the whole scan, and so says itself what is ambiguous."""
-
-    @property
-    def weighs(self) -> bool:
-        """Whether it does."""
+class _Weighs(Protocol):
+    weighs: bool
 
 
 @runtime_checkable
-class AveragesMatchings(Protocol):
-    """An association that may answer with a `Mixture`; the estimator then has to be able to average."""
-
-    @property
-    def averages(self) -> bool:
-        """Whether it does."""
+class _Averages(Protocol):
+    averages: bool
 
 
 @runtime_checkable
-class GatesNew(Protocol):
-    """An association with the probability with which an observation of a known landmark is not taken for a new one."""
-
-    @property
-    def new_gate(self) -> float:
-        """The probability."""
+class _GatesNew(Protocol):
+    new_gate: float
 
 
 def weighs(association: Association) -> bool:
-    """Return whether an association weighs matchings; one that does not say so does not."""
-    return isinstance(association, WeighsMatchings) and association.weighs
+    """Return whether an association weighs whole matchings, and so says itself what is ambiguous; by default not."""
+    return isinstance(association, _Weighs) and association.weighs
 
 
 def averages(association: Association) -> bool:
-    """Return whether an association averages over matchings; one that does not say so does not."""
-    return isinstance(association, AveragesMatchings) and association.averages
+    """Return whether an association may answer with a `Mixture`, which the estimator has to average; by default not."""
+    return isinstance(association, _Averages) and association.averages
 
 
 def new_gate(association: Association) -> float:
     """Return the probability of the gate beyond which an observation is of a new landmark, by default 0.99999."""
-    return association.new_gate if isinstance(association, GatesNew) else 0.99999
+    return association.new_gate if isinstance(association, _GatesNew) else 0.99999

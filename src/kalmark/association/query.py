@@ -5,10 +5,9 @@ from __future__ import annotations
 from zlib import crc32
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.association.matchings import Places
-from kalmark.association.posterior import log_volume_ratio
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import P_AT
@@ -19,14 +18,16 @@ from kalmark.report import Compared
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-
 LIMITS = 30, 1e-2  # linearisations of a matching, and the sigmas by which the last one moves anything
 
 
-class ScanQuery:
-    """One scan before it is fused: the association's window on the map.
+def log_volume_ratio(Z: Array, R: Array) -> Array:
+    """Return log |Z| / |R| (M,): twice the information that a measurement gives."""
+    return np.asarray(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(R)[1])
+
+
+class Query:
+    """One scan before it is fused: what an association may ask about it.
 
     `learned` are the numbers of observations without ids that are likely of landmarks of the map, and that are not.
     """
@@ -134,7 +135,7 @@ class ScanQuery:
         add_blocks(Z, R)
         return z, Z
 
-    def together(self, names: list[Id]) -> JointCandidates | None:
+    def together(self, names: list[Id]) -> Candidates | None:
         """Return landmarks to be asked about jointly; None if of several kinds, or if this sensor gives no places."""
         scan = self.scan
         if not scan.channel.gives_places or len({scan.tracks.sorts[name] for name in names}) > 1:
@@ -146,10 +147,10 @@ class ScanQuery:
         slots, model = scan.tracks.slots_of(names), scan.channel.models[scan.tracks.sorts[names[0]]]
         if read is None:
             read = scan.map.marginal(scan.robot, scan.channel.mount, slots)
-        return JointCandidates(scan, model, slots, read)
+        return Candidates(scan, model, slots, read)
 
 
-class JointCandidates:
+class Candidates:
     """Landmarks of one kind that a scan may show, asked about jointly; `read` is a joint marginal that has them."""
 
     def __init__(self, scan: ScanContext, model: ObservationModel, slots: Index, read: Marginal) -> None:

@@ -16,15 +16,13 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.association.protocol import DEFERRED, Decision
-from kalmark.association.query import ScanQuery
+from kalmark.association.query import Query
 from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.tracks.track import Tracks
-
-Array = npt.NDArray[np.float64]
 
 NEIGHBOURS = 4  # by whose distance the density of landmarks is estimated
 LEAST_M = 0.1  # they are not taken to stand closer than this
@@ -97,7 +95,7 @@ def doubtful(found: LogRatios, given: int, odds: float) -> list[int]:
     return out
 
 
-def accepted(query: ScanQuery, decisions: list[Decision], odds: float) -> list[Decision]:
+def accepted(query: Query, decisions: list[Decision], odds: float) -> list[Decision]:
     """Return the decisions, of pairs that are not accepted at these odds that they are deferred.
 
     Observations with ids are trusted.

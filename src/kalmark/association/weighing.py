@@ -6,19 +6,15 @@ import math
 from typing import Annotated, ClassVar
 
 import numpy as np
-import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
-from kalmark.association.gated import FORBIDDEN, Gated, GlobalAssignment, JointCompatibility
+from kalmark.arrays import Array, Flags, Index
+from kalmark.association.gated import Gated, GlobalAssignment, JointCompatibility, assigned
 from kalmark.association.posterior import WELL_KNOWN, Posterior, added, agreeing, expected_in_gate, posterior
-from kalmark.association.protocol import Answer, Matched, Query
+from kalmark.association.protocol import Answer, Matched
+from kalmark.association.query import Query
 from kalmark.declare import Count, Within, declared, register
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 NEW, DEFERRED, MIXTURE, REMAP = (each.value for each in (Answer.NEW, Answer.DEFERRED, Answer.MIXTURE, Answer.REMAP))
 
@@ -46,13 +42,12 @@ class Weighing(Gated):
         """Return that any pair of a matching is fused: it was tested as a whole."""
         return math.inf
 
-    def near(self, query: Query, open_: Index, gate: float) -> tuple[list[Id], Array]:
+    def near(self, query: Query, open_: Index, gate: float, nearest: int = 0) -> tuple[list[Id], Array]:
         """Return candidates, so many that each observation has one outside its gate, and d2 (K, L)."""
-        nearest = self.nearest
-        names, d2 = self._near(query, open_, nearest)
-        while nearest < WIDEST and ((d2 <= gate).sum(axis=1) >= nearest).any():
-            nearest *= 4
-            names, d2 = self._near(query, open_, nearest)
+        nearest = nearest or self.nearest
+        names, d2 = super().near(query, open_, gate, nearest)
+        if nearest < WIDEST and ((d2 <= gate).sum(axis=1) >= nearest).any():
+            return self.near(query, open_, gate, 4 * nearest)
         return names, d2
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
@@ -84,10 +79,8 @@ class Weighing(Gated):
 
     def remapped(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:
         """Pair what a lost robot sees with what it has just seen, at these d2 (K, L); the rest is strange to it."""
-        cost = np.full((len(d2), d2.shape[1] + len(d2)), gate)
-        cost[:, : d2.shape[1]] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
-        columns = linear_sum_assignment(cost)[1]
-        pairs = np.where(columns < d2.shape[1], columns, np.where(d2.min(axis=1) > far, REMAP, DEFERRED))
+        pairs = assigned(d2, gate)
+        pairs = np.where(pairs >= 0, pairs, np.where(d2.min(axis=1) > far, REMAP, DEFERRED))
         return Matched(pairs, reasons, None, np.full(len(d2), np.nan))
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:

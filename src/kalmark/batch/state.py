@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames, frames3d
@@ -19,9 +19,7 @@ from kalmark.geometry.rotations import left_jacobian_inverse
 from kalmark.geometry.spaces import SE2, SE3, Space, Table, retract
 from kalmark.models.observe import linearize
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
+Ints = Index
 
 POSES, LANDMARKS, FIRST_MOUNT = range(3)  # the first two groups; from the third on each group is one mount
 POSE_SPACES: dict[int, Space] = {3: SE2, 7: SE3}  # by their numbers

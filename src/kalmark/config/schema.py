@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
+from kalmark.arrays import Array
 from kalmark.config.sections import (
     BASES,
     Choice,
@@ -28,8 +28,6 @@ from kalmark.config.tree import OVERRIDE, name_of
 from kalmark.declare import classes, register
 from kalmark.errors import ConfigError
 from kalmark.geometry.rotations import from_euler
-
-Array = npt.NDArray[np.float64]
 
 Motion = Annotated[Any, Choice("motion")]
 Estimator = Annotated[Any, Choice("estimator", default="invariant")]

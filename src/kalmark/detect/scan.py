@@ -7,15 +7,12 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.declare import Limit, NotNegative, Within, declared
 from kalmark.errors import EventError
 from kalmark.events import Scan, when
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
 TURN = 2.01 * math.pi
 Acute = Annotated[float, Within(gt=0, lt=90)]

@@ -6,14 +6,12 @@ from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.declare import Positive, register
 from kalmark.errors import EventError, ModelError
 from kalmark.events import Scan, when
-from kalmark.models.sensors_camera import TagCorners
-
-Array = npt.NDArray[np.float64]
+from kalmark.models.sensors import TagCorners
 
 Family = Literal["16h5", "25h9", "36h10", "36h11"]
 

@@ -14,17 +14,13 @@ from typing import Any
 
 import llvmlite.binding
 import numpy as np
-import numpy.typing as npt
 import scipy
 from numba import types
 from numba.extending import get_cython_function_address
 from threadpoolctl import ThreadpoolController
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 def _load_blas(module: str) -> str:

@@ -8,12 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import inv_observe, move, observe
-
-Array = npt.NDArray[np.float64]
 
 
 class TextbookSlam:

@@ -2,17 +2,7 @@
 
 from kalmark.geometry import directions, frames3d, rotations
 from kalmark.geometry.angles import V, V_inverse, rotation, wrap
-from kalmark.geometry.frames import (
-    compose,
-    from_frame,
-    inv_observe,
-    inv_scan,
-    inverse,
-    move,
-    observe,
-    scan,
-    to_frame,
-)
+from kalmark.geometry.frames import compose, from_frame, inv_observe, inv_scan, inverse, move, observe, scan, to_frame
 from kalmark.geometry.gaussian import (
     between,
     bhattacharyya,

@@ -6,11 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
-
-Array = npt.NDArray[np.float64]
 
 
 @compiled

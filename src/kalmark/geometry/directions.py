@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
-
-Array = npt.NDArray[np.float64]
 
 
 @compiled

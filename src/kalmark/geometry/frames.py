@@ -7,15 +7,14 @@ Value first, then Jacobians in argument order; a Jacobian ``OUT_in`` is d OUT / 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.angles import wrap
-
-Array = npt.NDArray[np.float64]
 
 
 @compiled
@@ -97,42 +96,31 @@ def inv_scan_many(y: Array) -> tuple[Array, Array]:
     return p, P_y
 
 
-def _pose(f: Any) -> Array:
-    return np.ascontiguousarray(f, dtype=np.float64)
-
-
-def _rows(p: Any) -> tuple[Array, bool]:
-    """Return points as (K, 2) and whether a single one was given."""
-    p = np.ascontiguousarray(p, dtype=np.float64)
-    return (p.reshape(1, 2), True) if p.ndim == 1 else (p, False)
-
-
-def _back(single: bool, *arrays: Array) -> tuple[Array, ...]:
-    return tuple(a[0] for a in arrays) if single else arrays
+def one_or_many(function: Callable[..., tuple[Array, ...]], *given: Any) -> Any:
+    """Call a function of K rows, its last argument (K, n), or of a single one (n,) given without that dimension."""
+    *frame, p = (np.ascontiguousarray(each, dtype=np.float64) for each in given)
+    found = function(*frame, np.atleast_2d(p))
+    return found if p.ndim == 2 else tuple(each[0] for each in found)
 
 
 def to_frame(f: Any, p: Any) -> tuple[Array, Array, Array]:
     """Express global points p (2,) or (K, 2) in frame F: pf, PF_f, PF_p.  [S] (56)."""
-    rows, single = _rows(p)
-    return _back(single, *to_frame_many(_pose(f), rows))  # type: ignore[return-value]
+    return one_or_many(to_frame_many, f, p)
 
 
 def from_frame(f: Any, pf: Any) -> tuple[Array, Array, Array]:
     """Express points pf (2,) or (K, 2) of frame F globally: pw, PW_f, PW_pf.  [S] (55)."""
-    rows, single = _rows(pf)
-    return _back(single, *from_frame_many(_pose(f), rows))  # type: ignore[return-value]
+    return one_or_many(from_frame_many, f, pf)
 
 
 def scan(p: Any) -> tuple[Array, Array]:
     """Measure range (m) and bearing (rad) of points (2,) or (K, 2) of the sensor's frame: y, Y_p.  [S] (61)."""
-    rows, single = _rows(p)
-    return _back(single, *scan_many(rows))  # type: ignore[return-value]
+    return one_or_many(scan_many, p)
 
 
 def inv_scan(y: Any) -> tuple[Array, Array]:
     """Turn ranges and bearings (2,) or (K, 2) into points of the sensor's frame: p, P_y.  [S] (62)."""
-    rows, single = _rows(y)
-    return _back(single, *inv_scan_many(rows))  # type: ignore[return-value]
+    return one_or_many(inv_scan_many, y)
 
 
 def observe(r: Any, p: Any) -> tuple[Array, Array, Array]:
@@ -158,5 +146,5 @@ def inv_observe(r: Any, y: Any) -> tuple[Array, Array, Array]:
 def move(r: Any, u: Any, n: Any) -> tuple[Array, Array, Array]:
     """Move robot r by u + n = (forward, turn), forward along the old heading: ro, RO_r, RO_n (3, 2).  [S] (59)-(60)."""
     forward, turn = np.asarray(u, dtype=np.float64) + np.asarray(n, dtype=np.float64)
-    ro, RO_r, RO_d = compose(_pose(r), np.array([forward, 0.0, turn]))
+    ro, RO_r, RO_d = compose(np.ascontiguousarray(r, dtype=np.float64), np.array([forward, 0.0, turn]))
     return ro, RO_r, RO_d[:, [0, 2]]

@@ -10,23 +10,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
-from kalmark.geometry.rotations import (
-    conjugate,
-    exp,
-    from_euler,
-    left_jacobian,
-    log,
-    matrix,
-    multiply,
-    normalised,
-    skew,
-    to_euler,
-)
-
-Array = npt.NDArray[np.float64]
+from kalmark.geometry import rotations
+from kalmark.geometry.frames import one_or_many
 
 
 @compiled
@@ -34,7 +22,7 @@ def plus(a: Array, d: Array) -> Array:
     """Return the frame a moved by the error d (6,): p + d_p, Exp(d_theta) Q."""
     b = np.empty(7)
     b[:3] = a[:3] + d[:3]
-    b[3:] = multiply(exp(d[3:]), a[3:])
+    b[3:] = rotations.multiply(rotations.exp(d[3:]), a[3:])
     return b
 
 
@@ -43,20 +31,20 @@ def minus(b: Array, a: Array) -> Array:
     """Return the error d (6,) with a plus d = b, its rotation at most pi."""
     d = np.empty(6)
     d[:3] = b[:3] - a[:3]
-    d[3:] = log(multiply(b[3:], conjugate(a[3:])))
+    d[3:] = rotations.log(rotations.multiply(b[3:], rotations.conjugate(a[3:])))
     return d
 
 
 @compiled
 def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
     """Return c = a o b (frame b given in frame a), C_a (6, 6) and C_b (6, 6).  [S] (55) in space."""
-    Q = matrix(a[3:])
+    Q = rotations.matrix(a[3:])
     p = Q @ b[:3].copy()
     c = np.empty(7)
     c[:3] = a[:3] + p
-    c[3:] = multiply(a[3:], b[3:])
+    c[3:] = rotations.multiply(a[3:], b[3:])
     C_a, C_b = np.eye(6), np.zeros((6, 6))
-    C_a[:3, 3:] = -skew(p)
+    C_a[:3, 3:] = -rotations.skew(p)
     C_b[:3, :3] = Q
     C_b[3:, 3:] = Q
     return c, C_a, C_b
@@ -65,14 +53,14 @@ def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
 @compiled
 def inverse(a: Array) -> tuple[Array, Array]:
     """Return the inverse frame b, with b o a = identity, and B_a (6, 6)."""
-    q = normalised(conjugate(a[3:]))
-    Q = matrix(q)
+    q = rotations.normalised(rotations.conjugate(a[3:]))
+    Q = rotations.matrix(q)
     b = np.empty(7)
     b[:3] = -(Q @ a[:3].copy())
     b[3:] = q
     B_a = np.zeros((6, 6))
     B_a[:3, :3] = -Q
-    B_a[:3, 3:] = -(Q @ skew(a[:3]))
+    B_a[:3, 3:] = -(Q @ rotations.skew(a[:3]))
     B_a[3:, 3:] = -Q
     return b, B_a
 
@@ -82,9 +70,9 @@ def move(a: Array, u: Array) -> tuple[Array, Array, Array]:
     """Move frame a by u = (dx, dy, dz, rotation vector) of its own axes: b, B_a (6, 6), B_u (6, 6).  [TB] `odo3`."""
     step = np.empty(7)
     step[:3] = u[:3]
-    step[3:] = exp(u[3:])
+    step[3:] = rotations.exp(u[3:])
     b, B_a, B_step = compose(a, step)
-    B_step[3:, 3:] = B_step[3:, 3:].copy() @ left_jacobian(u[3:])
+    B_step[3:, 3:] = B_step[3:, 3:].copy() @ rotations.left_jacobian(u[3:])
     return b, B_a, B_step
 
 
@@ -93,7 +81,7 @@ def from_euler_pose(e: Array) -> tuple[Array, Array]:
     """Return the frame of (x, y, z, roll, pitch, yaw) and F_e (6, 6)."""
     f, F_e = np.empty(7), np.eye(6)
     f[:3] = e[:3]
-    f[3:], F_e[3:, 3:] = from_euler(e[3:])
+    f[3:], F_e[3:, 3:] = rotations.from_euler(e[3:])
     return f, F_e
 
 
@@ -102,7 +90,7 @@ def to_euler_pose(f: Array) -> tuple[Array, Array]:
     """Return (x, y, z, roll, pitch, yaw) of a frame and E_f (6, 6)."""
     e, E_f = np.empty(6), np.eye(6)
     e[:3] = f[:3]
-    e[3:], E_f[3:, 3:] = to_euler(f[3:])
+    e[3:], E_f[3:, 3:] = rotations.to_euler(f[3:])
     return e, E_f
 
 
@@ -120,7 +108,7 @@ def turned_rates(Q: Array, d: Array) -> Array:
 @compiled
 def to_frame_many(f: Array, p: Array) -> tuple[Array, Array, Array]:
     """Express K global points (K, 3) in frame F: pf, PF_f (K, 3, 6), PF_p (K, 3, 3).  [S] (56) in space."""
-    Q = matrix(f[3:]).T.copy()
+    Q = rotations.matrix(f[3:]).T.copy()
     k = len(p)
     pf, PF_f, PF_p = np.empty((k, 3)), np.empty((k, 3, 6)), np.empty((k, 3, 3))
     for i in range(k):
@@ -137,7 +125,7 @@ def to_frame_many(f: Array, p: Array) -> tuple[Array, Array, Array]:
 @compiled
 def from_frame_many(f: Array, pf: Array) -> tuple[Array, Array, Array]:
     """Express K points (K, 3) of frame F globally: pw, PW_f (K, 3, 6), PW_pf (K, 3, 3).  [S] (55) in space."""
-    Q = matrix(f[3:])
+    Q = rotations.matrix(f[3:])
     k = len(pf)
     pw, PW_f, PW_pf = np.empty((k, 3)), np.zeros((k, 3, 6)), np.empty((k, 3, 3))
     for i in range(k):
@@ -146,28 +134,16 @@ def from_frame_many(f: Array, pf: Array) -> tuple[Array, Array, Array]:
             d[j] = Q[j, 0] * pf[i, 0] + Q[j, 1] * pf[i, 1] + Q[j, 2] * pf[i, 2]
             pw[i, j] = f[j] + d[j]
             PW_f[i, j, j] = 1.0
-        PW_f[i, :, 3:] = -skew(d)
+        PW_f[i, :, 3:] = -rotations.skew(d)
         PW_pf[i] = Q
     return pw, PW_f, PW_pf
 
 
-def _rows(p: Any) -> tuple[Array, bool]:
-    """Return points as (K, 3) and whether a single one was given."""
-    p = np.ascontiguousarray(p, dtype=np.float64)
-    return (p.reshape(1, 3), True) if p.ndim == 1 else (p, False)
-
-
-def _back(single: bool, *arrays: Array) -> tuple[Array, ...]:
-    return tuple(a[0] for a in arrays) if single else arrays
-
-
 def to_frame(f: Any, p: Any) -> tuple[Array, Array, Array]:
     """Express global points p (3,) or (K, 3) in frame F: pf, PF_f, PF_p.  [S] (56) in space."""
-    rows, single = _rows(p)
-    return _back(single, *to_frame_many(np.ascontiguousarray(f, dtype=np.float64), rows))  # type: ignore[return-value]
+    return one_or_many(to_frame_many, f, p)
 
 
 def from_frame(f: Any, pf: Any) -> tuple[Array, Array, Array]:
     """Express points pf (3,) or (K, 3) of frame F globally: pw, PW_f, PW_pf.  [S] (55) in space."""
-    rows, single = _rows(pf)
-    return _back(single, *from_frame_many(np.ascontiguousarray(f, dtype=np.float64), rows))  # type: ignore[return-value]
+    return one_or_many(from_frame_many, f, pf)

@@ -10,12 +10,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, inverse
-
-Array = npt.NDArray[np.float64]
 
 
 def ellipse(mean: Any, cov: Any, sigmas: float = 1.0, points: int = 16) -> Array:

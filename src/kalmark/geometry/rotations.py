@@ -9,16 +9,12 @@ dimensions.  In these coordinates the Jacobian of `exp` is `left_jacobian`, that
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.angles import wrap
-
-Array = npt.NDArray[np.float64]
 
 
 @compiled
@@ -156,14 +152,6 @@ def left_jacobian_rate(v: Array, a: Array) -> Array:
 
 
 @compiled
-def rotate(q: Array, p: Array) -> tuple[Array, Array, Array]:
-    """Return the point or direction p (3,) turned by q: pw, PW_q (3, 3), PW_p (3, 3)."""
-    Q = matrix(q)
-    pw = Q @ np.ascontiguousarray(p)
-    return pw, -skew(pw), Q
-
-
-@compiled
 def from_euler(e: Array) -> tuple[Array, Array]:
     """Return the quaternion of (roll, pitch, yaw), rad, about x, then y, then z: Q = Qz Qy Qx; and Q_e (3, 3)."""
     cr, cp, cy = math.cos(0.5 * e[0]), math.cos(0.5 * e[1]), math.cos(0.5 * e[2])
@@ -200,16 +188,3 @@ def to_euler(q: Array) -> tuple[Array, Array]:
     t = math.sin(pitch) / cos_p
     E_q = np.array([[c / cos_p, s / cos_p, 0.0], [-s, c, 0.0], [t * c, t * s, 1.0]])
     return np.array([roll, pitch, yaw]), E_q
-
-
-def batched(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function`, made for single rotations or frames, for K of them: arguments (K, n), outputs stacked."""
-
-    def over(*arguments: Any) -> Any:
-        rows = [np.ascontiguousarray(a, dtype=np.float64) for a in arguments]
-        outputs = [function(*one) for one in zip(*rows, strict=True)]
-        if outputs and isinstance(outputs[0], tuple):
-            return tuple(np.array(each) for each in zip(*outputs, strict=True))
-        return np.array(outputs)
-
-    return over

@@ -36,15 +36,14 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.geometry.angles import exponential_v, rotation, wrap
 from kalmark.geometry.directions import direction_many, spherical_many
 from kalmark.geometry.rotations import conjugate, exp, left_jacobian, log, matrix, multiply, skew
 
-Array = npt.NDArray[np.float64]
-Table = npt.NDArray[np.int64]
+Table = Index
 
 SCALAR, VECTOR, HEADING, ANGLE, VECTOR3, ROTATION, DIRECTION, TURNED, HOMOGENEOUS, PLUECKER, ANCHOR, RHO = range(12)
 REMOVED = -1

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan
 from kalmark.geometry.angles import wrap
 
-Array = npt.NDArray[np.float64]
-Times = npt.NDArray[np.int64]
+Times = Index
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,17 +1,24 @@
-"""What of a scan is used: which landmarks are corrected, where new ones start, which are given up.  [TB] 4.4."""
+"""What of a scan is used: which landmarks are corrected, where new ones start, which are given up.
+
+Measurement selection: Davison 2005; [TB] 4.4.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Flags
+from kalmark.association.protocol import DEFERRED, REMAP, Answer, Decision
 from kalmark.declare import NotNegative, Within, register
+from kalmark.models.protocols import image_size
+from kalmark.tracks.channel import ObservationModel
+from kalmark.tracks.scan import ScanContext
 
-Array = npt.NDArray[np.float64]
+Group = tuple[ObservationModel, list[int]]
 
 
 @register("attention", "attention")
@@ -49,7 +56,7 @@ class Attention:
     def __post_init__(self) -> None:
         object.__setattr__(self, "grid", tuple(self.grid))
 
-    def worth_a_correction(self, information: Array) -> npt.NDArray[np.bool_]:
+    def worth_a_correction(self, information: Array) -> Flags:
         """Return which of the observations are corrected by, given what they tell (K,): the best `updates` of them."""
         best = np.zeros(len(information), dtype=np.bool_)
         best[np.argsort(-information, kind="stable")[: self.updates]] = True
@@ -95,3 +102,32 @@ class Attention:
 
 
 EVERYTHING = Attention()
+
+
+def chosen(
+    scan: ScanContext, attention: Attention, groups: Sequence[Group], decisions: Sequence[Decision]
+) -> tuple[list[Group], list[int]]:
+    """Return the groups of observations with those alone that correct the map, and the rows that are left out."""
+    rows, information = [], []
+    for model, some in groups:
+        slots = scan.tracks.slots_of([decisions[k][0] for k in some])
+        Z, _, R = scan.predict(model, slots, some)
+        rows += some
+        information.append(np.nan_to_num(np.linalg.slogdet(Z)[1] - np.linalg.slogdet(R)[1], nan=-np.inf))
+    worth = attention.worth_a_correction(np.concatenate(information))
+    out = [k for k, good in zip(rows, worth, strict=True) if not good]
+    return [(model, [k for k in some if k not in out]) for model, some in groups], out
+
+
+def left_out(
+    scan: ScanContext, attention: Attention, starts: Collection[Answer], new: Sequence[int], known: Sequence[int],
+    decisions: Sequence[Decision],
+) -> dict[int, str]:  # fmt: skip
+    """Return why some of the observations that could start landmarks do not.
+
+    `starts` are the answers that start a landmark; `known` are the observations of landmarks in the map.
+    """
+    held = [None, *(answer for answer in (DEFERRED, REMAP) if answer not in starts)]
+    wanted = [k for k in new if decisions[k][0] not in held and decisions[k][0] not in scan.tracks.slots]
+    empty = not scan.tracks.confirmed
+    return attention.worth_a_start(wanted, known, scan.y, image_size(scan.channel.sensor), empty)

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
-from kalmark.association.gated import FORBIDDEN
-from kalmark.association.posterior import WELL_KNOWN, log_volume_ratio
+from kalmark.arrays import Array, Flags
+from kalmark.association.gated import assigned
+from kalmark.association.posterior import WELL_KNOWN
 from kalmark.association.protocol import Association, new_gate
+from kalmark.association.query import log_volume_ratio
 from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.map import Map
@@ -30,9 +30,6 @@ from kalmark.tracks.channel import Channel
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Track
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 NEAREST = 4  # tentative landmarks an observation is compared with
 OUT_OF_VIEW = 20  # times `within` scans without an observation, in view or not: dropped
@@ -59,18 +56,15 @@ def matched(
     d2 = _distances(scan, rows, names, lost)
     gate = scan.channel.gate if np.isfinite(scan.channel.gate) else chi2_gate(0.99, scan.channel.dof)
     far = max(gate, chi2_gate(new_gate(association), scan.channel.dof))
-    cost = np.full((len(rows), len(names) + len(rows)), gate)
-    cost[:, : len(names)] = np.where(d2 <= gate, d2, FORBIDDEN * gate)
     matches, others = [], []
-    for i, (k, column) in enumerate(zip(rows, linear_sum_assignment(cost)[1].tolist(), strict=True)):
+    for i, (k, column) in enumerate(zip(rows, assigned(d2, gate).tolist(), strict=True)):
         least = int(np.argmin(d2[i]))
-        if column < len(names):
+        if column >= 0:
             matches.append(Match(k, names[column], float(d2[i, column])))
-        elif d2[i, least] <= gate:
-            why = f"its nearest tentative landmark {names[least]!r} is another observation's"
-            others.append(Observation(k, None, "ignored", None, float(d2[i, least]), why))
         elif d2[i, least] <= far:
             why = f"between {names[least]!r}, which is tentative, and a new one: d2 {d2[i, least]:.1f}"
+            if d2[i, least] <= gate:
+                why = f"its nearest tentative landmark {names[least]!r} is another observation's"
             others.append(Observation(k, None, "ignored", None, float(d2[i, least]), why))
     return matches, others
 

@@ -20,8 +20,9 @@ from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from scipy.linalg import block_diag
 
+from kalmark.arrays import Array
 from kalmark.declare import Count, Positive, Within, register
 from kalmark.events import Id
 from kalmark.geometry.frames import compose
@@ -30,8 +31,6 @@ from kalmark.models.observe import linearize
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
-
-Array = npt.NDArray[np.float64]
 
 VAGUE = 0.5  # a place less sure than this part of its distance is no Gaussian: not compared with anything
 FITS = 0.999  # probability with which the measurements of a true landmark agree
@@ -57,21 +56,14 @@ class Delayed:
     ] = 3
     candidates: Annotated[Count, "At most so many candidates, the most persistent ones."] = 200
 
-    def is_ready(self, merged: int) -> bool:
-        """Return whether a candidate of so many merged intersections has persisted."""
-        return merged >= self.persistence
-
 
 Candidates = list[Pending]
 
 
 def has_moved(scan: ScanContext, last: int | None, policy: Delayed) -> bool:
     """Return whether the robot is far enough from where its pose was cloned last, the number of that clone."""
-    if last is None:
-        return True
-    return bool(
-        np.linalg.norm(scan.map.mean(scan.robot)[:2] - scan.map.mean(scan.clones[last])[:2]) >= policy.spacing_m
-    )
+    here = scan.map.mean(scan.robot)[:2]
+    return last is None or bool(np.linalg.norm(here - scan.map.mean(scan.clones[last])[:2]) >= policy.spacing_m)
 
 
 # ---------------------------------------------------------------------- candidates
@@ -117,15 +109,10 @@ def joined(
         alone = Pending(scan.key, names[k], (m,))
         kept.append(alone)
         joined_[k] = joined_[k] or [alone]
-    return _hopeful(kept, policy), {k: max(mine, key=lambda c: len(c.measurements)) for k, mine in joined_.items()}
-
-
-def _hopeful(candidates: Candidates, policy: Delayed) -> Candidates:
-    """Return the candidates without those that were expected and not found, and without the least of too many."""
-    alone = [c for c in candidates if c.mean is None]
-    several = [c for c in candidates if c.mean is not None and c.missed < policy.patience]
+    several = [c for c in kept if c.mean is not None and c.missed < policy.patience]
     several.sort(key=lambda c: (len(c.measurements), -c.missed), reverse=True)
-    return several[: policy.candidates] + alone
+    left = several[: policy.candidates] + [c for c in kept if c.mean is None]
+    return left, {k: max(mine, key=lambda c: len(c.measurements)) for k, mine in joined_.items()}
 
 
 def without_clone(scan: ScanContext, candidates: Candidates, number: int) -> Candidates:
@@ -225,7 +212,7 @@ class Solution(NamedTuple):
 def started(scan: ScanContext, policy: Delayed, candidates: Candidates, c: Pending) -> Outcome:
     """Return the landmark that a candidate starts, or why not yet."""
     merged = len(c.measurements) - 1
-    if not policy.is_ready(merged):
+    if merged < policy.persistence:
         return Outcome(candidates, f"{merged} of {policy.persistence} intersections agree")
     found = solved(scan, c)
     if not found.chi2 <= gate(FITS, found.dof):
@@ -263,11 +250,9 @@ def solved(scan: ScanContext, c: Pending) -> Solution:
     -W (H d + v), d the error of the poses and v that of the measurements, so that G = -W H and Q = W R W'.
     """
     map_, slots, n, m = scan.map, _slots(scan, c), len(c.measurements), len(c.measurements[0].y)
-    P = map_.covariance(slots)
-    R = np.zeros((n * m, n * m))
-    for i, measurement in enumerate(c.measurements):
-        R[i * m : (i + 1) * m, i * m : (i + 1) * m] = measurement.R
-    p = _in_the_map(scan, c)
+    P, R = map_.covariance(slots), block_diag(*(measurement.R for measurement in c.measurements))
+    assert c.mean is not None
+    p: Array = scan.channel.landmark.from_view(scan.channel.pose(map_, slots[0]), c.mean[None])[0][0]
     for _ in range(10):
         z, E, H = _linearized(scan, c, p, len(P))
         W = _weights(E, H @ P @ H.T + R)
@@ -346,14 +331,6 @@ def _slots(scan: ScanContext, c: Pending) -> list[int]:
     """Return the slots that a candidate's measurements depend on: the clones and, if it is in the map, the mount."""
     slots = [scan.clones[m.clone] for m in c.measurements]
     return slots if scan.channel.mount < 0 else [*slots, scan.channel.mount]
-
-
-def _in_the_map(scan: ScanContext, c: Pending) -> Array:
-    """Return the mean of a candidate in the map's frame."""
-    assert c.mean is not None
-    T = scan.channel.pose(scan.map, scan.clones[c.measurements[0].clone])
-    p: Array = scan.channel.landmark.from_view(T, c.mean[None])[0][0]
-    return p
 
 
 def _mount(scan: ScanContext) -> Array:

@@ -11,16 +11,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Segmented, Visible, field_of_view
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 AROUND = 64  # landmarks nearest to the sensor that may be in view
 MARGIN = 0.1  # of ranges and of the field of view, within which a landmark may be out of view after all

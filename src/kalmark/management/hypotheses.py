@@ -19,8 +19,8 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.declare import Probability, Within, register
 from kalmark.geometry.spaces import POINT2
 from kalmark.management.pending import OTHERS, Correction, Step
@@ -28,8 +28,6 @@ from kalmark.models.landmarks import Polar2D
 from kalmark.models.observe import linearize
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
-
-Array = npt.NDArray[np.float64]
 
 POLAR = Polar2D.space
 SPREAD = 0.5  # of the hypotheses' means, in units of their covariance: so much may be left of their being several

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from kalmark.arrays import Array, Index
 from kalmark.association.ratio import density, log_ratios
 from kalmark.events import Id
 from kalmark.filter import kernels
@@ -26,8 +26,6 @@ from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3, Space
 from kalmark.tracks.scan import Start
 from kalmark.tracks.track import RECENT, Tracks
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 Pair = tuple[Id, Id]
 
 EVERY = 5  # observations of a landmark, after which it is compared again

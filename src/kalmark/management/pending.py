@@ -2,21 +2,17 @@
 
 All ways are one idea: measurements made from cloned poses, pending until a test passes.  They differ in the solver:
 where bearings intersect (`delayed`), where ranges meet (`trilateration`), which of several directions a range has
-(`hypotheses`), which of two poses a tag has (`mirrored`).  A way reads and returns steps; `Slam` applies them.
+(`hypotheses`), which of two poses a tag has (`tags`).  A way reads and returns steps; `Slam` applies them.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
-import numpy as np
-import numpy.typing as npt
-
+from kalmark.arrays import Array
 from kalmark.tracks.channel import Parts
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
-
-Array = npt.NDArray[np.float64]
 
 OTHERS = "another sensor's ranges of it are being kept"
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.geometry.frames3d import to_frame_many
 from kalmark.models.cameras import project_pinhole
 from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.models.lines import crossing_angles, extended
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, UnknownDepth
-from kalmark.models.segments import crossing_angles, extended
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Track
-
-Array = npt.NDArray[np.float64]
 
 NO_LENS = np.zeros(0)
 

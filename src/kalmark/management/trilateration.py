@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.declare import Probability, Within, register
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import POINT2
@@ -26,9 +26,6 @@ from kalmark.models.observe import composed
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
 STEPS = 25  # of a search,
 SETTLED = 1e-7  # which is over when they are shorter, m
@@ -55,10 +52,6 @@ class Fits(NamedTuple):
     H_x: Array
     inverse: Array
     R: Array
-
-    def only(self, which: Any) -> Fits:
-        """Return some of them."""
-        return Fits(*(each[which] for each in self))
 
 
 class Problem(NamedTuple):
@@ -122,7 +115,8 @@ class Trilateration:
         angles = heading + 2 * np.pi * np.arange(self.directions) / self.directions
         starts = problem.places[0] + distance * np.column_stack([np.cos(angles), np.sin(angles)])
         minima = _search(problem.fit, starts)
-        best = minima.only(int(np.argmin(minima.cost)))
+        least = int(np.argmin(minima.cost))
+        best = Fits(*(each[least] for each in minima))
         if best.chi2 > chi2_gate(OUTLIER, max(1, len(kept) - 2)):
             worst = int(np.argmax((best.inverse @ best.z) ** 2 / np.diag(best.inverse)))
             why = f"a range of {kept[worst].y[0]:.2f} m does not fit the others and is left out"

@@ -15,16 +15,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 import kalmark.models.landmarks  # noqa: F401 - registers the kinds that sensors see
+from kalmark.arrays import Array
 from kalmark.declare import classes
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import ANGLE, HOMOGENEOUS, RHO, ROTATION, SCALAR, SE2, SE3, TURNED, Rn, Space
 from kalmark.models import protocols
-from kalmark.models.sensors3d import Spatial
+from kalmark.models.sensors import Spatial
 
-Array = npt.NDArray[np.float64]
 Rng = np.random.Generator
 Batch = Callable[[Array], Any]
 

@@ -9,28 +9,13 @@ from __future__ import annotations
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.declare import NotNegative, Number, built_in, declared, register
+from kalmark.geometry import spaces
 from kalmark.geometry.directions import unit_many
-from kalmark.geometry.spaces import (
-    ANCHOR,
-    DIRECTION,
-    HEADING,
-    HOMOGENEOUS,
-    PLUECKER,
-    POINT2,
-    POINT3,
-    RHO,
-    SCALAR,
-    SE3,
-    VECTOR,
-    VECTOR3,
-    Space,
-)
-from kalmark.models import landmarks2d, landmarks3d, lines, seen, segments, tags
-
-Array = npt.NDArray[np.float64]
+from kalmark.geometry.spaces import SE3, Space
+from kalmark.models import landmarks2d, landmarks3d, lines, seen, tags
 
 TINY_M = 1e-12
 
@@ -38,21 +23,29 @@ PriorDepth = Annotated[Number, "Inverse distance expected where the sensor sees 
 DepthSigma = Annotated[NotNegative, "Standard deviation of that."]
 
 
+class _Landmark:
+    """What the landmarks share: the compiled view `look`, of the form `seen.LOOK`, and the landmark of a view `of`."""
+
+    look: ClassVar[Any]
+    of: ClassVar[Any]
+
+    def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
+        """Return the view v (K, d), V_T (K, ., 3 or 6), V_l (K, ., n), in error coordinates."""
+        return self.look(T, np.ascontiguousarray(l))
+
+    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return landmarks l (K, n) that look like v (K, d), L_T (K, ., 3 or 6), L_v (K, ., d)."""
+        return self.of(T, np.ascontiguousarray(v))
+
+
 @register("landmark", "point")
-class Point2D:
+class Point2D(_Landmark):
     """A Euclidean point (x, y) of the plane."""
 
     kind: ClassVar[str] = "point"
-    space: ClassVar[Space] = POINT2
+    space: ClassVar[Space] = spaces.POINT2
     look: ClassVar[Any] = staticmethod(landmarks2d.point_seen_from)
-
-    def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
-        """Return v (K, d), V_T (K, d, 3), V_l (K, d, d)."""
-        return landmarks2d.point_seen_from(T, np.ascontiguousarray(l))
-
-    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return l (K, d), L_T (K, d, 3), L_v (K, d, d)."""
-        return landmarks2d.point_from_view(T, np.ascontiguousarray(v))
+    of: ClassVar[Any] = staticmethod(landmarks2d.point_from_view)
 
     def place(self, l: Array) -> tuple[Array, Array]:
         """Return the positions (K, 2) and their Jacobian (K, 2, d)."""
@@ -67,27 +60,20 @@ class PointSignature2D(Point2D):
     """
 
     kind: ClassVar[str] = "point_signature"
-    space: ClassVar[Space] = Space("point_signature", (VECTOR, SCALAR))
+    space: ClassVar[Space] = Space("point_signature", (spaces.VECTOR, spaces.SCALAR))
 
 
 @register("landmark", "polar")
-class Polar2D:
+class Polar2D(_Landmark):
     """A point of the plane by anchor, direction and distance (4 numbers), for ranges with poor bearings.
 
     The errors are along an arc.  [S] 2.3.5.
     """
 
     kind: ClassVar[str] = "polar"
-    space: ClassVar[Space] = Space("polar", (VECTOR, HEADING, SCALAR))
+    space: ClassVar[Space] = Space("polar", (spaces.VECTOR, spaces.HEADING, spaces.SCALAR))
     look: ClassVar[Any] = staticmethod(landmarks2d.polar_seen_from)
-
-    def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
-        """Return v (K, 2), V_T (K, 2, 3), V_l (K, 2, 4)."""
-        return landmarks2d.polar_seen_from(T, np.ascontiguousarray(l))
-
-    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return l (K, 4), L_T (K, 4, 3), L_v (K, 4, 2)."""
-        return landmarks2d.polar_from_view(T, np.ascontiguousarray(v))
+    of: ClassVar[Any] = staticmethod(landmarks2d.polar_from_view)
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the Euclidean points p (K, 2) and P_l (K, 2, 4)."""
@@ -100,27 +86,14 @@ class Polar2D:
         return np.asarray(0.5 * l[:, 3] * sigmas[:, 2] ** 2 / np.maximum(sigmas[:, 3], TINY_M))
 
 
-class _Spatial:
-    """What the landmarks of space share: the compiled view `look`, of the form `seen.LOOK`."""
-
-    look: ClassVar[Any]
-
-    def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
-        """Return the view v (K, d), V_T (K, ., 6), V_l (K, ., n), in error coordinates."""
-        return self.look(T, np.ascontiguousarray(l))
-
-
 @register("landmark", "point")
-class Point3D(_Spatial):
+class Point3D(_Landmark):
     """A Euclidean point (x, y, z) of space."""
 
     kind: ClassVar[str] = "point3"
-    space: ClassVar[Space] = POINT3
+    space: ClassVar[Space] = spaces.POINT3
     look: ClassVar[Any] = staticmethod(landmarks3d.point_seen_from)
-
-    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return l (K, 3), L_T (K, 3, 6), L_v (K, 3, 3)."""
-        return landmarks3d.point_from_view(T, np.ascontiguousarray(v))
+    of: ClassVar[Any] = staticmethod(landmarks3d.point_from_view)
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, None]:
         """Return points (K, 3) for what a sensor found: points, or rays (K, 4) with their inverse distances."""
@@ -137,7 +110,7 @@ class Point3D(_Spatial):
 
 
 @declared
-class _Depth(_Spatial):
+class _Depth(_Landmark):
     """A point whose depth no measurement need tell: inverse distance rho, `prior_rho_per_m` +- `sigma_rho_per_m`.
 
     The prior is that of the first sight, by a sensor that sees a ray.
@@ -147,12 +120,11 @@ class _Depth(_Spatial):
     sigma_rho_per_m: DepthSigma = 0.5
 
     space: ClassVar[Space]
-    _from_view: ClassVar[Any]
-    _to_point: ClassVar[Any]
+    point: ClassVar[Any]
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return l (K, n) on rays at inverse distances v (K, d + 1), L_T (K, n, 6 or 3), L_v (K, n, d + 1)."""
-        l, L_T, L_ray, L_rho = type(self)._from_view(T, np.ascontiguousarray(v[:, :-1]), v[:, -1].copy())
+        l, L_T, L_ray, L_rho = self.of(T, np.ascontiguousarray(v[:, :-1]), v[:, -1].copy())
         return l, L_T, np.concatenate([L_ray, L_rho], axis=2)
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, Array]:
@@ -174,14 +146,23 @@ class _Depth(_Spatial):
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the Euclidean points p (K, d) and P_l (K, d, n)."""
-        p, P_l = type(self)._to_point(np.ascontiguousarray(l))
-        return p, P_l
+        return self.point(np.ascontiguousarray(l))
 
     place = to_point
 
 
+class _BecomesPoint(_Depth):
+    """A point of unknown depth that becomes a Euclidean one once that is as linear, by its compiled `index`."""
+
+    index: ClassVar[Any]
+
+    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
+        """Return the linearity indices (K,) of landmarks l (K, n) seen from T; `sigmas` (K, n)."""
+        return self.index(T, l, sigmas[:, -1].copy())
+
+
 @register("landmark", "inverse_depth")
-class InverseDepth2D(_Depth):
+class InverseDepth2D(_BecomesPoint):
     """A point of the plane by anchor, direction and inverse distance (4 numbers).
 
     The nearest landmark at d m is in the prior if prior_rho_per_m + 2 sigma_rho_per_m is 1 / d.  [S] 2.3.6, (48).  The
@@ -192,50 +173,41 @@ class InverseDepth2D(_Depth):
     sigma_rho_per_m: DepthSigma = 0.25
 
     kind: ClassVar[str] = "inverse_depth_2d"
-    space: ClassVar[Space] = Space("inverse_depth_2d", (VECTOR, HEADING, RHO))
+    space: ClassVar[Space] = Space("inverse_depth_2d", (spaces.VECTOR, spaces.HEADING, spaces.RHO))
     look: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_seen_from)
-    _from_view = landmarks2d.inverse_depth_from_view
-    _to_point = landmarks2d.inverse_depth_to_point
-
-    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
-        """Return the linearity indices (K,) seen from T; `sigmas` (K, n)."""
-        return landmarks2d.inverse_depth_linearity(T, l, sigmas[:, -1].copy())
+    of: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_from_view)
+    point: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_to_point)
+    index: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_linearity)
 
 
 @register("landmark", "inverse_depth")
-class InverseDepth3D(_Depth):
+class InverseDepth3D(_BecomesPoint):
     """A point of space by anchor, direction and inverse distance (6 numbers).
 
     [TB] idpPnt; Civera, Davison, Montiel 2008.
     """
 
     kind: ClassVar[str] = "inverse_depth"
-    space: ClassVar[Space] = Space("inverse_depth", (ANCHOR, DIRECTION, RHO))
+    space: ClassVar[Space] = Space("inverse_depth", (spaces.ANCHOR, spaces.DIRECTION, spaces.RHO))
     look: ClassVar[Any] = staticmethod(seen.inverse_depth)
-    _from_view = landmarks3d.inverse_depth_from_view
-    _to_point = landmarks3d.inverse_depth_to_point
-
-    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
-        """Return the linearity indices (K,) seen from T; `sigmas` (K, n)."""
-        return landmarks3d.inverse_depth_linearity(T, l, sigmas[:, -1].copy())
+    of: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_from_view)
+    point: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_to_point)
+    index: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_linearity)
 
 
 @register("landmark", "anchored_homogeneous")
-class AnchoredHomogeneous(_Depth):
+class AnchoredHomogeneous(_BecomesPoint):
     """A point of space by anchor, ray and inverse distance (7 numbers).
 
     [TB] ahmPnt; Sola 2012.
     """
 
     kind: ClassVar[str] = "anchored_homogeneous"
-    space: ClassVar[Space] = Space("anchored_homogeneous", (ANCHOR, VECTOR3, RHO))
+    space: ClassVar[Space] = Space("anchored_homogeneous", (spaces.ANCHOR, spaces.VECTOR3, spaces.RHO))
     look: ClassVar[Any] = staticmethod(seen.anchored)
-    _from_view = landmarks3d.anchored_from_view
-    _to_point = landmarks3d.anchored_to_point
-
-    def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
-        """Return the linearity indices (K,) seen from T; `sigmas` (K, n)."""
-        return landmarks3d.anchored_linearity(T, l, sigmas[:, -1].copy())
+    of: ClassVar[Any] = staticmethod(landmarks3d.anchored_from_view)
+    point: ClassVar[Any] = staticmethod(landmarks3d.anchored_to_point)
+    index: ClassVar[Any] = staticmethod(landmarks3d.anchored_linearity)
 
 
 @register("landmark", "homogeneous")
@@ -246,14 +218,14 @@ class Homogeneous(_Depth):
     """
 
     kind: ClassVar[str] = "homogeneous"
-    space: ClassVar[Space] = Space("homogeneous", (HOMOGENEOUS,))
+    space: ClassVar[Space] = Space("homogeneous", (spaces.HOMOGENEOUS,))
     look: ClassVar[Any] = staticmethod(seen.homogeneous)
-    _from_view = landmarks3d.homogeneous_from_view
-    _to_point = landmarks3d.homogeneous_to_point
+    of: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_from_view)
+    point: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_to_point)
 
 
 @register("landmark", "tag")
-class Tag(_Spatial):
+class Tag(_Landmark):
     """A square tag: its pose.
 
     l = (x, y, z, qx, qy, qz, qw), the tag in its plane z = 0.  Its size is part of the measurement.
@@ -262,10 +234,7 @@ class Tag(_Spatial):
     kind: ClassVar[str] = "tag"
     space: ClassVar[Space] = SE3
     look: ClassVar[Any] = staticmethod(tags.tag_seen_from)
-
-    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
-        """Return poses l (K, 7), L_T (K, 6, 6), L_v (K, 6, 6)."""
-        return tags.tag_from_view(T, np.ascontiguousarray(v))
+    of: ClassVar[Any] = staticmethod(tags.tag_from_view)
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the centres (K, 3) and their Jacobian (K, 3, 6)."""
@@ -275,7 +244,7 @@ class Tag(_Spatial):
 
 
 @declared
-class _Line(_Spatial):
+class _Line(_Landmark):
     """What the lines share: they start on the plane of two viewing rays, the rest is a prior (K, 2).
 
     With `extend`, the segment kept beside a line grows with what is seen of it; before, and without, it is what its
@@ -288,37 +257,33 @@ class _Line(_Spatial):
         NotNegative, "Pluecker kinds: a segment whose ends are less certain than this follows the measured one instead."
     ] = 10.0
 
-    name: ClassVar[str]
     first_ends: ClassVar[tuple[float, float]]
     anchored: ClassVar[bool] = True  # the first three numbers are the anchor
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, Array]:
         """Return both rays and the prior's mean (K, 8), V_y (K, 8, .) and the prior's covariance (K, 8, 8)."""
-        k = len(v)
         mean, sigma = self._prior()
-        W_y, N = np.zeros((k, 8, V_y.shape[2])), np.zeros((k, 8, 8))
+        W_y, N = np.zeros((len(v), 8, V_y.shape[2])), np.zeros((len(v), 8, 8))
         W_y[:, :6] = V_y
         N[:, 6, 6], N[:, 7, 7] = np.square(sigma)
-        return np.column_stack([v, np.tile(mean, (k, 1))]), W_y, N
+        return np.column_stack([v, np.tile(mean, (len(v), 1))]), W_y, N
 
     def _prior(self) -> tuple[tuple[float, float], tuple[float, float]]:
         raise NotImplementedError
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return l (K, n) of rays and prior v (K, 8), L_T (K, n, 6), L_v (K, n, 8)."""
-        run = vars(lines)[f"{self.name}_from_view"]
-        l, L_T, L_rays, L_prior = run(T, np.ascontiguousarray(v[:, :6]), np.ascontiguousarray(v[:, 6:]))
+        l, L_T, L_rays, L_prior = self.of(T, np.ascontiguousarray(v[:, :6]), np.ascontiguousarray(v[:, 6:]))
         return l, L_T, np.concatenate([L_rays, L_prior], axis=2)
 
     def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
         """Return the points (K, 2, 3) at abscissas t (K, 2), and P_l (K, 2, 3, n)."""
-        p, P_l = vars(segments)[f"{self.name}_endpoints"](np.ascontiguousarray(l), np.ascontiguousarray(t))
-        return p, P_l
+        raise NotImplementedError
 
     def abscissas(self, T: Array, l: Array, rays: Array) -> Array:
         """Return where (K, 2) on the lines two viewing rays (K, 6) from T pass nearest."""
-        t: Array = vars(segments)[f"{self.name}_abscissas"](T, np.ascontiguousarray(l), np.ascontiguousarray(rays))
-        return t
+        p, _ = self.endpoints(l, np.tile([0.0, 1.0], (len(l), 1)))
+        return lines.abscissas(T, p, np.ascontiguousarray(rays))
 
     def place(self, l: Array) -> tuple[Array, Array]:
         """Return the points (K, 3) of the lines nearest to their anchors, or to the origin, and P_l (K, 3, n)."""
@@ -345,23 +310,40 @@ class _DirectionPrior(_Line):
     sigma_beta_1: Annotated[NotNegative, "Standard deviation of the first component."] = 0.25
     sigma_beta_2: Annotated[NotNegative, "Standard deviation of the second component."] = 1.0
 
-    first_ends: ClassVar[tuple[float, float]] = segments.PLUECKER_ABSCISSAS_M
+    first_ends: ClassVar[tuple[float, float]] = lines.PLUECKER_ABSCISSAS_M
+    ends: ClassVar[Any]
 
     def _prior(self) -> tuple[tuple[float, float], tuple[float, float]]:
         return (self.prior_beta_1, self.prior_beta_2), (self.sigma_beta_1, self.sigma_beta_2)
 
+    def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2, 3) at abscissas t (K, 2), and P_l (K, 2, 3, n)."""
+        return self.ends(np.ascontiguousarray(l), np.ascontiguousarray(t))
+
 
 @declared
 class _DepthsPrior(_Line):
-    """Lines through two points of unknown depth."""
+    """Lines through two points of unknown depth, of the type `end`."""
 
     prior_rho_per_m: Annotated[Number, "Inverse distance expected of both ends."] = 0.1
     sigma_rho_per_m: Annotated[NotNegative, "Standard deviation of each."] = 0.5
 
-    first_ends: ClassVar[tuple[float, float]] = segments.POINT_ABSCISSAS
+    first_ends: ClassVar[tuple[float, float]] = lines.POINT_ABSCISSAS
+    end: ClassVar[type[_Depth]]
 
     def _prior(self) -> tuple[tuple[float, float], tuple[float, float]]:
         return (self.prior_rho_per_m,) * 2, (self.sigma_rho_per_m,) * 2
+
+    def of(self, T: Array, rays: Array, rho: Array) -> lines.New:
+        """Return lines l (K, n) through the ends on `rays` (K, 6) of T at rho (K, 2), L_T, L_rays and L_rho."""
+        a, b = (self.end.of(T, rays[:, 3 * i : 3 * i + 3].copy(), rho[:, i].copy()) for i in range(2))
+        return lines.stacked_views(a, b, 3 * self.anchored)
+
+    def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2, 3) at abscissas t (K, 2), and P_l (K, 2, 3, n)."""
+        shared = 3 * self.anchored
+        a, b = map(self.end.point, lines.ends(np.ascontiguousarray(l), shared))
+        return lines.points_between(a, b, np.ascontiguousarray(t), shared)
 
 
 @register("landmark", "pluecker_line")
@@ -372,9 +354,10 @@ class PlueckerLine(_DirectionPrior):
     """
 
     kind: ClassVar[str] = "pluecker_line"
-    space: ClassVar[Space] = Space("pluecker_line", (PLUECKER,))
+    space: ClassVar[Space] = Space("pluecker_line", (spaces.PLUECKER,))
     look: ClassVar[Any] = staticmethod(lines.pluecker_seen_from)
-    name: ClassVar[str] = "pluecker"
+    of: ClassVar[Any] = staticmethod(lines.pluecker_from_view)
+    ends: ClassVar[Any] = staticmethod(lines.pluecker_endpoints)
     anchored: ClassVar[bool] = False
 
 
@@ -386,9 +369,10 @@ class AnchoredPlueckerLine(_DirectionPrior):
     """
 
     kind: ClassVar[str] = "anchored_pluecker_line"
-    space: ClassVar[Space] = Space("anchored_pluecker_line", (VECTOR3, VECTOR3, VECTOR3))
+    space: ClassVar[Space] = Space("anchored_pluecker_line", (spaces.VECTOR3, spaces.VECTOR3, spaces.VECTOR3))
     look: ClassVar[Any] = staticmethod(lines.anchored_pluecker_seen_from)
-    name: ClassVar[str] = "anchored_pluecker"
+    of: ClassVar[Any] = staticmethod(lines.anchored_pluecker_from_view)
+    ends: ClassVar[Any] = staticmethod(lines.anchored_pluecker_endpoints)
 
 
 @register("landmark", "inverse_depth_line")
@@ -399,9 +383,9 @@ class InverseDepthLine(_DepthsPrior):
     """
 
     kind: ClassVar[str] = "inverse_depth_line"
-    space: ClassVar[Space] = Space("inverse_depth_line", (ANCHOR, DIRECTION, RHO, DIRECTION, RHO))
+    space: ClassVar[Space] = Space("inverse_depth_line", (spaces.ANCHOR, *2 * (spaces.DIRECTION, spaces.RHO)))
     look: ClassVar[Any] = staticmethod(lines.inverse_depth_line_seen_from)
-    name: ClassVar[str] = "inverse_depth_line"
+    end: ClassVar[type[_Depth]] = InverseDepth3D
 
 
 @register("landmark", "anchored_homogeneous_line")
@@ -412,9 +396,9 @@ class AnchoredHomogeneousLine(_DepthsPrior):
     """
 
     kind: ClassVar[str] = "anchored_homogeneous_line"
-    space: ClassVar[Space] = Space("anchored_homogeneous_line", (ANCHOR, VECTOR3, RHO, VECTOR3, RHO))
+    space: ClassVar[Space] = Space("anchored_homogeneous_line", (spaces.ANCHOR, *2 * (spaces.VECTOR3, spaces.RHO)))
     look: ClassVar[Any] = staticmethod(lines.anchored_homogeneous_line_seen_from)
-    name: ClassVar[str] = "anchored_homogeneous_line"
+    end: ClassVar[type[_Depth]] = AnchoredHomogeneous
 
 
 @register("landmark", "homogeneous_line")
@@ -425,9 +409,9 @@ class HomogeneousLine(_DepthsPrior):
     """
 
     kind: ClassVar[str] = "homogeneous_line"
-    space: ClassVar[Space] = Space("homogeneous_line", (HOMOGENEOUS, HOMOGENEOUS))
+    space: ClassVar[Space] = Space("homogeneous_line", (spaces.HOMOGENEOUS, spaces.HOMOGENEOUS))
     look: ClassVar[Any] = staticmethod(lines.homogeneous_line_seen_from)
-    name: ClassVar[str] = "homogeneous_line"
+    end: ClassVar[type[_Depth]] = Homogeneous
     anchored: ClassVar[bool] = False
 
 

@@ -18,13 +18,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import from_frame_many, to_frame_many
-
-Array = npt.NDArray[np.float64]
 
 
 @compiled

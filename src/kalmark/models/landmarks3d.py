@@ -21,14 +21,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.directions import direction_many, spherical_many, unit_many
 from kalmark.geometry.frames3d import from_frame_many, to_frame_many, turned_rates
 from kalmark.geometry.rotations import matrix, skew
-
-Array = npt.NDArray[np.float64]
 
 point_seen_from = to_frame_many
 point_from_view = from_frame_many

@@ -1,4 +1,313 @@
-"""All motions: those in the plane (`motion2d`) and those in space (`motion3d`)."""
+"""Motion models: odometry increments ([S] A.3), held velocities on exact arcs ([F]), Ackermann, constant velocity.
 
-from kalmark.models.motion2d import *  # noqa: F403
-from kalmark.models.motion3d import *  # noqa: F403
+Three kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
+displacement is sigma times the duration.  Its *bias* (`sigma_v_bias_mps`, ...), what is to be added to all of them, is
+in the map and estimated.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with time; in the plane along,
+across and about the robot, while the control is not zero (a robot told to stand does not wander).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import KW_ONLY
+from functools import cached_property
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.compiled import compiled
+from kalmark.declare import NotNegative, Number, Positive, declared, register
+from kalmark.geometry import frames3d
+from kalmark.geometry.angles import exponential_v, exponential_v_rate
+from kalmark.geometry.frames import compose
+from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
+from kalmark.geometry.spaces import ROTATION, SCALAR, SE2, SE3, VECTOR3, Space
+from kalmark.models.moving import Compiled
+
+__all__ = ["Ackermann", "ConstantVelocity3D", "Odometry2D", "Odometry3D", "Unicycle", "Velocity3D"]
+
+
+@compiled
+def increment_in_plane(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (3,) by u (3,) = (dx, dy, dtheta) in its own frame: the new r, R_r, R_u (3, 3).  [S] (59)-(60)."""
+    return compose(r, u)
+
+
+@compiled
+def unicycle(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (3,) by the speed and turn rate u (2,) for dt s: the new r, R_r (3, 3), R_u (3, 2)."""
+    return arc(r, u[0], u[1], dt)
+
+
+@compiled
+def arc(r: Array, v: float, w: float, dt: float) -> tuple[Array, Array, Array]:
+    """Move r along the exact arc of speed v and turn rate w; R_u (3, 2) with respect to (v, w).
+
+    Both limits of [F] are regular: a straight line for w -> 0 and a turn on the spot for v -> 0.
+    """
+    a = w * dt
+    p, q = exponential_v(a)
+    p_a, q_a = exponential_v_rate(a)
+    s = v * dt
+    step, R_u = np.empty(3), np.empty((3, 2))
+    step[0], step[1], step[2] = s * p, s * q, a
+    r2, R_r, R_d = compose(r, step)
+    for i in range(3):
+        R_u[i, 0] = R_d[i, 0] * (dt * p) + R_d[i, 1] * (dt * q)
+        R_u[i, 1] = R_d[i, 0] * (s * dt * p_a) + R_d[i, 1] * (s * dt * q_a) + R_d[i, 2] * dt
+    return r2, R_r, R_u
+
+
+@compiled
+def ackermann(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move the rear axle's centre r (3,) by u (2,) = (speed of the left rear wheel, steering), along the exact arc.
+
+    `par`: wheelbase and offset of the encoder.
+    """
+    wheelbase, offset = par[0], par[1]
+    tan = math.tan(u[1])
+    slip = 1.0 / (1.0 - tan * offset / wheelbase)
+    v, w = u[0] * slip, u[0] * slip * tan / wheelbase
+    tan_s = 1.0 + tan * tan
+    slip_s = slip * slip * tan_s * offset / wheelbase
+    v_s = u[0] * slip_s
+    VW_u = np.array([[slip, v_s], [slip * tan / wheelbase, (v_s * tan + v * tan_s) / wheelbase]])
+    r2, R_r, R_vw = arc(r, v, w, dt)
+    return r2, R_r, R_vw @ VW_u
+
+
+@compiled
+def increment_in_space(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (7,) by u (6,) = (dx, dy, dz, rotation vector) in its own frame: the new r, R_r, R_u (6, 6)."""
+    return frames3d.move(r, u)
+
+
+@compiled
+def twist(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (7,) for dt s by the constant velocity u = (v, w) in its own frame, exactly; R_r (6, 6), R_u (6, 6)."""
+    Q, turn, way = matrix(r[3:]), u[3:] * dt, u[:3] * dt
+    V = left_jacobian(turn)
+    moved, step = np.empty(7), Q @ (V @ way)
+    moved[:3] = r[:3] + step
+    moved[3:] = multiply(r[3:], exp(turn))
+    R_r, R_u = np.eye(6), np.zeros((6, 6))
+    R_r[:3, 3:] = -skew(step)
+    R_u[:3, :3] = Q @ V * dt
+    R_u[:3, 3:] = Q @ left_jacobian_rate(turn, way) * dt
+    R_u[3:, 3:] = Q @ V * dt
+    return moved, R_r, R_u
+
+
+@compiled
+def coast(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+    """Move r (13,) for dt s at its own velocity, which u then changes; R_r (12, 12), R_u (12, 6).  [TB] constVel."""
+    Q, turn = matrix(r[3:7]), r[10:] * dt
+    moved = r.copy()
+    moved[:3] += r[7:10] * dt
+    moved[3:7] = multiply(r[3:7], exp(turn))
+    moved[7:] += u
+    R_r, R_u = np.eye(12), np.zeros((12, 6))
+    for i in range(3):
+        R_r[i, 6 + i] = dt
+    R_r[3:6, 9:] = Q @ left_jacobian(turn) * dt
+    for i in range(6):
+        R_u[6 + i, i] = 1.0
+    return moved, R_r, R_u
+
+
+class _Motion(Compiled):
+    """What the motions share: white noise of a control and of its bias, both by the names of their parameters."""
+
+    sigmas: ClassVar[tuple[str, ...]]
+    biases: ClassVar[tuple[str, ...]] = ()
+
+    @cached_property
+    def _N(self) -> Array:
+        return np.diag(np.square([vars(self)[name] for name in self.sigmas]))
+
+    def control_noise(self, u: Array) -> Array:
+        """Return N (m, m) of a control (m,): of an increment, of an impulse or of what is held."""
+        return self._N
+
+    @property
+    def bias_cov(self) -> Array | None:
+        """The covariance (m, m) of the bias of a control, None if there is none."""
+        sigmas = [vars(self)[name] for name in self.biases]
+        return np.diag(np.square(sigmas)) if any(sigmas) else None
+
+    def diffusion(self, u: Array, dt_s: float) -> Array | None:
+        """Return the covariance (dof, dof) of the white noise gathered in `dt_s`, None: all noise is in u (m,)."""
+        return None
+
+
+@declared
+class _Planar(_Motion):
+    """What the planar motions share: the space and the diffusion."""
+
+    _: KW_ONLY
+    sigma_along_m_per_sqrt_s: Annotated[NotNegative, "Random walk along the heading, while it moves."] = 0.0
+    sigma_across_m_per_sqrt_s: Annotated[NotNegative, "Random walk across the heading, while it moves."] = 0.0
+    sigma_theta_rad_per_sqrt_s: Annotated[NotNegative, "Random walk of the heading, while it moves."] = 0.0
+
+    space: ClassVar[Space] = SE2
+
+    @cached_property
+    def _density(self) -> Array | None:
+        sigmas = (self.sigma_along_m_per_sqrt_s, self.sigma_across_m_per_sqrt_s, self.sigma_theta_rad_per_sqrt_s)
+        return np.diag(np.square(sigmas)) if any(sigmas) else None
+
+    def diffusion(self, u: Array, dt_s: float) -> Array | None:
+        """Return the covariance (3, 3) of the white noise gathered in `dt_s`, in the robot's frame."""
+        return None if self._density is None or not u.any() else self._density * dt_s
+
+
+@register("motion", "unicycle")
+class Unicycle(_Planar):
+    """Speed and turn rate, each held until the next control.
+
+    A control is u = (v m/s, w rad/s); the exact arc of [F] with both its limits.
+    """
+
+    sigma_v_mps: Annotated[NotNegative, "Error of the speed held over its interval."] = 0.1
+    sigma_w_radps: Annotated[NotNegative, "Error of the turn rate held over its interval."] = 0.05
+    sigma_v_bias_mps: Annotated[
+        NotNegative, "Constant part of the speed's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_w_bias_radps: Annotated[
+        NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+
+    columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
+    held: ClassVar[bool] = True
+    moves: ClassVar[Any] = unicycle
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_w_radps")
+    biases: ClassVar[tuple[str, ...]] = ("sigma_v_bias_mps", "sigma_w_bias_radps")
+
+
+@register("motion", "odometry_2d")
+class Odometry2D(_Planar):
+    """Increments dx, dy, dtheta in the robot's frame.
+
+    A control u (3,) is the motion that ended at its time.  [S] (57)-(60).  The sigmas are those of one increment.  A
+    diffusion counts the time since the last increment, none for the first.
+    """
+
+    sigma_x_m: Annotated[NotNegative, "Error of one increment, forward."] = 0.01
+    sigma_y_m: Annotated[NotNegative, "Error of one increment, to the left."] = 0.0
+    sigma_theta_rad: Annotated[NotNegative, "Error of one increment, heading."] = 0.02
+
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
+    held: ClassVar[bool] = False
+    moves: ClassVar[Any] = increment_in_plane
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_theta_rad")
+
+
+@register("motion", "ackermann")
+class Ackermann(_Planar):
+    """A car: wheel speed and steering angle, each held until the next control.
+
+    A control is u = (speed of the left rear wheel m/s, steering rad); the state is the rear axle's centre.
+    `encoder_offset_m` is the wheel's distance to the left of the centre line, negative to the right; 0 for a speed that
+    is the axle's own.
+    """
+
+    wheelbase_m: Annotated[Positive, "Distance between the axles."] = 2.83
+    encoder_offset_m: Annotated[Number, "Wheel encoder, left of the middle of the rear axle."] = 0.76
+    sigma_v_mps: Annotated[NotNegative, "Error of the wheel speed held over its interval."] = 0.1
+    sigma_steering_rad: Annotated[NotNegative, "Error of the steering angle held over its interval."] = 0.02
+    sigma_v_bias_mps: Annotated[
+        NotNegative, "Constant part of the wheel speed's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_steering_bias_rad: Annotated[
+        NotNegative, "Constant part of the steering angle's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+
+    columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
+    held: ClassVar[bool] = True
+    moves: ClassVar[Any] = ackermann
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_steering_rad")
+    biases: ClassVar[tuple[str, ...]] = ("sigma_v_bias_mps", "sigma_steering_bias_rad")
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The wheelbase and the offset of the encoder (2,), m."""
+        return np.array([self.wheelbase_m, self.encoder_offset_m])
+
+
+@register("motion", "odometry_3d")
+class Odometry3D(_Motion):
+    """Increments dx, dy, dz and a rotation vector rx, ry, rz, in the robot's frame.
+
+    A control is u (6,), m and rad.  The sigmas are those of one increment.
+    """
+
+    sigma_x_m: Annotated[NotNegative, "Error of one increment, forward."] = 0.01
+    sigma_y_m: Annotated[NotNegative, "Error of one increment, to the left."] = 0.01
+    sigma_z_m: Annotated[NotNegative, "Error of one increment, upwards."] = 0.01
+    sigma_rotation_rad: Annotated[NotNegative, "Error of one increment, rotation about each axis."] = 0.005
+
+    space: ClassVar[Space] = SE3
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    held: ClassVar[bool] = False
+    moves: ClassVar[Any] = increment_in_space
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_z_m", *3 * ("sigma_rotation_rad",))
+
+
+@register("motion", "velocity_3d")
+class Velocity3D(_Motion):
+    """Velocity and turn rate in the robot's frame, each held until the next control.
+
+    A control is u = (vx, vy, vz, wx, wy, wz), m/s and rad/s.
+    """
+
+    sigma_vx_mps: Annotated[NotNegative, "Error of the velocity held over its interval, forward."] = 0.1
+    sigma_vy_mps: Annotated[NotNegative, "Error of the velocity held over its interval, to the left."] = 0.1
+    sigma_vz_mps: Annotated[NotNegative, "Error of the velocity held over its interval, upwards."] = 0.1
+    sigma_wx_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about x."] = 0.05
+    sigma_wy_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about y."] = 0.05
+    sigma_wz_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about z."] = 0.05
+    sigma_v_bias_mps: Annotated[
+        NotNegative, "Constant part of the speed's error on each axis; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_w_bias_radps: Annotated[
+        NotNegative,
+        "Constant part of the turn rate's error about each axis; above 0 it is in the map and is estimated.",
+    ] = 0.0
+
+    space: ClassVar[Space] = SE3
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    held: ClassVar[bool] = True
+    moves: ClassVar[Any] = twist
+    sigmas: ClassVar[tuple[str, ...]] = tuple(f"sigma_{column}" for column in columns)
+    biases: ClassVar[tuple[str, ...]] = (*3 * ("sigma_v_bias_mps",), *3 * ("sigma_w_bias_radps",))
+
+
+@register("motion", "constant_velocity_3d")
+class ConstantVelocity3D(_Motion):
+    """Velocity and turn rate are in the state: it goes on as it goes, controls are changes of both, and needs none.
+
+    The state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.  The robot coasts to the
+    time of each event.  A control is an impulse u = (dv (world), dw (body)) at its time, with sigmas `sigma_v_mps`,
+    `sigma_w_radps`; `..._per_sqrt_s` are random walks of velocity and rate.
+    """
+
+    sigma_v_mps: Annotated[NotNegative, "Error of the change of velocity that a control is."] = 0.01
+    sigma_w_radps: Annotated[NotNegative, "Error of the change of turn rate that a control is."] = 0.002
+    sigma_v_mps_per_sqrt_s: Annotated[NotNegative, "Random walk of the velocity, all the time."] = 0.0
+    sigma_w_radps_per_sqrt_s: Annotated[NotNegative, "Random walk of the turn rate, all the time."] = 0.0
+
+    space: ClassVar[Space] = Space("SE3 with velocity", (VECTOR3, ROTATION, VECTOR3, SCALAR, SCALAR, SCALAR))
+    columns: ClassVar[tuple[str, ...]] = ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps")
+    held: ClassVar[bool] = False
+    moves: ClassVar[Any] = coast
+    coasts: ClassVar[bool] = True
+    sigmas: ClassVar[tuple[str, ...]] = (*3 * ("sigma_v_mps",), *3 * ("sigma_w_radps",))
+
+    def diffusion(self, u: Array, dt_s: float) -> Array | None:
+        """Return the covariance (12, 12) of the walks of velocity and rate, and of the way and turn they make."""
+        v, w = self.sigma_v_mps_per_sqrt_s**2, self.sigma_w_radps_per_sqrt_s**2
+        if not (v or w):
+            return None
+        way = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+        return np.kron(way, np.diag([v, v, v, w, w, w]))

@@ -8,15 +8,13 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from numba import types
 from numba.extending import overload
 
+from kalmark.arrays import Array
 from kalmark.compiled import address_of, by_address, signature_of
 from kalmark.declare import built_in
 from kalmark.models.protocols import Motion
-
-Array = npt.NDArray[np.float64]
 
 # of the state r (size,), the control u (m,), parameters and seconds: the new r, R_r (dof, dof), R_u (dof, m)
 MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")

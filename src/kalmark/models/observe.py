@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import types
 from numba.extending import overload
 
+from kalmark.arrays import Array, Flags
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
@@ -24,8 +24,7 @@ from kalmark.models.landmarks3d import chained
 from kalmark.models.protocols import Completing, FullSensor, Landmark, Parametrized, Sensor, finds_depth
 from kalmark.models.seen import EXPECT, LOOK, residual
 
-Array = npt.NDArray[np.float64]
-View = tuple[int, int, int, int, Array, Array, npt.NDArray[np.bool_]]
+View = tuple[int, int, int, int, Array, Array, Flags]
 # addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles
 VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
 LINEARIZE = signature_of(
@@ -79,7 +78,7 @@ class PythonView:
     sensor: Sensor
     landmark: Landmark
     mount: Array
-    angular: npt.NDArray[np.bool_]
+    angular: Flags
 
     def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Return e (K, m), z = y - e, E_h (K, m, 3 or more) and E_l (K, m, n)."""
@@ -102,7 +101,7 @@ def fix_view(antenna: Array) -> View:
 
 
 def built_in_view(
-    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: npt.NDArray[np.bool_]
+    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: Flags
 ) -> View:  # fmt: skip
     """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,)."""
     linearize_at = address_of(linearize_in_plane if len(mount) == 3 else linearize_in_space, LINEARIZE)
@@ -185,7 +184,8 @@ def linearize_in_plane(view: View, head: Array, l: Array, y: Array) -> tuple[Arr
 
     The landmarks l are (K, n), the measurements y (K, m); e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n).
     """
-    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 else view[MOUNT])
+    mount = view[4]
+    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 else mount)
     return _linearized(view, head, T, T_r, T_s, l, y)
 
 
@@ -195,7 +195,8 @@ def linearize_in_space(view: View, head: Array, l: Array, y: Array) -> tuple[Arr
 
     The landmarks l are (K, n), the measurements y (K, m); e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n).
     """
-    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 else view[MOUNT])
+    mount = view[4]
+    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 else mount)
     return _linearized(view, head, T, T_r, T_s, l, y)
 
 

@@ -7,12 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.errors import ModelError
 from kalmark.geometry.angles import wrap
-
-Array = npt.NDArray[np.float64]
 
 
 def jacobian(function: Callable[[Array], Array], x: Array, angular: tuple[bool, ...] = ()) -> Array:
@@ -113,13 +111,8 @@ def pointwise(
     if not np.allclose(R, R.T) or np.linalg.eigvalsh(R).min() <= 0:
         raise ModelError(f"pointwise sensor: noise is {R.tolist()}, expected a symmetric positive definite matrix")
     m = len(angular) or len(columns) or len(R)
-    kinds = {
-        (False, False): PointwiseSensor,
-        (True, False): PointwiseFullSensor,
-        (False, True): NoisyPointwiseSensor,
-        (True, True): NoisyPointwiseFullSensor,
-    }
-    return kinds[inverse is not None, noise_inside](
+    kinds = (PointwiseSensor, NoisyPointwiseSensor), (PointwiseFullSensor, NoisyPointwiseFullSensor)
+    return kinds[inverse is not None][noise_inside](
         measure=measure,
         R=R,
         columns=columns or tuple(f"y{i}" for i in range(m)),

@@ -14,13 +14,10 @@ import math
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Flags
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
-
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 
 @runtime_checkable
@@ -153,11 +150,6 @@ class _Biased(Protocol):
 
 
 @runtime_checkable
-class _UncertainParameters(Protocol):
-    parameter_cov: Array | None
-
-
-@runtime_checkable
 class _InnovationSize(Protocol):
     cov_size: int
 
@@ -204,7 +196,7 @@ def bias_covariance(motion: object) -> Array | None:
 
 def parameter_covariance(sensor: object) -> Array | None:
     """Return the covariance (p, p) of a sensor's own parameters; by default None: they are known."""
-    return sensor.parameter_cov if isinstance(sensor, _UncertainParameters) else None
+    return sensor.parameter_cov if isinstance(sensor, Calibrated) else None
 
 
 def innovation_size(sensor: Sensor) -> int:
@@ -219,16 +211,6 @@ class Visible(Protocol):
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d), in the sensor's frame, can be measured."""
-
-
-@runtime_checkable
-class PinHoleView(Protocol):
-    """A camera with the intrinsics of a pin hole, px."""
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
 
 
 @runtime_checkable

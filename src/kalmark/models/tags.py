@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.frames3d import compose, minus, plus, turned_rates
 from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inverse, matrix, multiply, skew
-from kalmark.models.lenses import back_project, project
-
-Array = npt.NDArray[np.float64]
+from kalmark.models.cameras import back_project, project
 
 ITERATIONS = 50
 FACING = 0.3  # rad: a tag that faces the camera so well is near its mirror image
@@ -122,18 +120,6 @@ def tags_from_corners(lens: int, y: Array, size: Array, par: Array) -> tuple[Arr
         else:
             v[i, 1], V_y[i, 1], cost[i, 1] = b, np.linalg.solve(E_b.T @ E_b, E_b.T), cost_b
     return v, V_y, cost
-
-
-def tag_pose(lens: int, y: Array, size: float, par: Array, sigma_px: float) -> tuple[Array, Array, float, float]:
-    """Find one tag from its corners y (8,): pose (7,) in the camera, covariance (6, 6), RMS px, ambiguity.
-
-    See `tags_from_corners`; the covariance is that of independent pixels, the RMS that of the distances of the corners.
-    The ambiguity is the ratio of the RMS of both poses: 1, no telling which; 0, only one.
-    """
-    rows = np.ascontiguousarray(y, dtype=np.float64).reshape(1, 8)
-    v, V_y, cost = tags_from_corners(lens, rows, np.array([float(size)]), par)
-    rms = np.sqrt(0.25 * cost[0])
-    return v[0, 0], sigma_px**2 * V_y[0, 0] @ V_y[0, 0].T, float(rms[0]), float(rms[0] / rms[1])
 
 
 @compiled

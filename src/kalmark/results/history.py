@@ -13,12 +13,11 @@ from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id
 
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+Ints = Index
 Texts = npt.NDArray[np.str_]
-Flags = npt.NDArray[np.bool_]
 Arrays = dict[str, npt.NDArray[Any]]
 Named = Mapping[str, npt.NDArray[Any]]
 Vector = Annotated[Array, 1]

@@ -226,7 +226,7 @@ def left_px(slam: Slam, scan: Scan, report: Report) -> Array:
     v = tag_seen_from(compose(slam.mean(scan.robot)[:7], at)[0], tags)[0]
     rows = [o.index for o in used]
     y, par = scan.y[rows], np.array(mount.sensor.parameters)
-    e = project_corners(mount.sensor.lens_code, v, np.ascontiguousarray(y[:, 8]), par)[0]
+    e = project_corners(mount.sensor.code, v, np.ascontiguousarray(y[:, 8]), par)[0]
     rms = np.sqrt(0.25 * np.sum((y[:, :8] - e) ** 2, axis=1))
     left[rows] = np.nan_to_num(rms, nan=np.inf)  # behind the camera
     return left

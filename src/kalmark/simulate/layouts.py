@@ -12,14 +12,13 @@ from itertools import product
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from numpy.random import Generator
 from pydantic import AfterValidator, Field, model_validator
 
+from kalmark.arrays import Array
 from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, expected
 from kalmark.geometry.frames3d import from_euler_pose
 
-Array = npt.NDArray[np.float64]
 Count = Annotated[int, Field(ge=1)]
 Segment = Annotated[tuple[Number, Number, Number, Number, Number, Number], Field(strict=False)]
 Triple = Annotated[tuple[Number, Number, Number], Field(strict=False)]

@@ -13,9 +13,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numpy.random import Generator, SeedSequence
 
+from kalmark.arrays import Array
 from kalmark.config.building import build_robot
 from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.geometry.angles import rotation
@@ -30,7 +30,6 @@ from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, 
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
 
-Array = npt.NDArray[np.float64]
 Key = tuple[int, str, str]
 
 

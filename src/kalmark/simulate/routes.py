@@ -8,17 +8,16 @@ from itertools import cycle
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from numpy.random import Generator
 from pydantic import Field
 
+from kalmark.arrays import Array
 from kalmark.config.sections import Number, OneOf, Positive, Section
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian, matrix
 from kalmark.models.motion import Ackermann, Odometry2D, Odometry3D, Unicycle
 from kalmark.simulate.layouts import Points
 
-Array = npt.NDArray[np.float64]
 Driver = Callable[[Array], Array]  # true state -> control of the next step
 
 

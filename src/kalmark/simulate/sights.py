@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numpy.random import Generator
 from pydantic import Field
 from scipy.spatial import cKDTree
 
 from kalmark import presets
+from kalmark.arrays import Array, Flags, Index
 from kalmark.config.sections import Section
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
@@ -27,9 +27,7 @@ from kalmark.models.protocols import StartNoise, range_limit, world_of
 from kalmark.models.tags import corners, tag_seen_from
 from kalmark.simulate.layouts import Scenery
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-Indices = npt.NDArray[np.int64]
+Indices = Index
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Pair = Annotated[tuple[int, int], Field(strict=False)]

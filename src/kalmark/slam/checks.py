@@ -6,14 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError, ModelError
 from kalmark.events import Control, Fix, Scan, finite, shown, when
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
-
-Array = npt.NDArray[np.float64]
 
 
 def covariance(value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError) -> Array:

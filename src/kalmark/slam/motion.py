@@ -15,16 +15,17 @@ from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.errors import EventError
 from kalmark.events import Control
 from kalmark.filter.estimators import Movement
+from kalmark.filter.kernels import moved_noise
+from kalmark.filter.map import Map
 from kalmark.geometry.spaces import Rn, Space
-from kalmark.models.moving import step_of
+from kalmark.models.moving import step, step_of
 from kalmark.models.protocols import Motion, bias_covariance, coasts
 
-Array = npt.NDArray[np.float64]
 NO_NOISE = np.zeros((0, 0))
 
 
@@ -116,12 +117,22 @@ class Moving:
         """The motion as the filter takes it."""
         return step_of(self.motion)
 
+    def added(self) -> list[int]:
+        """Return the slots of the blocks that are added to the control."""
+        return [block for block in (self.error, self.bias) if block is not None]
+
+    def leads_somewhere(self, map_: Map, part: Part) -> bool:
+        """Return whether one part of its control leads to a finite place, with a finite covariance."""
+        u = part.u + sum(map_.mean(block) for block in self.added())
+        return moved_noise(*step(self.model, map_.mean(self.slot), u, part.dt_s), part.N)[1]
+
     def movement(self, part: Part) -> Movement:
         """Return what one part of its control does to the robot."""
-        added = [block for block in (self.error, self.bias) if block is not None]
         D = self.motion.diffusion(part.u, part.dt_s)
         shared = self.error is not None
-        return Movement(self.model, self.slot, added, shared, part.u, part.N, NO_NOISE if D is None else D, part.dt_s)
+        return Movement(
+            self.model, self.slot, self.added(), shared, part.u, part.N, NO_NOISE if D is None else D, part.dt_s
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled model, whose address means nothing to another process."""

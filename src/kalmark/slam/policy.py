@@ -11,8 +11,8 @@ from kalmark.events import Scan
 from kalmark.filter.estimators import Estimator
 from kalmark.management.attention import Attention
 from kalmark.management.delayed import Delayed
-from kalmark.management.mirrored import Mirrored
 from kalmark.management.pending import Initialization
+from kalmark.management.tags import Mirrored
 from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Ambiguous, Intersecting, Landmark, Ranging, Reparametrizable, Segmented, world_of

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import block_diag
 
+from kalmark.arrays import Array
 from kalmark.association.protocol import Association
 from kalmark.errors import ModelError
 from kalmark.events import Scan, finite, shown
@@ -21,9 +21,6 @@ from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, Motion, Sensor, parameter_covariance, refuse_misspelt
 from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
-
-Array = npt.NDArray[np.float64]
-
 
 IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
 WANTED = {

@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.association import Association, ByIdentity
 from kalmark.association.averaging import average, outcomes, refuse_averaging
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
-from kalmark.association.query import ScanQuery
+from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
@@ -32,7 +32,8 @@ from kalmark.filter.estimators import Averaging, Correction, Estimator, Invarian
 from kalmark.filter.map import Map
 from kalmark.filter.maps import DENSE, grown, new_map
 from kalmark.geometry.spaces import SE2, SE3, Rn
-from kalmark.management import budget, confirm, delayed, existence, far, merge, mirrored, reparametrize
+from kalmark.management import confirm, delayed, existence, merge, reparametrize, tags
+from kalmark.management.attention import chosen, left_out
 from kalmark.management.pending import Initialization, Step
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
@@ -55,9 +56,6 @@ from kalmark.tracks.channel import Channel, ObservationModel, Parts
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import ChannelKey, Late, Pending, Status, Track, Tracks
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 UNEXPLAINED = "no landmark explains this measurement"
@@ -213,14 +211,11 @@ class Slam:
     def _move(self, name: str, part: Part) -> None:
         """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
         moving = self._moving[name]
-        before = moving.error
-        if before is None and not (part.first and part.last) and part.N.any():
+        shared = moving.error is None and not (part.first and part.last) and part.N.any()
+        if shared and moving.leads_somewhere(self.map, part):
             with suppress(MapError):  # it is full: each part has an error of its own
                 moving.error = self.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
         if not self.estimator.predict(self.map, moving.movement(part)):
-            if before is None and moving.error is not None:
-                self.map.remove(moving.error)
-                moving.error = None
             what = f"{name!r} at t={seconds(self.t_ns or 0)} s"
             raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
         self.clones.moved(name)
@@ -228,7 +223,7 @@ class Slam:
     # ------------------------------------------------------------------ scans
     def _fuse(self, scan: ScanContext, policy: Policy) -> None:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
-        query = ScanQuery(scan)
+        query = Query(scan)
         decisions = policy.association.associate(query)
         if policy.holds_back:
             decisions = accepted(query, decisions, policy.upkeep.odds)
@@ -251,7 +246,7 @@ class Slam:
         """Fuse observations of landmarks in the map, the groups of those of one type at once.  [S] (26)-(30)."""
         report, found, most = scan.report, list[Observation](), policy.attention.updates
         if most is not None and sum(len(rows) for _, rows in groups) > most:
-            groups, out = budget.chosen(scan, policy.attention, groups, decisions)
+            groups, out = chosen(scan, policy.attention, groups, decisions)
             why = f"not among the {most} of most information"
             found += [Observation(k, scan.ids[k], "ignored", decisions[k][0], None, why) for k in out]  # type: ignore[arg-type]
         if policy.attention.sequential:
@@ -263,7 +258,7 @@ class Slam:
                 continue
             names: list[Any] = [decisions[k][0] for k in rows]
             slots = self.tracks.slots_of(names)
-            if scan.channel.far is not None and (near := far.approach(scan, model, slots, rows)) is not None:
+            if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:
                 self.estimator.correct(self.map, near)
             done = self._corrected(scan.update(model, slots, rows), scan.event)
             report.fill(rows, done)
@@ -311,7 +306,7 @@ class Slam:
             for o in self._correct(scan, policy, groups, by_name):
                 seen[o.index] = o._replace(outcome="new", reason=by_name[o.index][1])
         new = [k for k in new if k not in seen]
-        reasons = budget.left_out(scan, policy.attention, policy.starts, new, known, decisions)
+        reasons = left_out(scan, policy.attention, policy.starts, new, known, decisions)
         for k in new:
             name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
             seen[k] = self._initialize(scan, policy, k, name, reason)
@@ -367,7 +362,7 @@ class Slam:
         if not scan.channel.is_ambiguous:
             why = f"a {sensor} measurement without an id cannot start a landmark"
             return Observation(k, id_, "ignored", None, None, why)
-        return None if mirrored.is_clear(scan, k) else Observation(k, id_, "deferred", None, None, mirrored.MIRRORED)
+        return None if tags.is_clear(scan, k) else Observation(k, id_, "deferred", None, None, tags.MIRRORED)
 
     # ------------------------------------------------------------------ pending landmarks
     def _defer(self, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:

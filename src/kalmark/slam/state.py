@@ -1,6 +1,7 @@
 """A Slam on disk: one zip of arrays, a JSON description and their checksums, never pickle: loading runs nothing of it.
 
-The settings are what a Slam is constructed with, the state is what events have made of it.
+The settings are what a Slam is constructed with, the state is what events have made of it.  Registered models are saved
+by name and parameters, others by name alone, to be given again.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,9 +20,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array
 from kalmark.association import Association
+from kalmark.declare import by_class_name, registered_name
 from kalmark.errors import KalmarkError, MapError
 from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
@@ -30,18 +33,18 @@ from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark
-from kalmark.slam.describe import described, landmark_type, restored, robot_described, robots_restored, same
 from kalmark.slam.motion import Moving, bias_name
-from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.robot import Mount, Robot, mount_name
 from kalmark.tracks.clones import Clone, Clones, Measurement
 from kalmark.tracks.track import Pending, Status, Track, Tracks
 
-Array = npt.NDArray[np.float64]
 Description = dict[str, Any]
 
 VERSION = 7
 DESCRIPTION, SUMS = "slam.json", "sha256"
 OF_TRACKS = ("recent", "last_scan", "changes", "unnamed", "experience")  # what `Tracks` knows beside the tracks
+PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
+NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 OF_MOVING = ("t_ns", "fresh")
 
 
@@ -60,15 +63,11 @@ def settings(
     upkeep: Upkeep, reparametrize: float | None, map_type: str, numbers: str,
 ) -> Description:  # fmt: skip
     """Return a description of what a Slam was constructed with."""
+    models = {"association": association, "estimator": estimator, "landmarks": landmarks, "upkeep": upkeep}
     return {
         "robots": [robot_described(robot) for robot in robots.values()],
-        "association": described(association),
-        "estimator": described(estimator),
-        "landmarks": None if landmarks is None else described(landmarks),
-        "upkeep": described(upkeep),
-        "reparametrize": reparametrize,
-        "map": map_type,
-        "numbers": numbers,
+        **{role: None if model is None else described(model) for role, model in models.items()},
+        **{"reparametrize": reparametrize, "map": map_type, "numbers": numbers},
     }
 
 
@@ -97,7 +96,7 @@ def save(path: Path, settings: Description, state: State) -> None:
 
 def _state(state: State) -> Description:
     tracks = state.tracks
-    all_ = [track for each in (tracks.confirmed, tracks.tentative, tracks.pending) for track in each.values()]
+    all_ = [*tracks.confirmed.values(), *tracks.tentative.values(), *tracks.pending.values()]
     blocks = {name: slot for name, slot in tracks.slots.items() if name not in tracks.confirmed}
     return {
         "t_ns": state.t_ns,
@@ -229,20 +228,18 @@ def load(
 
     Raises MapError if the file is damaged, lacks a model, or was saved with other robots or landmarks.
     """
-    given = None if robots is None else list(robots)
     saved = Saved(path, {}, {}, {})
     with saved.errors():
         description, members = _read(path)
         s, state = description["settings"], description["state"]
-        kinds = {"landmarks": s["landmarks"], "kinds": [[t["id"], t["model"]] for t in state["tracks"]]}
         found = {
-            "robots": robots_restored(s["robots"], given),
+            "robots": robots_restored(s["robots"], None if robots is None else list(robots)),
             "association": association or restored("association", s["association"], "association", "association"),
             "estimator": estimator or restored("estimator", s["estimator"], "estimator", "estimator"),
-            "landmarks": landmark_type(kinds, landmarks),
+            "landmarks": landmark_type(s["landmarks"], [t["model"] for t in state["tracks"]], landmarks),
             "map": s["map"],
             "numbers": s["numbers"],
-            "reparametrize": _threshold(s["reparametrize"]),
+            "reparametrize": _optional(s["reparametrize"], "reparametrize", "a number", int, float),
             "upkeep": restored("upkeep", s["upkeep"], "upkeep", "upkeep"),
         }
         return Saved(path, found, state, members, landmarks)
@@ -389,13 +386,112 @@ def _count(value: Any, what: str) -> int:
     return value
 
 
-def _threshold(value: Any) -> float | None:
-    if value is not None and not isinstance(value, float | int):
-        raise MapError(f"reparametrize is {value!r}, expected a number or none")
+def _optional(value: Any, what: str, expected: str, *kinds: type) -> Any:
+    if value is not None and type(value) not in kinds:
+        raise MapError(f"{what} is {value!r}, expected {expected} or none")
     return value
 
 
 def _time(value: Any) -> int | None:
-    if value is not None and type(value) is not int:
-        raise MapError(f"t_ns is {value!r}, expected an integer or none")
-    return value
+    return _optional(value, "t_ns", "an integer", int)
+
+
+# ---------------------------------------------------------------------- models and robots
+def described(model: Any) -> Description:
+    """Return a model that has a name in configurations as its class and parameters, another as its class alone."""
+    name = type(model).__name__
+    if registered_name(type(model)) is None:
+        return {"python": name, "kind": model.kind if isinstance(model, Landmark) else ""}
+    return {"type": name, **{f.name: _parameter(vars(model)[f.name]) for f in fields(model)}}
+
+
+def _parameter(value: Any) -> Any:
+    """Return NumPy's numbers as Python's, and those JSON has no word for as text."""
+    if isinstance(value, tuple):
+        return [_parameter(v) for v in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def restored(kind: str, description: Description, what: str, argument: str) -> Any:
+    """Make a registered model again; of another, say which argument of `load` has to give it."""
+    if "python" in description:
+        raise MapError(f"{what} is {_name(description)}, a model of your own: give the {argument} to load() again")
+    model = by_class_name(kind, description["type"])
+    if model is None:
+        raise MapError(f"{what} is {description['type']!r}, expected one of kalmark's, or of a plugin that is loaded")
+    parameters = {k: v for k, v in description.items() if k != "type"}
+    return model(**{k: float(v) if v in NOT_FINITE else v for k, v in parameters.items()})
+
+
+def _name(description: Description) -> str:
+    return str(description.get("type") or description["python"])
+
+
+def same(landmark: Any, description: Description | None) -> bool:
+    """Return whether a landmark type is the one that was saved."""
+    if description is None:
+        return False
+    mine = described(landmark)
+    return _name(mine) == _name(description) and mine.get("kind") == description.get("kind")
+
+
+def robot_described(robot: Robot) -> Description:
+    """Return a robot with its motion, its start and its mounted sensors."""
+    mounts = [
+        [name, {"at": list(mount.at), "cov": _listed(mount.cov), **_parts(mount)}]
+        for name, mount in robot.sensors.items()
+    ]
+    moved = {"motion": described(robot.motion), "columns": list(robot.motion.columns)}
+    return {"name": robot.name, **moved, "start": list(robot.start), "cov": _listed(robot.cov), "sensors": mounts}
+
+
+def _parts(mount: Mount) -> Description:
+    return {role: None if (model := vars(mount)[role]) is None else described(model) for role in PARTS}
+
+
+def _listed(cov: Any) -> Any:
+    return None if cov is None else np.asarray(cov).tolist()
+
+
+def _robot_restored(d: Description) -> Robot:
+    who, mounts = f"robot {d['name']!r}", {}
+    for name, m in d["sensors"]:
+        what = f"{who}: sensor {name!r}"
+        said = {"sensor": what} | {role: f"{what}: {role}" for role in PARTS[1:]}
+        parts = {role: restored(role, m[role], said[role], "robots") for role in PARTS if m.get(role) is not None}
+        mounts[name] = Mount(at=m["at"], cov=m["cov"], **parts)
+    return Robot(d["name"], restored("motion", d["motion"], f"{who}: motion", "robots"), d["start"], mounts, d["cov"])
+
+
+def robots_restored(saved: list[Description], given: list[Robot] | None) -> list[Robot]:
+    """Return the robots in the order saved: restored, or those given again if they are the same."""
+    if given is None:
+        return [_robot_restored(d) for d in saved]
+    for robot in given:
+        if not isinstance(robot, Robot):
+            raise MapError(f"robots holds {robot!r}, expected nothing but robots")
+    names = [d["name"] for d in saved]
+    got = [robot.name for robot in given]
+    if sorted(got) != sorted(names):
+        raise MapError(f"robots are {got}, expected {names}")
+    given = sorted(given, key=lambda robot: names.index(robot.name))
+    for robot, d in zip(given, saved, strict=True):
+        for what, mine, expected in (
+            ("motion is", type(robot.motion).__name__, _name(d["motion"])),
+            ("columns of the motion are", list(robot.motion.columns), d["columns"]),
+            ("sensors are", sorted(map(str, robot.sensors)), sorted(str(name) for name, _ in d["sensors"])),
+        ):
+            if mine != expected:
+                raise MapError(f"robot {robot.name!r}: {what} {mine}, expected {expected}")
+    return given
+
+
+def landmark_type(saved: Description | None, of_tracks: list[Description], given: Landmark | None) -> Landmark | None:
+    """Return the slam's type of landmark; one given again must be one that was saved, of the slam or of a track."""
+    if given is not None and same(given, saved):
+        return given
+    if given is not None and not any(same(given, d) for d in of_tracks):
+        names = sorted({_name(d) for d in (saved, *of_tracks) if d is not None})
+        raise MapError(f"landmarks is {type(given).__name__}, expected {' or '.join(names) or 'None'}")
+    return None if saved is None else restored("landmark", saved, "landmarks", "landmarks")

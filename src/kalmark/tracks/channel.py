@@ -9,34 +9,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.errors import ModelError
 from kalmark.filter import corrections
 from kalmark.filter.map import AT_ONCE, Map, StochasticMap
 from kalmark.filter.neighbours import has_place
 from kalmark.models import landmarks as kinds
+from kalmark.models import protocols
 from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
-from kalmark.models.protocols import (
-    Ambiguous,
-    Checked,
-    FarCorrected,
-    FullSensor,
-    Landmark,
-    NonAdditiveSensor,
-    Segmented,
-    Sensor,
-    StartNoise,
-    UnknownDepth,
-    finds_depth,
-    range_limit,
-    sees_kinds,
-)
+from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
 
 ROBOT = "robot"
@@ -100,18 +85,18 @@ class Channel:
         self._refuse_misfit()
         self.dof = self._dof()
         self.gate = threshold(self.dof)
-        full, self.finds_depth = isinstance(sensor, FullSensor), finds_depth(sensor)
-        any_depth = self.finds_depth or isinstance(landmark, UnknownDepth) or landmark.kind not in EUCLIDEAN
+        full, self.finds_depth = isinstance(sensor, protocols.FullSensor), finds_depth(sensor)
+        any_depth = self.finds_depth or isinstance(landmark, protocols.UnknownDepth) or landmark.kind not in EUCLIDEAN
         self.starts_landmarks = full and any_depth
         placed = all(has_place(model.landmark.space) for model in self.models.values())
         self.gives_places = full and self.finds_depth and placed
-        self.is_ambiguous = isinstance(sensor, Ambiguous)
-        self.check = sensor.check if isinstance(sensor, Checked) else None
-        self.start_noise = sensor.start_noise if isinstance(sensor, StartNoise) else None
-        varies = isinstance(sensor, NonAdditiveSensor) and not sensor.additive
+        self.is_ambiguous = isinstance(sensor, protocols.Ambiguous)
+        self.check = sensor.check if isinstance(sensor, protocols.Checked) else None
+        self.start_noise = sensor.start_noise if isinstance(sensor, protocols.StartNoise) else None
+        varies = isinstance(sensor, protocols.NonAdditiveSensor) and not sensor.additive
         self.noise_at: Any = sensor.noise_at if varies else None  # type: ignore[attr-defined]
         self.far: ObservationModel | None = None  # of poses, for measurements far from what is expected
-        if isinstance(sensor, FarCorrected):
+        if isinstance(sensor, protocols.FarCorrected):
             self.far = ObservationModel(landmark, TagPose(), self.at)
 
     def _models(self, polar: bool) -> dict[str, ObservationModel]:
@@ -192,7 +177,7 @@ class Channel:
     ) -> Index:
         """Return the indices (K,) of the `slots` in view; `extents` are the segments (2, 3) of lines, or None."""
         T, l = self.pose(map_, robot), map_.means(np.array(slots), model.d)
-        if not isinstance(model.landmark, Segmented):
+        if not isinstance(model.landmark, protocols.Segmented):
             v = model.landmark.seen_from(T, l)[0]
             if isinstance(model.landmark, InverseDepth2D):  # a ray, as long as rho times the distance
                 v = v / np.maximum(l[:, -1:], TINY_RHO)
@@ -266,6 +251,6 @@ def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool)
 
 def _arcs_matter(sensor: Sensor) -> bool:
     """Return whether the arc of a bearing's sigma leaves its tangent by half a sigma of the range, far away."""
-    if not isinstance(sensor, RangeBearing) or np.isinf(d := range_limit(sensor)):
+    if not isinstance(sensor, RangeBearing) or np.isinf(d := protocols.range_limit(sensor)):
         return False
     return bool(d * sensor.sigma_bearing_rad**2 > np.sqrt(sensor.range_variance(np.array([[d]]))[0]))

@@ -9,10 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
+from kalmark.arrays import Array
 
-Array = npt.NDArray[np.float64]
 User = tuple[str, str]  # a channel: robot, sensor
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
 from kalmark.events import Id, Scan
 from kalmark.filter.estimators import Estimator, Update
 from kalmark.filter.map import Map
@@ -16,9 +16,6 @@ from kalmark.report import Report
 from kalmark.tracks.channel import Channel, ObservationModel, Parts
 from kalmark.tracks.clones import Clones, Measurement
 from kalmark.tracks.track import ChannelKey, Tracks
-
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 
 
 class Start(NamedTuple):

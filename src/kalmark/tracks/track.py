@@ -8,8 +8,8 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.models.protocols import Landmark, Segmented
@@ -17,9 +17,6 @@ from kalmark.report import Observation
 from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
 from kalmark.tracks.clones import Measurement
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan
 ChannelKey = tuple[str, str]  # robot, sensor
 
@@ -266,11 +263,11 @@ class Tracks:
 
         Left out are names that a sensor of this robot does not observe in the map, itself among them.
         """
-        sorts, at = list(map(self.sorts.get, names)), range(len(names))
+        sorts, at = list(map(self.sorts.get, names)), list(range(len(names)))
         if robot in names:
             at = [i for i in at if names[i] != robot]
         elif len(set(sorts)) == 1:
-            return [(channel.models[sorts[0]], list(at))] if sorts[0] in channel.models else []
+            return [(channel.models[sorts[0]], at)] if sorts[0] in channel.models else []
         groups: dict[int, tuple[ObservationModel, list[int]]] = {}
         for i in at:
             if (sort := sorts[i]) in channel.models:

@@ -1,7 +1,12 @@
-"""Planar pose ambiguity: which of its two poses a tag has, by the evidence of several scans.
+"""Tags whose pose one scan does not determine, or whose pixels are far from what is expected of them.
 
-From afar a tag looks the same when it is mirrored along the line of sight.  Each scan says how much worse the other
-pose fits, as a difference of chi-squares; the tag starts when their sum decides.  Schweighofer and Pinz 2006.
+*Planar pose ambiguity*: from afar a tag looks the same when it is mirrored along the line of sight.  Each scan says how
+much worse the other pose fits, as a difference of chi-squares; the tag starts when their sum decides.  Schweighofer and
+Pinz 2006.
+
+*Pose-based relinearisation*, as after a time without any measurement: the pixels of a tag's corners are linear in its
+pose over some degrees only.  Farther away their Jacobians mislead, and behind the camera there are none.  The pose that
+the corners determine is linear in the errors of the robot and the tag.
 """
 
 from __future__ import annotations
@@ -9,18 +14,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from kalmark.arrays import Array, Index
+from kalmark.filter.estimators import Update
 from kalmark.management.pending import Step
-from kalmark.models.sensors_camera import TELLING
+from kalmark.models.protocols import FarCorrected
+from kalmark.models.sensors import TELLING
+from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Pending
-
-Array = npt.NDArray[np.float64]
 
 MIRRORED = "its mirror image fits as well"
 AGAIN = 1 / 3  # weight of the second scan and those after it: their errors are correlated (docs/datasets3d.md)
 FORGET_NS = 1_000_000_000  # evidence from so long before is dropped
+SHARE = 100.0  # the poses count a hundredth of what they determine: enough to relinearise, and the corners count again
 
 
 class Mirrored:
@@ -61,3 +68,23 @@ def is_clear(scan: ScanContext, k: int) -> bool:
     """Return whether one scan alone decides which pose a tag has; one without an id must be decided so."""
     _, _, chi2 = scan.channel.sensor.both(scan.y[k : k + 1])
     return not np.isfinite(chi2[0, 0]) or bool(chi2[0, 1] - chi2[0, 0] >= TELLING)
+
+
+def approach(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Update | None:
+    """Return the correction by the poses of those tags of the observations `rows` that are far; None if none is.
+
+    `slots` (K,) are the tags' blocks.  A tag of ambiguous pose is left out, and so is what is no tag.
+    """
+    channel, map_, robot = scan.channel, scan.map, scan.robot
+    if channel.far is None or not isinstance(channel.sensor, FarCorrected):
+        return None
+    y, R = scan.y[rows], scan.R[rows]
+    far = np.flatnonzero(channel.sensor.is_far(y, channel.innovations(map_, robot, model, slots, y)))
+    if not len(far):
+        return None
+    v, cov = channel.sensor.poses(y[far], R[far])
+    clear = channel.predict(map_, robot, channel.far, slots[far], v, cov)[1] <= channel.gate  # not of a NaN
+    if not clear.any():
+        return None
+    some, R_far = slots[far][clear], SHARE * cov[clear]
+    return Update(channel.far.model, robot, channel.mount, some, model.d, v[clear], R_far, channel.gate)
