@@ -15,8 +15,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from kalmark.arrays import Array, Flags
 from kalmark.batch.problem import Block, Factor, Motions, Problem, motions, positions, sightings
-from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, ORIGIN, POSE_SPACES, POSES, Array, Flags, Ints, State, unsolved
+from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, ORIGIN, POSE_SPACES, POSES, Ints, State, unsolved
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.geometry.spaces import mount_space
 from kalmark.models.observe import composed, inverse_expectation, view_of

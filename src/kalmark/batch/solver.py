@@ -24,8 +24,9 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
+from kalmark.arrays import Array
 from kalmark.batch.problem import Linearized, Problem
-from kalmark.batch.state import LANDMARKS, POSES, Array, Ints, State, unsolved
+from kalmark.batch.state import LANDMARKS, POSES, Ints, State, unsolved
 from kalmark.errors import KalmarkError
 from kalmark.events import Id
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from kalmark.arrays import Array
 from kalmark.campaign.scoring import NEES, Scores
 from kalmark.results.evaluate import none_for_nan
-from kalmark.results.history import Array
 from kalmark.results.scene import COLOURS, grouped
 
 POINTS = 400  # of a curve, at most

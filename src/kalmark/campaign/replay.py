@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.random import Generator, SeedSequence
 
+from kalmark.arrays import Array
 from kalmark.config.building import build_robot, build_slam, config_dict
 from kalmark.config.opening import described
 from kalmark.config.schema import Config, StartConfig
@@ -30,7 +31,6 @@ from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
 from kalmark.models.protocols import bias_covariance
 from kalmark.report import Report
-from kalmark.results.history import Array
 from kalmark.results.landmarks import MapLandmarks, refuse_other_than_points
 from kalmark.results.progress import track
 from kalmark.results.recording import config_yaml

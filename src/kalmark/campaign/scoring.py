@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
+from kalmark.arrays import Array
 from kalmark.errors import DivergedError
 from kalmark.events import Id, Scan
 from kalmark.geometry.angles import wrap
@@ -27,7 +28,6 @@ from kalmark.geometry.rotations import conjugate, exp, log, multiply
 from kalmark.models.landmarks import Polar2D
 from kalmark.models.protocols import Pointed, Segmented, place_of
 from kalmark.report import Report
-from kalmark.results.history import Array
 from kalmark.results.measures import SINGULAR, diverged, nees, point_error, pose_error, rigid, rmse, rotation_error
 from kalmark.simulate.robots import Simulation
 from kalmark.slam.slam import Slam

@@ -12,9 +12,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.declare import Count, NotNegative, Positive, register
-from kalmark.detect.scan import Acute, Array, Detections, Index, Laser
+from kalmark.detect.scan import Acute, Detections, Laser
 from kalmark.geometry.gaussian import gate
 
 STEPS = 10

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.declare import Limit, NotNegative, register
-from kalmark.detect.scan import Array, Detections, Laser
+from kalmark.detect.scan import Detections, Laser
 from kalmark.errors import EventError
 
 

@@ -15,9 +15,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.declare import Count, Limit, NotNegative, Positive, register
-from kalmark.detect.scan import Array, Detections, Index, Laser
+from kalmark.detect.scan import Detections, Laser
 
 STEPS = 12
 GRAZING = 0.35  # a beam that hits nearer to the edge than this, in radii of depth, is taken to hit there

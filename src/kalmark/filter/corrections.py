@@ -20,12 +20,10 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter import parallax
 from kalmark.filter.kernels import (
-    Array,
-    Flags,
-    Index,
     add_square,
     cholesky_inverse,
     downdate,

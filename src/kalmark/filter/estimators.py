@@ -9,9 +9,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
-from kalmark.filter.kernels import Array, Flags, Index
 from kalmark.filter.map import Map, StochasticMap
 
 

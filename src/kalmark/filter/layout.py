@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
-from kalmark.filter.kernels import Array, Index
 from kalmark.geometry.spaces import REMOVED, RHO, Space, Table
 
 State = dict[str, Any]  # of a JSON file

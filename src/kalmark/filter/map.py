@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.filter import corrections, kernels
-from kalmark.filter.kernels import Array, Index
 from kalmark.filter.layout import CAPACITY, P_AT, P_SIZE, Layout, Read, State, next_capacity, spaces_of
 from kalmark.filter.neighbours import Sorts, distances, near_places, paired
 from kalmark.filter.prefault import Prefault

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Array, Flags, Index
 from kalmark.filter.layout import X_AT
 from kalmark.geometry.spaces import HEADING, RHO, VECTOR, VECTOR3, Space, Table
 

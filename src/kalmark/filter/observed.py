@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
-from kalmark.filter.kernels import Array, Flags, Index
 from kalmark.geometry.spaces import ERROR_SIZE, HEADING, Table
 
 Linear = tuple[Array, Array, Array, Array]  # of all observations at once: innovation v (K p,), H, H P, Z

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
-from kalmark.filter.kernels import Array, Index, rows_of, submatrix
+from kalmark.filter.kernels import rows_of, submatrix
 from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, VECTOR, X_AT, Table
 
 Baselines = tuple[Table, Array, Array, Array]  # of the anchored at the prediction: table, s, S, c2

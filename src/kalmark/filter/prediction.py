@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
 from kalmark.filter.corrections import Map, generators
-from kalmark.filter.kernels import Array, Index
 from kalmark.geometry.rotations import matrix
 from kalmark.models.moving import step
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import scipy.io
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
-from kalmark.logs.log import Array, Times
+from kalmark.logs.log import Times
 from kalmark.logs.source import file_in
 
 

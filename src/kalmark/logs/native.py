@@ -24,9 +24,10 @@ from pathlib import Path
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Id, Scan, order
-from kalmark.logs.log import Array, Log, PositionTrack, Trajectory
+from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, landmark_id, mapping, nearest, seconds
 from kalmark.logs.table import CONTROL, OBSERVATION, Refused, Row, read_table
 

@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan
 from kalmark.logs.arrays import arrays
-from kalmark.logs.log import Array, Log, Trajectory
+from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Refuse, Request, nanoseconds, number, one_robot, rows, timed_rows
 
 ROBOT, SENSOR = "robot", "radio"

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, order
-from kalmark.logs.log import Array, Log, Trajectory
+from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, placed
 
 NAME = "slamtb"

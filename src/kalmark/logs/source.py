@@ -15,10 +15,11 @@ import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Event, Id, order
 from kalmark.geometry import rotations
-from kalmark.logs.log import Array, Log
+from kalmark.logs.log import Log
 
 Refuse = Callable[[str], None]
 """Takes one line about a bad row: raises it as a LogError, or notes it and lets reading go on (`on_error`)."""

@@ -23,9 +23,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan
-from kalmark.logs.log import Array, Log
+from kalmark.logs.log import Log
 from kalmark.logs.source import (
     STEP_NS,
     Format,

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.logs.arrays import arrays, events_of, find_variables, refuse_shapes, times
-from kalmark.logs.log import Array, Log, Trajectory
+from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, choice, frame, one_robot, placed, quantity
 
 SENSOR = "stereo"

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.logs.log import Array
 from kalmark.logs.source import Request, nanoseconds, nearest, number, read_text
 
 NAMES = ("t_s", "robot", "sensor", "id")

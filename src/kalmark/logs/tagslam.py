@@ -19,10 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.geometry.frames3d import compose, inverse
-from kalmark.logs.log import Array, Log, Trajectory
+from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     Format,
     Request,

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.arrays import arrays, times
-from kalmark.logs.log import Array, Log, PositionTrack, Times
+from kalmark.logs.log import Log, PositionTrack, Times
 from kalmark.logs.source import Format, Request, choice, folder_of, nanoseconds, one_robot, read_text, timed_rows
 
 ROBOT, SENSOR = "car", "laser"

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from ruamel.yaml import YAML
 
+from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Id, Scan
-from kalmark.logs.log import Array, Log
+from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
 from kalmark.logs.source import landmark_id, seconds
 from kalmark.logs.table import CANONICAL, cov_columns

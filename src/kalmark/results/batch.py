@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, Known, replayed
 from kalmark.batch.problem import Problem
 from kalmark.batch.solver import Batch, optimum
@@ -21,7 +22,7 @@ from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.models.landmarks import Point2D, Point3D, Tag
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
-from kalmark.results.history import Array, as_id
+from kalmark.results.history import as_id
 from kalmark.results.landmarks import refuse_other_than_points
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.progress import track

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.results.history import Array, Biased, Mounted
+from kalmark.arrays import Array
+from kalmark.results.history import Biased, Mounted
 from kalmark.results.readings import describe_pose
 from kalmark.results.words import figure
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.logs.source import records_of
 from kalmark.report import OUTCOMES
 from kalmark.results.calibration import bias_figures, mount_figures
-from kalmark.results.history import Array, History, Ints
+from kalmark.results.history import History, Ints
 from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
 from kalmark.results.matching import association_figures, best_known, by_position, no_ids
 from kalmark.results.measures import Rigid, diverged, identity, nees, nis, path_m, pose_error, rigid, rigid_robust, rmse

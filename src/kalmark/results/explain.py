@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import seconds as short
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.protocols import FullSensor, finds_depth
 from kalmark.report import Candidate
-from kalmark.results.history import Array, Change, History, Ints
+from kalmark.results.history import Change, History, Ints
 from kalmark.results.landmarks import LINE
 from kalmark.results.readings import mount_now
 from kalmark.results.recording import Recording, seconds

@@ -26,13 +26,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.declare import is_own
 from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
 from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
 from kalmark.models.landmarks import PointSignature2D
 from kalmark.models.protocols import Landmark, Segmented, place_of
-from kalmark.results.history import Array, Ints, as_id, padded_all
+from kalmark.results.history import Ints, as_id, padded_all
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam

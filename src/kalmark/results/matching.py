@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.events import Id
-from kalmark.results.history import Array, History, as_id
+from kalmark.results.history import History, as_id
 from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
 from kalmark.results.recording import Recording
 

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from kalmark.arrays import Array
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, multiply
-from kalmark.results.history import Array, Ints
+from kalmark.results.history import Ints
 
 SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix that still counts as regular
 DIVERGED_SIGMAS = 10.0

@@ -15,8 +15,8 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
+from kalmark.arrays import Array
 from kalmark.results.evaluate import headline
-from kalmark.results.history import Array
 from kalmark.results.landmarks import LINES, TAG
 from kalmark.results.recording import Recording
 from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares

@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.results.explain import Explanation, Fate
-from kalmark.results.history import Array
 from kalmark.results.recording import Recording
 from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
 from kalmark.results.words import figure as figure_of

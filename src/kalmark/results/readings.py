@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.declare import own_name, parameters, plugin_of, registered_name
 from kalmark.errors import MapError
 from kalmark.events import Scan
@@ -16,7 +17,7 @@ from kalmark.logs import FORMATS
 from kalmark.logs.log import Log
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
-from kalmark.results.history import Array, Biased, Camera, Mounted
+from kalmark.results.history import Biased, Camera, Mounted
 from kalmark.slam.motion import bias_name
 
 if TYPE_CHECKING:

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numba.core import event as numba_event
 
+from kalmark.arrays import Array
 from kalmark.declare import is_own, registered_name
 from kalmark.errors import DivergedError, EventError, LogError
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.source import nearest
-from kalmark.results.history import Array, Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
+from kalmark.results.history import Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
 from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, stated_noise

@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.report import OUTCOMES
 from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.explain import Explanation, Fate, explained
-from kalmark.results.history import Array, Camera, Change, History, Ints, MapSnapshot
+from kalmark.results.history import Camera, Change, History, Ints, MapSnapshot
 from kalmark.results.landmarks import shapes
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
 from kalmark.results.recording import Recording, config_yaml

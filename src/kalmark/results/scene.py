@@ -18,10 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
-from kalmark.results.history import Array, Camera, Flags, History, Ints
+from kalmark.results.history import Camera, History, Ints
 from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, LINE, Shapes, shapes
 from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording

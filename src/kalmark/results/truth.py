@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.logs.log import Log, PositionTrack
-from kalmark.results.history import Array, Arrays, History, Named, Start, as_id, padded_all, texts
+from kalmark.results.history import Arrays, History, Named, Start, as_id, padded_all, texts
 from kalmark.results.landmarks import LINE, TAG
 from kalmark.results.measures import Rigid, pose_error
 

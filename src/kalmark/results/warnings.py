@@ -23,10 +23,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from kalmark.arrays import Array
 from kalmark.declare import registered_name
 from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
-from kalmark.results.history import Array, History, Ints, UsedFix
+from kalmark.results.history import History, Ints, UsedFix
 from kalmark.results.matching import LEAST, no_ids
 from kalmark.results.measures import nis
 from kalmark.results.recording import Recording

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Array, Index
 from kalmark.geometry.spaces import DIRECTION, ERROR_SIZE, HOMOGENEOUS, MEAN_SIZE, VECTOR, VECTOR3, Space
 
 NO_NUMBERS = np.zeros(0)

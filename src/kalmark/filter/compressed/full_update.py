@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import compiled
 from kalmark.filter.compressed.immediate import Displacements, carried
 from kalmark.filter.compressed.storage import PANEL, Stored, Triangle, subtract
-from kalmark.filter.kernels import Array, Flags, Index
 from kalmark.filter.layout import P_AT, P_SIZE, X_SIZE, Layout, laid_out
 from kalmark.filter.prefault import Prefault
 

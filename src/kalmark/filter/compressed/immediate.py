@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Array, Index
 from kalmark.filter.layout import P_AT
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry.angles import wrap

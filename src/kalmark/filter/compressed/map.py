@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.filter import kernels
 from kalmark.filter.compressed import immediate
 from kalmark.filter.compressed.drift import Drift
@@ -28,7 +29,6 @@ from kalmark.filter.compressed.reading import carried_along, joined, split
 from kalmark.filter.compressed.schedule import PREFAULT, SLICE, Schedule
 from kalmark.filter.compressed.search import Search
 from kalmark.filter.compressed.storage import PANEL, Triangle
-from kalmark.filter.kernels import Array, Index
 from kalmark.filter.layout import P_AT, Layout, State, laid_out
 from kalmark.filter.map import AT_ONCE, NO_SLOTS, Marginal, Pairs, StochasticMap
 from kalmark.filter.neighbours import Sorts, distances, near_places

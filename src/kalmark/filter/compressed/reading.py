@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
 from kalmark.filter.compressed.immediate import carried
-from kalmark.filter.kernels import Array, Index
 from kalmark.filter.layout import laid_out
 from kalmark.geometry.spaces import Table
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
-from kalmark.filter.kernels import Array, Index
 from kalmark.filter.layout import Layout
 from kalmark.filter.neighbours import Sorts, distance, has_place, least
 

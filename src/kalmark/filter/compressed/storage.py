@@ -16,9 +16,10 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
-from kalmark.filter.kernels import Array, Index, subtract_product
+from kalmark.filter.kernels import subtract_product
 from kalmark.filter.prefault import Prefault
 
 Stored = npt.NDArray[Any]  # float64 or float32
