@@ -20,7 +20,7 @@ from kalmark.campaign.replay import replay_of
 from kalmark.config import load_config
 from kalmark.geometry import compose, wrap
 from kalmark.logs import FORMATS, open_log
-from kalmark.results.run import load_run
+from kalmark.results.run import Run
 from kalmark.results.scene import Scene
 
 CONFIG = """
@@ -96,7 +96,7 @@ def test_models_of_a_user_go_from_python_to_the_command_line_and_back(own: Any, 
 
     # the landmarks are written and drawn where they are: at their boards
     expected = {i: compose(np.array(post), np.array([0.7, 0, 0]))[0][:2] for i, post in SIGNS.items()}
-    drawn, loaded = Scene.of(load_run(saved)), load_run(saved).landmarks
+    drawn, loaded = Scene.of(Run.load(saved)), Run.load(saved).landmarks
     for k, name in enumerate(SIGNS):
         p, P = slam.place(name)
         assert np.linalg.norm(p - expected[name]) < 0.3 < np.linalg.norm(p - slam.mean(name)[:2])
@@ -121,7 +121,7 @@ def test_models_of_a_user_go_from_python_to_the_command_line_and_back(own: Any, 
         assert (tmp_path / "second" / name).read_text() == (saved / name).read_text(), name
     assert "associated 1" in kalmark("explain", "second", "--scan", "3", folder=tmp_path)
     for what, refused in (  # what only does points
-        ("batch solution", lambda: load_run(tmp_path / "second").evaluate(batch=True)),
+        ("batch solution", lambda: Run.load(tmp_path / "second").evaluate(batch=True)),
         ("day, to be replayed", lambda: replay_of(config, open_log(tmp_path / "day.signs"), progress=False)),
     ):
         with pytest.raises(km.KalmarkError, match=f"{what}: landmark 1 is a sign, expected points"):

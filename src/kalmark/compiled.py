@@ -15,13 +15,17 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
+from importlib import import_module
 from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
+import llvmlite.binding
 import numba
 import platformdirs
 from llvmlite import ir
@@ -33,13 +37,13 @@ from numba.extending import intrinsic, overload
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; it can take a minute\n"
+COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; it can take half a minute\n"
 
 _FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
 
-SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` calls them
+SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` and `moving` call them
     "models": ("compiled.py", "geometry/*.py", "models/*.py"),
-    "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py"),
+    "filter": ("compiled.py", "geometry/*.py", "models/moving.py", "models/observe.py", "filter/**/*.py"),
 }
 
 
@@ -67,6 +71,7 @@ def compiled(function: F) -> F:
 @cache
 def address_of(function: Any, signature: Signature) -> int:
     """Return the address of a compiled function for arguments of a signature: compiled, or loaded from disk, now."""
+    caught_up(function)
     function.compile(signature.args)
     result = function.overloads[signature.args]
     if result.signature.return_type != signature.return_type:
@@ -80,6 +85,44 @@ def address_of(function: Any, signature: Signature) -> int:
 def say_compiling() -> None:
     """Say on stderr that this takes longer than it will the next time; once in a process."""
     sys.stderr.write(COMPILING)
+
+
+_AHEAD: dict[Any, subprocess.Popen[bytes]] = {}  # by the functions that are compiled there
+
+
+def ahead(jobs: dict[Any, str]) -> None:
+    """Compile functions, of arguments of these types, on a second core, unless that was done before.
+
+    Who needs one of them calls `caught_up` first, and then finds it on the disk.
+    """
+    names = {f"{function.__module__}:compiled_{function.__name__}": types for function, types in jobs.items()}
+    version = f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version} {names}"
+    folder = Path(cache_folder("filter"))
+    mark = folder / f"ahead-{hashlib.sha256(version.encode()).hexdigest()[:16]}"
+    if parent_process() is not None or (os.cpu_count() or 1) < 2 or mark.exists():
+        return
+    with suppress(OSError):  # a cache that cannot be written to helps nobody
+        folder.mkdir(parents=True, exist_ok=True)
+        mark.touch(exist_ok=False)
+        code = "import sys; from kalmark.compiled import compile_jobs; compile_jobs(sys.argv[1:])"
+        command = [sys.executable, "-c", code, *(text for job in names.items() for text in job)]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+        _AHEAD.update(dict.fromkeys(jobs, process))
+
+
+def compile_jobs(texts: list[str]) -> None:
+    """Compile the functions that `ahead` was asked for: their names, each followed by the types of its arguments."""
+    for name, arguments in zip(texts[::2], texts[1::2], strict=True):
+        module, function = name.split(":")
+        getattr(import_module(module), function).compile(normalize_signature(f"({arguments})")[0])
+
+
+def caught_up(function: Any) -> None:
+    """Wait until a function is on the disk that is compiled on the second core."""
+    if _AHEAD and (process := _AHEAD.pop(function, None)) is not None:
+        say_compiling()
+        process.wait()
 
 
 class _Announcer(event.Listener):  # type: ignore[misc, unused-ignore]

@@ -113,7 +113,7 @@ def test_the_compiled_seam_equals_the_written_out_one(sensor: km.sensors.RangeBe
 def test_range_noise_grows_with_range() -> None:
     R = km.sensors.RangeBearing(sigma_range_m=0.1, sigma_range_rel=0.08).noise(np.array([[0.0, 0], [5.0, 0]]))
     np.testing.assert_allclose(R[:, 0, 0], [0.01, 0.01 + 0.16])
-    assert km.sensors.Range(0.1, 0.08).noise(np.array([[5.0]]))[0, 0, 0] == pytest.approx(0.17)
+    assert km.sensors.Range(0.1, sigma_range_rel=0.08).noise(np.array([[5.0]]))[0, 0, 0] == pytest.approx(0.17)
 
 
 def test_a_sensor_sees_within_its_range_and_field_of_view() -> None:

@@ -6,7 +6,6 @@ import math
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from kalmark.arrays import Array, Index
 from kalmark.association.matchings import best_matching
@@ -85,6 +84,8 @@ class Gated:
 
 def assigned(d2: Array, gate: float) -> Index:
     """Return the column for each row of d2 (K, L) whose sum is least, -1 for none, which counts as the gate."""
+    from scipy.optimize import linear_sum_assignment
+
     count = d2.shape[1]
     cost = np.full((len(d2), count + len(d2)), gate)
     cost[:, :count] = np.where(d2 <= gate, d2, FORBIDDEN * gate)

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from kalmark.arrays import Array
 from kalmark.campaign.scoring import NEES, Scores
+from kalmark.geometry.gaussian import quantile
 from kalmark.results.evaluate import none_for_nan
 from kalmark.results.scene import COLOURS, grouped
 
@@ -47,8 +47,8 @@ class Anees:
         divisor, dof = np.where(known, over, 1.0), np.where(known, dof, 1.0)
         tail = (1.0 - probability) / 2.0
         self.mean = np.where(known, np.where(finite, values, 0.0).sum(axis=0) / divisor, np.nan)
-        self.low = np.where(known, chi2.ppf(tail, dof) / divisor, np.nan)
-        self.high = np.where(known, chi2.ppf(1.0 - tail, dof) / divisor, np.nan)
+        self.low = np.where(known, quantile(tail, dof) / divisor, np.nan)
+        self.high = np.where(known, quantile(1.0 - tail, dof) / divisor, np.nan)
         self.ideal = 1.0 if kind == "joint" else mean(size[finite])
 
     @property
@@ -118,7 +118,7 @@ def mounts(scores: Sequence[Scores]) -> dict[str, float]:
         return {}
     names = ("mount", "mount_dof", "mount_m", "mount_rad")
     last = {name: np.array([_last(s.series[name]) for s in scores]) for name in names}
-    below = last["mount"] <= chi2.ppf(0.9973, last["mount_dof"])
+    below = last["mount"] <= quantile(0.9973, last["mount_dof"])
     degrees = float(np.degrees(rms(last["mount_rad"])))
     return {"mount_m": rms(last["mount_m"]), "mount_deg": degrees, "mount_sure": int(below.sum())}
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
+import itertools
 import math
 import sys
+import textwrap
+from contextlib import suppress
 from typing import Any
 
 from pydantic import BaseModel
@@ -100,12 +104,25 @@ def _choice(title: str, role: str, world: str = "") -> str:
 
 
 def _table(model: type[BaseModel], common: type[BaseModel] = Section) -> str:
+    said = {name: field.description for name, field in model.model_fields.items()} | _texts(model)
     rows = [
-        f"| `{name}` | {_default(field)} | {unit_of(name)} | {field.description} |"
+        f"| `{name}` | {_default(field)} | {unit_of(name)} | {said[name]} |"
         for name, field in model.model_fields.items()
-        if field.description and name not in common.model_fields
+        if said[name] and name not in common.model_fields
     ]
     return "\n".join(["| key | default | unit | meaning |", "|---|---|---|---|", *rows]) if rows else ""
+
+
+def _texts(model: type[BaseModel]) -> dict[str, str]:
+    """Return the text below each key in the source of a section: pydantic would read it each time kalmark starts."""
+    texts: dict[str, str] = {}
+    for section in reversed(model.__mro__):
+        with suppress(OSError, TypeError):  # it has no source: made of a declaration
+            body = ast.parse(textwrap.dedent(inspect.getsource(section))).body[0].body  # type: ignore[attr-defined]
+            for key, text in itertools.pairwise(body):
+                if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
+                    texts[key.target.id] = inspect.cleandoc(text.value.value)  # type: ignore[attr-defined, union-attr]
+    return texts
 
 
 def _default(field: Any) -> str:

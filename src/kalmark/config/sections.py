@@ -50,9 +50,7 @@ class Section(BaseModel):
     `elsewhere` says of keys that another section of this kind has what they are here.
     """
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
     elsewhere: ClassVar[dict[str, str]] = {}
 
     @model_validator(mode="before")

@@ -61,12 +61,23 @@ Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, 
 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
-ITERATE = signature_of(
-    f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({VIEW}, UniTuple(i8, 8), UniTuple(i8, 3), i8[:, ::1], f8[::1], "
-    "f8[:, ::1], f8[:, ::1], f8[:, :, ::1], Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8)))"
+TO_ITERATE = (
+    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 3), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
+    "Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
+)
+ITERATE = signature_of(f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({TO_ITERATE})")
+TO_CORRECT = (  # all but the last argument
+    f"{VIEW}, Tuple((f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8, UniTuple(i8, 8))), "
+    "Tuple((i8, i8, i8[::1], i8, f8[:, ::1], f8[:, :, ::1], f8))"
 )
 call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
 _RETRACT, _GENERATOR, _ITERATE, _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8)
+
+
+@cache
+def generator_address(axes: int) -> int:
+    """Return the address of the `generator` of a map of these axes, compiled now."""
+    return address_of(generator_plane if axes == 1 else generator, GENERATOR)
 
 
 @cache
@@ -75,15 +86,9 @@ def routines(axes: int, inverse_depths: bool) -> Routines:
 
     They are `retract`, `generator` and `iterate`, and what inverse distances need, 0 where there are none.
     """
-    moves, turns = (retract_plane, generator_plane) if axes == 1 else (retract, generator)
-    first = address_of(moves, RETRACT), address_of(turns, GENERATOR), address_of(compiled_iterate, ITERATE)
+    moves = address_of(retract_plane if axes == 1 else retract, RETRACT)
+    first = moves, generator_address(axes), address_of(compiled_iterate, ITERATE)
     return (*first, *((sensor_address(axes), *parallax.addresses()) if inverse_depths else (0, 0, 0, 0, 0)))
-
-
-@compiled
-def generators(ways: Routines, atoms: Table, x: Array, n: int, axes: int) -> Array:
-    """Return how the errors (n, axes) of a mean x move when the world turns about its origin."""
-    return call_generator(ways[_GENERATOR], (atoms, x, n, axes, np.zeros(3)))
 
 
 @compiled

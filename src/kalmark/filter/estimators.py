@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from kalmark.arrays import Array, Flags, Index
+from kalmark.compiled import ahead, caught_up
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
 from kalmark.filter.map import Map, StochasticMap
@@ -84,6 +85,14 @@ class Estimator(Protocol):
 
 
 @runtime_checkable
+class Compiling(Protocol):
+    """An estimator that is compiled, and can begin with that before it is needed."""
+
+    def compile_ahead(self) -> None:
+        """Begin to compile the correction on a second core."""
+
+
+@runtime_checkable
 class Averaging(Protocol):
     """An estimator that can fuse the mean over matchings, as `km.association.Averaged` wants."""
 
@@ -99,21 +108,31 @@ class _Estimator:
 
     source: ClassVar[Callable[..., Any]]
     compiled: ClassVar[Callable[..., Any]]
+    option: ClassVar[str] = "none"  # the type of what `_option` returns
+    iterates: ClassVar[bool] = False
     from_first: ClassVar[bool] = False  # whether displacements count from the first estimates
     transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
+
+    def compile_ahead(self) -> None:
+        """Begin to compile the correction on a second core."""
+        cls = type(self)
+        to_iterate = {corrections.compiled_iterate: corrections.TO_ITERATE} if cls.iterates else {}
+        ahead(to_iterate | {cls.compiled: f"{corrections.TO_CORRECT}, {cls.option}"})
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
         model, robot, added, *control = movement
         m, robot, _, here = map_.movable(robot, added)
         run: Any = prediction.compiled_predicted if isinstance(model, tuple) else prediction.predicted
-        return bool(run(m.whole, (model, robot, here, *control), m.x_first, self.from_first))
+        where = m.x, m.x_first, m.P, m.n, m.blocks, m.atoms, corrections.generator_address(m.axes)
+        return bool(run(where, (model, robot, here, *control), self.from_first))
 
     def correct(self, map_: Map, update: Update) -> Correction:
         """Fuse a scan, where d2 is within the gate."""
         model, robot, mount, slots, d, y, R, gate = update
         run = type(self).compiled if isinstance(model, tuple) else type(self).source
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
+        caught_up(type(self).compiled)
         scan = robot_here, mount_here, here, d, y, R, gate
         done = Correction(*run(model, m.whole, scan, self._option(m)))
         map_.corrected(robot, self.transports)
@@ -172,6 +191,8 @@ class Invariant(_Estimator):
     tolerance: Annotated[Positive, "No more once nothing moves by more than this many of its sigmas."] = 1e-3
 
     coordinates: ClassVar[str] = "log"
+    option: ClassVar[str] = "Tuple((i8, f8))"
+    iterates: ClassVar[bool] = True
     transports: ClassVar[bool] = True
     default_gate: ClassVar[float] = math.inf
     source = corrections.invariant
@@ -196,6 +217,7 @@ class Fej(_Estimator):
     """
 
     coordinates: ClassVar[str] = "world"
+    option: ClassVar[str] = "f8[::1]"
     from_first: ClassVar[bool] = True
     default_gate: ClassVar[float] = math.inf
     source = corrections.first_estimates

@@ -13,10 +13,12 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
-from kalmark.filter.corrections import Map, generators
+from kalmark.filter.corrections import call_generator
 from kalmark.geometry.rotations import matrix
+from kalmark.geometry.spaces import Table
 from kalmark.models.moving import step
 
+Map = tuple[Array, Array, Array, int, Table, Table, int]  # x, x_first, P, n, blocks, atoms, the generator's address
 Motion = tuple[Any, int, Index, bool, Array, Array, Array, float]  # as `estimators.Movement`
 
 
@@ -69,12 +71,12 @@ def transported(F: Array, now: Array, then: Array, at: int) -> Array:
     return out
 
 
-def predicted(map_: Map, motion: Motion, x_first: Array, from_first: bool) -> bool:
+def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
     """Move a robot in a map; return whether all of it is finite: if not, nothing has changed.
 
     `from_first`: displacements count from the first estimates, F (I + (generator(x) - generator(x_first)) e_theta').
     """
-    x, P, n, blocks, atoms, _axes, ways = map_
+    x, x_first, P, n, blocks, atoms, turns = map_
     model, robot, added, shared, u, N, D, dt_s = motion
     at, size, p_at, dof = blocks[robot, 0], blocks[robot, 1], blocks[robot, 2], blocks[robot, 3]
     k = len(u)
@@ -88,8 +90,10 @@ def predicted(map_: Map, motion: Motion, x_first: Array, from_first: bool) -> bo
     r = x[at : at + size].copy()
     moved, F, R_u = step(model, r, total, dt_s)
     if from_first:
-        axes = 1 if size == 3 else 3
-        F = transported(F, generators(ways, atoms, x, n, axes), generators(ways, atoms, x_first, n, axes), p_at)
+        axes, origin = 1 if size == 3 else 3, np.zeros(3)
+        now = call_generator(turns, (atoms, x, n, axes, origin))
+        then = call_generator(turns, (atoms, x_first, n, axes, origin))
+        F = transported(F, now, then, p_at)
     Q, valid = kernels.moved_noise(moved, F, R_u, N)
     if not valid:
         return False

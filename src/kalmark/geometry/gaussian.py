@@ -42,12 +42,17 @@ def bhattacharyya(a: Any, A: Any, b: Any, B: Any) -> float:
     return float(apart + (both - (np.linalg.slogdet(A)[1] + np.linalg.slogdet(B)[1]) / 2) / 2)
 
 
+def quantile(probability: Any, dof: Any) -> Any:
+    """Return the quantile of chi-square: of numbers, or of arrays that go together."""
+    from scipy.special import gammaincinv
+
+    return 2.0 * gammaincinv(np.asarray(dof) / 2, probability)
+
+
 @lru_cache(maxsize=256)
 def gate(probability: float, dof: int) -> float:
     """Return the squared Mahalanobis distance within which a Gaussian of `dof` dimensions lies so often."""
-    from scipy.special import gammaincinv
-
-    return float(2.0 * gammaincinv(dof / 2, probability))  # the quantile of chi-square
+    return float(quantile(probability, dof))
 
 
 def sigma_probability(sigmas: float, dof: int) -> float:

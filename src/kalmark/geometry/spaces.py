@@ -204,8 +204,8 @@ class Space:
 
     def plus(self, x: Array, d: Array) -> Array:
         """Return x (size,) moved by the error d (dof,)."""
-        x = np.array(x, dtype=np.float64)
-        retract(self.atoms, x, np.array(d, dtype=np.float64), NO_TURN)
+        x, moved = np.array(x, dtype=np.float64), retract if self.world == "space" else retract_plane
+        moved(self.atoms, x, np.array(d, dtype=np.float64), NO_TURN)
         return x
 
     def minus(self, x2: Array, x1: Array) -> Array:
@@ -259,7 +259,8 @@ class Space:
 
     def generator(self, x: Array) -> Array:
         """Return the derivative (dof, axes) of `rotated` at phi = 0."""
-        return generator(self.atoms, np.array(x, dtype=np.float64), self.dof, self.axes, np.zeros(3))
+        turned = generator if self.world == "space" else generator_plane
+        return turned(self.atoms, np.array(x, dtype=np.float64), self.dof, self.axes, np.zeros(3))
 
 
 SE2 = Space("SE2", (VECTOR, HEADING))

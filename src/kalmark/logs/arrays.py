@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import scipy.io
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
@@ -17,6 +16,8 @@ from kalmark.logs.source import file_in
 
 def variables(path: Path) -> set[str]:
     """Return the names of the variables in a MATLAB file, none if it is not one."""
+    import scipy.io
+
     try:
         return {name for name, *_ in scipy.io.whosmat(path)}
     except Exception:  # whatever a damaged or foreign file makes the reader raise
@@ -25,6 +26,8 @@ def variables(path: Path) -> set[str]:
 
 def arrays(path: Path, names: tuple[str, ...]) -> dict[str, Array]:
     """Return variables of a MATLAB file as float arrays.  Raises LogError if one is missing or not finite."""
+    import scipy.io
+
     if not path.is_file():
         raise LogError(f"{path}: no such file, expected a MATLAB file with {', '.join(names)}")
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, order
+from kalmark.geometry.gaussian import sigma_probability
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, placed
 
@@ -81,7 +82,7 @@ def recording(path: Path, content: dict[str, Any], request: Request) -> Log:
     seen = {(event.robot, event.sensor) for event in events if isinstance(event, Scan)}
     truth, reference = tracks(path, cfg, robots, step_ns)
     things = cfg["SimLmk"]["segments" if lines else "points"]  # points (3,) or both ends of segments (6,)
-    gate = float(chi2.cdf(cfg["Opt"]["correct"]["MD2th"], 2))  # the toolbox's is on d^2 of two numbers
+    gate = sigma_probability(math.sqrt(cfg["Opt"]["correct"]["MD2th"]), 2)  # the toolbox's is on d^2 of two numbers
     return Log(
         str(cfg["name"]), tuple(robot.name for robot in robots), sorted(events, key=order), NAME, path, truth,
         landmarks=dict(zip(*numbered(things["id"], things["coord"], 6 if lines else 3), strict=True)),

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
@@ -60,6 +59,8 @@ def read_starry_night(path: Path, request: Request) -> Log:
     Barfoot's C_vi = C(theta) maps the world to the vehicle, so theta is the rotation vector of ours, local to global,
     and his C_{k+1} = C(w dt) C_k is R_{k+1} = R_k Exp(w dt): rates and poses need no change.
     """
+    from scipy.spatial.transform import Rotation
+
     data = arrays(path, STARRY)
     steps, landmarks = data["t"].size, data["rho_i_pj_i"].shape[-1]
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("w_vk_vk_i", "v_vk_vk_i", "theta_vk_i", "r_i_vk_i"), (3, steps))

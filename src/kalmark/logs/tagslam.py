@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
@@ -283,6 +282,8 @@ def controls(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
 
     The odometry's frame O moves by D in its own frame, the rig by T D T^-1.  The noise grows with the time.
     """
+    from scipy.spatial.transform import Rotation
+
     t_ns = np.unique([scan.t_ns for scan in scans])
     rig = [compose(pose, inverse(moved.T)[0])[0] for pose in moved.path.at(t_ns, max_gap_s=1e9)]
     steps = np.array([between(*pair) for pair in pairwise(rig)]).reshape(-1, 7)

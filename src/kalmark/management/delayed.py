@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from kalmark.arrays import Array
 from kalmark.declare import Count, Positive, Within, register
@@ -249,6 +248,8 @@ def solved(scan: ScanContext, c: Pending) -> Solution:
     Least squares weighted by S = H P H' + R, P of the poses: with W = (E' S^-1 E)^-1 E' S^-1 the point errs by
     -W (H d + v), d the error of the poses and v that of the measurements, so that G = -W H and Q = W R W'.
     """
+    from scipy.linalg import block_diag
+
     map_, slots, n, m = scan.map, _slots(scan, c), len(c.measurements), len(c.measurements[0].y)
     P, R = map_.covariance(slots), block_diag(*(measurement.R for measurement in c.measurements))
     assert c.mean is not None

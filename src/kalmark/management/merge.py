@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Index
 from kalmark.association.ratio import density, log_ratios
@@ -185,6 +184,8 @@ class _Reading(NamedTuple):
 
 def _hypotheses(look: _Reading, name: Id) -> Iterator[list[Pair]]:
     """Return what a landmark and others recently observed may be: lists of pairs, its own first."""
+    from scipy.spatial import cKDTree
+
     tracks, at = look.tracks, look.places([name])[0]
     for count in (NEAR, NEAREST):  # most can be none of those nearby, and so of none
         others, possible = _others(look, name, at, count)

@@ -106,7 +106,7 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
         raise ModelError(f"angular has {len(model.angular)} entries for {m} columns, expected one each")
     plain = Space("y", tuple(ANGLE if angle else SCALAR for angle in model.angular))
     measured = SE3 if "qw" in model.columns else plain
-    v, view = _views(model, rng)
+    v, view = views(model, rng)
     y = np.tile([0.3 * (name == "size_m") for name in model.columns], (len(v), 1))
     e, E_v = _expect(model, v, y)
     _shape("e of expect", e, (len(v), m))
@@ -166,7 +166,7 @@ def _inverse(model: Any, y: Array, view: Space, measured: Space, found: _Finding
         found.same("expect(invert(y)) = y", _expect(model, whole, y)[0], y, measured, {"y": y})
 
 
-def _views(model: Any, rng: Rng) -> tuple[Array, Space]:
+def views(model: Any, rng: Rng) -> tuple[Array, Space]:
     """Return views (K, d) that a sensor can have, and their space."""
     d = _size_of_view(model, rng)
     if d == SE3.size:

@@ -11,10 +11,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from kalmark.arrays import Array
 from kalmark.geometry.angles import wrap
+from kalmark.geometry.gaussian import quantile
 from kalmark.geometry.rotations import from_matrix, multiply
 from kalmark.results.history import Ints
 
@@ -191,7 +191,7 @@ def nis(z: Array, Z: Array) -> tuple[Array, Ints]:
 def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tuple[float, float]:
     """Return the two-sided bounds of the mean of `runs` independent NEES values of `dof` degrees of freedom each."""
     tail = (1.0 - probability) / 2.0
-    return float(chi2.ppf(tail, dof * runs)) / runs, float(chi2.ppf(1.0 - tail, dof * runs)) / runs
+    return float(quantile(tail, dof * runs)) / runs, float(quantile(1.0 - tail, dof * runs)) / runs
 
 
 def diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:

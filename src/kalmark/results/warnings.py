@@ -21,10 +21,10 @@ from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from kalmark.arrays import Array
 from kalmark.declare import registered_name
+from kalmark.geometry.gaussian import quantile
 from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
 from kalmark.results.history import History, Ints, UsedFix
@@ -47,7 +47,7 @@ NO_ID = "no id in the log"  # the reason that association by identity gives
 POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
 NIS_HIGH = 3.0  # per degree of freedom
 FIX_NIS_HIGH = 5.0
-FIRST_FIX = {d: float(chi2.ppf(0.9999, d)) for d in (2, 3)}
+FIRST_FIX = {d: float(quantile(0.9999, d)) for d in (2, 3)}
 BEARINGS = ("range_bearing", "range_bearing_3d")
 ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
 MARGIN = 0.1  # of an image, by which its measurements may lie outside it
@@ -171,7 +171,7 @@ def window_warnings(run: Recording, _: Any = None) -> Iterator[str]:
 
 
 def _high_nis(worst: Window, median: float, count: int) -> str:
-    bound = float(chi2.ppf(1 - CHANCE / count, worst.number)) / worst.number
+    bound = float(quantile(1 - CHANCE / count, worst.number)) / worst.number
     if worst.value <= max(bound, TIMES * median):
         return ""
     return f"NIS per degree of freedom rises to {figure(worst.value, 2)}, median {figure(median, 2)},"

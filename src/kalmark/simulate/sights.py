@@ -13,7 +13,6 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.random import Generator
 from pydantic import Field
-from scipy.spatial import cKDTree
 
 from kalmark import presets
 from kalmark.arrays import Array, Flags, Index
@@ -95,6 +94,8 @@ class Things:
     dimensions: int = 2
 
     def __post_init__(self) -> None:
+        from scipy.spatial import cKDTree
+
         self.seen = np.zeros(len(self.values), dtype=np.bool_)
         self.tree = cKDTree(self.centres()) if len(self.values) else None
 

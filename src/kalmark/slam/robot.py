@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from kalmark.arrays import Array
 from kalmark.association.protocol import Association
@@ -93,6 +92,8 @@ class Mount:
 
         That is the mount, if it is uncertain, with the sensor's own parameters behind it, if they are.
         """
+        from scipy.linalg import block_diag
+
         pose, dof = len(self.at), 3 if len(self.at) == 3 else 6
         cov, own = self.covariance(dof, what), parameter_covariance(self.sensor)
         if own is None:

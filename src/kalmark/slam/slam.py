@@ -28,7 +28,8 @@ from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
-from kalmark.filter.estimators import Averaging, Correction, Estimator, Invariant, Update
+from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.estimators import Averaging, Compiling, Correction, Estimator, Invariant, Update
 from kalmark.filter.map import Map
 from kalmark.filter.maps import DENSE, grown, new_map
 from kalmark.geometry.spaces import SE2, SE3, Rn
@@ -104,6 +105,8 @@ class Slam:
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
         for robot in self.robots.values():
             self._place(robot)
+        if isinstance(self.estimator, Compiling):
+            self.estimator.compile_ahead()
         self._may_grow = map == "auto" and not any(policy.averages for policy in self._policies.values())
 
     def _place(self, robot: Robot) -> None:
@@ -764,6 +767,32 @@ class Slam:
             raise MapError(f"{name!r} is a {what}, expected a landmark")
         self.map.remove(slot)
         self.tracks.remove(name)
+
+    # ------------------------------------------------------------------ before the first event
+    def warm_up(self) -> None:
+        """Compile and load all that the events of this Slam will need, so that none of them waits for it.
+
+        Its state stays as it is: twins of it take made-up events, as `kalmark.slam.rehearsal` has them.
+        """
+        from kalmark.slam.rehearsal import rehearsal
+
+        robots = [
+            replace(robot, sensors={name: replace(mount, detector=None) for name, mount in robot.sensors.items()})
+            for robot in self.robots.values()
+        ]
+        for kind in ("dense", "postponed") if self._may_grow else (self.map_type,):
+            twin = Slam(
+                robots, self.association, self.estimator, self.landmark_type, kind, self.reparametrize, self.numbers,
+                self.upkeep,
+            )  # fmt: skip
+            for event in rehearsal(robots):
+                with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
+                    twin.process(event)
+            twin.covariance(*twin.robots, *twin.tracks.confirmed)
+            for track in [*twin.tracks.confirmed.values()]:
+                twin.map.remove(track.slot)
+            if isinstance(twin.map, CompressedMap):
+                twin.map.finish()
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:
