@@ -31,6 +31,7 @@ rover = km.Robot(
     sensors={"lidar": km.Mount(km.sensors.RangeBearing(sigma_range_m=0.05, sigma_bearing_rad=0.01))},
 )
 slam = km.Slam([rover])
+slam.warm_up()  # compiles and loads all that it will need: no event waits for that
 
 for t in np.arange(0.0, 20.0, 0.1):
     v, w = 0.5, 0.3

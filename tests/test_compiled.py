@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numba
 import numpy as np
 import pytest
 
+from kalmark import compiled
 from kalmark.compiled import address_of, by_address, signature_of
+from kalmark.filter.corrections import gauge
 
 SUM = signature_of("f8(f8[::1])")
 call = by_address(SUM)
@@ -41,3 +45,33 @@ def test_compiled_code_and_python_call_the_same_function_and_get_its_errors() ->
 def test_a_function_that_returns_something_else_has_no_address_to_be_called_by() -> None:
     with pytest.raises(TypeError, match="returns int64, expected float64"):
         address_of(count, SUM)
+
+
+def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited, asked = [], []
+
+    class Started:
+        def __init__(self, command: list[str], **_: object) -> None:
+            asked.append(command[-2:])
+
+        def wait(self) -> None:
+            waited.append(True)
+
+    monkeypatch.setattr(compiled.subprocess, "Popen", Started)
+    monkeypatch.setattr(compiled, "cache_folder", lambda part: str(tmp_path / part))
+    monkeypatch.setattr(compiled.os, "cpu_count", lambda: 2)
+    for _ in range(2):
+        compiled.ahead({positive_sum: "f8[::1]"})
+    assert asked == [[f"{__name__}:compiled_positive_sum", "f8[::1]"]]
+    for _ in range(2):
+        compiled.caught_up(count)
+        compiled.caught_up(positive_sum)
+    assert waited == [True]
+
+
+def test_functions_are_compiled_by_their_names() -> None:
+    before = len(gauge.overloads)
+    compiled.compile_jobs(["kalmark.filter.corrections:gauge", "f8[::1], f8[::1], i8, i8"])
+    assert len(gauge.overloads) >= max(1, before)

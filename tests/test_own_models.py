@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import os
 import shutil
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark import declare
 from kalmark.campaign.replay import replay_of
 from kalmark.config import load_config
 from kalmark.geometry import compose, wrap
@@ -44,6 +46,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Import the user's file as a program of his does."""
     shutil.copy(HERE / "own_models.py", tmp_path / "my_models.py")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(declare, "_CLASSES", copy.deepcopy(declare._CLASSES))
     yield import_module("my_models")
     del sys.modules["my_models"], FORMATS["signs"]
 
@@ -102,7 +105,7 @@ def test_models_of_a_user_go_from_python_to_the_command_line_and_back(own: Any, 
         assert np.linalg.norm(p - expected[name]) < 0.3 < np.linalg.norm(p - slam.mean(name)[:2])
         np.testing.assert_array_equal(loaded.means[k], p)
         np.testing.assert_allclose(loaded.covariances[k], P, rtol=1e-12)
-        np.testing.assert_array_equal(drawn.shapes.points.means[k], p)
+        np.testing.assert_array_equal(drawn.shapes.means[k], p)
 
     # the configuration and the map make the same filter again
     (tmp_path / "mine.yaml").write_text(CONFIG)

@@ -13,7 +13,7 @@ from kalmark.cli.campaign import campaign
 from kalmark.cli.check import check
 from kalmark.cli.folders import evaluate, explain, report
 from kalmark.cli.logs import config, convert, data, simulate
-from kalmark.cli.run import demo, run
+from kalmark.cli.run import demo, run, warm_up
 from kalmark.errors import KalmarkError
 
 COMING = {  # verbs that are not there yet: not in the help, but they say so when they are called
@@ -43,7 +43,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (demo, run, simulate, evaluate, report, explain, campaign, config, convert, check):
+for verb in (demo, run, simulate, evaluate, report, explain, campaign, config, convert, check, warm_up):
     app.command()(verb)
 app.add_typer(data, name="data")
 for name, what in COMING.items():

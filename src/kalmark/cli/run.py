@@ -76,6 +76,21 @@ def run(
         raise typer.Exit(2)
 
 
+def warm_up(
+    config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
+    overrides: Overrides = None,
+) -> None:
+    """Compile beforehand all that runs of a configuration need."""
+    from kalmark import config as cfg
+
+    with computing():
+        made = cfg.load_config(config, overrides or ())
+        with_log = made.log.path is not None
+        slam = cfg.build_slam(*cfg.open_run(config, None, overrides or ())) if with_log else cfg.build_slam(made)
+        slam.warm_up()
+    typer.echo("compiled: no event of such a run waits for it")
+
+
 def finish(result: Run, out: Path, title: str) -> None:
     """Print a run's figures and warnings, what was left out, and where the run folder is."""
     from kalmark.results.words import count

@@ -1,42 +1,70 @@
-"""Made-up events for a robot that stands in its world: what `Slam.warm_up` lets its twin take."""
+"""Made-up events for the robots of a Slam: what `Slam.warm_up` lets its twin take."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.events import Control, Event, Fix, Scan
+from kalmark.geometry import frames, frames3d
 from kalmark.models.check import views
+from kalmark.models.protocols import SegmentVisible, image_size
 from kalmark.models.sensors import Spatial
 from kalmark.slam.robot import Mount, Robot
 
 ROUNDS = 12  # of a control and scans: enough for whatever waits for several
 SEEN = 3  # observations in a scan
-CREEP = 1e-3
+STEP_S = 0.5
+MOVING = 0.5  # each number of a control
+LOST_PIXELS = 0.2  # of an image, at its border
 
 
-def rehearsal(robots: Iterable[Robot]) -> Iterator[Event]:
-    """Yield events of each robot and sensor: a few landmarks seen again and again, with ids and without, and a fix."""
-    robots = list(robots)
-    y = {id(mount): _measured(mount) for robot in robots for mount in robot.sensors.values()}
-    ids: list[Id] = [f"seen {i}" for i in range(SEEN)]
+def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
+    """Yield events of each robot and sensor: a few landmarks seen again and again, with ids and without, and a fix.
+
+    `pose` gives where a robot's sensor, both by name, is when it is asked, (3,) or (7,).
+    """
+    robots, t_s = list(robots), 0.0
+    scenes = {(r.name, name): _Scene(mount, pose(r.name, name)) for r in robots for name, mount in r.sensors.items()}
     for k in range(ROUNDS):
         for robot in robots:
-            pose = 2 if robot.motion.space.axes == 1 else 3
-            yield Control(float(k), robot.name, np.full(len(robot.motion.columns), CREEP))
-            for name, mount in robot.sensors.items():
-                yield Scan(k + 0.25, robot.name, name, y[id(mount)], [f"{name} {i}" for i in ids])
-                yield Scan(k + 0.5, robot.name, name, y[id(mount)])
+            t_s += STEP_S
+            yield Control(t_s, robot.name, np.full(len(robot.motion.columns), MOVING))
+            for name in robot.sensors:
+                y = scenes[robot.name, name].measured(pose(robot.name, name))
+                for ids in ([f"{name} {i}" for i in range(len(y))], None):
+                    t_s += STEP_S
+                    yield Scan(t_s, robot.name, name, y, ids)
             if k == ROUNDS - 2:
-                yield Fix(k + 0.75, robot.name, np.asarray(robot.start)[:pose], np.eye(pose))
+                size = 2 if robot.motion.space.axes == 1 else 3
+                yield Fix(t_s, robot.name, np.asarray(robot.start)[:size], np.eye(size))
 
 
-def _measured(mount: Mount) -> Array:
-    """Return a few measurements (SEEN, m) that a sensor can make."""
-    sensor, m = mount.sensor, len(mount.sensor.columns)
-    v = views(sensor, np.random.default_rng(0))[0][:SEEN]
-    y = np.tile([0.3 * (name == "size_m") for name in sensor.columns], (len(v), 1))
-    e = sensor.expect(v, y)[0] if isinstance(sensor, Spatial) else sensor.expect(v)[0]
-    return np.ascontiguousarray(np.reshape(e, (-1, m)), dtype=np.float64)
+class _Scene:
+    """What a mounted sensor, at T in the beginning, sees: points that stay where they are, or always the same."""
+
+    def __init__(self, mount: Mount, T: Array) -> None:
+        self.sensor, rng = mount.sensor, np.random.default_rng(0)
+        self.fixed: Array | None = None
+        if isinstance(self.sensor, SegmentVisible) and (size := image_size(self.sensor)) is not None:
+            inside = rng.uniform(LOST_PIXELS, 1.0 - LOST_PIXELS, (SEEN, len(self.sensor.columns)))
+            self.fixed = inside * [*size, *size]
+            return
+        self.v = views(self.sensor, rng)[0][:SEEN].copy()
+        self.places = None
+        if len(T) == 3 or self.v.shape[1] == 3:
+            here = frames.from_frame_many if len(T) == 3 else frames3d.from_frame_many
+            self.places = here(T, np.ascontiguousarray(self.v[:, : 2 if len(T) == 3 else 3]))[0]
+
+    def measured(self, T: Array) -> Array:
+        """Return the measurements (SEEN, m) from T."""
+        if self.fixed is not None:
+            return self.fixed
+        if self.places is not None:
+            seen_from = frames.to_frame_many if len(T) == 3 else frames3d.to_frame_many
+            self.v[:, : self.places.shape[1]] = seen_from(T, self.places)[0]
+        y = np.tile([0.3 * (name == "size_m") for name in self.sensor.columns], (len(self.v), 1))
+        e = self.sensor.expect(self.v, y)[0] if isinstance(self.sensor, Spatial) else self.sensor.expect(self.v)[0]
+        return np.ascontiguousarray(e, dtype=np.float64)

@@ -39,7 +39,7 @@ from kalmark.management.pending import Initialization, Step
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
-from kalmark.models.protocols import Landmark, Segmented, place_of
+from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, place_of
 from kalmark.report import LandmarkTable, Observation, Report, judged
 from kalmark.slam.checks import (
     covariance,
@@ -785,14 +785,20 @@ class Slam:
                 robots, self.association, self.estimator, self.landmark_type, kind, self.reparametrize, self.numbers,
                 self.upkeep,
             )  # fmt: skip
-            for event in rehearsal(robots):
+            for event in rehearsal(robots, twin._sensor_pose):
                 with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
                     twin.process(event)
             twin.covariance(*twin.robots, *twin.tracks.confirmed)
+            for track in twin.tracks.confirmed.values():
+                if isinstance(track.model, Reparametrizable):
+                    track.model.to_point(twin.mean(track.id)[None])
             for track in [*twin.tracks.confirmed.values()]:
                 twin.map.remove(track.slot)
             if isinstance(twin.map, CompressedMap):
                 twin.map.finish()
+
+    def _sensor_pose(self, robot: str, sensor: str) -> Array:
+        return self._channels[robot, sensor].pose(self.map, self._moving[robot].slot)
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:
