@@ -57,13 +57,22 @@ class Compared(NamedTuple):
     places: Array
 
 
-def judged(
-    rows: Sequence[int], ids: Sequence[Id | None], names: Sequence[Any], done: Correction, gate: float
-) -> list[Observation]:
-    """Return what became of the observations `rows` that were compared with those landmarks; NaN if they could not be.
+class Judged(NamedTuple):
+    """The observations `rows` of a scan that were compared with landmarks, and what came of it; `ids` of all the scan.
 
-    `ids` are those of the whole scan.
+    d2 is NaN where they could not be compared.
     """
+
+    rows: Sequence[int]
+    ids: Sequence[Id | None]
+    names: Sequence[Any]
+    done: Correction
+    gate: float
+
+
+def outcomes_of(judged: Judged) -> list[Observation]:
+    """Return what became of each observation."""
+    rows, ids, names, done, gate = judged
     d2, fused = done.d2.tolist(), done.fused.tolist()
     fates = zip(rows, [ids[k] for k in rows], repeat("associated"), names, d2, repeat(""), repeat(()), strict=False)
     outcomes = list(map(tuple.__new__, repeat(Observation), fates))  # several times as fast as by their constructor
@@ -91,11 +100,12 @@ class Report:
     come from.
     """
 
-    __slots__ = ("Z", "compared", "e", "event", "late", "merged", "observations", "removed", "seen_at", "y", "z")
+    __slots__ = ("Z", "_made", "compared", "e", "event", "judged", "late", "merged", "removed", "seen_at", "y", "z")
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
-        self.observations: tuple[Observation, ...] = ()
+        self.judged: tuple[Judged, ...] = ()  # of which `observations` are made when they are asked for
+        self._made: tuple[Observation, ...] = ()
         self.removed: tuple[tuple[Id, str], ...] = ()
         self.merged: tuple[tuple[Id, Id, str], ...] = ()
         self.late: tuple[Late, ...] = ()
@@ -105,6 +115,17 @@ class Report:
         self.e: Array = NOTHING
         self.z: Array = NOTHING
         self.Z: Array = NOTHING
+
+    @property
+    def observations(self) -> tuple[Observation, ...]:
+        """What became of each observation, in their order."""
+        if self.judged:
+            self._made, self.judged = tuple(sorted(o for group in self.judged for o in outcomes_of(group))), ()
+        return self._made
+
+    @observations.setter
+    def observations(self, made: Sequence[Observation]) -> None:
+        self._made, self.judged = tuple(sorted(made)), ()
 
     @property
     def t_ns(self) -> int:

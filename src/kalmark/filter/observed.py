@@ -144,14 +144,22 @@ def sparse_product(H: Array, S: Array, head: int, k: int) -> Array:
     """Return H S, H being zero but in the columns of the head and, for each of K observations, of its landmark."""
     p, n = len(H) // k, S.shape[1]
     d = (H.shape[1] - head) // k
-    out = np.zeros((len(H), n))
+    out, columns = np.zeros((len(H), n)), np.empty(head + d, np.int64)
     for r in range(len(H)):
-        own = r // p * d
         for i in range(head + d):
-            c = i if i < head else own + i
-            h = H[r, c]
+            columns[i] = i if i < head else r // p * d + i
+        i = 0
+        while i + 4 <= head + d:  # four rows of S at a time
+            c_0, c_1, c_2, c_3 = columns[i], columns[i + 1], columns[i + 2], columns[i + 3]
+            h_0, h_1, h_2, h_3 = H[r, c_0], H[r, c_1], H[r, c_2], H[r, c_3]
+            for j in range(n):
+                out[r, j] += h_0 * S[c_0, j] + h_1 * S[c_1, j] + h_2 * S[c_2, j] + h_3 * S[c_3, j]
+            i += 4
+        while i < head + d:
+            c, h = columns[i], H[r, columns[i]]
             for j in range(n):
                 out[r, j] += h * S[c, j]
+            i += 1
     return out
 
 

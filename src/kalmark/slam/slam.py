@@ -40,7 +40,7 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, place_of
-from kalmark.report import LandmarkTable, Observation, Report, judged
+from kalmark.report import Judged, LandmarkTable, Observation, Report, outcomes_of
 from kalmark.slam.checks import (
     covariance,
     instance,
@@ -199,7 +199,7 @@ class Slam:
         update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
         done = self._corrected(update, event, self.estimator.for_fixes())
         report.e, report.z, report.Z = done.e, done.z, done.Z
-        report.observations = tuple(judged([0], [event.robot], [event.robot], done, gate))
+        report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)
         return report
 
     # ------------------------------------------------------------------ motion
@@ -233,21 +233,26 @@ class Slam:
         self.tracks.learn(*query.learned)
         names = [name for name, _ in decisions]
         groups = self.tracks.by_model(scan.channel, names, scan.event.robot)
-        found = self._correct(scan, policy, groups, decisions)
+        judged, found = self._correct(scan, policy, groups, decisions)
+        if not found and not policy.reviews and sum(len(group.rows) for group in judged) == len(decisions):
+            scan.report.judged = tuple(judged)
+            return
+        found += [o for group in judged for o in outcomes_of(group)]
         if policy.reviews:
             self._review(scan, policy, found)
         if len(found) < len(decisions):
             seen = {o.index: o for o in found}
             self._start(scan, policy, [k for _, rows in groups for k in rows], decisions, seen)
             found = list(seen.values())
-        scan.report.observations = tuple(sorted(found))
+        scan.report.observations = tuple(found)
 
     def _correct(
         self, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],
         decisions: Sequence[Decision],
-    ) -> list[Observation]:  # fmt: skip
+    ) -> tuple[list[Judged], list[Observation]]:  # fmt: skip
         """Fuse observations of landmarks in the map, the groups of those of one type at once.  [S] (26)-(30)."""
         report, found, most = scan.report, list[Observation](), policy.attention.updates
+        judged: list[Judged] = []
         if most is not None and sum(len(rows) for _, rows in groups) > most:
             groups, out = chosen(scan, policy.attention, groups, decisions)
             why = f"not among the {most} of most information"
@@ -265,10 +270,9 @@ class Slam:
                 self.estimator.correct(self.map, near)
             done = self._corrected(scan.update(model, slots, rows), scan.event)
             report.fill(rows, done)
-            of_these = judged(rows, scan.ids, names, done, scan.channel.gate)
-            self.tracks.count(of_these)
-            found += of_these
-        return found + self._average(scan, decisions) if policy.averages else found
+            self.tracks.count(names, done.fused.tolist())
+            judged.append(Judged(rows, scan.ids, names, done, scan.channel.gate))
+        return judged, found + self._average(scan, decisions) if policy.averages else found
 
     def _average(self, scan: ScanContext, decisions: Sequence[Decision]) -> list[Observation]:
         """Correct by the mean over the matchings among the decisions.  [F]."""
@@ -279,7 +283,7 @@ class Slam:
         d2, valid = self.estimator.average(self.map, found.update, found.pairs, found.weights)
         self._refuse_diverged(valid, scan.event)
         of_these = outcomes(found, decisions, d2)
-        self.tracks.count(of_these)
+        self.tracks.count([o.landmark for o in of_these], [o.outcome == "associated" for o in of_these])
         return of_these
 
     def _corrected(self, update: Update, event: Event, estimator: Estimator | None = None) -> Correction:
@@ -306,7 +310,8 @@ class Slam:
         if confirmed:
             by_name = [confirmed.get(k, (None, "")) for k in range(len(decisions))]
             groups = self.tracks.by_model(scan.channel, [name for name, _ in by_name], scan.event.robot)
-            for o in self._correct(scan, policy, groups, by_name):
+            judged, found = self._correct(scan, policy, groups, by_name)
+            for o in found + [o for group in judged for o in outcomes_of(group)]:
                 seen[o.index] = o._replace(outcome="new", reason=by_name[o.index][1])
         new = [k for k in new if k not in seen]
         reasons = left_out(scan, policy.attention, policy.starts, new, known, decisions)

@@ -13,7 +13,6 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.models.protocols import Landmark, Segmented
-from kalmark.report import Observation
 from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
 from kalmark.tracks.clones import Measurement
 
@@ -183,10 +182,10 @@ class Tracks:
                 self.confirmed[name].covisible.add(kept.id)
         kept.covisible |= gone.covisible
 
-    def count(self, observations: Iterable[Observation]) -> None:
-        """Count the observations that were used, each at its landmark; those of robots are not counted."""
-        for seen in observations:
-            if seen.outcome == "associated" and (track := self.confirmed.get(seen.landmark)):  # type: ignore[arg-type]
+    def count(self, names: Iterable[Any], used: Iterable[bool]) -> None:
+        """Count observations that were used, each at its landmark; those of robots are not counted."""
+        for name, fused in zip(names, used, strict=False):
+            if fused and (track := self.confirmed.get(name)):
                 track.observations += 1
 
     def note_scan(self, names: list[Id]) -> None:
