@@ -311,6 +311,9 @@ def speed() -> Iterator[Figure]:
     for world in ("plane", "space, one camera"):
         yield Figure(section, f"first step of a new process, {world}, `Invariant`, processor time: cold / warm", "- / 1 s",
                      "python benchmarks/start.py", row(f"{world}, `Invariant`", "{2} s / {5} s"))  # fmt: skip
+    for world, wanted in (("plane", "20 s"), ("space, one camera", "30 s")):
+        yield Figure(section, f"first step with an empty cache, {world}: here / be0e13e / ratio", wanted,
+                     "python benchmarks/start.py be0e13e", row(f"{world}, cold:", "{0} s / {3} s / {7}"))  # fmt: skip
     for name in ("Trunks", "Walls", "Corners"):
         yield Figure(
             section,

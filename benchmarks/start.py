@@ -1,6 +1,7 @@
 """What the first step costs: a new process that imports kalmark and takes one control and two scans.
 
-    python benchmarks/start.py
+    python benchmarks/start.py             # or, in turn with a commit or the folder of another checkout:
+    python benchmarks/start.py be0e13e     # the cold first step of both, and their ratio
 
 Twice for each kind of run, each in its own process: cold, with an empty cache of compiled code, and warm, with the one
 the first has filled.  Wanted: warm below 1 s.  One thread, the interpreter's start included.
@@ -9,12 +10,15 @@ On a busy machine the processor's time is the one to compare.
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+from paired import HERE, checkout
 
 PLANE = """
 import kalmark as km
@@ -39,20 +43,39 @@ assert all(o.outcome == "associated" for o in slam.process(km.Scan(0.1, "r", "s"
 """
 
 
-def seconds(program: str, cache: str) -> tuple[float, float]:
-    """Return the wall and the processor time of a new process that runs a program, its compiled code in a folder."""
+def seconds(program: str, cache: str, place: Path = HERE) -> tuple[float, float]:
+    """Return the wall and the processor time of a new process of a checkout, its compiled code in a folder."""
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
     start, before = time.perf_counter(), os.times()
     subprocess.run(
-        [sys.executable, "-c", program], check=True, env={**os.environ, **one_thread, "KALMARK_CACHE": cache}
+        [sys.executable, "-c", program],
+        check=True,
+        env={**os.environ, **one_thread, "KALMARK_CACHE": cache, "PYTHONPATH": str(place / "src")},
     )
     after = os.times()
     spent = after.children_user + after.children_system - before.children_user - before.children_system
     return time.perf_counter() - start, spent
 
 
+def against(other: Path) -> None:
+    """Print the wall time of a cold first step here and in another checkout, and their ratio."""
+    for world, program in (("plane", PLANE), ("space, one camera", SPACE)):
+        spent = []
+        for place in (HERE, other):
+            with tempfile.TemporaryDirectory() as cache:
+                spent.append(seconds(program.replace("ESTIMATOR", "Invariant"), cache, place)[0])
+        print(
+            f"{world}, cold: {spent[0]:.1f} s here, {spent[1]:.1f} s there, ratio {spent[0] / spent[1]:.2f}", flush=True
+        )
+
+
 def main() -> None:
     """Measure and print the table.  `Ekf` after `Invariant` finds compiled what both share."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("other", nargs="?", help="a commit, or the folder of another checkout")
+    if other := parser.parse_args().other:
+        against(checkout(other))
+        return
     print("wall / processor seconds\n\n| first step | cold | warm, best of 5 | files, MB |\n|---|---|---|---|")
     for world, program in (("plane", PLANE), ("space, one camera", SPACE)):
         with tempfile.TemporaryDirectory() as cache:
