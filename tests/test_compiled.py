@@ -71,7 +71,11 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
     assert waited == [True]
 
 
-def test_functions_are_compiled_by_their_names() -> None:
-    before = len(gauge.overloads)
-    compiled.compile_jobs(["kalmark.filter.corrections:gauge", "f8[::1], f8[::1], i8, i8"])
-    assert len(gauge.overloads) >= max(1, before)
+def test_functions_are_compiled_by_their_names_and_the_mark_goes_where_that_fails(tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    mark.touch()
+    compiled.compile_jobs(str(mark), "kalmark.filter.corrections:gauge", "f8[::1], f8[::1], i8, i8")
+    assert gauge.overloads and mark.exists()
+    with pytest.raises(AttributeError):
+        compiled.compile_jobs(str(mark), "kalmark.filter.corrections:no_such_function", "f8")
+    assert not mark.exists()

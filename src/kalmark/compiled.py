@@ -104,18 +104,25 @@ def ahead(jobs: dict[Any, str]) -> None:
     with suppress(OSError):  # a cache that cannot be written to helps nobody
         folder.mkdir(parents=True, exist_ok=True)
         mark.touch(exist_ok=False)
-        code = "import sys; from kalmark.compiled import compile_jobs; compile_jobs(sys.argv[1:])"
-        command = [sys.executable, "-c", code, *(text for job in names.items() for text in job)]
+        code = "import sys; from kalmark.compiled import compile_jobs; compile_jobs(*sys.argv[1:])"
+        command = [sys.executable, "-c", code, str(mark), *(text for job in names.items() for text in job)]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
         _AHEAD.update(dict.fromkeys(jobs, process))
 
 
-def compile_jobs(texts: list[str]) -> None:
-    """Compile the functions that `ahead` was asked for: their names, each followed by the types of its arguments."""
-    for name, arguments in zip(texts[::2], texts[1::2], strict=True):
-        module, function = name.split(":")
-        getattr(import_module(module), function).compile(normalize_signature(f"({arguments})")[0])
+def compile_jobs(mark: str, *texts: str) -> None:
+    """Compile the functions that `ahead` was asked for: their names, each followed by the types of its arguments.
+
+    The file `mark` says that this was done, or is being done: it goes if that comes to nothing.
+    """
+    try:
+        for name, arguments in zip(texts[::2], texts[1::2], strict=True):
+            module, function = name.split(":")
+            getattr(import_module(module), function).compile(normalize_signature(f"({arguments})")[0])
+    except BaseException:  # the user's interruption, too
+        Path(mark).unlink(missing_ok=True)
+        raise
 
 
 def caught_up(function: Any) -> None:

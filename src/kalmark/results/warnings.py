@@ -24,7 +24,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import registered_name
-from kalmark.geometry.gaussian import quantile
+from kalmark.geometry.gaussian import gate, quantile
 from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
 from kalmark.results.history import History, Ints, UsedFix
@@ -47,7 +47,7 @@ NO_ID = "no id in the log"  # the reason that association by identity gives
 POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
 NIS_HIGH = 3.0  # per degree of freedom
 FIX_NIS_HIGH = 5.0
-FIRST_FIX = {d: float(quantile(0.9999, d)) for d in (2, 3)}
+FIRST_FIX = 0.9999  # of right starts pass the test of the first fix
 BEARINGS = ("range_bearing", "range_bearing_3d")
 ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
 MARGIN = 0.1  # of an image, by which its measurements may lie outside it
@@ -318,7 +318,7 @@ def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     starts = {start.robot: start for start in run.history.starts}
     for name in dict.fromkeys(fix.robot for fix in fixes):
         first = next(fix for fix in fixes if fix.robot == name)
-        if name in starts and _d2(first) > FIRST_FIX[len(first.z)]:
+        if name in starts and _d2(first) > gate(FIRST_FIX, len(first.z)):
             far = float(np.linalg.norm(first.z))
             d = len(first.z)
             sigma = float(np.sqrt(max(np.trace(starts[name].covariance[:d, :d]) / d, 0.0)))
