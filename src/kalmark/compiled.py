@@ -41,9 +41,9 @@ COMPILING = "kalmark: compiling its inner loops, this once for this kind of run;
 
 _FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
 
-SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` and `moving` call them
+SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` calls them
     "models": ("compiled.py", "geometry/*.py", "models/*.py"),
-    "filter": ("compiled.py", "geometry/*.py", "models/moving.py", "models/observe.py", "filter/**/*.py"),
+    "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py"),
 }
 
 

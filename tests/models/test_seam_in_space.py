@@ -117,12 +117,9 @@ def test_the_compiled_models_called_by_address_equal_the_written_out_composition
             np.testing.assert_allclose(mine, plain, rtol=1e-12, atol=1e-12 * (1 + np.abs(plain).max()))
 
 
-def test_the_filter_is_compiled_from_no_model_but_the_two_seams_that_its_folder_is_named_after() -> None:
+def test_the_filter_is_compiled_from_no_model_but_observe_that_its_folder_is_named_after() -> None:
     sources = [path.read_text() for path in (Path(km.__file__).parent / "filter").glob("*.py")]
-    assert {m for text in sources for m in re.findall(r"kalmark\.models[.\w]*", text)} == {
-        "kalmark.models.moving",
-        "kalmark.models.observe",
-    }
+    assert {m for text in sources for m in re.findall(r"kalmark\.models[.\w]*", text)} == {"kalmark.models.observe"}
 
 
 def test_an_observation_model_that_is_copied_to_another_process_leaves_the_addresses_behind() -> None:

@@ -16,7 +16,7 @@ from kalmark.filter import kernels
 from kalmark.filter.corrections import call_generator
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import Table
-from kalmark.models.moving import step
+from kalmark.models.observe import step
 
 Map = tuple[Array, Array, Array, int, Table, Table, int]  # x, x_first, P, n, blocks, atoms, the generator's address
 Motion = tuple[Any, int, Index, bool, Array, Array, Array, float]  # as `estimators.Movement`

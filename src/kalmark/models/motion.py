@@ -23,7 +23,7 @@ from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
 from kalmark.geometry.spaces import ROTATION, SCALAR, SE2, SE3, VECTOR3, Space
-from kalmark.models.moving import Compiled
+from kalmark.models.observe import Compiled
 
 __all__ = ["Ackermann", "ConstantVelocity3D", "Odometry2D", "Odometry3D", "Unicycle", "Velocity3D"]
 

@@ -4,12 +4,14 @@
 Python for a model written in Python, the compiled twin below for the built-in ones.  Both are tested to be equal.
 The head is the robot's pose or, for a mount in the map, the pose and the mount, and behind it the parameters that the
 sensor has in the map: gain and offset of its range.
+
+Motions have their seam at the end: a built-in one is compiled and called by its address, a user's is run in Python.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import types
@@ -17,11 +19,12 @@ from numba.extending import overload
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import address_of, by_address, compiled, signature_of
+from kalmark.declare import built_in
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.models import landmarks, seen, sensors
 from kalmark.models.landmarks3d import chained
-from kalmark.models.protocols import Completing, FullSensor, Landmark, Parametrized, Sensor, finds_depth
+from kalmark.models.protocols import Completing, FullSensor, Landmark, Motion, Parametrized, Sensor, finds_depth
 from kalmark.models.seen import EXPECT, LOOK, residual
 
 View = tuple[int, int, int, int, Array, Array, Flags]
@@ -33,6 +36,10 @@ LINEARIZE = signature_of(
 SENSOR_AT = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], f8[::1])")
 call_linearize, call_sensor_at = by_address(LINEARIZE), by_address(SENSOR_AT)
 MOUNT = 4  # where a view has the mount
+
+# of the state r (size,), the control u (m,), parameters and seconds: the new r, R_r (dof, dof), R_u (dof, m)
+MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")
+call_move = by_address(MOVE)
 
 NOTHING = np.zeros(0)
 
@@ -242,3 +249,38 @@ def turned(E_T: Array, T_r: Array) -> Array:
                 for b in range(first):
                     E_T[i, a, c] += E_T[i, a, b] * T_r[b, c]
     return E_T
+
+
+# ------------------------------------------------------------------ motions
+class Compiled:
+    """A motion whose step is compiled."""
+
+    moves: ClassVar[Any]
+
+    @property
+    def parameters(self) -> Array:
+        """The numbers that `moves` takes."""
+        return NOTHING
+
+    def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        """Return the moved state (size,), R_r (dof, dof) and R_u (dof, m) after the control u (m,).  [S] (1)."""
+        return type(self).moves(r, u, self.parameters, dt_s)
+
+
+def step_of(motion: Motion) -> Any:
+    """Return the argument of `step`: address and parameters of a built-in motion, else the motion."""
+    if type(motion) in built_in("motion") and isinstance(motion, Compiled):
+        return address_of(type(motion).moves, MOVE), motion.parameters
+    return motion
+
+
+def step(model: Any, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+    """Return the state (size,) after a control u (m,) of `dt_s` seconds, R_r (dof, dof) and R_u (dof, m)."""
+    return call_move(model[0], (r, u, model[1], dt_s)) if isinstance(model, tuple) else model.move(r, u, dt_s)
+
+
+@overload(step, strict=False)  # type: ignore[untyped-decorator]  # strict: the annotations differ
+def _compiled_step(model: Any, r: Any, u: Any, dt_s: Any) -> Any:
+    if isinstance(model, types.BaseTuple):
+        return lambda model, r, u, dt_s: call_move(model[0], (r, u, model[1], dt_s))
+    return None

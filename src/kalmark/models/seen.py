@@ -22,7 +22,6 @@ from kalmark.arrays import Array, Flags
 from kalmark.compiled import by_address, compiled, signature_of
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.directions import spherical_many
-from kalmark.geometry.frames import scan_many
 from kalmark.models import cameras, landmarks3d, lines, tags
 
 # of the sensor's pose T and landmarks l (K, n): views v (K, d), V_T (K, ., 3 or 6), V_l (K, ., n)
@@ -73,43 +72,6 @@ def oneself(T: Array, l: Array) -> tuple[Array, Array, Array]:
 
 
 # ------------------------------------------------------------------ sensors
-RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE = range(1, 6)
-
-
-@compiled
-def measured_in_plane(code: int, v: Array) -> tuple[Array, Array]:
-    """Return the measurements (K, m) that the built-in sensor `code` makes of v (K, d), and E_v (K, m, d)."""
-    k, d = v.shape
-    if code == POSITION:
-        E_v = np.zeros((k, 2, d))
-        E_v[:, 0, 0] = 1.0
-        E_v[:, 1, 1] = 1.0
-        return v[:, :2].copy(), E_v
-    y, Y_p = scan_many(v)
-    first, last = (1, 2) if code == BEARING else (0, 1 if code == RANGE else 2)
-    m = last - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
-    e, E_v = np.empty((k, m)), np.zeros((k, m, d))
-    for i in range(k):
-        for j in range(first, last):
-            e[i, j - first] = y[i, j]
-            E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
-        if code == RANGE_BEARING_SIGNATURE:
-            e[i, 2], E_v[i, 2, 2] = v[i, 2], 1.0
-    return e, E_v
-
-
-@compiled
-def in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e (K, m), the innovations z (K, m) of y (K, m), and E_v (K, m, d)."""
-    e, E_v = measured_in_plane(code, v)
-    if len(par) == 2:  # gain and offset of the range
-        for i in range(len(e)):
-            e[i, 0] = (e[i, 0] + par[1]) / par[0]
-            for j in range(E_v.shape[2]):
-                E_v[i, 0, j] /= par[0]
-    return e, residual(y, e, angular), E_v
-
-
 @compiled
 def position(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return e, z (K, d), E_v (K, d, d) of a measurement of v (K, d) itself."""

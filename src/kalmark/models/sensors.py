@@ -14,10 +14,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 
 from kalmark.arrays import Array, Flags
+from kalmark.compiled import compiled
 from kalmark.declare import Limit, NotNegative, Number, Positive, Within, built_in, declared, refuse, register
 from kalmark.errors import EventError
 from kalmark.geometry.directions import inv_spherical_many
-from kalmark.geometry.frames import inv_scan_many
+from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import cameras, lines, seen, tags
 
@@ -32,6 +33,8 @@ FISHEYE_BACK = (
     254.647909, 0.0, -0.00130899694, 0.0, -1.34575854e-09, 0.0, -1.97650363e-15, 0.0, -3.04801702e-21, 0.0,
     -4.74790438e-27, 0.0, -7.41305337e-33, 0.0, -1.15807555e-38, 0.0, -1.80940987e-44, 0.0, -2.82717051e-50,
 )  # fmt: skip
+
+RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE = range(1, 6)  # codes of the planar sensors
 
 # parameters that several sensors have
 BearingNoise = Annotated[Positive, "Noise of the bearing."]
@@ -57,6 +60,41 @@ def refuse_negative_ranges(y: Array) -> None:
     if min(ranges, default=0.0) < 0:
         i, value = next((i, value) for i, value in enumerate(ranges) if value < 0)
         raise EventError(f"observation {i}: range is {value} m, expected at least 0")
+
+
+@compiled
+def measured_in_plane(code: int, v: Array) -> tuple[Array, Array]:
+    """Return the measurements (K, m) that the built-in sensor `code` makes of v (K, d), and E_v (K, m, d)."""
+    k, d = v.shape
+    if code == POSITION:
+        e, E_v = np.empty((k, 2)), np.zeros((k, 2, d))
+        for i in range(k):
+            e[i, 0], e[i, 1] = v[i, 0], v[i, 1]
+            E_v[i, 0, 0] = E_v[i, 1, 1] = 1.0
+        return e, E_v
+    y, Y_p = scan_many(v)
+    first, last = (1, 2) if code == BEARING else (0, 1 if code == RANGE else 2)
+    m = last - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
+    e, E_v = np.empty((k, m)), np.zeros((k, m, d))
+    for i in range(k):
+        for j in range(first, last):
+            e[i, j - first] = y[i, j]
+            E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
+        if code == RANGE_BEARING_SIGNATURE:
+            e[i, 2], E_v[i, 2, 2] = v[i, 2], 1.0
+    return e, E_v
+
+
+@compiled
+def in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e (K, m), the innovations z (K, m) of y (K, m), and E_v (K, m, d)."""
+    e, E_v = measured_in_plane(code, v)
+    if len(par) == 2:  # gain and offset of the range
+        for i in range(len(e)):
+            e[i, 0] = (e[i, 0] + par[1]) / par[0]
+            for j in range(E_v.shape[2]):
+                E_v[i, 0, j] /= par[0]
+    return e, seen.residual(y, e, angular), E_v
 
 
 class _Sensor:
@@ -86,12 +124,12 @@ class _Planar(_Sensor):
     fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
 
     world: ClassVar[str] = "plane"
-    expected: ClassVar[Any] = seen.in_plane
+    expected: ClassVar[Any] = in_plane
     code: ClassVar[int]
 
     def expect(self, v: Array) -> tuple[Array, Array]:
         """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
-        return seen.measured_in_plane(self.code, np.ascontiguousarray(v, dtype=np.float64))
+        return measured_in_plane(self.code, np.ascontiguousarray(v, dtype=np.float64))
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d) lie within the sensor's range limits and field of view."""
@@ -203,7 +241,7 @@ class RangeBearing(_Ranging):
 
     sigma_bearing_rad: BearingNoise = 0.02
 
-    code: ClassVar[int] = seen.RANGE_BEARING
+    code: ClassVar[int] = RANGE_BEARING
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad")
 
@@ -218,7 +256,7 @@ class Bearing(_Planar):
 
     sigma_bearing_rad: BearingNoise = 0.02
 
-    code: ClassVar[int] = seen.BEARING
+    code: ClassVar[int] = BEARING
     columns: ClassVar[tuple[str, ...]] = ("bearing_rad",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_bearing_rad",)
     finds_depth: ClassVar[bool] = False
@@ -240,7 +278,7 @@ class Bearing(_Planar):
 class Range(_Ranging):
     """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
 
-    code: ClassVar[int] = seen.RANGE
+    code: ClassVar[int] = RANGE
     columns: ClassVar[tuple[str, ...]] = ("range_m",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m",)
 
@@ -255,7 +293,7 @@ class Position2D(_Planar):
     sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1
     sigma_y_m: Annotated[Positive, "Noise, to the left."] = 0.1
 
-    code: ClassVar[int] = seen.POSITION
+    code: ClassVar[int] = POSITION
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m")
 
@@ -274,7 +312,7 @@ class RangeBearingSignature(_Ranging):
     sigma_bearing_rad: BearingNoise = 0.02
     sigma_signature: Annotated[Positive, "Noise of the signature."] = 0.1
 
-    code: ClassVar[int] = seen.RANGE_BEARING_SIGNATURE
+    code: ClassVar[int] = RANGE_BEARING_SIGNATURE
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "signature")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad", "sigma_signature")
 

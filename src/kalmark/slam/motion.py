@@ -23,7 +23,7 @@ from kalmark.filter.estimators import Movement
 from kalmark.filter.kernels import moved_noise
 from kalmark.filter.map import Map
 from kalmark.geometry.spaces import Rn, Space
-from kalmark.models.moving import step, step_of
+from kalmark.models.observe import step, step_of
 from kalmark.models.protocols import Motion, bias_covariance, coasts
 
 NO_NOISE = np.zeros((0, 0))
