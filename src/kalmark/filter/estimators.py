@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.compiled import ahead, caught_up
+from kalmark.compiled import ahead
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
 from kalmark.filter.map import Map, StochasticMap
@@ -109,15 +109,16 @@ class _Estimator:
     source: ClassVar[Callable[..., Any]]
     compiled: ClassVar[Callable[..., Any]]
     option: ClassVar[str] = "none"  # the type of what `_option` returns
-    iterates: ClassVar[bool] = False
     from_first: ClassVar[bool] = False  # whether displacements count from the first estimates
     transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
 
     def compile_ahead(self) -> None:
         """Begin to compile the correction on a second core."""
         cls = type(self)
-        to_iterate = {corrections.compiled_iterate: corrections.TO_ITERATE} if cls.iterates else {}
-        ahead(to_iterate | {cls.compiled: f"{corrections.TO_CORRECT}, {cls.option}"})
+        correct = {cls.compiled: f"{corrections.TO_CORRECT}, {cls.option}"}
+        ahead(
+            {corrections.compiled_iterate: corrections.TO_ITERATE} | correct
+        )  # who corrects asks for the first's address
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
@@ -132,7 +133,6 @@ class _Estimator:
         model, robot, mount, slots, d, y, R, gate = update
         run = type(self).compiled if isinstance(model, tuple) else type(self).source
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
-        caught_up(type(self).compiled)
         scan = robot_here, mount_here, here, d, y, R, gate
         done = Correction(*run(model, m.whole, scan, self._option(m)))
         map_.corrected(robot, self.transports)
@@ -192,7 +192,6 @@ class Invariant(_Estimator):
 
     coordinates: ClassVar[str] = "log"
     option: ClassVar[str] = "Tuple((i8, f8))"
-    iterates: ClassVar[bool] = True
     transports: ClassVar[bool] = True
     default_gate: ClassVar[float] = math.inf
     source = corrections.invariant
