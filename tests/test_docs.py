@@ -66,6 +66,10 @@ ROLES = {  # what a row of CONTRIBUTING is about, and where that is
 
 
 def classes_of(role: str, world: str = "") -> list[Any]:
+    import kalmark.config
+    import kalmark.models.motion
+    import kalmark.models.sensors  # noqa: F401
+
     return [each for each in built_in(role) if world in ("", world_of_class(each))]
 
 
