@@ -115,10 +115,8 @@ class _Estimator:
     def compile_ahead(self) -> None:
         """Begin to compile the correction on a second core."""
         cls = type(self)
-        correct = {cls.compiled: f"{corrections.TO_CORRECT}, {cls.option}"}
-        ahead(
-            {corrections.compiled_iterate: corrections.TO_ITERATE} | correct
-        )  # who corrects asks for the first's address
+        jobs = {corrections.compiled_iterate: corrections.TO_ITERATE}  # every correction waits for its address
+        ahead(jobs | {cls.compiled: f"{corrections.TO_CORRECT}, {cls.option}"})
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
