@@ -10,7 +10,7 @@ import pytest
 
 from kalmark import compiled
 from kalmark.compiled import address_of, by_address, signature_of
-from kalmark.filter.corrections import gauge
+from kalmark.filter.corrections import compile_correction, compiled_textbook
 
 SUM = signature_of("f8(f8[::1])")
 call = by_address(SUM)
@@ -59,23 +59,26 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
         def wait(self) -> None:
             waited.append(True)
 
+    def begin() -> None:
+        compiled.ahead(positive_sum, compile_correction, "textbook", "none", 1, False)
+
     monkeypatch.setattr(compiled.subprocess, "Popen", Started)
-    monkeypatch.setattr(compiled, "cache_folder", lambda part: str(tmp_path / part))
+    monkeypatch.setattr(compiled, "cache_folder", lambda part: str(tmp_path))
     monkeypatch.setattr(compiled.os, "cpu_count", lambda: 2)
-    for _ in range(2):
-        compiled.ahead({positive_sum: "f8[::1]"})
-    assert asked == [[f"{__name__}:compiled_positive_sum", "f8[::1]"]]
+    begin()
+    begin()  # while it is under way
+    ((text, mark),) = asked
     for _ in range(2):
         compiled.caught_up(count)
         compiled.caught_up(positive_sum)
     assert waited == [True]
+    compiled.work_ahead(text, mark)
+    begin()
+    assert len(asked) == 1 and compiled_textbook.overloads
 
 
-def test_functions_are_compiled_by_their_names_and_the_mark_goes_where_that_fails(tmp_path: Path) -> None:
+def test_a_job_that_fails_is_not_taken_for_done(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
-    mark.touch()
-    compiled.compile_jobs(str(mark), "kalmark.filter.corrections:gauge", "f8[::1], f8[::1], i8, i8")
-    assert gauge.overloads and mark.exists()
-    with pytest.raises(AttributeError):
-        compiled.compile_jobs(str(mark), "kalmark.filter.corrections:no_such_function", "f8")
+    with pytest.raises(KeyError):
+        compiled.work_ahead('["kalmark.filter.corrections", "compile_correction", "no", "none", 1, false]', str(mark))
     assert not mark.exists()

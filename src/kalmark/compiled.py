@@ -14,6 +14,7 @@ code, never a constant in it that the disk would keep; who is copied to another 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
@@ -87,42 +88,31 @@ def say_compiling() -> None:
     sys.stderr.write(COMPILING)
 
 
-_AHEAD: dict[Any, subprocess.Popen[bytes]] = {}  # by the functions that are compiled there
+_AHEAD: dict[Any, subprocess.Popen[bytes]] = {}  # by the function that is waited for
 
 
-def ahead(jobs: dict[Any, str]) -> None:
-    """Compile functions, of arguments of these types, on a second core, unless that was done before.
+def ahead(function: Any, job: Callable[..., None], *arguments: str | int) -> None:
+    """Call job(*arguments), which compiles `function` and more, on a second core, unless that was done before.
 
-    Who needs one of them calls `caught_up` first, and then finds it on the disk.
+    Who needs one of them calls `caught_up(function)` first, and then finds them on the disk.
     """
-    names = {f"{function.__module__}:compiled_{function.__name__}": types for function, types in jobs.items()}
-    version = f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version} {names}"
-    folder = Path(cache_folder("filter"))
-    mark = folder / f"ahead-{hashlib.sha256(version.encode()).hexdigest()[:16]}"
-    if parent_process() is not None or (os.cpu_count() or 1) < 2 or mark.exists():
+    text = json.dumps([job.__module__, job.__name__, *arguments])
+    version = f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version} {text}"
+    mark = Path(cache_folder("filter")) / f"ahead-{hashlib.sha256(version.encode()).hexdigest()[:16]}"
+    if parent_process() is not None or (os.cpu_count() or 1) < 2 or mark.exists() or function in _AHEAD:
         return
-    with suppress(OSError):  # a cache that cannot be written to helps nobody
-        folder.mkdir(parents=True, exist_ok=True)
-        mark.touch(exist_ok=False)
-        code = "import sys; from kalmark.compiled import compile_jobs; compile_jobs(*sys.argv[1:])"
-        command = [sys.executable, "-c", code, str(mark), *(text for job in names.items() for text in job)]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
-        _AHEAD.update(dict.fromkeys(jobs, process))
+    code = "import sys; from kalmark.compiled import work_ahead; work_ahead(*sys.argv[1:])"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with suppress(OSError):  # without a second process all is compiled in this one
+        command = [sys.executable, "-c", code, text, str(mark)]
+        _AHEAD[function] = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
 
 
-def compile_jobs(mark: str, *texts: str) -> None:
-    """Compile the functions that `ahead` was asked for: their names, each followed by the types of its arguments.
-
-    The file `mark` says that this was done, or is being done: it goes if that comes to nothing.
-    """
-    try:
-        for name, arguments in zip(texts[::2], texts[1::2], strict=True):
-            module, function = name.split(":")
-            getattr(import_module(module), function).compile(normalize_signature(f"({arguments})")[0])
-    except BaseException:  # the user's interruption, too
-        Path(mark).unlink(missing_ok=True)
-        raise
+def work_ahead(text: str, mark: str) -> None:
+    """Do the job that `ahead` was asked for; the file `mark` says that it is done."""
+    module, name, *arguments = json.loads(text)
+    getattr(import_module(module), name)(*arguments)
+    Path(mark).touch()
 
 
 def caught_up(function: Any) -> None:

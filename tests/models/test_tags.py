@@ -36,7 +36,8 @@ def tag_pose(lens: int, y: Array, size: float, par: Array, sigma_px: float) -> t
     The ambiguity is the ratio of the RMS of both poses: 1, no telling which; 0, only one.
     """
     rows = np.ascontiguousarray(y, dtype=np.float64).reshape(1, 8)
-    v, V_y, cost = tags.tags_from_corners(lens, rows, np.array([float(size)]), par)
+    rays = cameras.back_project(lens, rows.reshape(-1, 2), par)[0].reshape(-1, 4, 3)
+    v, V_y, cost = tags.tags_from_corners(lens, rows, rays, np.array([float(size)]), par)
     rms = np.sqrt(0.25 * cost[0])
     return v[0, 0], sigma_px**2 * V_y[0, 0] @ V_y[0, 0].T, float(rms[0]), float(rms[0] / rms[1])
 

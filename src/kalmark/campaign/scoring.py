@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from kalmark.arrays import Array
 from kalmark.errors import DivergedError
 from kalmark.events import Id, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, exp, log, multiply
+from kalmark.geometry.spaces import POINT2, POINT3
 from kalmark.models.landmarks import Polar2D
 from kalmark.models.protocols import Pointed, Segmented, place_of
 from kalmark.report import Report
@@ -241,11 +241,11 @@ class _Scorer:
             d = pose_error(slam.mean(name)[: len(truth)], truth)
             mounts[name] = Judged(d, d, np.eye(len(d)))
         landmarks = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
-        self._score_landmarks(landmarks, row, k)
         self._score_mounts({n: mounts[n] for n, (carrier, _) in self.uncertain.items() if carrier == robot}, row, k)
         judged |= mounts | landmarks
-        F = block_diag(*(j.F for j in judged.values()))
+        F = on_diagonal([j.F for j in judged.values()])
         P = F @ slam.covariance(*judged) @ F.T
+        self._score_landmarks(list(landmarks.values()), P, row, k)
         d = np.array([np.concatenate([getattr(j, c) for j in judged.values()]) for c in ("own", "world")])
         series = self.series
         series["joint"][row, k], series["joint_world"][row, k] = joint_nees(d, P)
@@ -253,21 +253,34 @@ class _Scorer:
 
     def _landmarks(self, turn: Any, eye: Array) -> Iterator[tuple[Id, Judged]]:
         """Yield the landmarks that have a truth, and whose depth is known well enough."""
-        slam = self.slam
+        slam, coordinates = self.slam, self.slam.estimator.coordinates
+        points: dict[Id, Array] = {}
         for name, true in self.true_id.items():
-            model = slam.landmark_model(name)
-            if true in self.log.landmarks and model is not None:
-                mean, P = slam.mean(name), slam.covariance(name)
-                truth = self.log.landmarks[true]
-                if (j := landmark(model, mean, P, truth, turn, slam.estimator.coordinates, eye)) is not None:
-                    yield name, j
+            model, truth = slam.landmark_model(name), self.log.landmarks.get(true)  # type: ignore[arg-type]
+            if model is None or truth is None:
+                continue
+            if model.space in (POINT2, POINT3) and len(truth) == self.d:
+                points[name] = truth
+            elif j := landmark(model, slam.mean(name), slam.covariance(name), truth, turn, coordinates, eye):
+                yield name, j
+        if points:  # all at once
+            truth, place = np.array([*points.values()]), np.array([slam.mean(name) for name in points])
+            own, world = (point_error(place, truth, turn, c) for c in (coordinates, "world"))
+            for i, name in enumerate(points):
+                yield name, Judged(own[i], world[i], np.eye(self.d), place[i : i + 1], truth[i : i + 1])
 
-    def _score_landmarks(self, landmarks: dict[Id, Judged], row: int, k: int) -> None:
+    def _score_landmarks(self, landmarks: list[Judged], P: Array, row: int, k: int) -> None:
+        """Score landmarks by the last blocks of a covariance P (n, n)."""
         values: dict[str, list[Array]] = {"": [], "_world": [], "_dof": []}
-        for size in {len(j.own) for j in landmarks.values()}:
-            same = {name: j for name, j in landmarks.items() if len(j.own) == size}
-            P = np.array([j.F @ self.slam.covariance(name) @ j.F.T for name, j in same.items()])
-            own, world = (nees(np.array([getattr(j, c) for j in same.values()]), P) for c in ("own", "world"))
+        sizes = np.array([len(j.own) for j in landmarks], dtype=np.int64)
+        first = len(P) - sizes.sum() + np.cumsum(sizes) - sizes
+        for size in np.unique(sizes):
+            same = np.flatnonzero(sizes == size)
+            index = first[same][:, None] + np.arange(size)
+            own, world = (
+                nees(np.array([getattr(landmarks[i], c) for i in same]), P[index[:, :, None], index[:, None, :]])
+                for c in ("own", "world")
+            )
             values[""].append(own)
             values["_world"].append(world)
             values["_dof"].append(np.where(np.isfinite(own), float(size), np.nan))
@@ -305,6 +318,15 @@ class _Scorer:
         parts = zip(own[..., :d], self.P[..., :d, :d], s["position_m"], self.truth[..., :d], strict=True)
         lost = any(diverged(e, P, error_m, truth) for e, P, error_m, truth in parts)
         return Scores(s, aligned, rmse(place - true), count, self.nis, self.nis_dof, lost or bool(stopped), stopped)
+
+
+def on_diagonal(blocks: list[Array]) -> Array:
+    """Return the matrix with these blocks on its diagonal: scipy's takes as long as the scores of a map."""
+    F, i, j = np.zeros(np.sum([block.shape for block in blocks], axis=0)), 0, 0
+    for block in blocks:
+        F[i : i + block.shape[0], j : j + block.shape[1]] = block
+        i, j = i + block.shape[0], j + block.shape[1]
+    return F
 
 
 def joint_nees(d: Array, P: Array) -> Any:

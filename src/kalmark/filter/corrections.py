@@ -86,9 +86,16 @@ def routines(axes: int, inverse_depths: bool) -> Routines:
 
     They are `retract`, `generator` and `iterate`, and what inverse distances need, 0 where there are none.
     """
-    moves = address_of(retract_plane if axes == 1 else retract, RETRACT)
-    first = moves, generator_address(axes), address_of(compiled_iterate, ITERATE)
+    iterates = address_of(compiled_iterate, ITERATE)  # first: what `compile_correction` does is waited for here
+    first = address_of(retract_plane if axes == 1 else retract, RETRACT), generator_address(axes), iterates
     return (*first, *((sensor_address(axes), *parallax.addresses()) if inverse_depths else (0, 0, 0, 0, 0)))
+
+
+def compile_correction(name: str, option: str, axes: int, inverse_depths: bool) -> None:
+    """Compile one of the corrections below, whose last argument has the type `option`, and its routines."""
+    address_of(compiled_iterate, ITERATE)
+    globals()[f"compiled_{name}"].compile(signature_of(f"none({TO_CORRECT}, {option})").args)
+    routines(axes, inverse_depths)
 
 
 @compiled
@@ -127,8 +134,7 @@ def iterate(
     turned = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
     depths = anchored(table if most > 1 else table[:0])  # a single step is worse off with it: docs/bearing_only.md
     v, H, HP, Z = linear
-    s = s_j = v
-    S = S_j = HP
+    s, S = s_j, S_j = v, HP  # of the types of a sensor's place and Jacobian, which only inverse distances need
     baselines = (depths, s, S, s)
     if len(depths):
         s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
@@ -236,7 +242,7 @@ def invariant(
     before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     V, correction = gain(P, n, index, H, M, v, (h, count))
     depths = anchored(atoms if limits[0] > 1 else atoms[:0])
-    s, S = v, H
+    s, S = v, H  # of the types, as in `iterate`
     rows, baselines = index[:h], (depths, s, S, s)
     if len(depths):
         s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])

@@ -88,8 +88,8 @@ class Estimator(Protocol):
 class Compiling(Protocol):
     """An estimator that is compiled, and can begin with that before it is needed."""
 
-    def compile_ahead(self) -> None:
-        """Begin to compile the correction on a second core."""
+    def compile_ahead(self, axes: int, inverse_depths: bool) -> None:
+        """Begin to compile the correction of a map of these axes on a second core."""
 
 
 @runtime_checkable
@@ -112,11 +112,10 @@ class _Estimator:
     from_first: ClassVar[bool] = False  # whether displacements count from the first estimates
     transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
 
-    def compile_ahead(self) -> None:
-        """Begin to compile the correction on a second core."""
-        cls = type(self)
-        jobs = {corrections.compiled_iterate: corrections.TO_ITERATE}  # every correction waits for its address
-        ahead(jobs | {cls.compiled: f"{corrections.TO_CORRECT}, {cls.option}"})
+    def compile_ahead(self, axes: int, inverse_depths: bool) -> None:
+        """Begin to compile the correction of a map of these axes on a second core."""
+        job, cls = corrections.compile_correction, type(self)
+        ahead(corrections.compiled_iterate, job, cls.source.__name__, cls.option, axes, inverse_depths)
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
-from kalmark.filter.kernels import rows_of, submatrix
+from kalmark.filter.kernels import quadratic, rows_of, submatrix
 from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, VECTOR, X_AT, Table
 
 Baselines = tuple[Table, Array, Array, Array]  # of the anchored at the prediction: table, s, S, c2
@@ -64,29 +64,50 @@ def spread(P: Array, head: Index, x: Array, s: Array, S: Array, table: Table) ->
     """
     size, h = S.shape
     c2, rows, D = np.empty(len(table)), np.empty(h + size, np.int64), np.zeros((size, h + size))
-    rows[:h] = head
+    for j in range(h):
+        rows[j] = head[j]
+    for a in range(size):
+        D[a, h + a] = -1.0
     for i in range(len(table)):
-        D[:, :h], D[:, h:] = S, -np.eye(size)
+        for a in range(size):
+            rows[h + a] = table[i, ANCHOR_P] + a
+            for j in range(h):
+                D[a, j] = S[a, j]
         if size == 2:
-            a = table[i, ANCHOR_X]
-            D[0, 2] += s[1] - x[a + 1]
-            D[1, 2] -= s[0] - x[a]
-        rows[h:] = np.arange(table[i, ANCHOR_P], table[i, ANCHOR_P] + size)
-        c2[i] = np.trace(D @ submatrix(P, rows) @ D.T) + 1e-12
+            at = table[i, ANCHOR_X]
+            D[0, 2] += s[1] - x[at + 1]
+            D[1, 2] -= s[0] - x[at]
+        C = quadratic(D, submatrix(P, rows))
+        c2[i] = 1e-12
+        for a in range(size):
+            c2[i] += C[a, a]
     return c2
+
+
+@compiled
+def baseline(s: Array, x: Array, at: int, c2: float) -> tuple[Array, float]:
+    """Return the way t = s - a (2 or 3,) from the anchor, at `at` in x, to the sensor, and n = sqrt(|t|^2 + c2)."""
+    t, n2 = np.empty(len(s)), c2
+    for a in range(len(s)):
+        t[a] = s[a] - x[at + a]
+        n2 += t[a] * t[a]
+    return t, np.sqrt(n2)
 
 
 @compiled
 def retract_parallax(x: Array, before: Array, baselines: Baselines, d: Array, d_head: Array, s_now: Array) -> None:
     """Set rho = (n rho + n d_rho + g.d_t) / n+ in place, x being the mean after, `before` the one before d."""
     table, s, S, c2 = baselines
-    size, d_s = len(s), S @ d_head
     for i in range(len(table)):
-        at, p, a, a_p = table[i]
-        t, t_now = s - before[a : a + size], s_now - x[a : a + size]
-        n, n_now = np.sqrt((t * t).sum() + c2[i]), np.sqrt((t_now * t_now).sum() + c2[i])
-        along = (t * (d_s - d[a_p : a_p + size])).sum()
-        x[at] = (n * (before[at] + d[p]) + before[at] / n * along) / n_now
+        at, p, a, a_p = table[i, RHO_X], table[i, RHO_P], table[i, ANCHOR_X], table[i, ANCHOR_P]
+        t, n = baseline(s, before, a, c2[i])
+        along = 0.0  # t.d_t
+        for j in range(len(s)):
+            d_t = -d[a_p + j]
+            for c in range(len(d_head)):
+                d_t += S[j, c] * d_head[c]
+            along += t[j] * d_t
+        x[at] = (n * (before[at] + d[p]) + before[at] / n * along) / baseline(s_now, x, a, c2[i])[1]
 
 
 @compiled
@@ -97,22 +118,22 @@ def carried(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: 
     """
     table, s, S, c2 = baselines
     size, h = S.shape
-    C = np.empty((len(table), h + size + 1))
+    pose, C = 6 if size == 3 else 3, np.zeros((len(table), h + size + 1))
     for i in range(len(table)):
-        at, _, a, _ = table[i]
-        t, t_now = s - before[a : a + size], s_now - x[a : a + size]
-        n, n_now = np.sqrt((t * t).sum() + c2[i]), np.sqrt((t_now * t_now).sum() + c2[i])
-        g, g_now = before[at] / n * t, x[at] / n_now * t_now
-        pose = 2 * size if size == 3 else 3
-        C[i, :h] = g @ S - g_now @ S_now
-        C[i, :pose] = ((g - g_now) @ S_now)[:pose]
-        if size == 3:
-            C[i, 3:6] += np.cross(g, t_now)
-        else:
-            C[i, 2] += g[0] * t_now[1] - g[1] * t_now[0]
-        C[i, h : h + size] = g_now - g
-        C[i, -1] = n
-        C[i] /= n_now
+        at, a = table[i, RHO_X], table[i, ANCHOR_X]
+        (g, n), (t, n_now) = baseline(s, before, a, c2[i]), baseline(s_now, x, a, c2[i])
+        for j in range(size):
+            g[j] *= before[at] / n
+            g_now = x[at] / n_now * t[j]
+            for c in range(h):
+                C[i, c] += g[j] * (S_now[j, c] if c < pose else S[j, c]) - g_now * S_now[j, c]
+            C[i, h + j] = g_now - g[j]
+        for j in range(3 if size == 3 else 1):  # g x t; in the plane, its third component
+            k, l = ((j + 1) % 3, (j + 2) % 3) if size == 3 else (0, 1)
+            C[i, pose - (3 if size == 3 else 1) + j] += g[k] * t[l] - g[l] * t[k]
+        C[i, h + size] = n
+        for c in range(h + size + 1):
+            C[i, c] /= n_now
     return C
 
 
@@ -126,8 +147,8 @@ def carry_back(H: Array, before: Array, x: Array, baselines: Baselines, s_now: A
         p, anchor = table[i, RHO_P], table[i, ANCHOR_P]
         for r in range(len(H)):
             h = H[r, p]
-            H[r, :head] += h * C[i, :head]
-            H[r, anchor : anchor + last - head] += h * C[i, head:last]
+            for c in range(last):
+                H[r, c if c < head else anchor + c - head] += h * C[i, c]
             H[r, p] = h * C[i, last]
 
 
@@ -142,27 +163,24 @@ def transport_parallax(
     table, C = baselines[0], carried(before, x, baselines, s_now, S_now)
     h, count = len(head), len(table)
     size = C.shape[1] - h - 1
-    X = np.empty((count, n))  # (T - I) P at the rows of rho
-    common = rows_of(P, head, n)
+    X = np.zeros((count, n))  # (T - I) P at the rows of rho
+    common, own = rows_of(P, head, n), np.empty(size + 1, np.int64)
     for i in range(count):
-        anchor = np.arange(table[i, ANCHOR_P], table[i, ANCHOR_P] + size)
-        own = rows_of(P, table[i, RHO_P : RHO_P + 1], n)
-        X[i] = C[i, :h] @ common + C[i, h : h + size] @ rows_of(P, anchor, n) + own[0] * (C[i, -1] - 1.0)
-    D = np.empty((count, count))  # (T - I) P (T - I)'
-    for i in range(count):
-        for j in range(count):
-            s = X[i, table[j, RHO_P]] * (C[j, -1] - 1.0)
-            for k in range(h):
-                s += X[i, head[k]] * C[j, k]
-            for k in range(size):
-                s += X[i, table[j, ANCHOR_P] + k] * C[j, h + k]
-            D[i, j] = s
+        for k in range(size):
+            own[k] = table[i, ANCHOR_P] + k
+        own[size] = table[i, RHO_P]
+        rows = rows_of(P, own, n)
+        C[i, h + size] -= 1.0
+        for k in range(h + size + 1):
+            for j in range(n):
+                X[i, j] += C[i, k] * (common[k, j] if k < h else rows[k - h, j])
     for i in range(count):
         p = table[i, RHO_P]
-        P[p, : p + 1] += X[i, : p + 1]
-        P[p:n, p] += X[i, p:n]
-    for i in range(count):
-        for j in range(count):
+        for j in range(n):
+            P[max(p, j), min(p, j)] += X[i, j] if j != p else 2.0 * X[i, p]  # of row and column
+    for j in range(count):  # (T - I) P (T - I)'
+        for i in range(count):
             a, b = table[i, RHO_P], table[j, RHO_P]
-            if a >= b:
-                P[a, b] += D[i, j]
+            for k in range(h + size + 1 if a >= b else 0):
+                at = head[k] if k < h else (b if k == h + size else table[j, ANCHOR_P] + k - h)
+                P[a, b] += X[i, at] * C[j, k]

@@ -88,13 +88,13 @@ def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
             index[dof + b * k + i] = blocks[added[b], 2] + i
             total[i] += x[blocks[added[b], 0] + i]
     r = x[at : at + size].copy()
-    moved, F, R_u = step(model, r, total, dt_s)
+    moved, F, R_u = step(model, r, total, dt_s)  # [S] (14)
     if from_first:
         axes, origin = 1 if size == 3 else 3, np.zeros(3)
         now = call_generator(turns, (atoms, x, n, axes, origin))
         then = call_generator(turns, (atoms, x_first, n, axes, origin))
         F = transported(F, now, then, p_at)
-    Q, valid = kernels.moved_noise(moved, F, R_u, N)
+    Q, valid = kernels.moved_noise(moved, F, R_u, N)  # the last term of [S] (15)
     if not valid:
         return False
     F, Q = joined(F, R_u, Q, len(added), shared)
@@ -103,7 +103,7 @@ def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
         for i in range(len(D)):
             for j in range(len(D)):
                 Q[i, j] += Q_D[i, j]
-    kernels.predict(P, n, index, F, Q)
+    kernels.predict(P, n, index, F, Q)  # [S] (15)-(17)
     for i in range(size):
         x[at + i] = x_first[at + i] = moved[i]
     return True

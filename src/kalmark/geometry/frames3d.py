@@ -38,15 +38,17 @@ def minus(b: Array, a: Array) -> Array:
 @compiled
 def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
     """Return c = a o b (frame b given in frame a), C_a (6, 6) and C_b (6, 6).  [S] (55) in space."""
-    Q = rotations.matrix(a[3:])
-    p = Q @ b[:3].copy()
-    c = np.empty(7)
-    c[:3] = a[:3] + p
-    c[3:] = rotations.multiply(a[3:], b[3:])
-    C_a, C_b = np.eye(6), np.zeros((6, 6))
-    C_a[:3, 3:] = -rotations.skew(p)
-    C_b[:3, :3] = Q
-    C_b[3:, 3:] = Q
+    Q, q = rotations.matrix(a[3:]), rotations.multiply(a[3:], b[3:])
+    c, C_a, C_b = np.empty(7), np.eye(6), np.zeros((6, 6))
+    for i in range(3):
+        p = Q[i, 0] * b[0] + Q[i, 1] * b[1] + Q[i, 2] * b[2]
+        c[i] = a[i] + p
+        j, k = (i + 1) % 3, (i + 2) % 3
+        C_a[j, 3 + k], C_a[k, 3 + j] = p, -p  # -[p]x
+        for n in range(3):
+            C_b[i, n] = C_b[3 + i, 3 + n] = Q[i, n]
+    for i in range(4):
+        c[3 + i] = q[i]
     return c, C_a, C_b
 
 
@@ -68,12 +70,16 @@ def inverse(a: Array) -> tuple[Array, Array]:
 @compiled
 def move(a: Array, u: Array) -> tuple[Array, Array, Array]:
     """Move frame a by u = (dx, dy, dz, rotation vector) of its own axes: b, B_a (6, 6), B_u (6, 6).  [TB] `odo3`."""
-    step = np.empty(7)
-    step[:3] = u[:3]
-    step[3:] = rotations.exp(u[3:])
-    b, B_a, B_step = compose(a, step)
-    B_step[3:, 3:] = B_step[3:, 3:].copy() @ rotations.left_jacobian(u[3:])
-    return b, B_a, B_step
+    step, turn, V = np.empty(7), rotations.exp(u[3:]), rotations.left_jacobian(u[3:])
+    for i in range(3):
+        step[i] = u[i]
+    for i in range(4):
+        step[3 + i] = turn[i]
+    b, B_a, B_u = compose(a, step)
+    for i in range(3):
+        for j in range(3):
+            B_u[3 + i, 3 + j] = B_u[i, 0] * V[0, j] + B_u[i, 1] * V[1, j] + B_u[i, 2] * V[2, j]
+    return b, B_a, B_u
 
 
 @compiled

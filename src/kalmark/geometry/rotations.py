@@ -101,6 +101,21 @@ def log(q: Array) -> Array:
 
 
 @compiled
+def _polynomial(p: float, q: float, v: Array) -> Array:
+    """Return I + p [v]x + q [v]x^2 (3, 3), with [v]x^2 = v v' - v'v I."""
+    out, rest = np.empty((3, 3)), 1.0 - q * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = q * v[i] * v[j]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i, i] += rest
+        out[k, j] += p * v[i]
+        out[j, k] -= p * v[i]
+    return out
+
+
+@compiled
 def left_jacobian(v: Array) -> Array:
     """Return V(v) (3, 3) of SO(3): Exp(v + d) = Exp(V d) Exp(v) to first order, and (Exp(v) - I) p = V(v) (v x p).
 
@@ -114,8 +129,7 @@ def left_jacobian(v: Array) -> Array:
         a = math.sqrt(a2)
         half = math.sin(0.5 * a)
         p, q = 2.0 * half * half / a2, (a - math.sin(a)) / (a2 * a)
-    S = skew(v)
-    return np.eye(3) + p * S + q * (S @ S)
+    return _polynomial(p, q, v)
 
 
 @compiled
@@ -127,8 +141,7 @@ def left_jacobian_inverse(v: Array) -> Array:
     else:
         half = 0.5 * math.sqrt(a2)
         q = (1.0 - half * math.cos(half) / math.sin(half)) / a2
-    S = skew(v)
-    return np.eye(3) - 0.5 * S + q * (S @ S)
+    return _polynomial(-0.5, q, v)
 
 
 @compiled

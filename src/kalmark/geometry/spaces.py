@@ -128,8 +128,13 @@ def _retract_direction(x: Array, d: Array, turn: Array) -> None:
 
 @compiled
 def _direction_generator(m: Array) -> Array:
-    """Return how the azimuth and elevation of m (3,) move (2, 3) when the world turns."""
-    return -spherical_many(m.reshape(1, 3))[1][0, 1:] @ skew(m)
+    """Return how the azimuth and elevation of m (3,) move (2, 3) when the world turns: -Y_m [m]x."""
+    Y_m, g = spherical_many(m.reshape(1, 3))[1], np.empty((2, 3))
+    for a in range(2):
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            g[a, i] = Y_m[0, 1 + a, k] * m[j] - Y_m[0, 1 + a, j] * m[k]
+    return g
 
 
 @compiled
@@ -160,16 +165,22 @@ def generator(atoms: Table, x: Array, size: int, axes: int, origin: Array) -> Ar
             for j in range(3):
                 g[k + j, turn + j] = 1.0
         elif kind == DIRECTION:
-            g[k : k + 2, turn:] = _direction_generator(direction_many(x[at : at + 2].reshape(1, 2))[0][0])
+            moved = _direction_generator(direction_many(x[at : at + 2].reshape(1, 2))[0][0])
+            for a in range(2):
+                for j in range(3):
+                    g[k + a, turn + j] = moved[a, j]
         elif kind >= 0 and LINEAR[kind] > 0:
             for a in range(0, LINEAR[kind], 3):
                 g[k + a, turn + 1], g[k + a, turn + 2] = x[at + a + 2], -x[at + a + 1]
                 g[k + a + 1, turn], g[k + a + 1, turn + 2] = -x[at + a + 2], x[at + a]
                 g[k + a + 2, turn], g[k + a + 2, turn + 1] = x[at + a + 1], -x[at + a]
             if kind in (HOMOGENEOUS, PLUECKER) and axes == 6:
-                moved = x[at + 3] * np.eye(3) if kind == HOMOGENEOUS else -skew(x[at + 3 : at + 6])
-                g[k : k + 3, :3] = moved
-                g[k : k + 3, 3:] += moved @ skew(origin)
+                step = x[at + 3] * np.eye(3) if kind == HOMOGENEOUS else -skew(x[at + 3 : at + 6])
+                back = skew(origin)
+                for a in range(3):
+                    for j in range(3):
+                        g[k + a, j] = step[a, j]
+                        g[k + a, 3 + j] += step[a, 0] * back[0, j] + step[a, 1] * back[1, j] + step[a, 2] * back[2, j]
     return g
 
 

@@ -78,12 +78,11 @@ def project(lens: int, v: Array, par: Array) -> tuple[Array, Array]:
         flat = math.hypot(v[i, 0], v[i, 1])
         angle = math.atan2(flat, v[i, 2])
         shown = angle < par[4] if lens == EQUIDISTANT else v[i, 2] > 0.0 and flat < par[4] * v[i, 2]
-        if not shown:
-            e[i], E_v[i] = np.nan, np.nan
+        for a in range(0 if shown else 2):
+            e[i, a] = E_v[i, a, 0] = E_v[i, a, 1] = E_v[i, a, 2] = np.nan
     return e, E_v
 
 
-@compiled
 def back_project(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
     """Return the viewing rays m (K, 3), unit vectors, of pixels y (K, 2), and M_y (K, 3, 2).
 
@@ -100,22 +99,16 @@ def back_project(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
     return back_project_pinhole(y, par[:4], par[n:])
 
 
-@compiled
 def in_view(lens: int, v: Array, par: Array, size: Array) -> Flags:
     """Return which of v (K, 3) the lens shows at a pixel of the image (width, height), borders included.
 
     OMNI: where the ray back through the pixel is v's, within 2.6 degrees; elsewhere the polynomial has no meaning.
     """
     e, _ = project(lens, v, par)
-    seen = np.empty(len(v), dtype=np.bool_)
-    for i in range(len(v)):
-        seen[i] = 0.0 <= e[i, 0] <= size[0] and 0.0 <= e[i, 1] <= size[1]
+    seen: Flags = np.all((e >= 0.0) & (e <= size), axis=1)  # not where a lens shows nothing: those are NaN
     if lens == OMNI:
         m, _ = back_project(lens, e, par)
-        for i in range(len(v)):
-            length = math.sqrt(v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
-            along = m[i, 0] * v[i, 0] + m[i, 1] * v[i, 1] + m[i, 2] * v[i, 2]
-            seen[i] = seen[i] and along > 0.999 * length
+        seen &= np.sum(m * v, axis=1) > 0.999 * np.linalg.norm(v, axis=1)
     return seen
 
 
@@ -334,7 +327,8 @@ def back_project_pinhole(y: Array, k: Array, c: Array) -> tuple[Array, Array]:
             xd[i, a] = (y[i, a] - k[2 + a]) / k[a]
     x, X_xd, _ = radial_many(xd, c)
     v = np.ones((len(y), 3))
-    v[:, :2] = x
+    for i in range(len(y)):
+        v[i, 0], v[i, 1] = x[i, 0], x[i, 1]
     m, M_v = unit_many(v)
     M_y = np.empty((len(y), 3, 2))
     for i in range(len(y)):

@@ -25,8 +25,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.directions import direction_many, spherical_many, unit_many
-from kalmark.geometry.frames3d import from_frame_many, to_frame_many, turned_rates
-from kalmark.geometry.rotations import matrix, skew
+from kalmark.geometry.frames3d import from_frame_many, to_frame_many
+from kalmark.geometry.rotations import matrix
 
 point_seen_from = to_frame_many
 point_from_view = from_frame_many
@@ -35,19 +35,21 @@ point_from_view = from_frame_many
 @compiled
 def anchored_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the rays v (K, 3) to anchored points l (K, 7), V_T (K, 3, 6) and V_l (K, 3, 7)."""
-    Q = matrix(T[3:]).T.copy()
-    k = len(l)
-    v, V_T, V_l = np.empty((k, 3)), np.empty((k, 3, 6)), np.empty((k, 3, 7))
+    Q, k = matrix(T[3:]), len(l)
+    v, V_T, V_l = np.zeros((k, 3)), np.empty((k, 3, 6)), np.zeros((k, 3, 7))
+    base, ray = np.empty(3), np.empty(3)
     for i in range(k):
         rho = l[i, 6]
-        base = l[i, :3] - T[:3]
-        ray = l[i, 3:6] + rho * base
-        V_T[i, :, 3:] = turned_rates(Q, ray)
+        for a in range(3):
+            base[a] = l[i, a] - T[a]
+            ray[a] = l[i, 3 + a] + rho * base[a]
         for j in range(3):
-            v[i, j] = Q[j, 0] * ray[0] + Q[j, 1] * ray[1] + Q[j, 2] * ray[2]
-            V_l[i, j, 6] = Q[j, 0] * base[0] + Q[j, 1] * base[1] + Q[j, 2] * base[2]
             for a in range(3):
-                V_T[i, j, a], V_l[i, j, a], V_l[i, j, 3 + a] = -rho * Q[j, a], rho * Q[j, a], Q[j, a]
+                b, c = (a + 1) % 3, (a + 2) % 3
+                v[i, j] += Q[a, j] * ray[a]
+                V_l[i, j, 6] += Q[a, j] * base[a]
+                V_l[i, j, a], V_l[i, j, 3 + a] = rho * Q[a, j], Q[a, j]
+                V_T[i, j, a], V_T[i, j, 3 + a] = -rho * Q[a, j], Q[b, j] * ray[c] - Q[c, j] * ray[b]
     return v, V_T, V_l
 
 
@@ -62,18 +64,20 @@ def inverse_depth_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
 @compiled
 def homogeneous_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the rays v (K, 3) to homogeneous points l (K, 4), V_T (K, 3, 6) and V_l (K, 3, 4)."""
-    Q = matrix(T[3:]).T.copy()
-    k = len(l)
-    v, V_T, V_l = np.empty((k, 3)), np.empty((k, 3, 6)), np.empty((k, 3, 4))
+    Q, k = matrix(T[3:]), len(l)
+    v, V_T, V_l = np.zeros((k, 3)), np.empty((k, 3, 6)), np.zeros((k, 3, 4))
+    ray = np.empty(3)
     for i in range(k):
         rho = l[i, 3]
-        ray = l[i, :3] - rho * T[:3]
-        V_T[i, :, 3:] = turned_rates(Q, ray)
+        for a in range(3):
+            ray[a] = l[i, a] - rho * T[a]
         for j in range(3):
-            v[i, j] = Q[j, 0] * ray[0] + Q[j, 1] * ray[1] + Q[j, 2] * ray[2]
-            V_l[i, j, 3] = -(Q[j, 0] * T[0] + Q[j, 1] * T[1] + Q[j, 2] * T[2])
             for a in range(3):
-                V_T[i, j, a], V_l[i, j, a] = -rho * Q[j, a], Q[j, a]
+                b, c = (a + 1) % 3, (a + 2) % 3
+                v[i, j] += Q[a, j] * ray[a]
+                V_l[i, j, 3] -= Q[a, j] * T[a]
+                V_l[i, j, a] = Q[a, j]
+                V_T[i, j, a], V_T[i, j, 3 + a] = -rho * Q[a, j], Q[b, j] * ray[c] - Q[c, j] * ray[b]
     return v, V_T, V_l
 
 
@@ -92,13 +96,20 @@ def chained(A: Array, B: Array) -> Array:
 @compiled
 def world_rays(T: Array, ray: Array) -> tuple[Array, Array, Array]:
     """Return the world's unit vectors m (K, 3) along rays (K, 3) of T, M_theta (K, 3, 3) and M_ray (K, 3, 3)."""
-    Q = matrix(T[3:])
-    w = ray @ Q.T
+    Q, k = matrix(T[3:]), len(ray)
+    w, M_theta, M_ray = np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3))
+    for i in range(k):
+        for a in range(3):
+            for b in range(3):
+                w[i, a] += ray[i, b] * Q[a, b]
     m, M_w = unit_many(w)
-    M_theta, M_ray = np.empty((len(ray), 3, 3)), np.empty((len(ray), 3, 3))
-    for i in range(len(ray)):
-        M_theta[i] = -skew(m[i])
-        M_ray[i] = M_w[i] @ Q
+    for i in range(k):
+        for a in range(3):
+            b, c = (a + 1) % 3, (a + 2) % 3
+            M_theta[i, b, c], M_theta[i, c, b] = m[i, a], -m[i, a]
+            for j in range(3):
+                for d in range(3):
+                    M_ray[i, a, j] += M_w[i, a, d] * Q[d, j]
     return m, M_theta, M_ray
 
 
@@ -112,11 +123,12 @@ def anchored_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Array, 
     m, M_theta, M_ray = world_rays(T, ray)
     l, L_T, L_ray, L_rho = np.empty((k, 7)), np.zeros((k, 7, 6)), np.zeros((k, 7, 3)), np.zeros((k, 7, 1))
     for i in range(k):
-        l[i, :3], l[i, 3:6], l[i, 6] = T[:3], m[i], rho[i]
-        for a in range(3):
-            L_T[i, a, a] = 1.0
-        L_T[i, 3:6, 3:], L_ray[i, 3:6] = M_theta[i], M_ray[i]
+        l[i, 6] = rho[i]
         L_rho[i, 6, 0] = 1.0
+        for a in range(3):
+            l[i, a], l[i, 3 + a], L_T[i, a, a] = T[a], m[i, a], 1.0
+            for b in range(3):
+                L_T[i, 3 + a, 3 + b], L_ray[i, 3 + a, b] = M_theta[i, a, b], M_ray[i, a, b]
     return l, L_T, L_ray, L_rho
 
 
@@ -145,7 +157,8 @@ def homogeneous_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Arra
         for a in range(3):
             l[i, a] = m[i, a] + rho[i] * T[a]
             L_T[i, a, a], L_rho[i, a, 0] = rho[i], T[a]
-        L_T[i, :3, 3:], L_ray[i, :3] = M_theta[i], M_ray[i]
+            for b in range(3):
+                L_T[i, a, 3 + b], L_ray[i, a, b] = M_theta[i, a, b], M_ray[i, a, b]
     return l, L_T, L_ray, L_rho
 
 

@@ -56,8 +56,14 @@ def with_distance(l: Array, rays: tuple[Array, Array, Array]) -> tuple[Array, Ar
     ray, R_T, R_l = rays
     k, n = l.shape
     v, V_T, V_l = np.empty((k, 4)), np.zeros((k, 4, 6)), np.zeros((k, 4, n))
-    v[:, :3], v[:, 3] = ray, l[:, n - 1]
-    V_T[:, :3], V_l[:, :3], V_l[:, 3, n - 1] = R_T, R_l, 1.0
+    for i in range(k):
+        v[i, 3], V_l[i, 3, n - 1] = l[i, n - 1], 1.0
+        for a in range(3):
+            v[i, a] = ray[i, a]
+            for c in range(6):
+                V_T[i, a, c] = R_T[i, a, c]
+            for c in range(n):
+                V_l[i, a, c] = R_l[i, a, c]
     return v, V_T, V_l
 
 
@@ -92,10 +98,18 @@ def range_bearing(code: int, par: Array, angular: Flags, v: Array, y: Array) -> 
 @compiled
 def camera(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return e, z (K, 2), E_v (K, 2, d) of the pixels of a camera, `code` its lens."""
-    e, E_ray = cameras.project(code, v[:, :3].copy(), par)
-    E_v = np.zeros((len(v), 2, v.shape[1]))  # the pixel of a ray does not depend on its inverse distance
-    E_v[:, :, :3] = E_ray
-    return e, y - e, E_v
+    k, ray = len(v), np.empty((len(v), 3))
+    for i in range(k):
+        for b in range(3):
+            ray[i, b] = v[i, b]
+    e, E_ray = cameras.project(code, ray, par)
+    z, E_v = np.empty((k, 2)), np.zeros((k, 2, v.shape[1]))  # a pixel does not depend on its ray's inverse distance
+    for i in range(k):
+        for a in range(2):
+            z[i, a] = y[i, a] - e[i, a]
+            for b in range(3):
+                E_v[i, a, b] = E_ray[i, a, b]
+    return e, z, E_v
 
 
 @compiled

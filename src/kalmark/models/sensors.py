@@ -678,7 +678,9 @@ class TagCorners(_Lens):
     def both(self, y: Array) -> tuple[Array, Array, Array]:
         """Return the two poses (K, 2, 7) that look like y, the better first, V_y (K, 2, 6, 8), chi-squares (K, 2)."""
         corners, sizes = np.ascontiguousarray(y[:, :8]), np.ascontiguousarray(y[:, 8])
-        v, V_y, cost = tags.tags_from_corners(self.code, corners, sizes, np.array(self.parameters))
+        par = np.array(self.parameters)
+        rays = cameras.back_project(self.code, corners.reshape(-1, 2), par)[0].reshape(-1, 4, 3)
+        v, V_y, cost = tags.tags_from_corners(self.code, corners, rays, sizes, par)
         return v, V_y, cost / self.sigma_px**2
 
     def is_far(self, y: Array, z: Array) -> Flags:

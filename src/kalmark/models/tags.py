@@ -15,7 +15,7 @@ from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.frames3d import compose, minus, plus, turned_rates
 from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inverse, matrix, multiply, skew
-from kalmark.models.cameras import back_project, project
+from kalmark.models.cameras import project
 
 ITERATIONS = 50
 FACING = 0.3  # rad: a tag that faces the camera so well is near its mirror image
@@ -88,20 +88,20 @@ def pose_residual(y: Array, v: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def tags_from_corners(lens: int, y: Array, size: Array, par: Array) -> tuple[Array, Array, Array]:
+def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array) -> tuple[Array, Array, Array]:
     """Find the two tags whose corners look like y (K, 8): v (K, 2, 7), V_y (K, 2, 6, 8), sums of squares (K, 2) px^2.
 
-    From afar a tag looks the same when it is mirrored along the line of sight, so that the sum of squared pixels has
-    two minima: both are sought, by Levenberg's method from the homography of the corners and from its mirror image, and
-    the lower one comes first.  Where noise has left but one, the second is its mirror image, without V_y; its sum is
-    infinite where that is within `FACING`, for then it does not matter.  All is NaN where the four pixels are no convex
-    quadrangle of rays ahead.  V_y = (E'E)^-1 E' of Gauss-Newton, so that V_y N V_y' is the covariance for noise N of
-    the pixels.
+    `rays` (K, 4, 3) are the corners' viewing rays.  From afar a tag looks the same when it is mirrored along the line
+    of sight, so that the sum of squared pixels has two minima: both are sought, by Levenberg's method from the
+    homography of the corners and from its mirror image, and the lower one comes first.  Where noise has left but one,
+    the second is its mirror image, without V_y; its sum is infinite where that is within `FACING`, for then it does not
+    matter.  All is NaN where the four pixels are no convex quadrangle of rays ahead.  V_y = (E'E)^-1 E' of Gauss-
+    Newton, so that V_y N V_y' is the covariance for noise N of the pixels.
     """
     k = len(y)
     v, V_y, cost = np.full((k, 2, 7), np.nan), np.full((k, 2, 6, 8), np.nan), np.full((k, 2), np.nan)
     for i in range(k):
-        first, second = from_homography(back_project(lens, y[i].copy().reshape((4, 2)), par)[0], size[i])
+        first, second = from_homography(rays[i], size[i])
         a, E_a, cost_a = refined(lens, y[i], size[i], first, par)
         b, E_b, cost_b = refined(lens, y[i], size[i], second, par)
         if cost_b < cost_a or math.isnan(cost_a):

@@ -32,7 +32,7 @@ from kalmark.filter.compressed.map import CompressedMap
 from kalmark.filter.estimators import Averaging, Compiling, Correction, Estimator, Invariant, Update
 from kalmark.filter.map import Map
 from kalmark.filter.maps import DENSE, grown, new_map
-from kalmark.geometry.spaces import SE2, SE3, Rn
+from kalmark.geometry.spaces import RHO, SE2, SE3, Rn
 from kalmark.management import confirm, delayed, existence, merge, reparametrize, tags
 from kalmark.management.attention import chosen, left_out
 from kalmark.management.pending import Initialization, Step
@@ -106,7 +106,9 @@ class Slam:
         for robot in self.robots.values():
             self._place(robot)
         if isinstance(self.estimator, Compiling):
-            self.estimator.compile_ahead()
+            kinds = [kind for channel in self._channels.values() for kind in channel.landmark.space.kinds]
+            axes = max(robot.motion.space.axes for robot in self.robots.values())
+            self.estimator.compile_ahead(axes, RHO in kinds)
         self._may_grow = map == "auto" and not any(policy.averages for policy in self._policies.values())
 
     def _place(self, robot: Robot) -> None:
