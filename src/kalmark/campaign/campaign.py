@@ -19,10 +19,23 @@ from kalmark.arrays import Array
 from kalmark.campaign.scoring import NEES, Scores
 from kalmark.geometry.gaussian import quantile
 from kalmark.results.evaluate import none_for_nan
+from kalmark.results.recording import write
 from kalmark.results.scene import COLOURS, grouped
 
 POINTS = 400  # of a curve, at most
 COARSE, FINE = (1.0, 2.0, 5.0), (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # ticks in a decade
+FIGURES = (
+    ("diverged", "diverged"),
+    *((f"{name}_anees", name) for name in ("joint", "pose", "state", "heading", "landmarks", "mount")),
+    ("pose_inside", "pose in its band, %"),
+    ("position_rmse_m", "position RMSE, m"),
+    ("heading_rmse_deg", "heading RMSE, deg"),
+    ("landmark_rmse_m", "landmark RMSE, aligned, m"),
+    ("landmark_rmse_raw_m", "landmark RMSE, raw, m"),
+    ("mount_m", "mount at the end, m"),
+    ("mount_deg", "mount at the end, deg"),
+    ("mount_sure", "mounts within 3 sigma at the end"),
+)
 _WORDS = {"joint": "joint state, a dimension", "state": "pose and velocity"}
 _WITH_WORLD = ("pose", "landmarks", "joint")
 
@@ -117,13 +130,13 @@ def mounts(scores: Sequence[Scores]) -> dict[str, float]:
     if not any(np.isfinite(s.series["mount_m"]).any() for s in scores):
         return {}
     names = ("mount", "mount_dof", "mount_m", "mount_rad")
-    last = {name: np.array([_last(s.series[name]) for s in scores]) for name in names}
+    last = {name: np.array([last_value(s.series[name]) for s in scores]) for name in names}
     below = last["mount"] <= quantile(0.9973, last["mount_dof"])
     degrees = float(np.degrees(rms(last["mount_rad"])))
     return {"mount_m": rms(last["mount_m"]), "mount_deg": degrees, "mount_sure": int(below.sum())}
 
 
-def _last(values: Array) -> float:
+def last_value(values: Array) -> float:
     """Return the largest, over robots, of the last finite values."""
     rows = [row[np.isfinite(row)] for row in values]
     return max((float(row[-1]) for row in rows if len(row)), default=float("nan"))
@@ -229,7 +242,7 @@ class Campaign:
         """Write ``summary.json``, ``anees.csv`` (a row an estimator, robot and step), ``anees.png``, description."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "summary.json").write_text(json.dumps(self.summary(), indent=2) + "\n", encoding="utf-8")
+        write(folder / "summary.json", json.dumps(self.summary(), indent=2) + "\n")
         (folder / f"{self.kind}.yaml").write_text(self.description, encoding="utf-8")
         self._write_steps(folder / "anees.csv")
         title = f"{self.world}: average NEES of {self.runs} runs, seed {self.seed}"

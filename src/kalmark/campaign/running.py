@@ -6,8 +6,7 @@ are the same whatever the number of workers.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,35 +15,44 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib.parallel import get_active_backend
 from threadpoolctl import threadpool_limits
 
 from kalmark.campaign.campaign import Campaign
-from kalmark.campaign.replay import Replay, replay_of
+from kalmark.campaign.cells import Cell, Scene, open_scene
+from kalmark.campaign.keeping import Kept, cell_digest
+from kalmark.campaign.replay import Replay
 from kalmark.campaign.scoring import Scores, score
+from kalmark.campaign.sweep import Sweep
 from kalmark.config.building import build_slam
-from kalmark.config.opening import open_run
-from kalmark.config.reading import did_you_mean, resolve_config, resolve_name, shipped_configs, validate
+from kalmark.config.reading import did_you_mean, validate
 from kalmark.config.schema import Config
-from kalmark.config.tree import Tree, read_tree
+from kalmark.config.tree import Tree
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.results.progress import track
 from kalmark.simulate.robots import simulation
-from kalmark.simulate.worlds import World, load_world, shipped_worlds
+from kalmark.simulate.worlds import World
+
+Task = tuple[int, int]  # the number of a cell, and of a run of it
+Result = dict[str, Scores]  # by estimator
 
 BACKENDS = ("loky", "dask", "ray")
+DEATHS = {"BrokenProcessPool", "KilledWorker", "CancelledError", "RayActorError", "WorkerCrashedError"}
+TRIES = 3
+ROUND = 4  # runs a worker in one round, where results come in rounds
 ESTIMATORS = ("invariant", "ekf", "fej")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What every run of a campaign does; sent to the workers."""
+    """What every run of a cell does; sent to the workers."""
 
-    world: World | Replay
+    world: Scene
     configs: dict[str, Config]
     seed: int
     map_every: int
 
-    def run(self, number: int) -> dict[str, Scores]:
+    def run(self, number: int) -> Result:
         """Simulate run `number` and score every estimator on it."""
         with threadpool_limits(1):
             seed = np.random.SeedSequence(self.seed, spawn_key=(number,))
@@ -57,7 +65,7 @@ class Plan:
 
 
 def run_campaign(
-    world: World | Replay | str | Path,
+    world: Scene | str | Path,
     runs: int,
     estimators: Sequence[str] | None = None,
     seed: int = 0,
@@ -66,6 +74,9 @@ def run_campaign(
     progress: bool = True,
     map_every: int = 10,
     skip: int = 0,
+    address: str | None = None,
+    folder: str | Path | None = None,
+    resume: bool = True,
 ) -> Campaign:
     """Run a world, or the replay of a log, `runs` times and return the figures of each estimator.
 
@@ -73,42 +84,66 @@ def run_campaign(
     `estimators` are names like "invariant", "ekf" or, with a key of theirs, "invariant:iterations=1"; by default the
     one of the configuration or in the world's `filter`.  `jobs` is the number of processes (default: one a core).
     Landmarks and joint state are scored every `map_every` steps; averages of NEES leave out the first `skip` steps.
-    Raises ConfigError, LogError or KalmarkError on anything that cannot be run.
+    `address` is that of a dask or ray cluster.  Finished runs are kept in `folder`, if given, and are not run again
+    unless `resume` is False.  Raises ConfigError, LogError or KalmarkError on anything that cannot be run.
     """
+    refuse_unknown(estimators)
+    scene = world if isinstance(world, World | Replay) else open_scene(world, progress=progress)
+    sweep = run_sweep(
+        [Cell({}, scene)], runs, estimators, seed, jobs, backend, progress, map_every, skip, address, folder, resume
+    )
+    return sweep.campaigns[0]
+
+
+def run_sweep(
+    cells: Sequence[Cell],
+    runs: int,
+    estimators: Sequence[str] | None = None,
+    seed: int = 0,
+    jobs: int | None = None,
+    backend: str = "loky",
+    progress: bool = True,
+    map_every: int = 10,
+    skip: int = 0,
+    address: str | None = None,
+    folder: str | Path | None = None,
+    resume: bool = True,
+) -> Sweep:
+    """Run each of the cells (`open_cells`) as `run_campaign` does, all with the same seeds."""
     limits = (("runs", runs, 1), ("seed", seed, 0), ("map_every", map_every, 1), ("jobs", jobs, 1), ("skip", skip, 0))
     for name, value, least in limits:
         if value is not None and (not isinstance(value, int) or value < least):
             raise KalmarkError(f"campaign: {name} is {value!r}, expected a whole number of at least {least}")
     refuse_unknown(estimators)
-    world = world if isinstance(world, World | Replay) else open_scene(world, progress=progress)
-    if skip >= len(world.times()):
-        raise KalmarkError(f"campaign: skip is {skip}, expected less than the {len(world.times())} steps")
-    configs = configs_of(world, estimators)
-    plan = Plan(world, configs, seed, map_every)
-    results = list(track(results_of(plan, runs, jobs, backend), f"campaign {world.name}", runs, show=progress))
-    scores = {name: tuple(result[name] for result in results) for name in configs}
+    check_backend(backend, address)
+    for cell in cells:
+        if skip >= len(cell.scene.times()):
+            raise KalmarkError(f"campaign: skip is {skip}, expected less than the {len(cell.scene.times())} steps")
+        if estimators and any("estimator" in key.split(".") for key in cell.settings):
+            raise ConfigError(
+                "campaign: got estimators and a sweep over keys of the estimator, expected one of the two"
+            )
+    plans = [Plan(cell.scene, configs_of(cell.scene, estimators), seed, map_every) for cell in cells]
+    kept = None
+    digests = [cell_digest(plan.world, plan.configs) for plan in plans]
+    if folder is not None:
+        of = {cell.label: digest for cell, digest in zip(cells, digests, strict=True)}
+        kept = Kept(Path(folder), {"seed": seed, "map_every": map_every}, of, resume)
+    ready = finished(plans, digests, runs, kept, jobs, backend, address)
+    bar = track(ready, f"campaign {cells[0].scene.name}", runs * len(plans), show=progress)
+    results = dict(bar)
+    campaigns = []
+    for i, plan in enumerate(plans):
+        scores = {name: tuple(results[i, number][name] for number in range(runs)) for name in plan.configs}
+        campaigns.append(_campaign_of(plan, scores, runs, skip))
+    return Sweep(tuple(cells), tuple(campaigns))
+
+
+def _campaign_of(plan: Plan, scores: dict[str, tuple[Scores, ...]], runs: int, skip: int) -> Campaign:
+    world = plan.world
     robots, t_s = tuple(world.robots), tuple(t * 1e-9 for t in world.times())
     kind = "world" if isinstance(world, World) else "config"
-    return Campaign(world.name, world.to_yaml(), seed, runs, map_every, robots, t_s, scores, skip, kind)
-
-
-def open_scene(
-    path_or_name: str | Path, overrides: Sequence[str] = (), log: str | Path | None = None, progress: bool = True
-) -> World | Replay:
-    """Return the world, or the replay of the configuration, at a path or of a shipped name; of both, the world.
-
-    `log` is the log to use instead of the configuration's.  Raises ConfigError, LogError, KalmarkError.
-    """
-    shipped, path = shipped_worlds(), Path(path_or_name)
-    named = str(path_or_name) in shipped or (path.stem in shipped and path.suffix in (".yaml", ".yml"))
-    both = path.stem in shipped_configs()
-    if "world" in read_tree(path).values if path.is_file() else named and not (both and log is not None):
-        if log is not None:
-            raise ConfigError(f"--log {log}: {path} is a world, expected a configuration to use it in")
-        return load_world(path_or_name, overrides)
-    resolve_name(path_or_name, shipped_configs() | shipped, "world or a configuration")
-    config, found = open_run(resolve_config(path_or_name), log, overrides)
-    return replay_of(config, found, progress)
+    return Campaign(world.name, world.to_yaml(), plan.seed, runs, plan.map_every, robots, t_s, scores, skip, kind)
 
 
 def refuse_unknown(estimators: Sequence[str] | None) -> None:
@@ -124,7 +159,7 @@ def refuse_unknown(estimators: Sequence[str] | None) -> None:
             raise ConfigError(f"campaign: estimator {label!r} is given twice, expected each once")
 
 
-def configs_of(world: World | Replay, estimators: Sequence[str] | None) -> dict[str, Config]:
+def configs_of(world: Scene, estimators: Sequence[str] | None) -> dict[str, Config]:
     """Return the configuration of each estimator, by its label; the world's own keeps the world's keys.
 
     Raises ConfigError on an unknown one.
@@ -145,33 +180,123 @@ def configs_of(world: World | Replay, estimators: Sequence[str] | None) -> dict[
     return configs
 
 
-def results_of(plan: Plan, runs: int, jobs: int | None, backend: str) -> Iterable[dict[str, Scores]]:
-    """Yield the results of the runs in their order, as they become ready where the backend can do that."""
-    jobs = min(jobs or cpu_count(), runs)
-    if jobs == 1 and backend == "loky":
-        return (plan.run(number) for number in range(runs))
-    with joblib_backend(backend):
-        ordered = {"return_as": "generator"} if backend == "loky" else {}
-        parallel = Parallel(n_jobs=jobs, batch_size=1, **ordered)
-        return parallel(delayed(plan.run)(number) for number in range(runs))
+def finished(
+    plans: Sequence[Plan],
+    digests: Sequence[str],
+    runs: int,
+    kept: Kept | None,
+    jobs: int | None,
+    backend: str,
+    address: str | None,
+) -> Iterator[tuple[Task, Result]]:
+    """Yield each run of each plan once: first what is kept, then the others as they become ready, to be kept."""
+    missing = []
+    for task in ((cell, number) for cell in range(len(plans)) for number in range(runs)):
+        result = kept.read(digests[task[0]], task[1]) if kept else None
+        if result is None:
+            missing.append(task)
+        else:
+            yield task, result
+    for (cell, number), result in results_of(plans, missing, jobs, backend, address):
+        if kept:
+            kept.write(digests[cell], number, result)
+        yield (cell, number), result
 
 
-@contextmanager
-def joblib_backend(backend: str) -> Iterator[None]:
-    """Let joblib use a backend.  Raises KalmarkError if it is unknown or not installed.
+def results_of(
+    plans: Sequence[Plan],
+    tasks: Sequence[Task],
+    jobs: int | None = None,
+    backend: str = "loky",
+    address: str | None = None,
+) -> Iterator[tuple[Task, Result]]:
+    """Yield the result of each task once, as they become ready.
 
-    Dask: the cluster of ``DASK_SCHEDULER_ADDRESS`` if that is set, else processes of this machine.
+    Where a worker dies, the runs that are not finished are done again.  Raises KalmarkError if workers die `TRIES`
+    times and no run was finished meanwhile.
     """
+    if not tasks:
+        return
+    if backend == "loky":
+        jobs = min(jobs or cpu_count(), len(tasks))
+        if jobs == 1:
+            yield from (_done(plans[task[0]], task) for task in tasks)
+            return
+    left, tries = dict.fromkeys(tasks), 0
+    while left:
+        before = len(left)
+        try:
+            with joblib_backend(backend, address):
+                for task, result in _in_parallel(plans, [*left], jobs or -1):
+                    del left[task]
+                    yield task, result
+        except KalmarkError:
+            raise
+        except Exception as error:
+            if not died(error):
+                raise
+            tries = tries + 1 if len(left) == before else 0
+            if tries == TRIES:
+                message = (
+                    f"campaign: workers died {TRIES} times ({type(error).__name__}), expected them to finish a run"
+                )
+                raise KalmarkError(message) from error
+
+
+def _done(plan: Plan, task: Task) -> tuple[Task, Result]:
+    return task, plan.run(task[1])
+
+
+def _in_parallel(plans: Sequence[Plan], tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, Result]]:
+    """Yield results as they become ready; in rounds where the backend of joblib gives only whole lists."""
+    backend = get_active_backend()[0]
+    each = backend.supports_return_generator
+    size = len(tasks) if each else ROUND * backend.effective_n_jobs(jobs)
+    parallel = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered" if each else "list")
+    for start in range(0, len(tasks), size):
+        yield from parallel(delayed(_done)(plans[task[0]], task) for task in tasks[start : start + size])
+
+
+def died(error: BaseException | None) -> bool:
+    """Return whether an exception, or its cause, says that a worker died: one of loky, dask or ray."""
+    while error is not None:
+        if {cls.__name__ for cls in type(error).__mro__} & DEATHS:
+            return True
+        error = error.__cause__
+    return False
+
+
+def check_backend(backend: str, address: str | None) -> None:
+    """Refuse a backend that there is not, and an address for one that takes none."""
     if backend not in BACKENDS:
         expected = f"expected one of {', '.join(BACKENDS)}{did_you_mean(backend, BACKENDS)}"
         raise KalmarkError(f"campaign: backend is {backend!r}, {expected}")
+    if address is not None and backend == "loky":
+        raise KalmarkError(f"campaign: address is {address!r}, expected none with loky, or backend dask or ray")
+
+
+@contextmanager
+def joblib_backend(backend: str, address: str | None = None) -> Iterator[None]:
+    """Let joblib use a backend.  Raises KalmarkError if it is unknown, not installed or cannot be reached.
+
+    Without an address: the cluster that dask or ray itself is configured for (``DASK_SCHEDULER_ADDRESS``,
+    ``RAY_ADDRESS``), else processes of this machine.
+    """
+    check_backend(backend, address)
     with ExitStack() as open_:
-        if backend == "dask":
-            client = installed("dask.distributed", "dask distributed").Client
-            scheduler = os.environ.get("DASK_SCHEDULER_ADDRESS")
-            open_.enter_context(client(scheduler) if scheduler else client(processes=True, threads_per_worker=1))
-        elif backend == "ray":
-            installed("ray.util.joblib", "ray").register_ray()
+        try:
+            if backend == "dask":
+                client = installed("dask.distributed", "dask distributed").Client
+                local = {} if address else {"processes": True, "threads_per_worker": 1}
+                open_.enter_context(client(address, **local))
+            elif backend == "ray":
+                register, ray = installed("ray.util.joblib", "ray").register_ray, import_module("ray")
+                if not ray.is_initialized():
+                    ray.init(address, log_to_driver=False)
+                    open_.callback(ray.shutdown)
+                register()
+        except (OSError, ValueError) as error:
+            raise KalmarkError(f"campaign: {backend} at {address}: {' '.join(str(error).split())}") from error
         open_.enter_context(parallel_config(backend))
         yield
 

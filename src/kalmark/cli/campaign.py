@@ -11,21 +11,10 @@ import typer
 from kalmark.cli.shared import Overrides, announce_compilation_elsewhere, computing, number, print_table, writable
 
 if TYPE_CHECKING:
-    from kalmark.campaign import Campaign
+    from kalmark.campaign import Campaign, Sweep
 
 NEES = ("joint", "pose", "state", "heading", "landmarks", "mount")
-FIGURES = (
-    ("diverged", "diverged"),
-    *((f"{name}_anees", name) for name in NEES),
-    ("pose_inside", "pose in its band, %"),
-    ("position_rmse_m", "position RMSE, m"),
-    ("heading_rmse_deg", "heading RMSE, deg"),
-    ("landmark_rmse_m", "landmark RMSE, aligned, m"),
-    ("landmark_rmse_raw_m", "landmark RMSE, raw, m"),
-    ("mount_m", "mount at the end, m"),
-    ("mount_deg", "mount at the end, deg"),
-    ("mount_sure", "mounts within 3 sigma at the end"),
-)
+SHOWN = ("diverged", "joint_anees", "pose_anees", "position_rmse_m", "heading_rmse_deg", "landmark_rmse_m")  # of sweeps
 
 
 class Backend(StrEnum):
@@ -47,6 +36,16 @@ def campaign(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the campaign.")] = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes. (default: one a core)")] = None,
     backend: Annotated[Backend, typer.Option(help="Who runs the processes.")] = Backend.LOKY,
+    address: Annotated[
+        str | None, typer.Option(help="Of the dask or ray cluster. (default: its own, else this machine)")
+    ] = None,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY.PATH=A,B", help="Run with each of the values; of several keys, all combinations."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume/--no-resume", help="Keep the finished runs of this campaign, or run all anew.")
+    ] = True,
     skip: Annotated[int, typer.Option(min=0, help="Steps at the beginning that no average of NEES counts.")] = 0,
     out: Annotated[Path | None, typer.Option(help="The folder to write. (default: out/campaign-NAME)")] = None,
     overrides: Overrides = None,
@@ -56,21 +55,38 @@ def campaign(
     A log's route, map and sightings are those that its configured filter finds; all else is simulated by its models.
     """
     announce_compilation_elsewhere()
-    from kalmark.campaign import open_scene, run_campaign
-    from kalmark.campaign.running import refuse_unknown
+    from kalmark.campaign import open_cells, run_sweep
+    from kalmark.campaign.running import check_backend, refuse_unknown
 
     out = writable(out or Path("out") / f"campaign-{Path(world).stem}")
     refuse_unknown(estimator)
+    check_backend(backend.value, address)
     with computing():
-        scene = open_scene(world, overrides or (), log)
-    result = run_campaign(scene, runs, estimator, seed=seed, jobs=jobs, backend=backend.value, skip=skip)
+        cells = open_cells(world, sweep or (), overrides or (), log)
+    result = run_sweep(
+        cells, runs, estimator, seed, jobs, backend.value, skip=skip, address=address, folder=out, resume=resume
+    )
     result.save(out)
-    print_campaign(result)
-    typer.echo(f"{out}: summary.json, anees.csv and anees.png")
+    if sweep:
+        print_sweep(result)
+    else:
+        print_campaign(result.campaigns[0])
+    typer.echo(f"{out}: report.html, summary.json, runs.parquet and, of each step, anees.csv and anees.png")
+
+
+def print_sweep(sweep: Sweep) -> None:
+    """Print one row a cell and estimator, one column a figure."""
+    head, rows = sweep.table(SHOWN)
+    first = sweep.campaigns[0]
+    title = f"{first.world}: {first.runs} runs a cell, seed {first.seed}; ANEES (in brackets: of a consistent filter)"
+    texts = [[cell if isinstance(cell, str) else number(cell) for cell in row] for row in rows]
+    print_table(title, head, texts, align="<" * (len(sweep.keys) + 1) + ">" * (len(head) - len(sweep.keys) - 1))
 
 
 def print_campaign(campaign: Campaign) -> None:
     """Print one row a figure, one column an estimator."""
+    from kalmark.campaign.campaign import FIGURES
+
     estimators: dict[str, dict[str, Any]] = campaign.summary()["estimators"]
     rows = []
     for key, label in FIGURES:

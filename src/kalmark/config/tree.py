@@ -80,6 +80,11 @@ def show(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def parse_value(text: str, where: str) -> Any:
+    """Return a value written in YAML, plain.  Raises ConfigError, naming `where`."""
+    return _plain(_parse(text, where), (), Tree(), where)
+
+
 def _parse(text: str, name: str) -> Any:
     try:
         return YAML(typ="rt", pure=True).load(io.StringIO(text))
@@ -146,8 +151,7 @@ def _override(tree: Tree, override: str) -> None:
         node = node[part]
         if not isinstance(node, dict):
             raise ConfigError(f"{where}: {'.'.join(path[:depth])}: got {show(node)}, expected a mapping of keys")
-    overlay = Tree()
-    value = _plain(_parse(text, where), (), overlay, where)
+    value = parse_value(text, where)
     if path[-1] == "type" and node.get("type", value) != value:  # another type has other keys; a mount stays
         for key in [key for key in node if key != "mount"]:
             del node[key]

@@ -30,6 +30,7 @@ from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import Sensing
 
 Count = Annotated[int, Field(ge=1)]
+EACH = "robots.each."  # how an override begins that is meant for all robots of a world
 
 
 class _Underway(Section):
@@ -184,12 +185,26 @@ def shipped_worlds() -> dict[str, Path]:
 def load_world(path_or_name: str | Path, overrides: Sequence[str] = ()) -> World:
     """Return the world at a path or of a shipped name, with overrides like ``steps=200`` applied.
 
+    ``robots.each`` in an override stands for every robot of the world.
     Raises ConfigError: ``file:line:column: key.path: got value, expected what``.
     """
     path = resolve_name(path_or_name, shipped_worlds(), "world")
-    tree = read_tree(path, overrides)
+    tree = read_tree(path, _of_each(path, overrides))
     run_plugins(tree, path)
     world = validate(tree, World)
     world._file, world._tree = path, tree
     world.config()  # a mistake in `filter` shows now, not after the simulation
     return world
+
+
+def _of_each(path: Path, overrides: Sequence[str]) -> list[str]:
+    """Return the overrides with those of ``robots.each`` said of each robot of the world by its name."""
+    if not any(override.startswith(EACH) for override in overrides):
+        return [*overrides]
+    robots = read_tree(path).values.get("robots")
+    names = [*robots] if isinstance(robots, dict) else []
+    result = []
+    for override in overrides:
+        of_each = override.startswith(EACH) and names
+        result += [f"robots.{name}.{override.removeprefix(EACH)}" for name in names] if of_each else [override]
+    return result

@@ -1,0 +1,108 @@
+"""Cells: what a campaign runs, one scene for each combination of the values that are swept."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from kalmark.campaign.replay import Replay, replay_of
+from kalmark.config.opening import open_run
+from kalmark.config.reading import resolve_config, resolve_name, shipped_configs
+from kalmark.config.schema import Config
+from kalmark.config.tree import OVERRIDE, parse_value, read_tree
+from kalmark.errors import ConfigError
+from kalmark.logs.log import Log
+from kalmark.simulate.worlds import World, load_world, shipped_worlds
+
+Scene = World | Replay
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """A scene, and the values of the swept keys that are set in it."""
+
+    settings: dict[str, Any]
+    scene: Scene
+
+    @property
+    def label(self) -> str:
+        """The settings in words: "a.b=1, c=2"; empty without a sweep."""
+        return ", ".join(f"{key}={shown(value)}" for key, value in self.settings.items())
+
+
+def shown(value: Any) -> str:
+    """Return a swept value as it is written in YAML."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def open_scene(
+    path_or_name: str | Path, overrides: Sequence[str] = (), log: str | Path | None = None, progress: bool = True
+) -> Scene:
+    """Return the world, or the replay of the configuration, at a path or of a shipped name; of both, the world.
+
+    `log` is the log to use instead of the configuration's.  Raises ConfigError, LogError, KalmarkError.
+    """
+    found = _found(path_or_name, overrides, log)
+    return found if isinstance(found, World) else replay_of(*found, progress)
+
+
+def open_cells(
+    path_or_name: str | Path,
+    sweeps: Sequence[str] = (),
+    overrides: Sequence[str] = (),
+    log: str | Path | None = None,
+    progress: bool = True,
+) -> list[Cell]:
+    """Return a cell for each combination of swept values, the last key's changing fastest; one without a sweep.
+
+    A sweep is "key.path=value,value"; values are YAML.  All cells are read before anything is simulated.
+    Raises ConfigError on a key or value that the file cannot have.
+    """
+    grid: dict[str, list[Any]] = {}
+    for text in sweeps:
+        key, values = swept(text)
+        if key in grid:
+            raise ConfigError(f"--sweep {text}: {key} is given twice, expected each key once")
+        grid[key] = values
+    combinations = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    found = []
+    for settings in combinations:
+        told = [f"{key}={json.dumps(value)}" for key, value in settings.items()]
+        try:
+            found.append(_found(path_or_name, [*overrides, *told], log))
+        except ConfigError as error:
+            message = str(error)
+            for override in told:
+                message = message.replace(f"{OVERRIDE}{override}", f"--sweep {override}")
+            raise ConfigError(message) from None
+    scenes = [one if isinstance(one, World) else replay_of(*one, progress) for one in found]
+    return [Cell(settings, scene) for settings, scene in zip(combinations, scenes, strict=True)]
+
+
+def swept(text: str) -> tuple[str, list[Any]]:
+    """Return the key and the values of a sweep.  Raises ConfigError if there are none, or one twice."""
+    key, equals, values = (part.strip() for part in text.partition("="))
+    where = f"--sweep {text}"
+    if not key or not equals or not values:
+        raise ConfigError(f"{where}: got no key and values, expected key.path=value,value")
+    listed: list[Any] = parse_value(f"[{values}]", where)
+    if len({json.dumps(value) for value in listed}) < len(listed):
+        raise ConfigError(f"{where}: got a value twice, expected each once")
+    return key, listed
+
+
+def _found(path_or_name: str | Path, overrides: Sequence[str], log: str | Path | None) -> World | tuple[Config, Log]:
+    """Return the world, or the configuration and its log."""
+    shipped, path = shipped_worlds(), Path(path_or_name)
+    named = str(path_or_name) in shipped or (path.stem in shipped and path.suffix in (".yaml", ".yml"))
+    both = path.stem in shipped_configs()
+    if "world" in read_tree(path).values if path.is_file() else named and not (both and log is not None):
+        if log is not None:
+            raise ConfigError(f"--log {log}: {path} is a world, expected a configuration to use it in")
+        return load_world(path_or_name, overrides)
+    resolve_name(path_or_name, shipped_configs() | shipped, "world or a configuration")
+    return open_run(resolve_config(path_or_name), log, overrides)

@@ -1,0 +1,215 @@
+"""`Sweep`: the campaigns of all cells side by side, as figures, a table of runs, a picture and a page."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.campaign.campaign import FIGURES, Campaign, kinds, last_value, mean, rms
+from kalmark.campaign.cells import Cell, shown
+from kalmark.campaign.scoring import Scores
+from kalmark.results.recording import replace_file, write
+from kalmark.results.report import show
+from kalmark.results.scene import COLOURS
+
+NORMAL_95 = 1.96
+_PANELS = (
+    ("pose_nees", "pose NEES"),
+    ("position_rmse_m", "position RMSE (m)"),
+    ("heading_rmse_deg", "heading RMSE (deg)"),
+    ("landmark_rmse_m", "landmark RMSE,\naligned (m)"),
+)
+
+
+def run_figures(score: Scores, names: list[str], skip: int) -> dict[str, Any]:
+    """Return the figures of one run; `..._nees` are averages over robots and steps after the first `skip`."""
+    series = score.series
+    row: dict[str, Any] = {"diverged": score.diverged, "stopped": score.stopped}
+    for name in names:
+        over = series["joint_dof"] if name == "joint" else 1.0
+        row[f"{name}_nees"] = mean((series[name] / over)[:, skip:])
+    row["position_rmse_m"] = rms(series["position_m"])
+    row["heading_rmse_deg"] = float(np.degrees(rms(series["heading_rad"])))
+    row |= {"landmark_rmse_m": score.landmark_rmse_m, "landmark_rmse_raw_m": score.landmark_rmse_raw_m}
+    row |= {"landmarks": score.landmarks, "nis_per_dof": score.nis / score.nis_dof if score.nis_dof else float("nan")}
+    if "mount" in names:
+        row["mount_m"] = last_value(series["mount_m"])
+        row["mount_deg"] = float(np.degrees(last_value(series["mount_rad"])))
+    return row
+
+
+def over_runs(key: str, values: Array) -> tuple[float, float]:
+    """Return the figure of the runs' figures (N,), and half its 95 % interval: a mean, of RMSE the root mean square."""
+    values = values[np.isfinite(values)]
+    power = values**2 if "rmse" in key else values
+    if not len(values):
+        return float("nan"), float("nan")
+    middle = float(power.mean())
+    half = NORMAL_95 * float(power.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0
+    if "rmse" not in key:
+        return middle, half
+    return middle**0.5, half / (2.0 * middle**0.5) if middle > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The cells of a campaign and what each gave; run i of every cell has the same seed.  One cell without a sweep."""
+
+    cells: tuple[Cell, ...]
+    campaigns: tuple[Campaign, ...]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys that were swept."""
+        return tuple(self.cells[0].settings)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures of ``summary.json``: without a sweep those of the campaign, else a section a cell."""
+        summaries = [campaign.summary() for campaign in self.campaigns]
+        if not self.keys:
+            return summaries[0]
+        head = {key: summaries[0][key] for key in (self.campaigns[0].kind, "seed", "runs", "map_every", "skip")}
+        grid = {key: list({shown(v): v for v in (c.settings[key] for c in self.cells)}.values()) for key in self.keys}
+        own = ("steps", "dof", "band", "estimators")
+        pairs = zip(self.cells, summaries, strict=True)
+        cells = [{"settings": cell.settings, **{key: summary[key] for key in own}} for cell, summary in pairs]
+        return {**head, "sweep": grid, "cells": cells}
+
+    def runs(self) -> list[dict[str, Any]]:
+        """Return one row a cell, estimator and run: settings, figures; run i has the same number in all cells."""
+        return [
+            {**cell.settings, "estimator": name, "run": number, **run_figures(score, kinds(scores), campaign.skip)}
+            for cell, campaign in zip(self.cells, self.campaigns, strict=True)
+            for name, scores in campaign.scores.items()
+            for number, score in enumerate(scores)
+        ]
+
+    def table(self, keys: Sequence[str] = ()) -> tuple[list[str], list[list[Any]]]:
+        """Return the head, and a row a cell and estimator: its settings, and the figures `keys` that any of them has.
+
+        By default all figures.
+        """
+        rows: list[tuple[list[Any], dict[str, Any]]] = []
+        for cell, campaign in zip(self.cells, self.campaigns, strict=True):
+            for name, figures in campaign.summary()["estimators"].items():
+                rows.append(([*map(shown, cell.settings.values()), name], figures))
+        found = [(key, label) for key, label in FIGURES if any(f.get(key) is not None for _, f in rows)]
+        found = [(key, label) for key, label in found if not keys or key in keys]
+        words = [self.campaigns[0].label(label) if key.endswith("_anees") else label for key, label in found]
+        head = [*(key.rpartition(".")[2] if self._short else key for key in self.keys), "estimator", *words]
+        return head, [[*first, *(_percent(key, f.get(key)) for key, _ in found)] for first, f in rows]
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``report.html``, ``summary.json`` and ``runs.parquet``; of a campaign all that `Campaign.save` writes.
+
+        With a sweep, each cell has that in a folder of its own, ``cells/NUMBER``, and ``sweep.png`` compares them.
+        """
+        folder = Path(folder)
+        for i, campaign in enumerate(self.campaigns):
+            campaign.save(folder / f"cells/{i + 1:03d}" if self.keys else folder)
+        pictures = [folder / "sweep.png" if self.keys else folder / "anees.png"]
+        if self.keys:
+            write(folder / "summary.json", json.dumps(self.summary(), indent=2) + "\n")
+            self.draw(pictures[0])
+        self.write_runs(folder / "runs.parquet")
+        write(folder / "report.html", self.page(pictures[0]))
+        return folder
+
+    def write_runs(self, path: Path) -> None:
+        """Write the rows of `runs` to a Parquet file; a swept key whose values are of several kinds as text."""
+        from pyarrow import Table
+        from pyarrow.parquet import write_table
+
+        rows = self.runs()
+        for key in self.keys:
+            kinds_of = {float if isinstance(v, float | int) and not isinstance(v, bool) else type(v)
+                        for v in (row[key] for row in rows)}  # fmt: skip
+            as_type = float if kinds_of == {float} else shown if kinds_of != {bool} else bool
+            rows = [row | {key: as_type(row[key])} for row in rows]
+        names = list({name: None for row in rows for name in row})
+        table = Table.from_pydict({name: [row.get(name) for row in rows] for name in names})
+        replace_file(path, lambda temporary: write_table(table, temporary))
+
+    def draw(self, path: Path) -> None:
+        """Write the picture of a sweep to a PNG file: figures over one key, a curve for each of the other settings.
+
+        The key is the last one of numbers, else the last one.  Bars are 95 % intervals over the runs.
+        """
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        rows = self.runs()
+        numeric = [k for k in self.keys if all(_is_number(c.settings[k]) for c in self.cells)]
+        along = (numeric or self.keys)[-1]
+        values = [*dict.fromkeys(shown(cell.settings[along]) for cell in self.cells)]
+        at = {text: float(text) if numeric else float(i) for i, text in enumerate(values)}
+        curves: dict[str, list[dict[str, Any]]] = {}
+        for row in rows:
+            others = [f"{key.rpartition('.')[2]} {shown(row[key])}" for key in self.keys if key != along]
+            same = any(key.endswith("estimator.type") for key in self.keys)
+            curves.setdefault(", ".join(others + ([] if same else [row["estimator"]])), []).append(row)
+        panels = [(key, label) for key, label in _PANELS if any(np.isfinite(row[key]) for row in rows)]
+        figure = Figure(figsize=(9, 2.3 * len(panels) + 0.8), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        for axis, (key, label) in zip(axes, panels, strict=True):
+            for i, (name, mine) in enumerate(curves.items()):
+                there = [text for text in values if any(shown(row[along]) == text for row in mine)]
+                told = [over_runs(key, np.array([r[key] for r in mine if shown(r[along]) == text])) for text in there]
+                middle, half = np.array(told).T
+                x = sorted(range(len(there)), key=lambda k, there=there: at[there[k]])  # type: ignore[misc]
+                where = [at[there[k]] for k in x]
+                axis.errorbar(where, middle[x], half[x], marker="o", markersize=4, capsize=3, linewidth=1.1,
+                              color=COLOURS[i % len(COLOURS)], label=name or None)  # fmt: skip
+            if key == "pose_nees":
+                axis.axhline(self.campaigns[0].ideal("pose"), color="0.4", linewidth=0.8, label="consistent")
+            axis.set_ylabel(label)
+            axis.grid(visible=True, linewidth=0.3)
+        axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False)
+        axes[-1].set_xlabel(along)
+        axes[-1].set_xticks([*at.values()], values)
+        first = self.campaigns[0]
+        figure.suptitle(f"{first.world}: {first.runs} runs a cell, seed {first.seed}; bars: 95 % intervals")
+        replace_file(path, lambda temporary: figure.savefig(temporary, dpi=110))
+
+    def page(self, picture: Path) -> str:
+        """Return the page: the figures of every cell, the picture, the description.  It needs no other file."""
+        first, (head, rows) = self.campaigns[0], self.table()
+        title = f"{first.world}: campaign of {first.runs} runs" + (f" in {len(self.cells)} cells" if self.keys else "")
+        lost = sum(score.diverged for c in self.campaigns for scores in c.scores.values() for score in scores)
+        told = [f"seed {first.seed}", f"{len(first.t_s)} steps", f"{lost} diverged"]
+        told += [f"first {first.skip} steps left out"] if first.skip else []
+        cells = [[c if isinstance(c, str) else show(c) for c in row] for row in rows]
+        page = resources.files("kalmark.results") / "page"
+        return (page / "campaign.html").read_text(encoding="utf-8").format(
+            title=html.escape(title),
+            style=(page / "report.css").read_text(encoding="utf-8"),
+            figures="".join(f"<span>{html.escape(text)}</span>" for text in told),
+            head="".join(f"<th>{html.escape(cell)}</th>" for cell in head),
+            rows="".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in cells),
+            picture=base64.b64encode(picture.read_bytes()).decode("ascii"),
+            config=html.escape(first.description),
+            of=" of the first cell" if self.keys else "",
+        )  # fmt: skip
+
+    @property
+    def _short(self) -> bool:
+        """Whether the last words of the keys tell them apart."""
+        return len({key.rpartition(".")[2] for key in self.keys}) == len(self.keys)
+
+
+def _percent(key: str, value: Any) -> Any:
+    return 100.0 * value if key.endswith("_inside") and value is not None else value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
