@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from kalmark.arrays import Array
 from kalmark.campaign.campaign import FIGURES, Campaign, kinds, last_value, mean, rms
@@ -21,7 +22,6 @@ from kalmark.results.recording import replace_file, write
 from kalmark.results.report import show
 from kalmark.results.scene import COLOURS
 
-NORMAL_95 = 1.96
 _PANELS = (
     ("pose_nees", "pose NEES"),
     ("position_rmse_m", "position RMSE (m)"),
@@ -54,7 +54,8 @@ def over_runs(key: str, values: Array) -> tuple[float, float]:
     if not len(values):
         return float("nan"), float("nan")
     middle = float(power.mean())
-    half = NORMAL_95 * float(power.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0
+    n = len(values)
+    half = float(stdtrit(n - 1, 0.975) * power.std(ddof=1)) / n**0.5 if n > 1 else 0.0  # Student's t
     if "rmse" not in key:
         return middle, half
     return middle**0.5, half / (2.0 * middle**0.5) if middle > 0 else 0.0
@@ -154,7 +155,7 @@ class Sweep:
         at = {text: float(text) if numeric else float(i) for i, text in enumerate(values)}
         curves: dict[str, list[dict[str, Any]]] = {}
         for row in rows:
-            others = [f"{key.rpartition('.')[2]} {shown(row[key])}" for key in self.keys if key != along]
+            others = [_setting(key, row[key]) for key in self.keys if key != along]
             same = any(key.endswith("estimator.type") for key in self.keys)
             curves.setdefault(", ".join(others + ([] if same else [row["estimator"]])), []).append(row)
         panels = [(key, label) for key, label in _PANELS if any(np.isfinite(row[key]) for row in rows)]
@@ -209,6 +210,11 @@ class Sweep:
 
 def _percent(key: str, value: Any) -> Any:
     return 100.0 * value if key.endswith("_inside") and value is not None else value
+
+
+def _setting(key: str, value: Any) -> str:
+    """Return a setting as a curve's label has it: the name of an estimator, or the key's last word and the value."""
+    return shown(value) if key.endswith("estimator.type") else f"{key.rpartition('.')[2]} {shown(value)}"
 
 
 def _is_number(value: Any) -> bool:
