@@ -153,6 +153,15 @@ def carry_back(H: Array, before: Array, x: Array, baselines: Baselines, s_now: A
 
 
 @compiled
+def add_combined(X: Array, i: int, C: Array, first: int, rows: Array) -> None:
+    """Add the rows (k, n), weighted by the numbers of C[i] from `first` on, to X[i] (n,)."""
+    for k in range(len(rows)):
+        c = C[i, first + k]
+        for j in range(rows.shape[1]):
+            X[i, j] += c * rows[k, j]
+
+
+@compiled
 def transport_parallax(
     P: Array, n: int, head: Index, before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: Array
 ) -> None:  # fmt: skip
@@ -171,13 +180,14 @@ def transport_parallax(
         own[size] = table[i, RHO_P]
         rows = rows_of(P, own, n)
         C[i, h + size] -= 1.0
-        for k in range(h + size + 1):
-            for j in range(n):
-                X[i, j] += C[i, k] * (common[k, j] if k < h else rows[k - h, j])
+        add_combined(X, i, C, 0, common)
+        add_combined(X, i, C, h, rows)
     for i in range(count):
         p = table[i, RHO_P]
-        for j in range(n):
-            P[max(p, j), min(p, j)] += X[i, j] if j != p else 2.0 * X[i, p]  # of row and column
+        for j in range(p + 1):
+            P[p, j] += X[i, j]
+        for j in range(p, n):
+            P[j, p] += X[i, j]
     for j in range(count):  # (T - I) P (T - I)'
         for i in range(count):
             a, b = table[i, RHO_P], table[j, RHO_P]
