@@ -216,10 +216,8 @@ def test_the_command_line_replays_a_configuration_and_saves_it_to_be_run(tmp_pat
     assert summary["config"] == "log" and [*summary["estimators"]] == ["ekf"]
     assert main(["run", str(out / "config.yaml"), "--out", str(tmp_path / "run")]) == 0
     config.write_text(config.read_text().replace("path:", "#"))
-    assert (
-        main(["campaign", str(config), "--log", str(config.parent), "--runs", "1", "--jobs", "1", "--out", str(out)])
-        == 0
-    )
+    again = "--log", str(config.parent), "--runs", "1", "--jobs", "1", "--out", str(tmp_path / "again")
+    assert main(["campaign", str(config), *again]) == 0
 
 
 def test_what_cannot_be_replayed_is_refused_with_its_place(tmp_path: Path) -> None:
