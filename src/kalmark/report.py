@@ -88,6 +88,25 @@ def _rejected(seen: Observation, gate: float) -> Observation:
     return seen._replace(outcome="rejected", reason=far)
 
 
+class Gap(NamedTuple):
+    """A time without controls of a robot, so far: `kind` is "increments" (lost) or "held" (a velocity for too long).
+
+    The standard deviations are those of each coordinate and each angle that the pose was given for it.
+    """
+
+    robot: str
+    kind: str
+    start_ns: int
+    end_ns: int
+    sigma_m: float
+    sigma_rad: float
+
+    @property
+    def lasts_s(self) -> float:
+        """How long it is."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
 class Report:
     """The answer to one event.
 
@@ -97,10 +116,24 @@ class Report:
     `merged` are those that are gone, the ones they turned out to be, and why.  `late` are earlier
     observations, tentative then, that this scan has let be fused: time, robot, sensor and number in its scan of each.
     `compared` are the landmarks that observations were compared with, `seen_at` (K, 2 or 3) is where these seemed to
-    come from.
+    come from.  `gaps` are times without controls, up to now, for which the pose was widened.
     """
 
-    __slots__ = ("Z", "_made", "compared", "e", "event", "judged", "late", "merged", "removed", "seen_at", "y", "z")
+    __slots__ = (
+        "Z",
+        "_made",
+        "compared",
+        "e",
+        "event",
+        "gaps",
+        "judged",
+        "late",
+        "merged",
+        "removed",
+        "seen_at",
+        "y",
+        "z",
+    )
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
@@ -109,6 +142,7 @@ class Report:
         self.removed: tuple[tuple[Id, str], ...] = ()
         self.merged: tuple[tuple[Id, Id, str], ...] = ()
         self.late: tuple[Late, ...] = ()
+        self.gaps: tuple[Gap, ...] = ()
         self.compared: Compared | None = None
         self.seen_at: Array = NOTHING
         self.y = y

@@ -250,7 +250,7 @@ class Course:
 
     def __init__(self, robot: Robot, node: int) -> None:
         self.motion = robot.motion
-        self.drive = HeldInput(robot.motion)
+        self.drive = HeldInput(robot.motion, robot.watch())
         self.held = -1  # which of the split controls is in force
         self.reset(node)
 
@@ -274,10 +274,10 @@ class Course:
                 self.held = len(roots)
                 roots.append(_root(part.N))
             self.shared[self.held] = self.shared.get(self.held, 0.0) + R_u @ roots[self.held]
-        D = self.motion.diffusion(part.u, part.dt_s)
-        if D is not None:
-            axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
-            self.Q += axes @ D @ axes.T
+        for D in (self.motion.diffusion(part.u, part.dt_s), part.unknown):
+            if D is not None:
+                axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
+                self.Q += axes @ D @ axes.T
 
 
 class Chain:
@@ -320,6 +320,7 @@ class Chain:
             node = self._new_node(course.node, course.moved, course.Q)
             self.shared += [(node, key, S) for key, S in course.shared.items()]
             course.reset(node)
+            course.drive.located(t_ns)
         return course.node
 
     def motions(self) -> Motions:

@@ -86,7 +86,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     if batch:
         table = [(label, number(value), unit) for _, label, value, unit in in_words(batch, BATCH)]
         print_table("against the batch solution", ("", "", ""), table, align="<><")
-    for kind, key in (("warning", "warnings"), ("advice", "advice")):
+    for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
         for line in summary.get(key, ()):
             typer.echo(f"{kind}: {line}")
 

@@ -79,7 +79,8 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
     if log is not None:
         refuse_scans(config, key, name, mounts, log)
-    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov)
+    watched = {key: getattr(robot, key) for key in ("gaps", "max_speed_mps", "max_turn_radps")}
+    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov, **watched)
 
 
 def _names(config: Config, log: Log | None) -> list[str]:

@@ -262,6 +262,12 @@ class LogConfig(Section):
 class _AnyRobot(Section):
     motion: Motion = section_of("motion", "unicycle")()
     """Motion model."""
+    gaps: Literal["refuse", "widen", "ignore"] = "widen"
+    """Controls that stop: refuse the log, widen the covariance by what the robot may have moved, or ignore it."""
+    max_speed_mps: Positive | None = None
+    """Greatest speed in a gap; from the controls so far if absent."""
+    max_turn_radps: Positive | None = None
+    """Greatest turn rate in a gap; from the controls so far if absent."""
 
 
 class RobotConfig(_AnyRobot):

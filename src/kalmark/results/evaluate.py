@@ -12,6 +12,7 @@ from kalmark.arrays import Array
 from kalmark.logs.source import records_of
 from kalmark.report import OUTCOMES
 from kalmark.results.calibration import bias_figures, mount_figures
+from kalmark.results.gaps import gap_figures, gap_notes
 from kalmark.results.history import History, Ints
 from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
 from kalmark.results.matching import association_figures, best_known, by_position, no_ids
@@ -71,12 +72,14 @@ def evaluate(run: Recording) -> dict[str, Any]:
         summary["mounts"] = {mount.name: mount_figures(mount) for mount in history.mounts}
     if history.biases:
         summary["biases"] = {bias.robot: bias_figures(bias) for bias in history.biases}
+    summary["gaps"] = gap_figures(run)
     summary |= run.reference
     if run.truth.fixes and not np.isfinite(run.truth.poses).any():
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
     summary["advice"] = advice(run, summary)
+    summary["notes"] = list(gap_notes(summary["gaps"]))
     return summary
 
 

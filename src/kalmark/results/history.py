@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id
+from kalmark.report import Gap
 
 Ints = Index
 Texts = npt.NDArray[np.str_]
@@ -130,6 +131,7 @@ ROWS: dict[
     "cameras": ("camera", Camera, True),
     "mounts": ("mount", Mounted, True),
     "biases": ("bias", Biased, True),
+    "gaps": ("gap", Gap, False),
 }
 
 
@@ -150,7 +152,7 @@ class History:
     Observations `candidate_row` (C,) were compared with landmarks, `candidate_landmark` (C,), of distance
     `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks
     `share_landmark` with weights `share_weight`.  `changes` is what became of landmarks, `fixes` are those used, in the
-    order they came, `controls` those of each robot that had any.
+    order they came, `controls` those of each robot that had any, `gaps` the times without.
     """
 
     t_ns: Ints
@@ -191,6 +193,7 @@ class History:
     cameras: tuple[Camera, ...] = ()
     mounts: tuple[Mounted, ...] = ()
     biases: tuple[Biased, ...] = ()
+    gaps: tuple[Gap, ...] = ()
 
     @property
     def fused(self) -> Flags:

@@ -16,6 +16,7 @@ from kalmark.errors import DivergedError, EventError, LogError
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.source import nearest
+from kalmark.results.gaps import joined
 from kalmark.results.history import Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
@@ -25,7 +26,7 @@ from kalmark.results.run import Run
 from kalmark.results.truth import Truth
 
 if TYPE_CHECKING:
-    from kalmark.report import Report
+    from kalmark.report import Gap, Report
     from kalmark.slam.slam import Slam
 
 SNAPSHOTS = 60
@@ -95,6 +96,7 @@ class _Recorder:
         )
         self.controls: dict[str, Controlled] = {}
         self.fixes: list[UsedFix] = []
+        self.gaps: list[Gap] = []
         self.skipped: list[str] = []
         self.stopped = ""
         self.scans: list[Scan] = []
@@ -114,6 +116,7 @@ class _Recorder:
             report = self.slam.process(event)
         finally:
             self.spent_ns += time.perf_counter_ns() - start
+        self.gaps += report.gaps
         if type(event) is Control:
             number, first_ns, _ = self.controls.get(event.robot, (0, event.t_ns, 0))
             self.controls[event.robot] = Controlled(number + 1, first_ns, event.t_ns)
@@ -204,6 +207,7 @@ class _Recorder:
             cameras=cameras(self.slam),
             mounts=mounts(self.slam),
             biases=biases(self.slam),
+            gaps=joined(self.gaps),
             **decisions(reports, 3 if n > 3 else 2),
         )
 

@@ -68,6 +68,7 @@ def report_html(run: Recording) -> str:
 
     title, figures = headline(run)
     summary = summary_of(run)
+    notes = [*summary.get("notes", ()), *summary.get("advice", ())]
     return _resource("report.html").format(
         title=html.escape(title),
         style=_resource("report.css"),
@@ -75,7 +76,7 @@ def report_html(run: Recording) -> str:
         robots=robot_table(summary),
         summary=summary_table(summary),
         warnings="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("warnings", ())),
-        advice="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("advice", ())),
+        advice="".join(f"<li>{html.escape(line)}</li>" for line in notes),
         mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),
         changes=_section("Landmarks merged and removed", [*change_rows(run)], ("t (s)", "landmark", "", "why")),
@@ -128,7 +129,7 @@ def show(value: Any, unit: str = "") -> str:
 def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
-        if (key in ("robots", "warnings", "advice") and not prefix) or key == "directions":
+        if (key in ("robots", "warnings", "advice", "notes", "gaps") and not prefix) or key == "directions":
             continue
         out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
     return out

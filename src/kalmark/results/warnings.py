@@ -27,6 +27,7 @@ from kalmark.declare import registered_name
 from kalmark.geometry.gaussian import gate, quantile
 from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
+from kalmark.results.gaps import gap_warnings
 from kalmark.results.history import History, Ints, UsedFix
 from kalmark.results.matching import LEAST, no_ids
 from kalmark.results.measures import nis
@@ -192,7 +193,7 @@ def _left_out(worst: Window, median: float, count: int) -> str:
 def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
     parts = (_lost, window_warnings, _observations, _robots, _sensors, _truth, _fixes, _noise, mount_warnings)
-    return [line for part in parts for line in part(run, summary)]
+    return [*gap_warnings(summary["gaps"]), *(line for part in parts for line in part(run, summary))]
 
 
 def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:

@@ -25,6 +25,8 @@ from kalmark.filter.map import Map
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.observe import step, step_of
 from kalmark.models.protocols import Motion, bias_covariance, coasts
+from kalmark.report import Gap
+from kalmark.slam.gaps import Gaps
 
 NO_NOISE = np.zeros((0, 0))
 
@@ -33,6 +35,7 @@ class Part(NamedTuple):
     """One piece of motion: the control, the covariance N of its error, and its duration.
 
     `first` and `last` say whether it begins and ends its control's interval: if not both, the error is shared.
+    `unknown` (dof, dof) is the covariance of what the robot may have moved besides, without a control.
     """
 
     u: Array
@@ -40,39 +43,77 @@ class Part(NamedTuple):
     dt_s: float
     first: bool
     last: bool
+    unknown: Array | None = None
 
 
 class HeldInput:
     """The control in force of one robot and how far it has been acted upon.
 
-    As a context manager it puts the clock back if a control turns out to be impossible.
+    As a context manager it puts the clock back if a control turns out to be impossible.  `gaps` watches for controls
+    that stop.
     """
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: Motion, gaps: Gaps | None = None) -> None:
         self.motion, self.coasts = motion, coasts(motion)
         self.t_ns: int | None = None
         self.u: Array | None = None
         self.N: Array | None = None
         self.fresh = True
+        self.gaps = None if self.coasts else gaps
         self._before: tuple[Any, ...] = ()
 
     def __enter__(self) -> Self:
-        self._before = self.t_ns, self.u, self.N, self.fresh
+        self._before = self.t_ns, self.u, self.N, self.fresh, None if self.gaps is None else self.gaps.state()
         return self
 
     def __exit__(self, kind: Any, *_: object) -> None:
         if kind is not None and issubclass(kind, EventError):
-            self.t_ns, self.u, self.N, self.fresh = self._before
+            self.t_ns, self.u, self.N, self.fresh, watched = self._before
+            if self.gaps is not None:
+                self.gaps.restore(watched)
 
     def advance(self, to_ns: int, last: bool = False) -> Part | None:
         """Return the part from where the robot stands to `to_ns`, or None if it does not move."""
         if self.coasts:
             return self._coast(to_ns)
+        if not self.motion.held:
+            return self._lost(to_ns)
         if self.u is None or self.N is None or self.t_ns is None or to_ns <= self.t_ns:
             return None
-        part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last)
+        unknown = None if self.gaps is None else self.gaps.unknown(to_ns)
+        part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last, unknown)
         self.t_ns, self.fresh = to_ns, False
         return part
+
+    def _lost(self, to_ns: int, u: Array | None = None) -> Part | None:
+        """Return what is unknown of the motion up to a time, of increments that are late; u (k,) ends then."""
+        unknown = None if self.gaps is None else self.gaps.unknown(to_ns, u)
+        if unknown is None:
+            return None
+        k = len(self.motion.columns)
+        return Part(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)
+
+    def noticed(self) -> tuple[Gap, ...]:
+        """Return the gap that was noticed since the last question, if any."""
+        if self.gaps is None or self.gaps.noticed is None:
+            return ()
+        gap, self.gaps.noticed = self.gaps.noticed, None
+        return (gap,)
+
+    def located(self, t_ns: int) -> None:
+        """Take note that the pose was corrected."""
+        if self.gaps is not None:
+            self.gaps.located(t_ns)
+
+    @property
+    def is_adrift(self) -> bool:
+        """Whether its pose may be anywhere since a gap."""
+        return self.gaps is not None and self.gaps.adrift
+
+    def recovered(self) -> None:
+        """Take note that its heading is known again."""
+        if self.gaps is not None:
+            self.gaps.adrift = False
 
     def lags(self, t_ns: int) -> bool:
         """Return whether a robot is still where it was before a time: nothing has asked for it yet."""
@@ -92,11 +133,14 @@ class HeldInput:
         N = self.motion.control_noise(control.u) if control.cov is None else control.cov
         if not self.motion.held:
             dt_s = 0.0 if self.t_ns is None else (control.t_ns - self.t_ns) * 1e-9
+            part, closing = self._lost(control.t_ns, control.u), [Part(control.u, N, dt_s, True, True)]
             self.t_ns = control.t_ns
-            return [Part(control.u, N, dt_s, True, True)]
-        part = self.advance(control.t_ns, last=True)
-        self.t_ns, self.u, self.N, self.fresh = control.t_ns, control.u, N, True
-        return [] if part is None else [part]
+        else:
+            part, closing = self.advance(control.t_ns, last=True), []
+            self.t_ns, self.u, self.N, self.fresh = control.t_ns, control.u, N, True
+        if self.gaps is not None:
+            self.gaps.take(control)
+        return closing if part is None else [part, *closing]
 
 
 @dataclass
@@ -129,6 +173,8 @@ class Moving:
     def movement(self, part: Part) -> Movement:
         """Return what one part of its control does to the robot."""
         D = self.motion.diffusion(part.u, part.dt_s)
+        if part.unknown is not None:
+            D = part.unknown if D is None else part.unknown + D
         shared = self.error is not None
         return Movement(
             self.model, self.slot, self.added(), shared, part.u, part.N, NO_NOISE if D is None else D, part.dt_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,6 +21,7 @@ from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, Motion, Sensor, parameter_covariance, refuse_misspelt
 from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
+from kalmark.slam.gaps import ACTIONS, Gaps
 
 IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
 WANTED = {
@@ -106,7 +108,9 @@ class Mount:
 class Robot:
     """A robot: its motion model, its start with covariance `cov` (None: known exactly), its sensors.
 
-    `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.
+    `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.  `gaps` says
+    what to do about controls that stop: "widen" the covariance by what the robot may have moved meanwhile, at most by
+    these speeds (None: by the largest so far), "refuse" to go on, or "ignore" it.
     """
 
     name: str
@@ -114,11 +118,20 @@ class Robot:
     start: Any = None
     sensors: Mapping[str, Mount] = field(default_factory=dict)
     cov: Any = None
+    gaps: str = "widen"
+    max_speed_mps: float | None = None
+    max_turn_radps: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ModelError(f"Robot: name is {shown(self.name)}, expected a text that is not empty")
         what = f"robot {self.name!r}"
+        if self.gaps not in ACTIONS:
+            raise ModelError(f"{what}: gaps is {shown(self.gaps)}, expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}")
+        for key in ("max_speed_mps", "max_turn_radps"):
+            limit = vars(self)[key]
+            if limit is not None and not (isinstance(limit, int | float) and 0 < limit < math.inf):
+                raise ModelError(f"{what}: {key} is {shown(limit)}, expected a number > 0, or None")
         instance(self.motion, Motion, f"{what}: motion", "a motion model")
         refuse_misspelt(self.motion, f"{what}: motion")
         space = self.motion.space
@@ -132,6 +145,10 @@ class Robot:
             mount.covariance(3 if pose == 3 else 6, f"{what}: sensor {name!r}: cov")
         if self.cov is not None:
             object.__setattr__(self, "cov", _cov(self.cov, pose, space, f"{what}: cov"))
+
+    def watch(self) -> Gaps:
+        """Return what watches for controls that stop."""
+        return Gaps(self.name, self.motion, self.gaps, self.max_speed_mps, self.max_turn_radps)
 
 
 def robots_given(value: Any) -> list[Robot]:

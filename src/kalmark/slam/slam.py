@@ -26,12 +26,14 @@ from kalmark.association.averaging import average, outcomes, refuse_averaging
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
 from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
+from kalmark.association.relocalization import relocalized
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
 from kalmark.filter.compressed.map import CompressedMap
 from kalmark.filter.estimators import Averaging, Compiling, Correction, Estimator, Invariant, Update
 from kalmark.filter.map import Map
 from kalmark.filter.maps import DENSE, grown, new_map
+from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import RHO, SE2, SE3, Rn
 from kalmark.management import confirm, delayed, existence, merge, reparametrize, tags
 from kalmark.management.attention import chosen, left_out
@@ -40,7 +42,7 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, place_of
-from kalmark.report import Judged, LandmarkTable, Observation, Report, outcomes_of
+from kalmark.report import Gap, Judged, LandmarkTable, Observation, Report, outcomes_of
 from kalmark.slam.checks import (
     covariance,
     instance,
@@ -60,6 +62,7 @@ from kalmark.tracks.track import ChannelKey, Late, Pending, Status, Track, Track
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 UNEXPLAINED = "no landmark explains this measurement"
+HEADING_RAD = 0.3  # a sigma above which a correction is not linearised at the prediction
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
@@ -122,7 +125,7 @@ class Slam:
         bias_slot = None if bias is None else self.map.add(*bias)
         if bias_slot is not None:
             self.tracks.enter_block(bias_name(robot.name), bias_slot)
-        self._moving[robot.name] = Moving(robot.motion, slot, bias_slot, HeldInput(robot.motion))
+        self._moving[robot.name] = Moving(robot.motion, slot, bias_slot, HeldInput(robot.motion, robot.watch()))
         for name, mount in robot.sensors.items():
             mount_slot, block = -1, mount.block(name)
             if block is not None:  # the mount calibrates itself
@@ -155,7 +158,7 @@ class Slam:
             raise
 
     def _control(self, event: Control) -> Report:
-        moving = self._moving[event.robot]
+        moving, report = self._moving[event.robot], Report(event)
         refuse_bad_control(event, moving.motion.columns)
         self.t_ns = event.t_ns
         with moving.held as held:
@@ -164,7 +167,8 @@ class Slam:
         if moving.error is not None:  # of a control that is no longer held
             self.map.remove(moving.error)
             moving.error = None
-        return Report(event)
+        report.gaps = moving.held.noticed()
+        return report
 
     def _scan(self, event: Scan) -> Report:
         key = event.robot, event.sensor
@@ -177,17 +181,20 @@ class Slam:
         if policy.averages:
             refuse_averaging(self.map, self.estimator, event)
         self.t_ns = event.t_ns
-        self._advance(event.robot)
+        gaps = self._advance(event.robot)
         ids = event.ids or (None,) * len(event.y)
         for i in ids if len(self.robots) > 1 else ():
             if i in self.robots:
-                self._advance(i)
+                gaps += self._advance(i)
         robot, report = self._moving[event.robot].slot, Report(event, event.y)
+        report.gaps = gaps
         scan = ScanContext(
             self.map, self.tracks, self.clones, self.estimator, channel, robot, event, ids, R, report
         )  # fmt: skip
         if len(event.y):
             self._fuse(scan, policy)
+            if gaps and any(o.outcome == "associated" for o in report.observations):
+                self._moving[event.robot].held.located(event.t_ns)
         self._maintain(scan, policy)
         return report
 
@@ -195,8 +202,9 @@ class Slam:
         pose, size = (3, 2) if self.robots[event.robot].motion.space.axes == 1 else (7, 3)
         refuse_bad_fix(event, size)
         self.t_ns = event.t_ns
-        self._advance(event.robot)
+        gaps = self._advance(event.robot)
         slot, report = self._moving[event.robot].slot, Report(event, event.y.reshape(1, size))
+        report.gaps = gaps
         gate, R = self.association.threshold(size, self.estimator.default_gate), event.cov.reshape(1, size, size)
         update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
         done = self._corrected(update, event, self.estimator.for_fixes())
@@ -205,13 +213,14 @@ class Slam:
         return report
 
     # ------------------------------------------------------------------ motion
-    def _advance(self, name: str) -> None:
-        """Move a robot up to now by the control it holds."""
+    def _advance(self, name: str) -> tuple[Gap, ...]:
+        """Move a robot up to now by the control it holds; return a gap in its controls."""
         assert self.t_ns is not None
         with self._moving[name].held as held:
             part = held.advance(self.t_ns)
             if part is not None:
                 self._move(name, part)
+            return held.noticed()
 
     def _move(self, name: str, part: Part) -> None:
         """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
@@ -228,7 +237,7 @@ class Slam:
     # ------------------------------------------------------------------ scans
     def _fuse(self, scan: ScanContext, policy: Policy) -> None:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
-        query = Query(scan)
+        query = self._relocalized(scan, Query(scan))
         decisions = policy.association.associate(query)
         if policy.holds_back:
             decisions = accepted(query, decisions, policy.upkeep.odds)
@@ -247,6 +256,24 @@ class Slam:
             self._start(scan, policy, [k for _, rows in groups for k in rows], decisions, seen)
             found = list(seen.values())
         scan.report.observations = tuple(found)
+
+    def _relocalized(self, scan: ScanContext, query: Query) -> Query:
+        """Move a robot whose heading a gap has left unknown to where its scan fits; return what to ask then.
+
+        Its mean alone: the covariance says that it may be there.
+        """
+        held = self._moving[scan.event.robot].held
+        if not held.is_adrift:
+            return query
+        r = self.map.mean(scan.robot)
+        if len(r) != 3 or self.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2:
+            held.recovered()
+            return query
+        T = relocalized(query)
+        if T is None:
+            return query
+        self.map.set_predicted(scan.robot, compose(T, compose(inverse(scan.pose())[0], r)[0])[0])
+        return Query(scan)
 
     def _correct(
         self, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],

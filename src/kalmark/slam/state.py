@@ -33,6 +33,7 @@ from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark
+from kalmark.slam.gaps import Gaps
 from kalmark.slam.motion import Moving, bias_name
 from kalmark.slam.robot import Mount, Robot, mount_name
 from kalmark.tracks.clones import Clone, Clones, Measurement
@@ -40,12 +41,13 @@ from kalmark.tracks.track import Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 7
+VERSION = 8
 DESCRIPTION, SUMS = "slam.json", "sha256"
 OF_TRACKS = ("recent", "last_scan", "changes", "unnamed", "experience")  # what `Tracks` knows beside the tracks
 PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 OF_MOVING = ("t_ns", "fresh")
+OF_GAPS = ("gaps", "max_speed_mps", "max_turn_radps")  # of a robot
 
 
 class State(NamedTuple):
@@ -109,7 +111,10 @@ def _state(state: State) -> Description:
         "clones": [[number, _record(clone)] for number, clone in state.clones.clones.items()],
         "latest": state.clones.latest,
         "numbered": state.clones.numbered,
-        "moving": {name: [m.error, *(getattr(m.held, key) for key in OF_MOVING)] for name, m in state.moving.items()},
+        "moving": {
+            name: [m.error, *(getattr(m.held, key) for key in OF_MOVING), _watched(m.held.gaps)]
+            for name, m in state.moving.items()
+        },
     }
 
 
@@ -209,12 +214,14 @@ class Saved:
         clones.latest = {robot: _count(number, "number of a clone") for robot, number in s["latest"].items()}
         clones.numbered = _count(s["numbered"], "number of clones")
         for i, (name, m) in enumerate(moving.items()):
-            error, t_ns, fresh = s["moving"][name]
+            error, t_ns, fresh, watched = s["moving"][name]
             k, m.slot, m.error = len(m.motion.columns), tracks.slots[name], error
             m.bias = tracks.slots.get(bias_name(name))
             m.held.t_ns, m.held.fresh = _time(t_ns), bool(fresh)
             if f"u{i}.npy" in self._members:
                 m.held.u, m.held.N = _array(self._members, f"u{i}", (k,)), _array(self._members, f"N{i}", (k, k))
+            if m.held.gaps is not None:
+                m.held.gaps.restore(_watching(watched, k))
         _check_owners(robots, state)
         _check_measurements(robots, state)
         return state
@@ -323,6 +330,29 @@ def _measurement(record: Description) -> Measurement:
     if m.y.ndim != 1 or m.R.ndim != 2 or m.R.shape[0] != m.R.shape[1]:
         raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} has the noise {m.R.tolist()}")
     return m
+
+
+def _watched(gaps: Gaps | None) -> Description | None:
+    return None if gaps is None else gaps.state()
+
+
+def _watching(record: Description, k: int) -> Description:
+    """Return what was known of the controls of a robot, which have k numbers."""
+
+    def control(value: Any) -> Array:
+        u = _numbers(value)
+        if u.shape != (k,):
+            raise MapError(f"a control is {value!r}, expected {k} numbers")
+        return u
+
+    times = {key: _time(record[key]) for key in ("last_ns", "since_ns", "until_ns", "usual_ns", "bound_ns")}
+    return times | {
+        "u": None if record["u"] is None else control(record["u"]),
+        "intervals": tuple(_count(dt, "interval of controls") for dt in record["intervals"]),
+        "pending": tuple((_count(dt, "interval of controls"), control(u)) for dt, u in record["pending"]),
+        "largest": control(record["largest"]),
+        "adrift": bool(record["adrift"]),
+    }
 
 
 def _numbers(value: Any) -> Array:
@@ -443,7 +473,9 @@ def robot_described(robot: Robot) -> Description:
         for name, mount in robot.sensors.items()
     ]
     moved = {"motion": described(robot.motion), "columns": list(robot.motion.columns)}
-    return {"name": robot.name, **moved, "start": list(robot.start), "cov": _listed(robot.cov), "sensors": mounts}
+    watched = {key: vars(robot)[key] for key in OF_GAPS}
+    start = {"start": list(robot.start), "cov": _listed(robot.cov)}
+    return {"name": robot.name, **moved, **start, **watched, "sensors": mounts}
 
 
 def _parts(mount: Mount) -> Description:
@@ -461,7 +493,8 @@ def _robot_restored(d: Description) -> Robot:
         said = {"sensor": what} | {role: f"{what}: {role}" for role in PARTS[1:]}
         parts = {role: restored(role, m[role], said[role], "robots") for role in PARTS if m.get(role) is not None}
         mounts[name] = Mount(at=m["at"], cov=m["cov"], **parts)
-    return Robot(d["name"], restored("motion", d["motion"], f"{who}: motion", "robots"), d["start"], mounts, d["cov"])
+    motion = restored("motion", d["motion"], f"{who}: motion", "robots")
+    return Robot(d["name"], motion, d["start"], mounts, d["cov"], **{key: d[key] for key in OF_GAPS})
 
 
 def robots_restored(saved: list[Description], given: list[Robot] | None) -> list[Robot]:

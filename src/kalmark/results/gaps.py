@@ -1,0 +1,89 @@
+"""Gaps in the controls of a run: when they were, by how much the pose was widened, and when it was known again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from kalmark.report import Gap
+from kalmark.results.history import History
+from kalmark.results.recording import Recording
+from kalmark.results.words import count, figure
+
+KNOWN = 0.5  # of the sigma that a gap gave it, below which the position is known again
+NOTED = 0.2  # of a metre or a radian, sigmas above which a gap is worth a line
+
+
+def joined(found: list[Gap]) -> tuple[Gap, ...]:
+    """Return the gaps of which these are parts, each with all by which the pose was widened for it."""
+    whole: dict[tuple[str, str, int], Gap] = {}
+    for gap in found:
+        key = gap.robot, gap.kind, gap.start_ns
+        before = whole.get(key, gap._replace(sigma_m=0.0, sigma_rad=0.0))
+        sigma_m, sigma_rad = np.hypot(before.sigma_m, gap.sigma_m), np.hypot(before.sigma_rad, gap.sigma_rad)
+        whole[key] = gap._replace(sigma_m=float(sigma_m), sigma_rad=float(sigma_rad))
+    return tuple(whole.values())
+
+
+def gap_figures(run: Recording) -> list[dict[str, Any]]:
+    """Return the gaps as they are in ``summary.json``: times in seconds of the log, sigmas that the pose was given.
+
+    `known_s` is when the position was known again to half of that, None if it never was.
+    """
+    history = run.history
+    return [
+        {
+            "robot": gap.robot,
+            "kind": gap.kind,
+            "start_s": gap.start_ns * 1e-9,
+            "end_s": gap.end_ns * 1e-9,
+            "action": "widen" if gap.sigma_m > 0 else "ignore",
+            "sigma_m": gap.sigma_m,
+            "sigma_rad": gap.sigma_rad,
+            "known_s": _known_s(history, gap),
+        }
+        for gap in history.gaps
+    ]
+
+
+def _known_s(history: History, gap: Gap) -> float | None:
+    later = np.flatnonzero((history.robot == gap.robot) & (history.t_ns >= gap.end_ns))
+    sigma = np.sqrt(np.trace(history.covariance[later, : history.d, : history.d], axis1=1, axis2=2) / history.d)
+    again = later[sigma <= max(KNOWN * gap.sigma_m, _before(history, gap))]
+    return float(history.t_ns[again[0]]) * 1e-9 if len(again) else None
+
+
+def _before(history: History, gap: Gap) -> float:
+    """Return the sigma of a coordinate before a gap."""
+    earlier = np.flatnonzero((history.robot == gap.robot) & (history.t_ns <= gap.start_ns))
+    if not len(earlier):
+        return 0.0
+    return float(np.sqrt(np.trace(history.covariance[earlier[-1], : history.d, : history.d]) / history.d))
+
+
+def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
+    """Tell of the gaps that were bridged, a line a robot."""
+    noted = [gap for gap in gaps if max(gap["sigma_m"], gap["sigma_rad"]) > NOTED]
+    for robot in dict.fromkeys(gap["robot"] for gap in noted):
+        mine = [gap for gap in noted if gap["robot"] == robot]
+        longest = max(mine, key=lambda gap: gap["end_s"] - gap["start_s"])
+        lasts, turn = longest["end_s"] - longest["start_s"], np.degrees(longest["sigma_rad"])
+        what = "is held too long" if longest["kind"] == "held" else "stops"
+        often = f" {count(len(mine), 'time')}, at the longest" if len(mine) > 1 else ""
+        yield (
+            f"the control of {robot} {what}{often} for {figure(lasts)} s from t={longest['start_s']:.1f} s in the log: "
+            f"its pose was widened by {figure(longest['sigma_m'], 2)} m and {figure(float(turn), 2)} deg there"
+        )
+
+
+def gap_warnings(gaps: list[dict[str, Any]]) -> Iterator[str]:
+    """Warn of gaps after which the map may be wrong: ignored ones, and those after which the robot stayed lost."""
+    for gap in gaps:
+        lasts = f"no controls of {gap['robot']} for {figure(gap['end_s'] - gap['start_s'])} s"
+        since = f"from t={gap['start_s']:.1f} s in the log"
+        if gap["action"] == "ignore":
+            yield f"{lasts} {since}, which was ignored: the map may be wrong from there on; robots.each.gaps=widen"
+        elif gap["known_s"] is None and gap["sigma_m"] > NOTED:
+            yield f"{lasts} {since}: it was not localized again, the map may be wrong from there on"

@@ -1,0 +1,148 @@
+"""Gaps in the controls: noticed by their intervals, bridged by the motion that the robot was capable of meanwhile.
+
+A control is late if it comes after more than `TIMES` the longest interval that is usual.  In a gap the motion of the
+robot is unknown: its position is anywhere within the distance that its greatest speed allows, its heading turned by
+anything that its greatest turn rate allows, both uniformly, and the covariance of the pose grows by theirs.  The
+estimate of an increment's robot stays where it is, a held control stays held.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import EventError
+from kalmark.events import Control, seconds
+from kalmark.models.protocols import Motion
+from kalmark.report import Gap
+
+ACTIONS = ("refuse", "widen", "ignore")
+TIMES = 5
+RECENT = 100  # intervals that tell what is usual,
+RANK = 3  # of which the longest two may be gaps
+LEARNED = 20  # controls from one look at them to the next, and before the first
+MARGIN = 1.2  # greatest speed over the greatest one in the log so far
+KEPT = (
+    "last_ns", "u", "since_ns", "until_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest", "adrift",
+)  # fmt: skip
+WHOLE = 1.5  # an increment so much larger than any before is of the whole gap: its odometry went on
+
+
+class Gaps:
+    """Watches the controls of one robot, learns what is usual of them, and answers how far it may have moved.
+
+    `max_speed_mps` and `max_turn_radps` are its limits; None: `MARGIN` times the largest so far.
+    """
+
+    def __init__(
+        self, robot: str, motion: Motion, action: str, max_speed_mps: float | None, max_turn_radps: float | None
+    ) -> None:
+        self.robot, self.motion, self.action = robot, motion, action
+        self.max_speed_mps, self.max_turn_radps = max_speed_mps, max_turn_radps
+        self.last_ns: int | None = None  # time of the last control,
+        self.u: Array | None = None  # which was this one
+        self.since_ns: int | None = None  # from when on the motion is unknown,
+        self.until_ns = 0  # and up to when the pose has been widened for it
+        self.usual_ns = 0
+        self.bound_ns: int | None = None  # what is later is a gap, None: not known yet
+        self.intervals: tuple[int, ...] = ()
+        self.pending: tuple[tuple[int, Array], ...] = ()
+        self.largest: Array = np.zeros(len(motion.columns))  # of an increment: per second
+        self.adrift = False  # whether the pose may be anywhere since a gap
+        self.noticed: Gap | None = None
+
+    def state(self) -> dict[str, Any]:
+        """Return what events have made of it."""
+        return {name: vars(self)[name] for name in KEPT}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take back what `state` gave."""
+        vars(self).update(state)
+
+    def take(self, control: Control) -> None:
+        """Learn from a control, which ends a gap."""
+        if self.last_ns is not None:
+            self.pending = (*self.pending, (control.t_ns - self.last_ns, control.u))
+            if len(self.pending) == LEARNED:
+                self._learn()
+        self.last_ns, self.u, self.since_ns = control.t_ns, control.u, None
+
+    def _learn(self) -> None:
+        times = np.array([dt for dt, _ in self.pending])
+        kept = times if self.bound_ns is None else np.minimum(times, self.bound_ns)  # a gap changes little
+        self.intervals = (*self.intervals, *kept.tolist())[-RECENT:]
+        ordered = sorted(self.intervals)
+        self.usual_ns, self.bound_ns = ordered[len(ordered) // 2], TIMES * ordered[-RANK]
+        sizes = np.abs([u for _, u in self.pending])
+        if not self.motion.held:
+            sizes /= np.maximum(times, max(self.usual_ns, 1))[:, None] * 1e-9
+        self.largest, self.pending = np.maximum(self.largest, sizes.max(axis=0)), ()
+
+    def located(self, t_ns: int) -> None:
+        """Take note that the pose was corrected: the motion is unknown from then on."""
+        if self.since_ns is not None:
+            self.since_ns = self.until_ns = t_ns
+
+    def unknown(self, t_ns: int, u: Array | None = None) -> Array | None:
+        """Return the covariance (dof, dof) of the motion that is unknown up to a time, None if it is known.
+
+        `u` is the increment that ends then.  Raises EventError for a gap that is refused.
+        """
+        if self.last_ns is None or self.bound_ns is None or t_ns - self.last_ns <= self.bound_ns:
+            return None
+        if self._is_of_all(t_ns, u):
+            return None
+        if self.action == "refuse":
+            gap_s, usual_s = (t_ns - self.last_ns) * 1e-9, self.usual_ns * 1e-9
+            what = f"{self.robot!r} had no control for {gap_s:.3g} s from t={seconds(self.last_ns)} s on"
+            raise EventError(f"{what}, expected one every {usual_s:.3g} s; gaps: widen bridges that")
+        if self.since_ns is None:
+            self.since_ns = self.until_ns = self.last_ns + (self.usual_ns if self.motion.held else 0)
+        ends_ns = t_ns if u is None else max(t_ns - self.usual_ns, self.until_ns)
+        D, self.until_ns = self._reached(ends_ns) - self._reached(self.until_ns), ends_ns
+        if self.action == "ignore":
+            D[:] = 0.0
+        self.adrift = self.adrift or bool(D.any())
+        kind = "held" if self.motion.held else "increments"
+        sigmas = np.sqrt(D.diagonal()[[0, len(D) - 1 if len(D) < 6 else 5]]).tolist()
+        self.noticed = Gap(self.robot, kind, self.last_ns, t_ns, *sigmas)
+        return D if D.any() else None
+
+    def _is_of_all(self, t_ns: int, u: Array | None) -> bool:
+        """Return whether an increment is of the whole gap: larger than any usual one, yet possible in that time."""
+        if u is None or self.last_ns is None or self.since_ns is not None:
+            return False
+        usual_s, gap_s = self.usual_ns * 1e-9, (t_ns - self.last_ns) * 1e-9
+        larger = (np.abs(u) > WHOLE * self.largest * usual_s).any()
+        return bool(larger and (np.abs(u) <= MARGIN * self.largest * gap_s).all())
+
+    def _reached(self, t_ns: int) -> Array:
+        """Return the covariance of what it may have moved by since its motion is unknown."""
+        assert self.since_ns is not None
+        after_s, space = (t_ns - self.since_ns) * 1e-9, self.motion.space
+        speed, turn = self._rates(self.largest if self.motion.held else self.largest * self.usual_ns * 1e-9)
+        speed, turn = self.max_speed_mps or MARGIN * speed, self.max_turn_radps or MARGIN * turn
+        if self.motion.held and self.u is not None:  # what is held may be all wrong
+            speed, turn = (a + b for a, b in zip((speed, turn), self._rates(self.u), strict=True))
+        d = 2 if space.axes == 1 else 3
+        D = np.zeros((space.dof, space.dof))
+        D[np.arange(d), np.arange(d)] = (speed * after_s) ** 2 / (d + 2)
+        angles = np.arange(d, d + space.axes)
+        D[angles, angles] = min(turn * after_s, math.pi) ** 2 / (space.axes + 2)
+        return D
+
+    def _rates(self, u: Array) -> tuple[float, float]:
+        """Return the speed and the turn rate of a control that lasts the usual time."""
+        space, dt_s = self.motion.space, max(self.usual_ns, 1) * 1e-9
+        origin = np.zeros(space.size)
+        if space.axes > 1:
+            origin[6] = 1.0
+        moved = self.motion.move(origin, u, dt_s)[0]
+        if space.axes == 1:
+            turned = abs(float(moved[2]))
+        else:
+            turned = 2.0 * math.atan2(float(np.linalg.norm(moved[3:6])), abs(float(moved[6])))
+        return float(np.linalg.norm(moved[: 2 if space.axes == 1 else 3])) / dt_s, turned / dt_s

@@ -1,0 +1,129 @@
+"""Controls that stop: noticed, and bridged by what the robot may have done meanwhile."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hall import alarmed, hall, mapped, right
+
+import kalmark as km
+from kalmark.association.relocalization import aligned
+from kalmark.errors import EventError, ModelError
+from kalmark.report import Gap
+
+STEP = (0.08, 0.0, 0.02)  # an increment each tenth of a second: .8 m/s and .2 rad/s
+LASER = {"laser": km.Mount(km.sensors.RangeBearing(0.03, 0.01))}
+
+
+def driven(motion: km.motion.Odometry2D | km.motion.Unicycle, u: tuple[float, ...], **of_robot: object) -> km.Slam:
+    """Return the filter of a robot after 40 controls, the last of them at 4 s."""
+    slam = km.Slam([km.Robot("r", motion, sensors=LASER, **of_robot)])  # type: ignore[arg-type]
+    for k in range(1, 41):
+        slam.process(km.Control(0.1 * k, "r", u))
+    return slam
+
+
+def odometer(**of_robot: object) -> km.Slam:
+    return driven(km.motion.Odometry2D(), STEP, **of_robot)
+
+
+def test_an_increment_that_comes_late_widens_the_pose_by_the_motion_that_was_possible() -> None:
+    slam = odometer()
+    before = slam.covariance("r")
+    report = slam.process(km.Control(7.0, "r", STEP))
+    (gap,) = report.gaps
+    assert (gap.robot, gap.kind, gap.start_ns, gap.end_ns) == ("r", "increments", 4_000_000_000, 7_000_000_000)
+    lost_s = 2.9  # the late increment is of the last tenth
+    assert gap.sigma_m == pytest.approx(1.2 * 0.8 * lost_s / 2, rel=1e-3)  # uniform in a disc
+    assert gap.sigma_rad == pytest.approx(1.2 * 0.2 * lost_s / math.sqrt(3), rel=1e-3)  # uniform to both sides
+    grown = np.diag(slam.covariance("r") - before)
+    np.testing.assert_allclose(grown, [gap.sigma_m**2, gap.sigma_m**2, gap.sigma_rad**2], rtol=0.05)
+
+
+def test_the_limits_of_the_robot_replace_those_of_the_log() -> None:
+    slam = odometer(max_speed_mps=2.0, max_turn_radps=10.0)
+    (gap,) = slam.process(km.Control(7.0, "r", STEP)).gaps
+    assert gap.sigma_m == pytest.approx(2.0 * 2.9 / 2)
+    assert gap.sigma_rad == pytest.approx(math.pi / math.sqrt(3))  # any heading
+
+
+def test_an_increment_of_the_whole_gap_is_no_gap() -> None:
+    slam = odometer()
+    assert slam.process(km.Control(7.0, "r", (2.4, 0.0, 0.6))).gaps == ()
+    assert slam.covariance("r")[0, 0] < 0.2
+
+
+def test_a_velocity_that_is_held_too_long_is_noticed_at_the_next_scan() -> None:
+    slam = driven(km.motion.Unicycle(0.01, 0.01), (0.8, 0.2))
+    assert slam.process(km.Scan(4.3, "r", "laser", [[3.0, 0.1]], [1])).gaps == ()
+    (gap,) = slam.process(km.Scan(7.1, "r", "laser", [], None)).gaps
+    assert (gap.kind, gap.start_ns, gap.end_ns) == ("held", 4_000_000_000, 7_100_000_000)
+    assert gap.sigma_m == pytest.approx(2.2 * 0.8 * 3.0 / 2, rel=1e-2)  # what is held may be all wrong
+
+
+def test_a_gap_grows_as_one_while_scans_go_on_without_a_landmark() -> None:
+    slam = odometer()
+    parts = [gap for t in (5.0, 6.0, 7.0) for gap in slam.process(km.Scan(t, "r", "laser", [], None)).gaps]
+    parts += slam.process(km.Control(7.0, "r", STEP)).gaps
+    whole = odometer().process(km.Scan(7.0, "r", "laser", [], None)).gaps[0]
+    assert math.hypot(*(part.sigma_m for part in parts)) == pytest.approx(whole.sigma_m)
+
+
+def test_a_gap_is_refused_where_that_is_asked_for_and_nothing_changes() -> None:
+    slam = odometer(gaps="refuse")
+    mean, P = slam.mean("r"), slam.covariance("r")
+    with pytest.raises(EventError, match=r"'r' had no control for 3 s from t=4 s on, expected one every 0\.1 s"):
+        slam.process(km.Control(7.0, "r", STEP))
+    assert np.array_equal(slam.mean("r"), mean)
+    assert np.array_equal(slam.covariance("r"), P)
+    slam.process(km.Control(4.1, "r", STEP))  # the clock was put back
+
+
+def test_a_gap_that_is_ignored_is_reported_all_the_same() -> None:
+    (gap,) = odometer(gaps="ignore").process(km.Control(7.0, "r", STEP)).gaps
+    assert gap == Gap("r", "increments", 4_000_000_000, 7_000_000_000, 0.0, 0.0)
+
+
+def test_what_is_no_way_to_take_a_gap_is_refused() -> None:
+    with pytest.raises(ModelError, match="gaps is 'bridge', expected refuse, widen or ignore"):
+        odometer(gaps="bridge")
+    with pytest.raises(ModelError, match="max_speed_mps is -1"):
+        odometer(max_speed_mps=-1.0)
+
+
+def test_a_saved_filter_notices_the_same_gap(tmp_path: Path) -> None:
+    slam = odometer()
+    slam.save(tmp_path / "map.kmk")
+    resumed = km.Slam.load(tmp_path / "map.kmk")
+    late = km.Control(7.0, "r", STEP)
+    assert resumed.process(late).gaps == slam.process(late).gaps
+    assert np.array_equal(resumed.covariance("r"), slam.covariance("r"))
+
+
+def test_points_seen_from_a_pose_give_it_back() -> None:
+    rng = np.random.default_rng(0)
+    T, v = np.array([3.0, -2.0, 3.0]), rng.uniform(-5, 5, (4, 2))
+    l = km.geometry.from_frame(T, v)[0]
+    np.testing.assert_allclose(aligned(v, l, np.array([1.0, 2.0, 0.5, 1.0])), T, atol=1e-12)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_robot_lost_in_a_gap_finds_its_place_in_the_hall_again(held: bool) -> None:
+    log = hall(4, gap_s=16.0, held=held)
+    run = mapped(log, held)
+    assert right(run, log)
+    assert not alarmed(run)
+    (gap,) = run.evaluate()["gaps"]
+    assert gap["end_s"] - gap["start_s"] == pytest.approx(16.0, abs=0.2)
+    assert gap["known_s"] - gap["end_s"] < 1.0
+    assert any("of rover" in line for line in run.evaluate()["notes"])
+
+
+def test_a_gap_that_is_ignored_doubles_the_map_and_is_warned_of() -> None:
+    log = hall(4, gap_s=4.0)
+    run = mapped(log, gaps="ignore")
+    assert len(run.landmarks) > 40
+    assert alarmed(run)
