@@ -216,7 +216,7 @@ def test_no_line_is_drawn_across_a_gap_in_time() -> None:
     before = int((run.history.t_ns <= 4.05e9).sum())
     (axes,) = draw_map(run).axes
     lines = [line.get_xydata() for line in axes.lines if len(line.get_xydata()) == len(run.history.t_ns) + 1]
-    assert len(lines) == 2, "the estimated path and the true one"
+    assert len(lines) == 3, "the estimated path, the true one and that by dead reckoning"
     for points in lines:
         assert np.flatnonzero(np.isnan(points).any(axis=1)).tolist() == [before]
     (robot,) = page_data(report_html(run))["robots"]

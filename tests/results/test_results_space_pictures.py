@@ -75,7 +75,14 @@ def test_the_map_of_a_run_in_space_has_a_view_and_a_plan(run: Run, tmp_path: Pat
     assert (plan.get_xlabel(), plan.get_ylabel()) == ("x (m)", "y (m)")
     labels = [text.get_text() for text in draw_map(run).legends[0].get_texts()]
     ends = ["start", "end", r"$3\sigma$ of the end"]
-    assert labels == ["estimated path", "true path", "true landmarks", r"Euclidean landmarks, $3\sigma$", *ends]
+    assert labels == [
+        "estimated path",
+        "true path",
+        "true landmarks",
+        r"Euclidean landmarks, $3\sigma$",
+        *ends,
+        "dead reckoning",
+    ]
 
 
 @pytest.mark.parametrize("view", ["normal", "top", "side", "front", (60.0, 10.0)])

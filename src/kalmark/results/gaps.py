@@ -13,7 +13,7 @@ from kalmark.results.recording import Recording
 from kalmark.results.words import count, figure
 
 KNOWN = 0.5  # of the sigma that a gap gave it, below which the position is known again
-NOTED = 0.2  # of a metre or a radian, sigmas above which a gap is worth a line
+NOTED, NOTED_S = 0.2, 0.5  # of a metre or a radian, sigmas above which a longer gap is worth a line
 
 
 def joined(found: list[Gap]) -> tuple[Gap, ...]:
@@ -63,9 +63,13 @@ def _before(history: History, gap: Gap) -> float:
     return float(np.sqrt(np.trace(history.covariance[earlier[-1], : history.d, : history.d]) / history.d))
 
 
+def _matters(gap: dict[str, Any]) -> bool:
+    return max(gap["sigma_m"], gap["sigma_rad"]) > NOTED and gap["end_s"] - gap["start_s"] > NOTED_S
+
+
 def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
     """Tell of the gaps that were bridged, a line a robot."""
-    noted = [gap for gap in gaps if max(gap["sigma_m"], gap["sigma_rad"]) > NOTED]
+    noted = [gap for gap in gaps if _matters(gap)]
     for robot in dict.fromkeys(gap["robot"] for gap in noted):
         mine = [gap for gap in noted if gap["robot"] == robot]
         longest = max(mine, key=lambda gap: gap["end_s"] - gap["start_s"])
@@ -85,5 +89,5 @@ def gap_warnings(gaps: list[dict[str, Any]]) -> Iterator[str]:
         since = f"from t={gap['start_s']:.1f} s in the log"
         if gap["action"] == "ignore":
             yield f"{lasts} {since}, which was ignored: the map may be wrong from there on; robots.each.gaps=widen"
-        elif gap["known_s"] is None and gap["sigma_m"] > NOTED:
+        elif gap["known_s"] is None and _matters(gap):
             yield f"{lasts} {since}: it was not localized again, the map may be wrong from there on"

@@ -139,7 +139,8 @@ ROWS: dict[
 class History:
     """A run's steps (S of them) and observations (O of them).
 
-    Steps: time, robot, its mean (S, n) and covariance (S, q, q) after the scan, and the wall time in microseconds.
+    Steps: time, robot, its mean (S, n) and covariance (S, q, q) after the scan, its state `dead_reckoned` (S, n) by
+    its controls alone, NaN without any, and the wall time in microseconds.
     Observations: `step` is the row of the step, `id`, `landmark` and `true_id`, what the log knows and the filter may
     not, are texts ("" for none), `kind` is that of the landmark after the scan, `d2` is NaN where there is none;
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
@@ -159,6 +160,7 @@ class History:
     robot: Texts
     mean: Array
     covariance: Array
+    dead_reckoned: Array
     step_us: Array
     step: Ints
     sensor: Texts

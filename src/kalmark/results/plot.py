@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
 from kalmark.arrays import Array
-from kalmark.results.evaluate import headline
+from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.landmarks import LINES, TAG
 from kalmark.results.recording import Recording
 from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares
@@ -38,6 +39,7 @@ FEW = 40  # landmarks of space that are labelled
 GROUND, SHADOW, TICK, SOFT = "#d7dbe1", "#c3c8d0", "#7a818c", "#555b66"
 NAMED: dict[str, Any] = {"color": "#1e4d2b", "fontsize": 7, "ha": "center", "va": "bottom", "zorder": 9}
 POSE_COLOUR = "#d62f2f"
+ALARM_COLOUR = "#b3261e"
 INCHES = {2: 8.3, 3: 13.6}  # what the panels are wide together
 LINE_INCHES, CHARACTERS = 0.17, 13  # the height of a line of text, and how many fit an inch
 
@@ -78,8 +80,9 @@ def draw_map(run: Recording, step: int | None = None, view: str | tuple[float, f
     width = max(sum(aspects) * tall + 0.2 + 0.65 * len(spans), 6.0)
     title, figures = headline(run)
     lines, handles = _lines(figures, int(CHARACTERS * width)), legend(scene)
+    alarms = [part for line in summary_of(run)["warnings"] for part in textwrap.wrap(line, int(CHARACTERS * width))]
     columns = max(1, int(width / 1.9))
-    below, above = 0.6 + 0.25 * -(-len(handles) // columns), 0.55 + LINE_INCHES * len(lines)
+    below, above = 0.6 + 0.25 * -(-len(handles) // columns), 0.55 + LINE_INCHES * (len(lines) + len(alarms))
     figure = Figure(figsize=(width, tall + below + above), facecolor="white")
     height = figure.get_figheight()
     left = 0.1 if scene.d == 3 else 0.75
@@ -92,6 +95,8 @@ def draw_map(run: Recording, step: int | None = None, view: str | tuple[float, f
     figure.text(left / width, 1 - 0.3 / height, title, fontsize=13, fontweight="bold", color=INK)
     text: dict[str, Any] = {"va": "top", "fontsize": 9, "color": SOFT, "linespacing": 1.35}
     figure.text(left / width, 1 - 0.4 / height, "\n".join(lines), **text)
+    below_lines = 1 - (0.4 + LINE_INCHES * len(lines)) / height
+    figure.text(left / width, below_lines, "\n".join(alarms), **text | {"color": ALARM_COLOUR})
     figure.legend(handles=handles, loc="lower center", ncols=columns, frameon=False, fontsize=9)
     return figure
 
@@ -128,12 +133,13 @@ def draw_plan(axes: Axes, scene: Scene) -> None:
 def strokes(scene: Scene) -> list[Stroke]:
     """Return all that is drawn of a scene, in the order of the legend."""
     several, crowded = len(scene.paths) > 1, len(scene.ids) > CROWD
-    gaps = " (gaps: no scans)" if any(s[-1:].any() for s in scene.stretches.values()) else ""
+    gaps = " (dotted: no scans)" if any(s[-1:].any() for s in scene.stretches.values()) else ""
     out = []
     for robot, path in scene.paths.items():
         style = {"color": scene.colour(robot), "linewidth": 0.8 if len(path) > LONG else 1.2, "alpha": 0.9, "zorder": 6}
         label = robot if several else f"estimated path{gaps}"
         out.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
+        out.append(Stroke(scene.bridges(robot), style | {"linestyle": ":"}))
     truth = {"color": TRUTH_COLOUR, "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
     label = "true paths" if several else "true path"
     out += [Stroke(broken(scene.truth[robot], scene.stretches[robot]), truth, label, truth) for robot in scene.truth]
@@ -141,7 +147,12 @@ def strokes(scene: Scene) -> list[Stroke]:
     aligned = "position fixes (aligned, not used)"
     out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
     out += [Stroke(fixes, cross, "fixes used", cross | {"markersize": 5}) for fixes in scene.used.values()]
-    return out + _true_strokes(scene, truth, crowded) + _landmark_strokes(scene, crowded) + _robot_strokes(scene)
+    out += _true_strokes(scene, truth, crowded) + _landmark_strokes(scene, crowded) + _robot_strokes(scene)
+    for robot, path in scene.dead.items():
+        dead = {"color": scene.colour(robot), "linewidth": 0.7, "alpha": 0.5, "linestyle": (0, (5, 3)), "zorder": 3}
+        if np.isfinite(path).any():
+            out.append(Stroke(broken(path, scene.stretches[robot]), dead, "dead reckoning", dead))
+    return out
 
 
 def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[Stroke]:

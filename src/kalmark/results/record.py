@@ -24,9 +24,11 @@ from kalmark.results.readings import biases, cameras, describe, left_px, mounts,
 from kalmark.results.recording import LogReference
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
+from kalmark.slam.motion import HeldInput
 
 if TYPE_CHECKING:
     from kalmark.report import Gap, Report
+    from kalmark.slam.robot import Robot
     from kalmark.slam.slam import Slam
 
 SNAPSHOTS = 60
@@ -81,6 +83,27 @@ class _Compiler(numba_event.Listener):  # type: ignore[misc, unused-ignore]
         pass
 
 
+class DeadReckoning:
+    """A robot's state by its controls alone."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.motion, self.held = robot.motion, HeldInput(robot.motion)
+        self.state, self.started = np.array(robot.start), False
+
+    def take(self, control: Control) -> None:
+        """Move by a control, or by the one before it."""
+        self.started = True
+        for part in self.held.accept(control):
+            self.state = self.motion.move(self.state, part.u, part.dt_s)[0]
+
+    def at(self, t_ns: int) -> Array:
+        """Return the state (n,) at a time, NaN before the first control."""
+        part = self.held.advance(t_ns)
+        if part is not None:
+            self.state = self.motion.move(self.state, part.u, part.dt_s)[0]
+        return self.state if self.started else np.full_like(self.state, np.nan)
+
+
 class _Recorder:
     """Gathers one run; `process` is the hot path, everything is put in order afterwards by `run`."""
 
@@ -95,6 +118,8 @@ class _Recorder:
             if t_ns is not None
         )
         self.controls: dict[str, Controlled] = {}
+        self.reckoned = {name: DeadReckoning(robot) for name, robot in slam.robots.items()}
+        self.dead: list[Array] = []
         self.fixes: list[UsedFix] = []
         self.gaps: list[Gap] = []
         self.skipped: list[str] = []
@@ -120,6 +145,7 @@ class _Recorder:
         if type(event) is Control:
             number, first_ns, _ = self.controls.get(event.robot, (0, event.t_ns, 0))
             self.controls[event.robot] = Controlled(number + 1, first_ns, event.t_ns)
+            self.reckoned[event.robot].take(event)
         elif type(event) is Fix:
             used = all(o.outcome == "associated" for o in report.observations)
             self.fixes.append(UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0]))
@@ -127,6 +153,7 @@ class _Recorder:
             return
         self.step_ns.append(math.nan if self.compiler.was_busy else self.spent_ns)
         self.spent_ns, self.compiler.was_busy = 0, False
+        self.dead.append(self.reckoned[event.robot].at(event.t_ns))
         self.scans.append(event)
         self.reports.append(report)
         self.states.append((self.slam.mean(event.robot), self.slam.covariance(event.robot)))
@@ -180,6 +207,7 @@ class _Recorder:
             robot=texts([r.robot for r in reports]),
             mean=padded([mean[None] for mean, _ in self.states], ones, n),
             covariance=padded([P[None] for _, P in self.states], ones, q, matrices=True),
+            dead_reckoned=padded([r[None] for r in self.dead], ones, n),
             step_us=np.array(self.step_ns, dtype=np.float64) * 1e-3,
             step=np.array([s for s, _, _ in rows], dtype=np.int64),
             sensor=texts([scan.sensor for _, scan, _ in rows]),

@@ -229,6 +229,9 @@ def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]
     stretches = scene.stretches[robot][thin(len(scene.stretches[robot]))]
     out["gaps"] = _gaps(stretches)
     out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
+    dead = scene.dead[robot]
+    if np.isfinite(dead).any():
+        out["dead"] = xy(broken(dead[thin(len(dead))], stretches))
     if robot in scene.truth:
         true = scene.truth[robot]
         out["truth"] = xy(broken(true[thin(len(true))], stretches))

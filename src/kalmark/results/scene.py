@@ -54,7 +54,8 @@ class Scene:
     """A run up to one of its steps, in the plane (d = 2) or in space (d = 3).
 
     By robot: poses (N, 3|7) and their covariances up to the step, `stretches` (S,), the gaps in time up to each of all
-    its steps, true positions (S, d; NaN: unknown), fixes (F, 2) to score with and those `used` by the filter (F, d).
+    its steps, positions by `dead` reckoning (N, d), true ones (S, d; NaN: unknown), fixes (F, 2) to score with and
+    those `used` by the filter (F, d).
     `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places.  `low` and `high` (d,) are the
     corners of the box to draw, the same for all steps.
     """
@@ -63,6 +64,7 @@ class Scene:
     paths: dict[str, Array]
     pose_covariances: dict[str, Array]
     stretches: dict[str, Ints]
+    dead: dict[str, Array]
     truth: dict[str, Array]
     fixes: dict[str, Array]
     used: dict[str, Array]
@@ -99,13 +101,14 @@ class Scene:
         true = [l.reshape(-1, d) if len(l) == LINE else l[None, :d] for l in landmarks.values()]
         low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true])
         paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
+        dead = {r: history.dead_reckoned[until][rows[until]][:, :d] for r, rows in mine.items()}
         stretches = {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()}
         fixes = {}
         for robot in scored:  # the antenna's offset is taken off
             to_fixes, _, offset, xy = aligned_fixes(run, robot)
             fixes[robot] = to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
         cameras = history.cameras
-        return cls(d, paths, covariances, stretches, truth, fixes, used, landmarks, ids, now, cameras, low, high)
+        return cls(d, paths, covariances, stretches, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high)
 
     @property
     def size(self) -> float:
@@ -125,6 +128,12 @@ class Scene:
     def line(self, robot: str) -> Array:
         """Return a robot's path (N, d), NaN in gaps of time."""
         return broken(self.paths[robot][:, : self.d], self.stretches[robot])
+
+    def bridges(self, robot: str) -> Array:
+        """Return a robot's path (N, d) across gaps of time alone: a straight line each, NaN between them."""
+        path, stretches = self.paths[robot][:, : self.d], self.stretches[robot]
+        after = np.flatnonzero(np.diff(stretches[: len(path)])) + 1
+        return joined([path[[k - 1, k]] for k in after.tolist()], self.d)
 
     def inside(self, lines: Array) -> Array:
         """Return polylines (..., d) with NaN where they leave the box."""

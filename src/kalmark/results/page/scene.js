@@ -88,12 +88,23 @@ function still() {
   const skip = {hoverinfo: "skip"};
   each(Object.values(DATA.fixes), "position fixes (aligned, not used)", f => marks(f, {color: TRUTH}, [3, 2], skip));
   each(Object.values(DATA.usedFixes), "fixes used", f => marks(f, thin("x", FIX), [5, 2], skip));
+  const thinly = r => { const s = stroke(r.dead, r.colour, 0.9, {opacity: 0.5}); return {...s, line: {...s.line, dash: "dash"}}; };
+  each(DATA.robots.filter(r => r.dead), "dead reckoning", thinly);
   each(DATA.robots.filter(r => r.truth), "true path", r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
   if (DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: "true lines"}));
   if (l.x.length)
     traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],
                       {name: "true landmarks", hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
   return traces;
+}
+
+/* A dart that points along the heading of a robot of the plane. */
+const DART = [[0.62, 0], [-0.38, 0.36], [-0.16, 0], [-0.38, -0.36], [0.62, 0]];
+function dart(r, at) {
+  const size = 0.035 * Math.max(...DATA.box.high.map((v, a) => v - DATA.box.low[a]));
+  const turned = (i, [f, l]) => [f * Math.cos(r.theta[i]) - l * Math.sin(r.theta[i]), f * Math.sin(r.theta[i]) + l * Math.cos(r.theta[i])];
+  const points = at.flatMap(i => DART.map(p => turned(i, p)).map(([x, y]) => [r.x[i] + size * x, r.y[i] + size * y]));
+  return {x: points.map(p => p[0]), y: points.map(p => p[1])};
 }
 
 /* The map and the robots at a position of the slider. */
@@ -113,11 +124,12 @@ function moving(frame) {
     const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path", at = n ? [n - 1] : [];
     const own = {legendgroup: r.name, ...quiet};
     traces.push(stroke(pathOf(r, n, AXES), r.colour, 1.6, {name, legendgroup: r.name}));
+    const bridges = along(k => r.gaps.filter(g => g < n).flatMap(g => [r[k][g - 1], r[k][g], null]));
+    const dotted = stroke(bridges, r.colour, 1.6, own);
+    traces.push({...dotted, line: {...dotted.line, dash: "dot"}});
     if (SPACE) traces.push(stroke(n ? placed(DATA.bodies[r.name], r, n - 1) : along(() => []), r.colour, 1.2, own));
-    else traces.push({...along(k => at.map(i => r[k][i])), mode: "markers", ...own,
-                      marker: {symbol: "triangle-up", size: 13, color: r.colour, line: {color: "white", width: 1},
-                               angle: at.map(i => 90 - r.theta[i] * 180 / Math.PI)},
-                      hovertemplate: `${r.name}: ${WHERE}<extra></extra>`});
+    else traces.push({...dart(r, at), mode: "lines", ...own, fill: "toself", fillcolor: r.colour,
+                      line: {color: "white", width: 1}, hovertemplate: `${r.name}: ${WHERE}<extra></extra>`});
     traces.push(stroke(contours(r, at, 48), SPACE ? POSE : r.colour, SPACE ? 0.8 : 1.4,
                        {name: "robot, 3 sigma", legendgroup: "pose", showlegend: SPACE && i === 0}));
   });
