@@ -61,7 +61,7 @@ def test_a_velocity_that_is_held_too_long_is_noticed_at_the_next_scan() -> None:
     assert slam.process(km.Scan(4.3, "r", "laser", [[3.0, 0.1]], [1])).gaps == ()
     (gap,) = slam.process(km.Scan(7.1, "r", "laser", [], None)).gaps
     assert (gap.kind, gap.start_ns, gap.end_ns) == ("held", 4_000_000_000, 7_100_000_000)
-    assert gap.sigma_m == pytest.approx(2.2 * 0.8 * 3.0 / 2, rel=1e-2)  # what is held may be all wrong
+    assert gap.sigma_m == pytest.approx(1.2 * 0.8 * 3.0 / 2, rel=1e-2)  # about the motion that is held
 
 
 def test_a_gap_grows_as_one_while_scans_go_on_without_a_landmark() -> None:

@@ -21,12 +21,12 @@ from kalmark.report import Gap
 
 ACTIONS = ("refuse", "widen", "ignore")
 TIMES = 5
-RECENT = 100  # intervals that tell what is usual,
-RANK = 3  # of which the longest two may be gaps
+RECENT = 1000  # intervals that tell what is usual,
+RANK = 5  # of which the longest four may be gaps
 LEARNED = 20  # controls from one look at them to the next, and before the first
 MARGIN = 1.2  # greatest speed over the greatest one in the log so far
 KEPT = (
-    "last_ns", "u", "since_ns", "until_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest", "adrift",
+    "last_ns", "since_ns", "until_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest", "adrift",
 )  # fmt: skip
 WHOLE = 1.5  # an increment so much larger than any before is of the whole gap: its odometry went on
 
@@ -42,8 +42,7 @@ class Gaps:
     ) -> None:
         self.robot, self.motion, self.action = robot, motion, action
         self.max_speed_mps, self.max_turn_radps = max_speed_mps, max_turn_radps
-        self.last_ns: int | None = None  # time of the last control,
-        self.u: Array | None = None  # which was this one
+        self.last_ns: int | None = None  # time of the last control
         self.since_ns: int | None = None  # from when on the motion is unknown,
         self.until_ns = 0  # and up to when the pose has been widened for it
         self.usual_ns = 0
@@ -68,7 +67,7 @@ class Gaps:
             self.pending = (*self.pending, (control.t_ns - self.last_ns, control.u))
             if len(self.pending) == LEARNED:
                 self._learn()
-        self.last_ns, self.u, self.since_ns = control.t_ns, control.u, None
+        self.last_ns, self.since_ns = control.t_ns, None
 
     def _learn(self) -> None:
         times = np.array([dt for dt, _ in self.pending])
@@ -125,8 +124,6 @@ class Gaps:
         after_s, space = (t_ns - self.since_ns) * 1e-9, self.motion.space
         speed, turn = self._rates(self.largest if self.motion.held else self.largest * self.usual_ns * 1e-9)
         speed, turn = self.max_speed_mps or MARGIN * speed, self.max_turn_radps or MARGIN * turn
-        if self.motion.held and self.u is not None:  # what is held may be all wrong
-            speed, turn = (a + b for a, b in zip((speed, turn), self._rates(self.u), strict=True))
         d = 2 if space.axes == 1 else 3
         D = np.zeros((space.dof, space.dof))
         D[np.arange(d), np.arange(d)] = (speed * after_s) ** 2 / (d + 2)

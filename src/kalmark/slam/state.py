@@ -347,7 +347,6 @@ def _watching(record: Description, k: int) -> Description:
 
     times = {key: _time(record[key]) for key in ("last_ns", "since_ns", "until_ns", "usual_ns", "bound_ns")}
     return times | {
-        "u": None if record["u"] is None else control(record["u"]),
         "intervals": tuple(_count(dt, "interval of controls") for dt in record["intervals"]),
         "pending": tuple((_count(dt, "interval of controls"), control(u)) for dt, u in record["pending"]),
         "largest": control(record["largest"]),
