@@ -23,6 +23,7 @@ ACTIONS = ("refuse", "widen", "ignore")
 TIMES = 5
 RECENT = 1000  # intervals that tell what is usual,
 RANK = 5  # of which the longest four may be gaps
+HELD_NS = 2_000_000_000  # a velocity or a steering angle may well be held so long
 LEARNED = 20  # controls from one look at them to the next, and before the first
 MARGIN = 1.2  # greatest speed over the greatest one in the log so far
 KEPT = (
@@ -74,7 +75,8 @@ class Gaps:
         kept = times if self.bound_ns is None else np.minimum(times, self.bound_ns)  # a gap changes little
         self.intervals = (*self.intervals, *kept.tolist())[-RECENT:]
         ordered = sorted(self.intervals)
-        self.usual_ns, self.bound_ns = ordered[len(ordered) // 2], TIMES * ordered[-RANK]
+        least = HELD_NS if self.motion.held else 0
+        self.usual_ns, self.bound_ns = ordered[len(ordered) // 2], max(TIMES * ordered[-RANK], least)
         sizes = np.abs([u for _, u in self.pending])
         if not self.motion.held:
             sizes /= np.maximum(times, max(self.usual_ns, 1))[:, None] * 1e-9
