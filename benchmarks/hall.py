@@ -135,18 +135,22 @@ def main() -> None:
     parser.add_argument("--action", default="widen")
     options = parser.parse_args()
     print("controls    wheel  gap s   right  wrong, said  wrong, not said  right, alarm")
+    total = Counter[tuple[bool, bool]]()
     for held, bad, gap_s in itertools.product((False, True), (False, True), options.gaps):
         counts = Counter[tuple[bool, bool]]()
         for seed in range(options.runs):
             log = hall(seed, gap_s, bad, held)
             run = mapped(log, held, options.action)
             counts[right(run, log), alarmed(run)] += 1
+        total += counts
         good = counts[True, True] + counts[True, False]
         which = f"{'velocities' if held else 'increments'}  {'+1 %' if bad else 'true':>5}  {gap_s:>5g}"
         print(
             f"{which}  {good:>6}  {counts[False, True]:>11}  {counts[False, False]:>15}  {counts[True, True]:>12}",
             flush=True,
         )
+    good, silent = total[True, True] + total[True, False], total[False, False]
+    print(f"total  {good}  {total.total()}  {silent}  {total[True, True]}")
 
 
 if __name__ == "__main__":
