@@ -26,6 +26,7 @@ RANK = 5  # of which the longest four may be gaps
 HELD_NS = 2_000_000_000  # a velocity or a steering angle may well be held so long
 LEARNED = 20  # controls from one look at them to the next, and before the first
 MARGIN = 1.2  # greatest speed over the greatest one in the log so far
+NEVER_NS = 2**62
 KEPT = (
     "last_ns", "since_ns", "until_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest", "adrift",
 )  # fmt: skip
@@ -44,6 +45,7 @@ class Gaps:
         self.robot, self.motion, self.action = robot, motion, action
         self.max_speed_mps, self.max_turn_radps = max_speed_mps, max_turn_radps
         self.last_ns: int | None = None  # time of the last control
+        self.late_ns = NEVER_NS  # after which the next is late
         self.since_ns: int | None = None  # from when on the motion is unknown,
         self.until_ns = 0  # and up to when the pose has been widened for it
         self.usual_ns = 0
@@ -61,6 +63,7 @@ class Gaps:
     def restore(self, state: dict[str, Any]) -> None:
         """Take back what `state` gave."""
         vars(self).update(state)
+        self._expect_next()
 
     def take(self, control: Control) -> None:
         """Learn from a control, which ends a gap."""
@@ -69,6 +72,11 @@ class Gaps:
             if len(self.pending) == LEARNED:
                 self._learn()
         self.last_ns, self.since_ns = control.t_ns, None
+        self._expect_next()
+
+    def _expect_next(self) -> None:
+        if self.last_ns is not None and self.bound_ns is not None:
+            self.late_ns = self.last_ns + self.bound_ns
 
     def _learn(self) -> None:
         times = np.array([dt for dt, _ in self.pending])
@@ -92,9 +100,7 @@ class Gaps:
 
         `u` is the increment that ends then.  Raises EventError for a gap that is refused.
         """
-        if self.last_ns is None or self.bound_ns is None or t_ns - self.last_ns <= self.bound_ns:
-            return None
-        if self._is_of_all(t_ns, u):
+        if t_ns <= self.late_ns or self.last_ns is None or self._is_of_all(t_ns, u):
             return None
         if self.action == "refuse":
             gap_s, usual_s = (t_ns - self.last_ns) * 1e-9, self.usual_ns * 1e-9

@@ -63,14 +63,14 @@ class HeldInput:
         self._before: tuple[Any, ...] = ()
 
     def __enter__(self) -> Self:
-        self._before = self.t_ns, self.u, self.N, self.fresh, None if self.gaps is None else self.gaps.state()
+        self._before = self.t_ns, self.u, self.N, self.fresh, None if self.gaps is None else vars(self.gaps).copy()
         return self
 
     def __exit__(self, kind: Any, *_: object) -> None:
         if kind is not None and issubclass(kind, EventError):
             self.t_ns, self.u, self.N, self.fresh, watched = self._before
             if self.gaps is not None:
-                self.gaps.restore(watched)
+                vars(self.gaps).update(watched)
 
     def advance(self, to_ns: int, last: bool = False) -> Part | None:
         """Return the part from where the robot stands to `to_ns`, or None if it does not move."""
@@ -80,14 +80,16 @@ class HeldInput:
             return self._lost(to_ns)
         if self.u is None or self.N is None or self.t_ns is None or to_ns <= self.t_ns:
             return None
-        unknown = None if self.gaps is None else self.gaps.unknown(to_ns)
+        unknown = None if self.gaps is None or to_ns <= self.gaps.late_ns else self.gaps.unknown(to_ns)
         part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last, unknown)
         self.t_ns, self.fresh = to_ns, False
         return part
 
     def _lost(self, to_ns: int, u: Array | None = None) -> Part | None:
         """Return what is unknown of the motion up to a time, of increments that are late; u (k,) ends then."""
-        unknown = None if self.gaps is None else self.gaps.unknown(to_ns, u)
+        if self.gaps is None or to_ns <= self.gaps.late_ns:
+            return None
+        unknown = self.gaps.unknown(to_ns, u)
         if unknown is None:
             return None
         k = len(self.motion.columns)
