@@ -16,20 +16,19 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.problem import Block, Factor, Motions, Problem, motions, positions, sightings
-from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, ORIGIN, POSE_SPACES, POSES, Ints, State, unsolved
+from kalmark.batch.course import Chain, Starts
+from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
+from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, Ints, State, unsolved
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.geometry.spaces import mount_space
-from kalmark.models.observe import composed, inverse_expectation, view_of
-from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor, bias_covariance
+from kalmark.models.observe import inverse_expectation, view_of
+from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor
 from kalmark.slam.checks import measurements
-from kalmark.slam.motion import HeldInput, Part
 
 if TYPE_CHECKING:
     from kalmark.slam.robot import Robot
 
 Texts = npt.NDArray[np.str_]
-Starts = Mapping[str, tuple[Array, Array]]
 Known = Mapping[Id, tuple[Any, Any]]
 Seen = tuple[int, Id, Array, Array]  # node, landmark or node of a robot, y and R
 NONE = np.zeros(0, dtype=np.int64)
@@ -128,10 +127,11 @@ class _Replay:
 
     def _scan(self, scan: Scan, rows: list[int]) -> None:
         used, node = self.given.associations, self.nodes[-1]
-        index = used.index[rows]
+        mount = self.given.robots[scan.robot].sensors[scan.sensor]
+        scan, index = scan if mount.detector is None else mount.detector(scan), used.index[rows]
         if (used.sensor[rows] != scan.sensor).any() or (index >= len(scan.y)).any():
             raise unsolved(f"scan at t={scan.t_s:.9g} s is not the one of the run, expected its log")
-        R = self._noise(scan, self.given.robots[scan.robot].sensors[scan.sensor].sensor, rows)
+        R = self._noise(scan, mount.sensor, rows)
         for row, y, R_row in zip(rows, scan.y[index], R, strict=True):
             target, group = used.landmark[row], LANDMARKS
             if isinstance(target, str) and target in self.given.robots:
@@ -160,7 +160,7 @@ class _Replay:
         if given.motion:
             poses, motion = self.chain.poses(nodes, given.poses), self.chain.motions()
         else:
-            poses, motion = np.empty((len(self.apart), size)), motions(NONE, np.zeros((0, size)), sp.csr_array((0, 0)))
+            poses, motion = np.empty((len(self.apart), size)), motionless(size)
             poses[nodes] = given.poses
         values = np.array([self._value(name, poses) for name in names]).reshape(-1, space.size)
         seen, mounts = self._sightings({name: k for k, name in enumerate(names)})
@@ -172,7 +172,8 @@ class _Replay:
         for group, rows in ((POSES, held), (LANDMARKS, np.flatnonzero(exactly))):
             free[state.columns(group, rows)[:, None] + np.arange(state.spaces[group].dof)] = False
         kind = "tag" if given.landmark.kind == "tag" else "landmark"
-        return Problem(motion, (*seen, *self._positions(names)), free, state, names, nodes, kind)
+        robots = [node.robot for node in self.chain.nodes] if given.motion else [robot for robot, _ in self.apart]
+        return Problem(motion, (*seen, *self._positions(names)), free, state, names, nodes, robots, kind)
 
     def _names(self) -> list[Id]:
         """Return the landmarks.  One that was measured by fewer numbers than it has says nothing and is left out."""
@@ -203,7 +204,7 @@ class _Replay:
             if (robot, sensor) in groups:
                 blocks.insert(1, Block(groups[robot, sensor], np.zeros_like(node), mount_space(size)))
             view = view_of(mount.sensor, given.landmark, mean)
-            factors.append(sightings(view, tuple(blocks), y, R, given.huber, sensor))
+            factors.append(sightings(view, tuple(blocks), y, R, given.huber, (robot, sensor)))
         return factors, [np.array(given.mounts[name], dtype=np.float64) for name in groups]
 
     def _positions(self, names: list[Id]) -> list[Factor]:
@@ -242,118 +243,3 @@ def _first_poses(seen: list[Factor], n: int, exactly: Flags) -> Ints:
     part = connected_components(links, directed=False)[1]
     found, first = np.unique(part[:n], return_index=True)
     return np.asarray(first[~np.isin(found, part[n:][exactly])], dtype=np.int64)
-
-
-# ------------------------------------------------------------------ motion, as the filter predicts it  [S] (14)-(17)
-class Course:
-    """One robot's motion since its last node, in that node's frame, and the errors it gathered."""
-
-    def __init__(self, robot: Robot, node: int) -> None:
-        self.motion = robot.motion
-        self.drive = HeldInput(robot.motion, robot.watch())
-        self.held = -1  # which of the split controls is in force
-        self.reset(node)
-
-    def reset(self, node: int) -> None:
-        """Start from a node."""
-        self.node, self.moves = node, 0
-        space = self.motion.space
-        self.moved, self.Q = ORIGIN[space.size], np.zeros((space.dof, space.dof))
-        self.shared: dict[int, Array] = {}
-
-    def add(self, part: Part, roots: list[Array]) -> None:
-        """Move by one part.  The error of a control that scans split is kept out of Q, with a root of N in `roots`."""
-        self.moves += 1
-        self.moved, F, R_u = self.motion.move(self.moved, part.u, part.dt_s)
-        self.Q = F @ self.Q @ F.T
-        self.shared = {key: F @ S for key, S in self.shared.items()}
-        if part.first and part.last:
-            self.Q += R_u @ part.N @ R_u.T
-        else:
-            if part.first:
-                self.held = len(roots)
-                roots.append(_root(part.N))
-            self.shared[self.held] = self.shared.get(self.held, 0.0) + R_u @ roots[self.held]
-        for D in (self.motion.diffusion(part.u, part.dt_s), part.unknown):
-            if D is not None:
-                axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
-                self.Q += axes @ D @ axes.T
-
-
-class Chain:
-    """The nodes of all robots: each follows one of its robot by a step with its errors, the first the origin.
-
-    `starts` are the means and covariances of the robots' starts, where they are not those that the robots state.
-    Raises KalmarkError for a robot with more than a pose, or with a bias.
-    """
-
-    def __init__(self, robots: Mapping[str, Robot], starts: Starts) -> None:
-        self.previous: list[int] = []
-        self.steps: list[Array] = []
-        self.Q: list[Array] = []
-        self.shared: list[tuple[int, int, Array]] = []  # node, number of the split control, d w / d root
-        self.roots: list[Array] = []
-        self.courses: dict[str, Course] = {}
-        for name, robot in robots.items():
-            space = robot.motion.space
-            if space.size not in ORIGIN:
-                raise unsolved(f"robot {name!r} has {space.size} state coordinates, expected a pose alone")
-            if bias_covariance(robot.motion) is not None:
-                raise unsolved(f"the bias of {name!r} is in the map, expected controls without one")
-            mean, P = starts.get(name, (robot.start, np.zeros((space.dof,) * 2) if robot.cov is None else robot.cov))
-            self.courses[name] = Course(robot, self._new_node(-1, np.array(mean), np.array(P)))
-
-    def take(self, control: Control) -> None:
-        """Move a robot by a control; one that does not fit its motion is left out, as in the filter."""
-        course = self.courses[control.robot]
-        if control.u.shape == (len(course.motion.columns),):
-            for part in course.drive.accept(control):
-                course.add(part, self.roots)
-
-    def node_at(self, robot: str, t_ns: int) -> int:
-        """Move a robot up to a time and return its node there."""
-        course = self.courses[robot]
-        part = course.drive.advance(t_ns)
-        if part is not None:
-            course.add(part, self.roots)
-        if course.moves:
-            node = self._new_node(course.node, course.moved, course.Q)
-            self.shared += [(node, key, S) for key, S in course.shared.items()]
-            course.reset(node)
-            course.drive.located(t_ns)
-        return course.node
-
-    def motions(self) -> Motions:
-        """Return the steps of all nodes; those that share a held control's error have blocks of Q between them."""
-        n, q = len(self.steps), len(self.Q[0])
-        Q = sp.block_diag(self.Q, format="csr")
-        if self.shared:
-            first = np.cumsum([0, *(root.shape[1] for root in self.roots)])
-            G = sp.lil_array((q * n, int(first[-1])))
-            for node, key, S in self.shared:
-                G[q * node : q * node + q, first[key] : first[key + 1]] = S
-            G = sp.csr_array(G)
-            Q = sp.csr_array(Q + G @ G.T)
-        return motions(np.array(self.previous), np.array(self.steps), Q)
-
-    def poses(self, nodes: Ints, known: Array) -> Array:
-        """Return the poses `known` (S, size) of some nodes (S,), and those of all others chained on from them."""
-        poses = np.full((len(self.steps), known.shape[1]), np.nan)
-        poses[nodes] = known
-        for i, previous in enumerate(self.previous):
-            if np.isnan(poses[i, 0]):
-                poses[i] = composed(ORIGIN[known.shape[1]] if previous < 0 else poses[previous], self.steps[i])[0]
-        return poses
-
-    def _new_node(self, previous: int, step: Array, Q: Array) -> int:
-        self.previous.append(previous)
-        self.steps.append(step)
-        self.Q.append(Q)
-        return len(self.steps) - 1
-
-
-def _root(N: Array) -> Array:
-    """Return G (k, j) with G G' = N, without columns for errors that are zero."""
-    values, vectors = np.linalg.eigh(N)
-    some = values > 1e-14 * max(values.max(initial=0.0), 0.0)
-    return vectors[:, some] * np.sqrt(values[some])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -83,12 +84,17 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """A term with independent noise `R` (K, p, p); residuals that are longer than `huber` when whitened count less."""
+    """A term with independent noise `R` (K, p, p); residuals that are longer than `huber` when whitened count less.
+
+    `y` (K, m) is what was measured, by a `sensor` of a robot with a `view` of the landmarks; ("", "") for a survey.
+    """
 
     term: Term
+    y: Array
     R: Array
     huber: float = np.inf
-    sensor: str = ""
+    sensor: tuple[str, str] = ("", "")
+    view: Any = None
 
     def rows(self, state: State) -> Rows:
         """Return the whitened residuals and what they sum up to."""
@@ -108,7 +114,9 @@ class Factor:
         return self.term.hessian(state, lambda z: np.einsum("kij,kj->ki", weights, z))
 
 
-def sightings(view: Any, blocks: tuple[Block, ...], y: Array, R: Array, huber: float, sensor: str) -> Factor:
+def sightings(
+    view: Any, blocks: tuple[Block, ...], y: Array, R: Array, huber: float, sensor: tuple[str, str]
+) -> Factor:
     """Return what a mounted sensor measured, y (K, m) with noise R (K, p, p).  [S] (63).
 
     `view` is how it sees landmarks (`kalmark.models.observe`); the blocks are the poses, its mount if that is unknown,
@@ -118,13 +126,13 @@ def sightings(view: Any, blocks: tuple[Block, ...], y: Array, R: Array, huber: f
     def residuals(*values: Array) -> tuple[Array, Array]:
         return looked(view, np.concatenate(values[:-1], axis=1), values[-1], y)
 
-    return Factor(Term(residuals, blocks), R, huber, sensor)
+    return Factor(Term(residuals, blocks), y, R, huber, sensor, view)
 
 
 def positions(group: int, rows: Ints, y: Array, R: Array) -> Factor:
     """Return absolute positions y (K, d) with noise R (K, d, d) of rows (K,) of a group."""
     E, space = np.tile(np.eye(y.shape[1]), (len(y), 1, 1)), POINT2 if y.shape[1] == 2 else POINT3
-    return Factor(Term(lambda p: (y - p, E), (Block(group, rows, space),)), R)
+    return Factor(Term(lambda p: (y - p, E), (Block(group, rows, space),)), y, R)
 
 
 def _sparse(E: Array, row: Ints, column: Ints, shape: tuple[int, int]) -> sp.csr_array:
@@ -135,17 +143,35 @@ def _sparse(E: Array, row: Ints, column: Ints, shape: tuple[int, int]) -> sp.csr
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """The errors w (n, q) of the robots' motion as the residuals of `term`, their covariance `Q` (q n, q n)."""
+    """The errors w (n, q) of the robots' motion as the residuals of `term`, of which w = root e + systematic s.
+
+    The e (r,) are white, each of one of the `kinds`, the s (K,) are named by `errors`.
+    """
 
     term: Term
-    Q: sp.csr_array
+    root: sp.csr_array
+    kinds: list[str]
+    systematic: Array
+    errors: tuple[Any, ...]
+
+    @cached_property
+    def Q(self) -> sp.csr_array:
+        """The covariance (q n, q n) of the errors."""
+        return sp.csr_array(self.root @ self.root.T)
 
 
-def motions(previous: Ints, step: Array, Q: sp.csr_array) -> Motions:
+def motionless(size: int) -> Motions:
+    """Return the motion of poses (n, size) that have none."""
+    return motions(np.zeros(0, dtype=np.int64), np.zeros((0, size)), sp.csr_array((0, 0)), [], np.zeros((0, 0)), ())
+
+
+def motions(
+    previous: Ints, step: Array, root: sp.csr_array, kinds: list[str], systematic: Array, errors: tuple[Any, ...]
+) -> Motions:
     """Return the motion of all robots: pose i follows pose `previous[i]` (-1: the origin, for a start) by `step[i]`.
 
-    The steps (n, 3) or (n, 7) are in the frames of the previous poses, and so are their errors, whose covariance Q has
-    blocks between steps that share a held control.  None at all: poses without motion.
+    The steps (n, 3) or (n, 7) are in the frames of the previous poses, and so are their errors.  Steps that share a
+    held control have columns of the `root` (q n, r) of their covariance in common.
     """
     started, space = previous >= 0, POSE_SPACES[step.shape[1]]
 
@@ -155,7 +181,7 @@ def motions(previous: Ints, step: Array, Q: sp.csr_array) -> Motions:
         return w, -W
 
     blocks = Block(POSES, np.where(started, previous, 0), space), Block(POSES, np.arange(len(step)), space)
-    return Motions(Term(residuals, blocks), Q)
+    return Motions(Term(residuals, blocks), root, kinds, systematic, errors)
 
 
 class Linearized(NamedTuple):
@@ -174,7 +200,7 @@ class Problem:
     """Minimise the whitened residuals + w' Q^+ w, w the errors of the motion, which must lie in the range of Q.
 
     `free` says which numbers of a step are unknown; the others are held.  The search begins at `start`.  `ids` name the
-    landmarks, of `kind`, and `nodes` (S,) are the poses at the scans of the log.
+    landmarks, of `kind`, and `nodes` (S,) are the poses at the scans of the log; `robots` (n,) are those of all poses.
     """
 
     motions: Motions
@@ -183,6 +209,7 @@ class Problem:
     start: State
     ids: list[Id]
     nodes: Ints
+    robots: list[str]
     kind: str
 
     def at(self, state: State) -> Linearized:
@@ -203,4 +230,4 @@ class Problem:
 
     def left(self, state: State) -> list[tuple[str, Array]]:
         """Return what a state leaves of each sensor's measurements, (K, p); NaN where a landmark is not in view."""
-        return [(factor.sensor, factor.term.at(state)[0]) for factor in self.factors if factor.sensor]
+        return [(factor.sensor[1], factor.term.at(state)[0]) for factor in self.factors if factor.sensor[1]]

@@ -97,7 +97,7 @@ class _Search:
         self.problem, self.at, self.size = problem, problem.at(start), np.inf
         self.damping, self.flat = 0.0 if len(self.at.w) else DAMPING, False
         self.multipliers, self.penalty = np.zeros(len(self.at.w)), np.zeros(start.spaces[POSES].dof)
-        self.followers = _followers(self.at)
+        self.followers = followers(self.at)
 
     def advance(self) -> None:
         """Take one step, of Newton's method if near and if that lowers the merit; without motion of Levenberg's."""
@@ -148,11 +148,11 @@ def _refuse_hidden(problem: Problem, start: State) -> None:
             node, *_, target = (int(block.rows[hidden[0]]) for block in factor.term.blocks)
             known = factor.term.blocks[-1].group == LANDMARKS
             what = f"{problem.kind if known else 'pose'} {problem.ids[target] if known else target}"
-            what += f" to {factor.sensor} at pose {node}"
+            what += f" to {factor.sensor[1]} at pose {node}"
             raise unsolved(f"the start does not show {what}, which saw it")
 
 
-def _followers(at: Linearized) -> sp.csr_array:
+def followers(at: Linearized) -> sp.csr_array:
     """Return (m, n): for each landmark the weights, summing to 1, of the poses that see it."""
     (path, end), (pose, landmark) = at.state.ends[:2], at.state.spaces[:2]
     shape = len(at.state.groups[LANDMARKS]), len(at.state.groups[POSES])
@@ -196,17 +196,25 @@ class Reduced:
             raise UndeterminedError(
                 "batch solution: the path is not determined by its motion and its sightings"
             ) from None
-        g = at.H.T @ at.z
-        self.rhs = np.concatenate([g[self.path], -at.w])[self.order]
-        self.S, self.g = A[self.rest][:, self.rest].toarray(), g[self.rest] - self.coupling.T @ self.lu.solve(self.rhs)
+        self.at, self.S = at, A[self.rest][:, self.rest].toarray()
         for first in range(0, len(self.rest), CHUNK):
             columns = slice(first, first + CHUNK)
             self.S[:, columns] -= self.coupling.T @ self.lu.solve(self.coupling[:, columns].toarray())
 
     def step(self) -> tuple[Array, Array]:
-        """Return the step of the whole state and the multipliers after it.  Raises UndeterminedError."""
-        d_l, x, step = self._solved(self.g), np.empty(len(self.order)), np.zeros(self.state.ends[-1])
-        x[self.order] = self.lu.solve(self.rhs - self.coupling @ d_l)
+        """Return the step (N,) of the whole state and the multipliers after it.  Raises UndeterminedError."""
+        return self.solved(self.at.z, self.at.w)
+
+    def solved(self, z: Array, w: Array) -> tuple[Array, Array]:
+        """Return the step (N, ...) and the multipliers for whitened residuals z and errors w of the motion, (., ...).
+
+        Raises UndeterminedError.
+        """
+        g = self.at.H.T @ z
+        rhs = np.concatenate([g[self.path], -w])[self.order]
+        d_l = self._solved(g[self.rest] - self.coupling.T @ self.lu.solve(rhs))
+        x, step = np.empty_like(rhs), np.zeros_like(g)
+        x[self.order] = self.lu.solve(rhs - self.coupling @ d_l)
         step[self.path], step[self.rest] = x[: len(self.path)], d_l
         return step, x[len(self.path) :]
 

@@ -19,7 +19,9 @@ from kalmark.batch.state import LANDMARKS, POSES, State
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Scan
 from kalmark.geometry.frames3d import from_frame, minus
+from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.models.landmarks import Point2D, Point3D, Tag
+from kalmark.models.protocols import Landmark
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.history import as_id
@@ -30,6 +32,7 @@ from kalmark.results.progress import track
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.results.recording import Recording
+    from kalmark.slam.slam import Slam
 
 
 def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
@@ -40,7 +43,7 @@ def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dic
     if not np.isnan(run.history.left_px).all():
         problem = tag_problem(run)
         return compare_tags(run, problem, optimum(problem))
-    return compare(run, solve_batch(run, _log_of(run) if log is None else log))
+    return compare(run, solve_batch(run, log_of(run) if log is None else log))
 
 
 def solve_batch(
@@ -88,7 +91,7 @@ def given_by(run: Recording, known: Known | None = None) -> Given:
             beforehand[name] = (mean, None)
     return Given(
         robots=robots,
-        landmark=Point3D() if history.in_space else Point2D(),
+        landmark=_point(slam),
         t_ns=history.t_ns,
         robot=history.robot,
         poses=history.poses,
@@ -100,6 +103,21 @@ def given_by(run: Recording, known: Known | None = None) -> Given:
         starts={start.robot: (start.mean, start.covariance) for start in history.starts},
         fixes=len(run.history.fixes),
     )
+
+
+def _point(slam: Slam) -> Landmark:
+    """Return what the landmarks of a map are in the batch solution: points, with the numbers that all have besides."""
+    space = any(robot.motion.space.axes > 1 for robot in slam.robots.values())
+    models = {track.model.space.kinds: track.model for track in slam.tracks.confirmed.values()}
+    kinds, model = next(iter(models.items()), ((), None))
+    if (
+        model is not None
+        and len(models) == 1
+        and kinds[0] == (VECTOR3 if space else VECTOR)
+        and {*kinds[1:]} == {SCALAR}
+    ):
+        return model
+    return Point3D() if space else Point2D()
 
 
 def tag_problem(run: Recording) -> Problem:
@@ -144,7 +162,7 @@ def compare(run: Recording, batch: Batch) -> dict[str, Any]:
     """
     rows = [(k, batch.ids.index(id_)) for k, id_ in enumerate(run.landmarks.ids) if id_ in batch.ids]
     d, sigma = batch.state.d, batch.sigma()[np.array([j for _, j in rows], dtype=np.int64)]
-    distance = np.array([np.linalg.norm(run.landmarks.means[k][:d] - batch.means[j]) for k, j in rows])
+    distance = np.array([np.linalg.norm(run.landmarks.means[k][:d] - batch.means[j][:d]) for k, j in rows])
     filtered = np.array([np.sqrt(np.trace(run.landmarks.covariances[k][:d, :d])) for k, _ in rows])
     free, path, truth = sigma > 0, run.history.mean[:, :d], run.truth.poses_in_map()
     known = np.isfinite(truth).all(axis=1)
@@ -196,7 +214,7 @@ def compare_tags(run: Recording, problem: Problem, batch: Batch) -> dict[str, An
     }
 
 
-def _log_of(run: Recording) -> Iterable[Event]:
+def log_of(run: Recording) -> Iterable[Event]:
     """Read again the log a run was made from, as its configuration says."""
     from kalmark.config.opening import open_config_log
     from kalmark.config.schema import Config

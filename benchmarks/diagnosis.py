@@ -1,0 +1,192 @@
+"""Faults planted in simulated logs: does the diagnosis name them, and is it silent where nothing is wrong?
+
+    python benchmarks/diagnosis.py                       # 5 logs a fault, and 200 clean ones
+    python benchmarks/diagnosis.py --runs 1 --clean 5 --only range
+
+A robot wanders between 40 landmarks whose ids it knows; a car does for the steering, and the hall of benchmarks/hall.py
+is for the recorder that stops.  A line a log: what was planted, what is named, best first.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from kalmark.config import build_slam
+from kalmark.diagnosis.verdict import findings
+from kalmark.events import Control, Scan, order
+from kalmark.geometry import observe
+from kalmark.geometry.frames import compose
+from kalmark.logs.log import Log
+from kalmark.results.record import record
+from kalmark.results.run import Run
+from kalmark.simulate import load_world, simulate
+
+FIELD = ("world.count=40", "world.size_m=24", "steps=700", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")
+MOUNT = np.array([0.3, 0.0, 0.0])
+Plant = Callable[[Log, np.random.Generator], Log]
+
+
+def seen(scan: Scan, y: np.ndarray | None = None, ids: list | None = None, t_ns: int | None = None) -> Scan:
+    """Return a scan with other measurements, ids or another time."""
+    return Scan(
+        t_ns=scan.t_ns if t_ns is None else t_ns,
+        robot=scan.robot,
+        sensor=scan.sensor,
+        y=scan.y if y is None else y,
+        ids=scan.ids if ids is None else ids,
+    )
+
+
+def measured(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    """Return what changes the measurements y (K, 2) of all scans."""
+
+    def plant(log: Log, rng: np.random.Generator) -> Log:
+        return replace(log, events=[seen(e, y=change(e.y.copy())) if isinstance(e, Scan) else e for e in log.events])
+
+    return plant
+
+
+def controlled(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    """Return what changes the controls u (2,)."""
+
+    def plant(log: Log, rng: np.random.Generator) -> Log:
+        return replace(
+            log,
+            events=[
+                Control(t_ns=e.t_ns, robot=e.robot, u=change(e.u.copy())) if isinstance(e, Control) else e
+                for e in log.events
+            ],
+        )
+
+    return plant
+
+
+def late(log: Log, rng: np.random.Generator) -> Log:
+    """Stamp the scans .1 s late."""
+    moved = [seen(e, t_ns=e.t_ns + 100_000_000) if isinstance(e, Scan) else e for e in log.events]
+    return replace(log, events=sorted(moved, key=order))
+
+
+def moving(log: Log, rng: np.random.Generator) -> Log:
+    """Move the landmark that is seen most by 2 cm/s."""
+    ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
+    name = max(set(ids), key=ids.count)
+    truth, place, direction = log.truth["rover"], np.array(log.landmarks[name]), rng.normal(size=2)
+    direction *= 0.02 / np.linalg.norm(direction)
+    events = []
+    for e in log.events:
+        event = e
+        if isinstance(event, Scan) and event.ids is not None and name in event.ids:
+            y, k = event.y.copy(), list(event.ids).index(name)
+            pose = truth.poses[np.searchsorted(truth.t_ns, event.t_ns)]
+            at = compose(pose, MOUNT)[0]
+            there = place + direction * event.t_ns * 1e-9
+            y[k] += observe(at, there[None])[0][0] - observe(at, place[None])[0][0]
+            event = seen(event, y=y)
+        events.append(event)
+    return replace(log, events=events)
+
+
+def wrong_ids(log: Log, rng: np.random.Generator) -> Log:
+    """Give 3 % of the observations the id of another landmark in view."""
+    events = []
+    for e in log.events:
+        event = e
+        if isinstance(event, Scan) and event.ids is not None and len(event.ids) > 1:
+            ids = list(event.ids)
+            for k in np.flatnonzero(rng.random(len(ids)) < 0.015).tolist():
+                other = int(rng.integers(len(ids) - 1))
+                other += other >= k
+                ids[k], ids[other] = ids[other], ids[k]
+            event = seen(event, ids=ids)
+        events.append(event)
+    return replace(log, events=events)
+
+
+def scaled(factor: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda y: y * [factor, 1.0]
+
+
+def wheel(u: np.ndarray) -> np.ndarray:
+    """Return the control of a differential drive that takes its right wheel 1 % too small.
+
+    The wheels are .5 m apart.
+    """
+    left, right = u[0] - u[1] * 0.25, (u[0] + u[1] * 0.25) / 1.01
+    return np.array([(left + right) / 2, (right - left) / 0.5])
+
+
+def none(log: Log, rng: np.random.Generator) -> Log:
+    """Change nothing."""
+    return log
+
+
+CAR = (
+    "robots.rover.motion={type: ackermann, wheelbase_m: 1.0, encoder_offset_m: 0.0,"
+    " sigma_v_mps: 0.05, sigma_steering_rad: 0.02}",
+)
+SIGMA = "robots.rover.sensors.lidar.sigma_range_m"
+CONTROLS = ("robots.rover.motion.sigma_v_mps=0.01667", "robots.rover.motion.sigma_w_radps=0.01667")
+# fault: the names that are right, what it does to the log, settings of the world and of the filter
+FAULTS: dict[str, tuple[tuple[str, ...], Plant, tuple[str, ...], tuple[str, ...]]] = {
+    "none": ((), none, (), ()),
+    "range sigma half": (("range_sigma",), none, (), (f"{SIGMA}=0.2",)),
+    "range sigma double": (("range_sigma",), none, (), (f"{SIGMA}=0.05",)),
+    "bearing bias 1 deg": (("bearing_offset",), measured(lambda y: np.add(y, [0.0, np.radians(1.0)])), (), ()),
+    "range scale 5 %": (("range_scale",), measured(scaled(1.05)), (), ()),
+    "time offset .1 s": (("time_offset",), late, (), ()),
+    "control noise threefold": (("control_sigma",), none, (), CONTROLS),
+    "moving landmark": (("moving_landmark",), moving, (), ()),
+    "wrong ids 3 %": (("wrong_ids",), wrong_ids, (), ()),
+    "steering bias 1 deg": (("steering_offset",), controlled(lambda u: np.add(u, [0.0, np.radians(1.0)])), CAR, ()),
+    "wheel 1 %": (("odometry_turn",), controlled(wheel), (), ()),
+}
+
+
+def planted(fault: str, seed: int) -> tuple[Log, Run]:
+    """Return the log with a fault, and the run of it."""
+    _, plant, of_world, of_filter = FAULTS[fault]
+    world = load_world("random_field", [*FIELD, *of_world])
+    log = plant(simulate(world, seed), np.random.default_rng(seed))
+    config = load_world("random_field", [*FIELD, *of_world, *of_filter]).config()
+    return log, record(build_slam(config, log), log, progress=False)
+
+
+def main() -> None:
+    """Print the lines."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--clean", type=int, default=200)
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    first = third = count = accused = 0
+    for fault, (names, *_) in FAULTS.items():
+        if options.only not in fault:
+            continue
+        for seed in range(options.runs if names else options.clean):
+            _, run = planted(fault, seed)
+            _, found = findings(run)
+            told = [f.name for f in found]
+            print(
+                f"{fault:24s} {seed:4d}  "
+                + "; ".join(f"{f.name} {f.label} {f.value:.3g} ({f.gain:.0f})" for f in found),
+                flush=True,
+            )
+            if names:
+                count, first, third = (
+                    count + 1,
+                    first + (told[:1] == [*names][:1]),
+                    third + bool({*told[:3]} & {*names}),
+                )
+            else:
+                accused += bool(told)
+    print(f"planted: {first} of {count} named first, {third} among the first three")
+    print(f"clean: {accused} accused")
+
+
+if __name__ == "__main__":
+    main()

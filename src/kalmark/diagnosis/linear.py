@@ -1,0 +1,169 @@
+"""The batch problem of a run, linear about its optimum: what noise and systematic errors leave of the data.
+
+The data are the whitened residuals z of the sensors and the errors w of the motion (docs/batch.md).  The state takes up
+what it can of them, (r, m) is left: r = z - H dx, and m the multipliers, with r'r + m'Qm the sum of squares.  Both are
+linear in the data: a systematic error s that adds (Z, W) s to them is estimated by s = g / I with the score
+g = Z'r + W'm and its information I = Z'r_Z + W'm_Z, (r_Z, m_Z) being what is left of (Z, W) itself.  Rao's score test;
+Bar-Shalom, Li, Kirubarajan 2001, section 5.4, for the whiteness of residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from kalmark.arrays import Array, Flags
+from kalmark.batch.problem import Linearized, Problem
+from kalmark.batch.solver import Reduced, followers
+from kalmark.batch.state import LANDMARKS, Ints, State
+
+NONE = -1
+OUT = 1e3  # times its noise: what is so uncertain does not count
+MOST_GAP = 5  # scans between two sightings of one landmark that are still successive
+
+
+class Rows(NamedTuple):
+    """What each whitened residual (N,) is of: factor and row there, column, landmark (-1: none) and node.
+
+    `one` and `two` (P,) are the rows of successive sightings of one landmark, by one sensor and column.
+    """
+
+    factor: Ints
+    row: Ints
+    column: Ints
+    landmark: Ints
+    node: Ints
+    one: Ints
+    two: Ints
+
+
+class Left(NamedTuple):
+    """What the state leaves of data, a column a set: r (N, ...) of the sensors, m (q n, ...) of the motion."""
+
+    r: Array
+    m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A problem linearised at `base`, with some of it taken out of the data and its noise made larger or smaller.
+
+    `noise` (N,) and `errors` (r,) are factors of the noise of the residuals and of the motion's errors, `z` (N,) and
+    `w` (q n,) are what was taken out of the data, as whitened by the problem.
+    """
+
+    problem: Problem
+    base: Linearized
+    noise: Array
+    errors: Array
+    z: Array
+    w: Array
+
+    @classmethod
+    def of(cls, problem: Problem, state: State) -> Linear:
+        """Return the problem at a state, as it is."""
+        at, r = problem.at(state), problem.motions.root.shape[1]
+        return cls(problem, at, np.ones(len(at.z)), np.ones(r), np.zeros(len(at.z)), np.zeros(len(at.w)))
+
+    @property
+    def state(self) -> State:
+        """Where it is linear."""
+        return self.base.state
+
+    def scaled(self, noise: Array | None, errors: Array | None) -> Linear:
+        """Return it with the noise (N,) times and the motion's errors (r,) times as large."""
+        noise, errors = (have if by is None else have * by for have, by in ((self.noise, noise), (self.errors, errors)))
+        return replace(self, noise=noise, errors=errors)
+
+    def without(self, Z: Array, W: Array) -> Linear:
+        """Return it with Z (N,), whitened as `at` is, and W (q n,) taken out of the data."""
+        return replace(self, z=self.z + Z * self.noise, w=self.w + W)
+
+    @cached_property
+    def root(self) -> sp.csr_array:
+        """The root (q n, r) of the covariance of the motion's errors."""
+        return sp.csr_array(self.problem.motions.root @ sp.diags_array(self.errors))
+
+    @cached_property
+    def at(self) -> Linearized:
+        """Residuals and Jacobians, whitened by the noise."""
+        H = sp.csr_array(sp.diags_array(1.0 / self.noise) @ self.base.H)
+        return self.base._replace(z=(self.base.z - self.z) / self.noise, H=H, w=self.base.w - self.w)
+
+    @cached_property
+    def reduced(self) -> Reduced:
+        """The factorised problem."""
+        return Reduced(replace(self.problem, motions=replace(self.problem.motions, root=self.root)), self.at)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """What each residual is of."""
+        parts: list[tuple[Ints, ...]] = []
+        for f, factor in enumerate(self.problem.factors):
+            k, p, _ = factor.R.shape
+            first, last = factor.term.blocks[0], factor.term.blocks[-1]
+            on_map = last.group == LANDMARKS and bool(factor.sensor[1])
+            of = (np.full(k, f), np.arange(k), last.rows if on_map else np.full(k, NONE), first.rows)
+            factor_, row, landmark, node = (np.repeat(a, p) for a in of)
+            parts.append((factor_, row, np.tile(np.arange(p), k), landmark, node))
+        factor_, row, column, landmark, node = (np.concatenate(a) for a in zip(*parts, strict=True))
+        order = np.lexsort((node, landmark, column, factor_))
+        one, two = order[:-1], order[1:]
+        same = (landmark[one] >= 0) & (node[two] > node[one])
+        for of_ in (landmark, column, factor_):
+            same &= of_[one] == of_[two]
+        counts, rank = dict.fromkeys(self.problem.robots, 0), np.zeros(len(self.problem.robots), dtype=np.int64)
+        for k, robot in enumerate(self.problem.robots):
+            rank[k] = counts[robot]
+            counts[robot] += 1
+        same &= rank[node[two]] - rank[node[one]] <= MOST_GAP
+        return Rows(factor_, row, column, landmark, node, one[same], two[same])
+
+    @cached_property
+    def observations(self) -> Ints:
+        """The number (N,) of the observation that each residual is a component of."""
+        first = np.concatenate([[0], np.cumsum([len(f.R) for f in self.problem.factors])])
+        return np.unique(self.rows.row + first[self.rows.factor], return_inverse=True)[1]
+
+    @property
+    def kept(self) -> Flags:
+        """Which residuals (N,) still count."""
+        return self.noise < OUT
+
+    def moved(self) -> State:
+        """Return the state at which the data as they are have their optimum."""
+        return self.state.moved(self.reduced.step()[0], followers(self.at))
+
+    def whitened(self, parts: list[Array]) -> Array:
+        """Return Z (N, ...) of what is added to the innovations of each factor (K, p, ...)."""
+        rows = [
+            np.einsum("kij,kj...->ki...", np.linalg.inv(np.linalg.cholesky(factor.R)), part).reshape(
+                -1, *part.shape[2:]
+            )
+            for factor, part in zip(self.problem.factors, parts, strict=True)
+        ]
+        return np.asarray((np.concatenate(rows).T / self.noise).T)
+
+    def left(self, z: Array, w: Array) -> Left:
+        """Return what the state leaves of data z (N, ...), w (q n, ...)."""
+        step, m = self.reduced.solved(z, w)
+        return Left(z - self.at.H @ step, m)
+
+    @cached_property
+    def residuals(self) -> Left:
+        """What the state leaves of the data of the run."""
+        return self.left(self.at.z, self.at.w)
+
+    def simulated(self, number: int, seed: int = 0) -> Left:
+        """Return what is left of data of which everything is as configured, a column a set."""
+        rng = np.random.default_rng(seed)
+        z, e = rng.normal(size=(len(self.at.z), number)), rng.normal(size=(self.root.shape[1], number))
+        return self.left(z, self.root @ e)
+
+    def errors_of(self, left: Left) -> Array:
+        """Return the estimates of the white errors of the motion (r, ...), of unit variance or less."""
+        return np.asarray(self.root.T @ left.m)

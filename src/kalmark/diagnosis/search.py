@@ -1,0 +1,122 @@
+"""Which causes explain a run: one after the other, the likeliest first, each taken out of the data before the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kalmark.batch.state import LANDMARKS, looked
+from kalmark.diagnosis import causes
+from kalmark.diagnosis.causes import Finding, Where
+from kalmark.diagnosis.linear import Linear
+
+ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
+ROUNDS = 6
+LEAST_GAIN = 8.0
+TAKEN_UP, ALIKE = 0.5, 0.85
+ORDER = ("steering_offset", "odometry_scale", "odometry_turn", "odometry_offset")
+SCALINGS, SCALED = 5, 0.03
+NEAR = 9.0  # d2 of a landmark that an observation may well be of
+LOOKED_AT = 200  # outliers whose landmarks are looked for
+
+
+def best(sure: list[Finding]) -> list[Finding]:
+    """Return what explains most, and what explains as much after it.
+
+    A systematic error goes before a noise that would take it up.  Of those that explain as much, one in the sensors
+    goes before one in the controls.
+    """
+    first = max(sure, key=lambda f: f.gain)
+    steady = [f for f in sure if f.Z is not None and f.gain > TAKEN_UP * first.gain]
+    if not steady or (first.unit != causes.TIMES and first.Z is None):
+        return [first]
+    most = max(f.gain for f in steady)
+    alike = sorted((f for f in steady if f.gain > ALIKE * most), key=lambda f: -f.gain)
+    by_name = {f.name: f for f in reversed(alike)}
+    return sorted(by_name.values(), key=lambda f: (ORDER.index(f.name) if f.name in ORDER else 0, -f.gain))
+
+
+class Search:
+    """The causes found so far, and the problem with these taken out."""
+
+    def __init__(self, linear: Linear, sensors: Mapping[Where, tuple[str, ...]], robot: Any, t_ns: Any) -> None:
+        self.first = self.linear = linear
+        self.sensors = sensors
+        self.rates = causes.rates_of(linear, robot, t_ns)
+        self.t_s = np.zeros(len(linear.problem.robots))
+        self.t_s[linear.problem.nodes] = (t_ns - t_ns[:1].sum()) * 1e-9
+        self.found: list[Finding] = []
+        self.simulated = linear.simulated(causes.SETS)
+
+    def run(self) -> list[Finding]:
+        """Return all causes, the one that explains most first."""
+        while len(self.found) < ROUNDS:
+            candidates = self.candidates()
+            sure = [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > LEAST_GAIN]
+            if not sure:
+                break
+            first, *alike = best(sure)
+            self.take(replace(first, alike=tuple(alike)))
+        rest = causes.correlations(self.linear, self.simulated, self.sensors)
+        self.found += [f for f in rest if f.p * len(rest) < ALPHA and f.gain > LEAST_GAIN]
+        return sorted(self.found, key=lambda f: -f.gain)
+
+    def candidates(self) -> list[Finding]:
+        """Return all that may explain what is left."""
+        columns = causes.columns_of(self.linear, self.sensors, self.rates)
+        return [
+            *causes.systematic(self.linear, columns),
+            *causes.noise(self.linear, self.simulated, self.sensors),
+            *causes.outliers(self.linear),
+            *causes.landmarks(self.linear, self.t_s),
+            *causes.jumps(self.linear),
+        ]
+
+    def take(self, finding: Finding) -> None:
+        """Take a cause out of the data."""
+        if finding.Z is not None and finding.W is not None:
+            self.linear = self.linear.without(finding.Z * finding.value, finding.W * finding.value)
+        elif finding.unit == causes.TIMES:
+            finding = self._scaled(finding)
+        else:
+            self._scale(finding)
+        if finding.name == "outliers" and finding.rows is not None:
+            finding = replace(finding, name=self._outliers(finding.rows))
+        self.found.append(finding)
+
+    def _scaled(self, finding: Finding) -> Finding:
+        """Make a noise as large as it is, which takes a few rounds: other noise was taken for it, or it for other."""
+        value, step = 1.0, finding
+        for _ in range(SCALINGS):
+            self._scale(step)
+            value *= step.value
+            again = causes.noise(self.linear, self.simulated, self.sensors)
+            step = next((f for f in again if f.label == finding.label), step)
+            if abs(step.value - 1.0) < SCALED:
+                break
+        return replace(finding, value=value, sigma=finding.sigma * value / finding.value)
+
+    def _scale(self, finding: Finding) -> None:
+        self.linear = self.linear.scaled(finding.noise, finding.errors)
+        self.simulated = self.linear.simulated(causes.SETS)
+
+    def _outliers(self, far: Any) -> str:
+        """Return "wrong_ids" if most of the observations that are `far` off fit another landmark, else "outliers"."""
+        problem, fits, number, first = self.linear.problem, 0, 0, 0
+        poses, places, *_ = self.linear.moved().groups
+        for factor in problem.factors:
+            k = len(factor.R)
+            blocks = factor.term.blocks
+            mine = np.flatnonzero(far[first : first + k])
+            first += k
+            if blocks[-1].group != LANDMARKS or not factor.sensor[1] or len(blocks) != 2:
+                continue
+            for row in mine[:LOOKED_AT].tolist():
+                rows = np.full(len(places), row)
+                z, _ = looked(factor.view, poses[blocks[0].rows[rows]], places, factor.y[rows])
+                d2 = np.einsum("ki,ij,kj->k", z, np.linalg.inv(factor.R[row]), z)
+                number, fits = number + 1, fits + bool(np.nanmin(d2) < NEAR)
+        return "wrong_ids" if 2 * fits > number else "outliers"
