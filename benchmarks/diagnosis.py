@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from kalmark.config import build_slam
-from kalmark.diagnosis.verdict import findings
+from kalmark.diagnosis.verdict import Cause, diagnose
 from kalmark.events import Control, Scan, order
 from kalmark.geometry import observe
 from kalmark.geometry.frames import compose
@@ -120,6 +120,24 @@ def wheel(u: np.ndarray) -> np.ndarray:
     return np.array([(left + right) / 2, (right - left) / 0.5])
 
 
+def turned(y: np.ndarray) -> np.ndarray:
+    """Return what a sensor that looks back measures."""
+    return np.stack([y[:, 0], (y[:, 1] + 2 * np.pi) % (2 * np.pi) - np.pi], axis=1)
+
+
+def kidnapped(log: Log, rng: np.random.Generator) -> Log:
+    """Leave out the controls and scans of the middle fifth of the log: the robot is elsewhere when they come again."""
+    begin, end = (log.events[k * len(log.events) // 5].t_ns for k in (2, 3))
+    events = []
+    for e in log.events:
+        if e.t_ns < begin:
+            events.append(e)
+        elif e.t_ns >= end:
+            t_ns = e.t_ns - end + begin
+            events.append(seen(e, t_ns=t_ns) if isinstance(e, Scan) else Control(t_ns=t_ns, robot=e.robot, u=e.u))
+    return replace(log, events=events)
+
+
 def none(log: Log, rng: np.random.Generator) -> Log:
     """Change nothing."""
     return log
@@ -143,6 +161,17 @@ FAULTS: dict[str, tuple[tuple[str, ...], Plant, tuple[str, ...], tuple[str, ...]
     "moving landmark": (("moving_landmark",), moving, (), ()),
     "wrong ids 3 %": (("wrong_ids",), wrong_ids, (), ()),
     "steering bias 1 deg": (("steering_offset",), controlled(lambda u: np.add(u, [0.0, np.radians(1.0)])), CAR, ()),
+    "kidnapped": (("kidnapped",), kidnapped, (), ()),
+    "bearing clockwise": (("bearing_sign",), measured(lambda y: y * [1.0, -1.0]), (), ()),
+    "bearing in degrees": (("units",), measured(lambda y: y * [1.0, 180 / np.pi]), (), ()),
+    "turn rate in degrees": (("units",), controlled(lambda u: u * [1.0, 180 / np.pi]), (), ()),
+    "range and bearing swapped": (
+        ("swapped_columns",),
+        measured(lambda y: np.stack([y[:, 1] % (2 * np.pi), y[:, 0]], axis=1)),
+        (),
+        (),
+    ),
+    "mount 180 deg": (("mount",), measured(turned), (), ()),
     "wheel 1 %": (("odometry_turn",), controlled(wheel), (), ()),
 }
 
@@ -163,29 +192,27 @@ def main() -> None:
     parser.add_argument("--clean", type=int, default=200)
     parser.add_argument("--only", default="")
     options = parser.parse_args()
-    first = third = count = accused = 0
+    first = third = count = accused = alarmed = 0
     for fault, (names, *_) in FAULTS.items():
         if options.only not in fault:
             continue
         for seed in range(options.runs if names else options.clean):
             _, run = planted(fault, seed)
-            _, found = findings(run)
-            told = [f.name for f in found]
-            print(
-                f"{fault:24s} {seed:4d}  "
-                + "; ".join(f"{f.name} {f.label} {f.value:.3g} ({f.gain:.0f})" for f in found),
-                flush=True,
-            )
+            verdict = diagnose(run)
+            told = [name for cause in verdict.causes for name in named(cause)]
+            causes = "; ".join(f"{cause.name} ({cause.score:.0f})" for cause in verdict.causes)
+            print(f"{fault:24s} {seed:4d}  {verdict.map:9s} {causes}", flush=True)
             if names:
-                count, first, third = (
-                    count + 1,
-                    first + (told[:1] == [*names][:1]),
-                    third + bool({*told[:3]} & {*names}),
-                )
+                count, first, third = count + 1, first + (told[:1] == [names[0]]), third + bool({*told[:3]} & {*names})
             else:
-                accused += bool(told)
+                accused, alarmed = accused + bool(told), alarmed + (verdict.map != "ok")
     print(f"planted: {first} of {count} named first, {third} among the first three")
-    print(f"clean: {accused} accused")
+    print(f"clean: {accused} of {options.clean} accused, the map of {alarmed}")
+
+
+def named(cause: Cause) -> list[str]:
+    """Return the name of a cause."""
+    return [cause.name]
 
 
 if __name__ == "__main__":

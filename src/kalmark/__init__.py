@@ -18,6 +18,7 @@ from kalmark.errors import KalmarkError
 if TYPE_CHECKING:
     from kalmark import association, detect, geometry
     from kalmark.declare import register
+    from kalmark.diagnosis.verdict import Verdict, diagnose
     from kalmark.events import Control, Fix, Scan
     from kalmark.filter import estimators
     from kalmark.logs import Log, open_log
@@ -37,8 +38,8 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Attention", "Control", "Delayed", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run",
-    "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry", "initialization", "landmarks",
-    "motion", "open_log", "pointwise", "presets", "record", "register", "sensors",
+    "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators", "geometry",
+    "initialization", "landmarks", "motion", "open_log", "pointwise", "presets", "record", "register", "sensors",
 ]  # fmt: skip
 
 _MODULES = {
@@ -54,6 +55,7 @@ _MODULES = {
 }
 _NAMES = {
     "kalmark.declare": ("register",),
+    "kalmark.diagnosis.verdict": ("Verdict", "diagnose"),
     "kalmark.events": ("Control", "Fix", "Scan"),
     "kalmark.logs": ("Log", "open_log"),
     "kalmark.management.attention": ("Attention",),

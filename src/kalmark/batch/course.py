@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,6 +13,7 @@ from kalmark.arrays import Array
 from kalmark.batch.problem import Motions, motions
 from kalmark.batch.state import ORIGIN, Ints, unsolved
 from kalmark.events import Control
+from kalmark.geometry import frames, frames3d
 from kalmark.models.observe import composed
 from kalmark.models.protocols import Motion, bias_covariance
 from kalmark.slam.motion import HeldInput, Part
@@ -20,8 +22,9 @@ if TYPE_CHECKING:
     from kalmark.slam.robot import Robot
 
 Starts = Mapping[str, tuple[Array, Array]]
+ANYWHERE = 1e3  # m and rad, sigmas of a motion that is not known at all
 ZERO = 1e-14  # of a covariance's largest eigenvalue
-OTHER, START = "", "start"  # errors that are of no component of a control
+OTHER, START, UNKNOWN = "", "start", "unknown"  # errors that are of no component of a control
 
 
 class Systematic(NamedTuple):
@@ -51,15 +54,6 @@ def _turns(columns: tuple[str, ...]) -> list[int]:
     return [j for j, name in enumerate(columns) if name.endswith(("_rad", "_radps"))]
 
 
-def _by_systematic(columns: tuple[str, ...], u: Array, duration_s: float) -> Array:
-    """Return the derivative (k, K) of a control u (k,) by each of its systematic errors."""
-    k, turns = len(u), _turns(columns)
-    way = float(np.linalg.norm(np.delete(u, turns)))
-    per_way = np.zeros((k, len(turns)))
-    per_way[turns, np.arange(len(turns))] = way
-    return np.hstack([duration_s * np.eye(k), np.diag(u), per_way])
-
-
 class Course:
     """One robot's motion since its last node, in that node's frame, and the errors it gathered.
 
@@ -69,48 +63,69 @@ class Course:
 
     def __init__(self, robot: Robot, node: int) -> None:
         self.motion, self.columns = robot.motion, tuple(robot.motion.columns)
-        self.drive = HeldInput(robot.motion, robot.watch())
+        self.robot, self.drive = robot, HeldInput(robot.motion, robot.watch())
         self.held = -1  # which of the split controls is in force
-        self.size = len(systematic_errors(robot.name, robot.motion))
+        self.turns = _turns(self.columns)
+        self.lengths = [j for j in range(len(self.columns)) if j not in self.turns]
+        self.N, self.root = np.zeros(0), np.zeros(0)  # of the last control
         self.reset(node)
 
     def reset(self, node: int) -> None:
         """Start from a node."""
-        self.node, self.moves = node, 0
+        self.node, self.moves, self.known = node, 0, True
         space = self.motion.space
         self.moved, self.Q = ORIGIN[space.size], np.zeros((len(self.columns) + 1, space.dof, space.dof))
-        self.T = np.zeros((space.dof, self.size))
+        self.T = np.zeros((space.dof, 2 * len(self.columns) + len(self.turns)))
         self.shared: dict[int, Array] = {}
+
+    def forget(self) -> None:
+        """Have any motion since the node, and no control in force."""
+        self.reset(self.node)
+        self.drive, self.moves, self.known = HeldInput(self.motion, self.robot.watch()), 1, False
+        self.Q[-1] = ANYWHERE**2 * np.eye(len(self.T))
 
     def add(self, part: Part, roots: list[Array]) -> None:
         """Move by one part.  The error of a control that scans split is kept out of Q, with a root of N in `roots`."""
         self.moves += 1
         self.moved, F, R_u = self.motion.move(self.moved, part.u, part.dt_s)
         self.Q = F @ self.Q @ F.T
-        self.T = F @ self.T + R_u @ _by_systematic(self.columns, part.u, 1.0 if self.motion.held else part.dt_s)
+        self._stay(part, F, R_u)
         self.shared = {key: F @ S for key, S in self.shared.items()}
+        if part.N is not self.N:
+            self.N, self.root = part.N, root(part.N)
         if part.first and part.last:
-            G = (R_u @ root(part.N)).T
+            G = (R_u @ self.root).T
             self.Q[:-1] += G[:, :, None] * G[:, None, :]
         else:
             if part.first:
                 self.held = len(roots)
-                roots.append(root(part.N))
+                roots.append(self.root)
             self.shared[self.held] = self.shared.get(self.held, 0.0) + R_u @ roots[self.held]
         for D in (self.motion.diffusion(part.u, part.dt_s), part.unknown):
             if D is not None:
                 axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
                 self.Q[-1] += axes @ D @ axes.T
 
+    def _stay(self, part: Part, F: Array, R_u: Array) -> None:
+        """Carry the systematic errors on, in the order of `systematic_errors`."""
+        k, T = len(part.u), F @ self.T
+        T[:, :k] += R_u if self.motion.held else R_u * part.dt_s
+        T[:, k : 2 * k] += R_u * part.u
+        if self.turns:
+            way = part.u[self.lengths]
+            T[:, 2 * k :] += R_u[:, self.turns] * math.sqrt(way @ way)
+        self.T = T
+
 
 class Node(NamedTuple):
-    """A pose of a robot: it follows node `previous` (-1: the origin) by a step with its errors."""
+    """A pose of a robot: it follows node `previous` (-1: the origin) by a step with its errors, if that is `known`."""
 
     robot: str
     previous: int
     step: Array
     Q: Array
     T: Array
+    known: bool
 
 
 class Chain:
@@ -143,6 +158,10 @@ class Chain:
             for part in course.drive.accept(control):
                 course.add(part, self.roots)
 
+    def lose(self, robot: str) -> None:
+        """Forget how a robot moves from its last node on, until now."""
+        self.courses[robot].forget()
+
     def node_at(self, robot: str, t_ns: int) -> int:
         """Move a robot up to a time and return its node there."""
         course = self.courses[robot]
@@ -156,11 +175,14 @@ class Chain:
 
     def _enter(self, robot: str, previous: int, step: Array, course: Course) -> None:
         self.shared += [(len(self.nodes), key, S) for key, S in course.shared.items()]
-        self.nodes.append(Node(robot, previous, step, course.Q, course.T))
+        self.nodes.append(Node(robot, previous, step, course.Q, course.T, course.known))
         course.reset(len(self.nodes) - 1)
 
-    def motions(self) -> Motions:
-        """Return the steps of all nodes; those that share a held control's error have columns of the root in common."""
+    def motions(self, poses: Array) -> Motions:
+        """Return the steps of all nodes; those that share a held control's error have columns of the root in common.
+
+        A step that is not known is the one between the initial `poses` (n, size).
+        """
         n, q = len(self.nodes), len(self.nodes[0].T)
         columns = _Columns()
         for name, course in self.courses.items():
@@ -169,7 +191,7 @@ class Chain:
             kinds = [f"{name}.{column}" for column in (*course.columns, OTHER)]
             for c, kind in enumerate(kinds):
                 for i, G in zip(of, Q[:, c], strict=True):
-                    columns.add(q * i, G, START if self.nodes[i].previous < 0 else kind)
+                    columns.add(q * i, G, self._kind(i, kind))
         owners = {key: self.nodes[i].robot for i, key, _ in self.shared}
         held = {
             key: [columns.new(f"{robot}.{c}") for c in self.courses[robot].columns] for key, robot in owners.items()
@@ -184,7 +206,13 @@ class Chain:
         previous, steps = (
             np.array(column) for column in ([x.previous for x in self.nodes], [x.step for x in self.nodes])
         )
+        for i in (i for i, node in enumerate(self.nodes) if not node.known and node.previous >= 0):
+            steps[i] = between(poses[previous[i]], poses[i])
         return motions(previous, steps, columns.matrix(q * n), columns.kinds, T.reshape(q * n, -1), tuple(errors))
+
+    def _kind(self, node: int, kind: str) -> str:
+        """Return the kind of the errors before a node, which is `kind` between two of them."""
+        return START if self.nodes[node].previous < 0 else kind if self.nodes[node].known else UNKNOWN
 
     def poses(self, nodes: Ints, known: Array) -> Array:
         """Return the poses `known` (S, size) of some nodes (S,), and those of all others chained on from them."""
@@ -217,6 +245,12 @@ class _Columns:
     def matrix(self, rows: int) -> sp.csr_array:
         row, column, value = zip(*self.entries, strict=True) if self.entries else ((), (), ())
         return sp.csr_array(sp.coo_array((value, (row, column)), shape=(rows, len(self.kinds))))
+
+
+def between(a: Array, b: Array) -> Array:
+    """Return the pose b in the frame of a."""
+    back = frames.inverse(a) if len(a) == 3 else frames3d.inverse(a)
+    return composed(back[0], b)[0]
 
 
 def root(N: Array) -> Array:

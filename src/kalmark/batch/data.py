@@ -60,6 +60,9 @@ class Given:
     that is known exactly the first pose is held.  `mounts`, by robot and sensor, are the means of those that are not
     known: solved for where another sensor sees something at the same pose, else held.  Sightings with whitened
     residuals beyond `huber` count less.
+
+    With `segments` (J, 2), from and to in ns, the events between them are left out, and so is how a robot came from one
+    to the next.
     """
 
     robots: Mapping[str, Robot]
@@ -75,6 +78,7 @@ class Given:
     motion: bool = True
     mounts: Mapping[tuple[str, str], Array] = field(default_factory=dict)
     huber: float = np.inf
+    segments: Ints | None = None
 
 
 def replayed(given: Given, events: Iterable[Event]) -> Problem:
@@ -101,6 +105,7 @@ class _Replay:
         self.sighted: dict[tuple[str, str, int], list[Seen]] = {}  # by robot, sensor and group
         self.fixes: list[tuple[int, Array, Array]] = []
         self.nodes: list[int] = []
+        self.segment: dict[str, int] = {}  # that a robot is in
         self.rows: dict[int, list[int]] = {}
         for row, scan in enumerate(given.associations.scan.tolist()):
             self.rows.setdefault(scan, []).append(row)
@@ -108,7 +113,7 @@ class _Replay:
     def take(self, event: Event) -> None:
         """Replay one event; scans that are none of the given ones change nothing."""
         step, given = len(self.nodes), self.given
-        if event.robot not in given.robots:
+        if event.robot not in given.robots or not self._counts(event):
             return
         if isinstance(event, Control):
             self.chain.take(event)
@@ -119,6 +124,19 @@ class _Replay:
             self.nodes.append(self._node(event.robot, event.t_ns))
             if step in self.rows:
                 self._scan(event, self.rows[step])
+
+    def _counts(self, event: Event) -> bool:
+        """Return whether an event is in one of the segments; where a robot comes to the next one it is lost."""
+        segments = self.given.segments
+        if segments is None:
+            return True
+        at = int(np.searchsorted(segments[:, 0], event.t_ns, side="right")) - 1
+        if at < 0 or event.t_ns > segments[at, 1]:
+            return False
+        if self.segment.setdefault(event.robot, 0) != at:
+            self.segment[event.robot] = at
+            self.chain.lose(event.robot)
+        return True
 
     def _node(self, robot: str, t_ns: int) -> int:
         if self.given.motion:
@@ -158,7 +176,8 @@ class _Replay:
         given, nodes = self.given, np.array(self.nodes, dtype=np.int64)
         size, space, names = given.poses.shape[1], given.landmark.space, self._names()
         if given.motion:
-            poses, motion = self.chain.poses(nodes, given.poses), self.chain.motions()
+            poses = self.chain.poses(nodes, given.poses)
+            motion = self.chain.motions(poses)
         else:
             poses, motion = np.empty((len(self.apart), size)), motionless(size)
             poses[nodes] = given.poses

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg as la
@@ -225,10 +226,9 @@ class Reduced:
         P[np.ix_(at, at)] = self._solved(np.eye(len(at)))
         return P[: m * dof, : m * dof].reshape(m, dof, m, dof)[np.arange(m), :, np.arange(m)]
 
-    def _solved(self, b: Array) -> Array:
-        """Return S^-1 b."""
-        if not len(b):
-            return b
+    @cached_property
+    def factor(self) -> tuple[Array, bool]:
+        """The Cholesky factor of S.  Raises UndeterminedError."""
         try:
             L, lower = la.cho_factor(0.5 * (self.S + self.S.T))
         except la.LinAlgError:
@@ -236,5 +236,11 @@ class Reduced:
         if not (np.diagonal(L) ** 2 > FLAT * self.information).all():
             what = f"a {self.kind} is not determined, the sightings do not determine all poses and {self.kind}s"
             raise UndeterminedError(f"batch solution: {what}: expected more of them")
-        x: Array = la.cho_solve((L, lower), b)
+        return L, lower
+
+    def _solved(self, b: Array) -> Array:
+        """Return S^-1 b.  Raises UndeterminedError."""
+        if not len(b):
+            return b
+        x: Array = la.cho_solve(self.factor, b)
         return x

@@ -11,6 +11,7 @@ import typer
 
 from kalmark.cli.campaign import campaign
 from kalmark.cli.check import check
+from kalmark.cli.diagnose import diagnose
 from kalmark.cli.folders import evaluate, explain, report
 from kalmark.cli.logs import config, convert, data, simulate
 from kalmark.cli.run import demo, run, warm_up
@@ -18,7 +19,6 @@ from kalmark.errors import KalmarkError
 
 COMING = {  # verbs that are not there yet: not in the help, but they say so when they are called
     "view": "replay a run interactively",
-    "diagnose": "say whether the filter is consistent on a log, and if not why",
     "tune": "fit the noise of a configuration",
     "live": "take events as JSON lines, give estimates",
 }
@@ -43,7 +43,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (demo, run, simulate, evaluate, report, explain, campaign, config, convert, check, warm_up):
+for verb in (demo, run, simulate, evaluate, diagnose, report, explain, campaign, config, convert, check, warm_up):
     app.command()(verb)
 app.add_typer(data, name="data")
 for name, what in COMING.items():

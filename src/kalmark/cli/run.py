@@ -70,6 +70,7 @@ def run(
                 if batch:
                     raise
                 typer.echo(f"warning: no batch solution: {error}", err=True)
+        judge(result)
         result.save(out)
     finish(result, out, name_on(name_of(Path(config), "config"), result.log.name))
     if summary.get("stopped"):
@@ -89,6 +90,13 @@ def warm_up(
         slam = cfg.build_slam(*cfg.open_run(config, None, overrides or ())) if with_log else cfg.build_slam(made)
         slam.warm_up()
     typer.echo("compiled: no event of such a run waits for it")
+
+
+def judge(result: Run) -> None:
+    """Put a short verdict into the summary of a run."""
+    from kalmark.diagnosis.verdict import SHORT, diagnose
+
+    diagnose(result, SHORT)
 
 
 def finish(result: Run, out: Path, title: str) -> None:
@@ -119,5 +127,6 @@ def demo(
         world = load_world("cloister")
         log, config = simulate(world, seed), world.config().model_copy(update={"seed": seed})
         result = record(build_slam(config, log), log, config=config_dict(config))
+        judge(result)
         result.save(out)
     finish(result, out, f"Sola's cloister, seed {seed}")

@@ -58,6 +58,7 @@ def writable(folder: Path) -> Path:
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
     from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
+    from kalmark.results.verdict import verdict_lines
     from kalmark.results.warnings import POSE_NEES
 
     rows = [
@@ -89,6 +90,9 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
         for line in summary.get(key, ()):
             typer.echo(f"{kind}: {line}")
+    verdict = summary.get("verdict")
+    for n, line in enumerate(verdict_lines(verdict) if verdict else ()):
+        typer.echo(f"{'  ' if n else 'verdict: '}{line}")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:

@@ -16,8 +16,8 @@ from scipy.special import expit
 from scipy.stats import chi2, norm
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.course import START
-from kalmark.batch.state import POSES, Ints
+from kalmark.batch.course import START, UNKNOWN
+from kalmark.batch.state import LANDMARKS, POSES, Ints
 from kalmark.diagnosis.linear import OUT, Left, Linear
 from kalmark.results.measures import pose_error
 
@@ -29,8 +29,12 @@ FIRST_SHARE, MIXTURE_ROUNDS = 0.01, 30
 FAR = 4.0  # sigmas of an outlier
 SETS = 40  # of simulated data
 SEEN = 8  # times a landmark that can be judged by itself
+LOOKED_AT = 20  # landmarks
+MOST_CONDITION = 1e12
+SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the end
 SLOW_S = 1e-3
 MOST_RHO = 0.999
+SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
 TIMES = "times"  # the unit of noise
 
 Where = tuple[str, str]
@@ -38,14 +42,16 @@ Where = tuple[str, str]
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A cause that explains the data better by `gain`, `name` and `label` say what it is of.
+    """A cause that explains the data better by `gain`.  `of` says what it is of.
 
+    That is robot, sensor and column, or robot, column and kind of error of its controls, or a landmark, or a robot.
     `value` and `sigma` are its size in `unit`.  `cure` is what takes it out of the data: the systematic error itself as
-    (Z, W), factors of the noise (N,) and of the motion's errors (r,).  `alike` are causes that explain the same.
+    (Z, W), factors of the noise (N,) and of the motion's errors (r,).  `since_s` is when it begins, after the first
+    scan, None for all the time.  `alike` are causes that explain the same.
     """
 
     name: str
-    label: str
+    of: tuple[str, ...]
     gain: float
     p: float
     value: float
@@ -56,6 +62,7 @@ class Finding:
     noise: Array | None = None
     errors: Array | None = None
     rows: Flags | None = None
+    since_s: float | None = None
     alike: tuple[Finding, ...] = ()
 
 
@@ -63,7 +70,7 @@ class Column(NamedTuple):
     """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,)."""
 
     name: str
-    label: str
+    of: tuple[str, ...]
     unit: str
     Z: Array
     W: Array
@@ -84,7 +91,7 @@ def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates:
         names, (k, p) = sensors.get(factor.sensor, ()), factor.R.shape[:2]
         if len(names) != p:
             continue
-        where, (z, E) = ".".join(factor.sensor), factor.term.at(linear.state)
+        z, E = factor.term.at(linear.state)
 
         def added(part: Array, f: int = f) -> Array:
             parts = [np.zeros(other.R.shape[:2]) for other in factors]
@@ -94,24 +101,32 @@ def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates:
         for c, name in enumerate(names):
             one = np.eye(p)[c]
             if name.startswith("range"):
-                yield Column("range_scale", where, "", added((factor.y - z)[:, c : c + 1] * one), none)
-                yield Column("range_offset", where, "m", added(np.tile(one, (k, 1))), none)
+                yield Column("range_scale", (*factor.sensor, name), "", added((factor.y - z)[:, c : c + 1] * one), none)
+                yield Column("range_offset", (*factor.sensor, name), "m", added(np.tile(one, (k, 1))), none)
             elif name.endswith("_rad"):
-                yield Column(f"{name.removesuffix('_rad')}_offset", where, "rad", added(np.tile(one, (k, 1))), none)
+                offset = f"{name.removesuffix('_rad')}_offset"
+                yield Column(offset, (*factor.sensor, name), "rad", added(np.tile(one, (k, 1))), none)
         pose = factor.term.blocks[0]
         moving = np.einsum("kij,kj->ki", E[:, :, : pose.space.dof], rates[pose.rows])
-        yield Column("time_offset", where, "s", added(moving), none)
+        yield Column("time_offset", factor.sensor, "s", added(moving), none)
 
 
 def _of_controls(linear: Linear) -> Iterator[Column]:
-    nothing = np.zeros(len(linear.at.z))
-    for k, error in enumerate(linear.problem.motions.errors):
+    """Yield the systematic errors of the controls.
+
+    A scale is that of the control as estimated.  The measured one has its noise in it: its scale would come out short.
+    """
+    motions, nothing = linear.problem.motions, np.zeros(len(linear.at.z))
+    e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds)
+    for k, error in enumerate(motions.errors):
         turns = error.column.endswith(("_rad", "_radps"))
         name = "odometry_turn" if turns else "odometry_scale" if error.kind == "scale" else "odometry_offset"
         if error.column == "steering_rad":
             name = "steering_offset"
-        label = f"{error.robot} {error.column} {error.kind}"
-        yield Column(name, label, error.unit, nothing, linear.problem.motions.systematic[:, k])
+        W = motions.systematic[:, k]
+        if error.kind == "scale":
+            W = W + linear.root @ np.where(kinds == f"{error.robot}.{error.column}", e, 0.0)
+        yield Column(name, (error.robot, error.column, error.kind), error.unit, nothing, W)
 
 
 def rates_of(linear: Linear, robot: Any, t_ns: Ints) -> Array:
@@ -138,20 +153,19 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
     Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
     have, left = linear.residuals, linear.left(Z, W)
     g, I = Z.T @ have.r + W.T @ have.m, np.sum(Z * left.r, axis=0) + np.sum(W * left.m, axis=0)
-    block, motion = _blocks(linear)
-    found = []
+    (block, motion), Q, found = _blocks(linear), linear.root @ linear.root.T, []
     for k, column in enumerate(columns):
         if not LEAST_INFORMATION * (Z[:, k] @ Z[:, k] + 1.0) < I[k] < math.inf:
             continue
         s = float(g[k] / I[k])
-        parts = np.bincount(block, Z[:, k] * (have.r - s * left.r[:, k]), minlength=BLOCKS)
-        parts += np.bincount(motion, W[:, k] * (have.m - s * left.m[:, k]), minlength=BLOCKS)
+        parts = np.bincount(block, left.r[:, k] * (have.r - s * left.r[:, k]), minlength=BLOCKS)
+        parts += np.bincount(motion, left.m[:, k] * (Q @ (have.m - s * left.m[:, k])), minlength=BLOCKS)
         sigma = float(np.sqrt(max(I[k], float(parts @ parts))) / I[k])
         t2 = (s / sigma) ** 2
         found.append(
             Finding(
                 column.name,
-                column.label,
+                column.of,
                 0.5 * s * s * float(I[k]),
                 float(chi2.sf(t2, 1)),
                 s,
@@ -185,19 +199,18 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
             mine = (rows.factor == f) & (rows.column == c) & linear.kept
             column = names[c] if len(names) == factor.R.shape[1] else ""
             name = f"{column.rsplit('_', 1)[0]}_sigma" if column else "measurement_sigma"
-            label = f"{'.'.join(factor.sensor)} {column or f'component {c}'}"
+            of = (*factor.sensor, column or f"component {c}")
             factor_of = _ratio(r2[mine].sum(), simulated2[mine].sum(axis=0))
             if factor_of is not None:
-                found.append(_noise(name, label, *factor_of, noise=mine))
+                found.append(_noise(name, of, *factor_of, noise=mine))
     e2, simulated2 = linear.errors_of(linear.residuals) ** 2, linear.errors_of(simulated) ** 2
     kinds = np.where(linear.errors < OUT, np.array(linear.problem.motions.kinds), "")
-    for kind in dict.fromkeys(linear.problem.motions.kinds):
+    for kind in dict.fromkeys(k for k in linear.problem.motions.kinds if k != UNKNOWN):
         mine = kinds == kind
         factor_of = _ratio(e2[mine].sum(), simulated2[mine].sum(axis=0))
         if factor_of is not None:
             name = "start" if kind == START else "control_sigma"
-            label = kind if kind == START or not kind.endswith(".") else f"{kind[:-1]} unmodelled motion"
-            found.append(_noise(name, label, *factor_of, errors=mine))
+            found.append(_noise(name, tuple(kind.split(".")), *factor_of, errors=mine))
     return found
 
 
@@ -211,7 +224,7 @@ def _ratio(value: float, simulated: Array) -> tuple[float, float] | None:
 
 
 def _noise(
-    name: str, label: str, ratio: float, dof: float, noise: Flags | None = None, errors: Flags | None = None
+    name: str, of: tuple[str, ...], ratio: float, dof: float, noise: Flags | None = None, errors: Flags | None = None
 ) -> Finding:
     """Return the finding of a group of residuals, or of errors of the motion, of `ratio` times the variance."""
     gain = 0.5 * dof * (ratio - 1.0 - math.log(ratio))
@@ -219,19 +232,26 @@ def _noise(
     value = math.sqrt(ratio)
     factors = [None if group is None else np.where(group, value, 1.0) for group in (noise, errors)]
     sigma = value / math.sqrt(2.0 * dof)
-    return Finding(name, label, gain, min(p, 1.0), value, sigma, TIMES, noise=factors[0], errors=factors[1])
+    return Finding(name, of, gain, min(p, 1.0), value, sigma, TIMES, noise=factors[0], errors=factors[1])
 
 
-def correlations(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ...]]) -> list[Finding]:
-    """Return by how much what is left of successive sightings of one landmark is correlated, by sensor and column."""
+def correlations(
+    linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ...]], t_s: Array
+) -> list[Finding]:
+    """Return by how much what is left of successive sightings of one landmark is correlated, by sensor and column.
+
+    `t_s` (n,) are the times of the poses.  The noise of a finding is the white one that says as little.
+    """
     rows, found = linear.rows, []
+    apart = t_s[rows.node[rows.two]] - t_s[rows.node[rows.one]]
+    soon = apart <= SUCCESSIVE * np.median(apart) if len(apart) else np.ones(0, dtype=np.bool_)
     pairs = linear.residuals.r[rows.one] * linear.residuals.r[rows.two]
     squares = 0.5 * (linear.residuals.r[rows.one] ** 2 + linear.residuals.r[rows.two] ** 2)
     both = simulated.r[rows.one] * simulated.r[rows.two]
     for f, factor in enumerate(linear.problem.factors):
         names = sensors.get(factor.sensor, ())
         for c in range(factor.R.shape[1]) if factor.sensor[1] else ():
-            mine = (rows.factor[rows.one] == f) & (rows.column[rows.one] == c)
+            mine = soon & (rows.factor[rows.one] == f) & (rows.column[rows.one] == c)
             usual, total, number = both[mine].sum(axis=0), squares[mine].sum(), int(mine.sum())
             if number < SETS or total <= 0 or usual.std() == 0:
                 continue
@@ -240,12 +260,14 @@ def correlations(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[
             column = names[c] if len(names) == factor.R.shape[1] else f"component {c}"
             gain = -0.5 * number * math.log(1.0 - rho**2)
             p = 2.0 * float(norm.sf(abs(rho) / sigma))
-            found.append(Finding("correlated_noise", f"{'.'.join(factor.sensor)} {column}", gain, p, rho, sigma))
+            mine = (rows.factor == f) & (rows.column == c)
+            noise = np.where(mine, math.sqrt(max((1.0 + rho) / (1.0 - rho), 1.0)), 1.0)
+            found.append(Finding("correlated_noise", (*factor.sensor, column), gain, p, rho, sigma, noise=noise))
     return found
 
 
 # ------------------------------------------------------------------ single observations, landmarks and steps
-def outliers(linear: Linear) -> list[Finding]:
+def outliers(linear: Linear, t_s: Array) -> list[Finding]:
     """Return how much better a mixture with few observations of a far wider noise explains what is left."""
     of = linear.observations
     d2, m = np.bincount(of, linear.residuals.r**2), np.bincount(of)
@@ -262,49 +284,59 @@ def outliers(linear: Linear) -> list[Finding]:
     gain, share = best
     far = d2 > FAR**2 + m
     p, sigma = float(chi2.sf(2 * gain, 2)), math.sqrt(max(share, 1e-9) / len(d2))
-    noise = np.where(far[of], OUT, 1.0)
-    return [Finding("outliers", "observations", gain, p, share, sigma, "of the observations", noise=noise, rows=far)]
+    noise, when = np.where(far[of], OUT, 1.0), t_s[linear.rows.node[far[of]]]
+    return [Finding("outliers", (), gain, p, share, sigma, "of the observations", noise=noise, rows=far,
+                    since_s=float(when.min(initial=np.inf)))]  # fmt: skip
 
 
 def landmarks(linear: Linear, t_s: Array) -> list[Finding]:
     """Return the landmarks that move: whose sightings fit a constant velocity better than a place.
 
-    `t_s` (n,) are the times of the poses.
+    `t_s` (n,) are the times of the poses.  Only those are looked at that seem to move most with all else as it is.
     """
-    rows, found = linear.rows, []
-    d, dof = linear.state.d, linear.state.spaces[1].dof
-    at = linear.state.columns(1, np.arange(len(linear.problem.ids)))
-    H, have = linear.at.H, linear.residuals.r
-    for l, name in enumerate(linear.problem.ids):
-        mine = np.flatnonzero(rows.landmark == l)
-        if len(mine) < SEEN * d:
-            continue
-        t = t_s[rows.node[mine]]
-        if np.ptp(t) <= 0:
-            continue
+    rows, have, d, found = linear.rows, linear.residuals.r, linear.state.d, []
+    if linear.state.spaces[LANDMARKS].dof < d:
+        return []
+    block, _ = _blocks(linear)
+    for _, l, mine, part in sorted(_seeming(linear, t_s), key=lambda seems: -seems[0])[:LOOKED_AT]:
         Z = np.zeros((len(have), d))
-        Z[mine] = H[mine][:, at[l] : at[l] + d].toarray() * (t - t.mean())[:, None]
-        b = H.T @ Z
-        step, _ = linear.reduced.solved(Z, np.zeros((len(linear.at.w), d)))
-        I, g = Z.T @ Z - b.T @ step, Z.T @ have
-        try:
-            v = np.linalg.solve(I, g)
-        except np.linalg.LinAlgError:
+        Z[mine] = part
+        left = linear.left(Z, np.zeros((len(linear.at.w), d))).r
+        I, g = part.T @ left[mine], part.T @ have[mine]
+        if np.linalg.cond(I) > MOST_CONDITION:
             continue
-        others = linear.residuals.r[mine] ** 2
-        scale = max(float(others.mean()), 1.0)
-        t2 = float(g @ v)
-        speed, sigma = float(np.linalg.norm(v)), float(np.sqrt(np.trace(np.linalg.inv(I)) / d))
-        if not math.isfinite(t2) or t2 < 0 or dof < d:
+        v = np.linalg.solve(I, g)
+        if np.abs(part @ v).max() < SHOWS:
             continue
-        found.append(
-            Finding("moving_landmark", str(name), 0.5 * t2, float(chi2.sf(t2 / scale, d)), speed, sigma, "m/s",
-                    noise=np.where(rows.landmark == l, OUT, 1.0))
-        )  # fmt: skip
+        speed = float(np.linalg.norm(v))
+        parts = np.bincount(block, (left @ v / speed) * (have - left @ v))
+        information = float(v @ I @ v) / speed**2
+        sigma = math.sqrt(max(information, float(parts @ parts))) / information
+        p = float(chi2.sf((speed / sigma) ** 2, d))
+        noise = np.where(rows.landmark == l, OUT, 1.0)
+        since_s = float(t_s[rows.node[mine]].min())
+        name, gain = str(linear.problem.ids[l]), 0.5 * float(g @ v)
+        found.append(Finding("moving_landmark", (name,), gain, p, speed, sigma, "m/s", noise=noise, since_s=since_s))
     return found
 
 
-def jumps(linear: Linear) -> list[Finding]:
+def _seeming(linear: Linear, t_s: Array) -> Iterator[tuple[float, int, Ints, Array]]:
+    """Yield of each landmark how much it seems to move, its number, its rows and their derivative by a velocity."""
+    rows, d = linear.rows, linear.state.d
+    at = linear.state.columns(LANDMARKS, np.arange(len(linear.problem.ids)))
+    order = np.argsort(rows.landmark, kind="stable")
+    ends = np.searchsorted(rows.landmark[order], np.arange(len(linear.problem.ids) + 1))
+    for l in range(len(linear.problem.ids)):
+        mine = order[ends[l] : ends[l + 1]]
+        t = t_s[rows.node[mine]]
+        if linear.kept[mine].sum() < SEEN * d or np.ptp(t) <= 0:
+            continue
+        part = linear.at.H[mine][:, at[l] : at[l] + d].toarray() * (t - t.mean())[:, None]
+        g = part.T @ linear.residuals.r[mine]
+        yield float(g @ np.linalg.pinv(part.T @ part) @ g), l, mine, part
+
+
+def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     """Return the step of the motion whose error is largest."""
     e = linear.errors_of(linear.residuals)
     root = linear.problem.motions.root.tocoo()
@@ -313,7 +345,7 @@ def jumps(linear: Linear) -> list[Finding]:
     owner = np.full(len(e), -1)
     owner[root.col] = root.row // q
     kinds = np.array(linear.problem.motions.kinds)
-    counts = np.array([kind != START for kind in kinds.tolist()]) & (owner >= 0)
+    counts = ~np.isin(kinds, (START, UNKNOWN)) & (owner >= 0)
     squares = np.bincount(owner[counts], e[counts] ** 2, minlength=n)
     numbers = np.bincount(owner[counts], minlength=n)
     if not len(squares):
@@ -322,6 +354,6 @@ def jumps(linear: Linear) -> list[Finding]:
     p = min(1.0, n * float(chi2.sf(squares[node], max(int(numbers[node]), 1))))
     errors = np.where((owner == node) & counts, OUT, 1.0)
     return [
-        Finding("kidnapped", linear.problem.robots[node], 0.5 * float(squares[node]), p, math.sqrt(squares[node]),
-                1.0, "sigmas", errors=errors, rows=np.arange(n) == node)
+        Finding("kidnapped", (linear.problem.robots[node],), 0.5 * float(squares[node]), p, math.sqrt(squares[node]),
+                1.0, "sigmas", errors=errors, rows=np.arange(n) == node, since_s=float(t_s[node]))
     ]  # fmt: skip

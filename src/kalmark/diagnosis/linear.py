@@ -23,7 +23,6 @@ from kalmark.batch.state import LANDMARKS, Ints, State
 
 NONE = -1
 OUT = 1e3  # times its noise: what is so uncertain does not count
-MOST_GAP = 5  # scans between two sightings of one landmark that are still successive
 
 
 class Rows(NamedTuple):
@@ -116,11 +115,6 @@ class Linear:
         same = (landmark[one] >= 0) & (node[two] > node[one])
         for of_ in (landmark, column, factor_):
             same &= of_[one] == of_[two]
-        counts, rank = dict.fromkeys(self.problem.robots, 0), np.zeros(len(self.problem.robots), dtype=np.int64)
-        for k, robot in enumerate(self.problem.robots):
-            rank[k] = counts[robot]
-            counts[robot] += 1
-        same &= rank[node[two]] - rank[node[one]] <= MOST_GAP
         return Rows(factor_, row, column, landmark, node, one[same], two[same])
 
     @cached_property

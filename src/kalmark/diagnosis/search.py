@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -12,6 +13,7 @@ from kalmark.batch.state import LANDMARKS, looked
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import Finding, Where
 from kalmark.diagnosis.linear import Linear
+from kalmark.results.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
 ROUNDS = 6
@@ -39,6 +41,13 @@ def best(sure: list[Finding]) -> list[Finding]:
     return sorted(by_name.values(), key=lambda f: (ORDER.index(f.name) if f.name in ORDER else 0, -f.gain))
 
 
+def _joined(same: list[Finding]) -> Finding:
+    """Return what was found of one cause in several rounds as one."""
+    first, last = same[0], same[-1]
+    value = math.prod(f.value for f in same) if last.unit == causes.TIMES else sum(f.value for f in same)
+    return replace(first, value=value, sigma=last.sigma, gain=sum(f.gain for f in same))
+
+
 class Search:
     """The causes found so far, and the problem with these taken out."""
 
@@ -51,17 +60,19 @@ class Search:
         self.found: list[Finding] = []
         self.simulated = linear.simulated(causes.SETS)
 
-    def run(self) -> list[Finding]:
+    def run(self, progress: bool = False) -> list[Finding]:
         """Return all causes, the one that explains most first."""
-        while len(self.found) < ROUNDS:
+        for _ in track(range(ROUNDS), "causes, one after the other", ROUNDS, show=progress):
             candidates = self.candidates()
             sure = [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > LEAST_GAIN]
             if not sure:
                 break
             first, *alike = best(sure)
             self.take(replace(first, alike=tuple(alike)))
-        rest = causes.correlations(self.linear, self.simulated, self.sensors)
-        self.found += [f for f in rest if f.p * len(rest) < ALPHA and f.gain > LEAST_GAIN]
+        rest = causes.correlations(self.linear, self.simulated, self.sensors, self.t_s)
+        for finding in rest:
+            if finding.p * len(rest) < ALPHA and finding.gain > LEAST_GAIN:
+                self.take(finding)
         return sorted(self.found, key=lambda f: -f.gain)
 
     def candidates(self) -> list[Finding]:
@@ -70,9 +81,9 @@ class Search:
         return [
             *causes.systematic(self.linear, columns),
             *causes.noise(self.linear, self.simulated, self.sensors),
-            *causes.outliers(self.linear),
+            *causes.outliers(self.linear, self.t_s),
             *causes.landmarks(self.linear, self.t_s),
-            *causes.jumps(self.linear),
+            *causes.jumps(self.linear, self.t_s),
         ]
 
     def take(self, finding: Finding) -> None:
@@ -85,7 +96,8 @@ class Search:
             self._scale(finding)
         if finding.name == "outliers" and finding.rows is not None:
             finding = replace(finding, name=self._outliers(finding.rows))
-        self.found.append(finding)
+        same = [f for f in self.found if (f.name, f.of) == (finding.name, finding.of) and f.unit == finding.unit]
+        self.found = [f for f in self.found if f not in same] + [_joined([*same, finding])]
 
     def _scaled(self, finding: Finding) -> Finding:
         """Make a noise as large as it is, which takes a few rounds: other noise was taken for it, or it for other."""
@@ -94,7 +106,7 @@ class Search:
             self._scale(step)
             value *= step.value
             again = causes.noise(self.linear, self.simulated, self.sensors)
-            step = next((f for f in again if f.label == finding.label), step)
+            step = next((f for f in again if (f.name, f.of) == (finding.name, finding.of)), step)
             if abs(step.value - 1.0) < SCALED:
                 break
         return replace(finding, value=value, sigma=finding.sigma * value / finding.value)

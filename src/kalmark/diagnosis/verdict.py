@@ -1,16 +1,146 @@
-"""Whether the map of a run can be trusted, to what accuracy, and if not, why."""
+"""Whether the map of a run can be trusted, to what accuracy, and if not, why: without any truth."""
 
 from __future__ import annotations
 
-from kalmark.batch.data import replayed
-from kalmark.batch.solver import optimum
-from kalmark.diagnosis.causes import Finding, Where
-from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.search import Search
-from kalmark.results.batch import given_by, log_of
-from kalmark.results.run import Run
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
-NEAR = 1e-4
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.batch.data import Associations, Given, replayed
+from kalmark.batch.solver import Batch, optimum
+from kalmark.batch.state import LANDMARKS
+from kalmark.diagnosis.causes import TIMES, Finding, Where
+from kalmark.diagnosis.gross import gross
+from kalmark.diagnosis.linear import Linear
+from kalmark.diagnosis.search import LEAST_GAIN, Search
+from kalmark.diagnosis.words import words
+from kalmark.errors import KalmarkError
+from kalmark.logs.log import Log
+from kalmark.results.batch import given_by, log_of
+from kalmark.results.measures import rigid, rmse
+from kalmark.results.run import Run
+from kalmark.results.warnings import window_warnings
+from kalmark.results.words import figure
+
+NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
+MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
+EVENTS = 4  # times as many as observations are taken
+SEGMENT = 30  # successive scans that are taken together where not all are
+MORE = 4  # times as many are taken if the segments do not determine the map
+LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
+SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
+TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
+TINY_M = 1e-12
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What makes a run less than it could be, since when (s of the log), and what would cure it.
+
+    `score` is the logarithm of the likelihood ratio against a run without it.  A noise that is stated too large is
+    `harmless`: the map is as good as it would be, and better than it claims.
+    """
+
+    name: str
+    since_s: float
+    score: float
+    evidence: str
+    cure: str = ""
+    harmless: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What is to be thought of a map: `map` is ok, doubtful or wrong, the `causes` are why, best first.
+
+    `sigma_factor` is what the filter's sigmas are to be multiplied by, `accuracy_m` the sigma of a landmark's position
+    after it, both the median over landmarks; `shift_m` is by how much the shape of the map changes without the causes.
+    `checked` says of what all this was made, `search` is how.
+    """
+
+    map: str
+    causes: tuple[Cause, ...]
+    checked: str
+    sigma_factor: float | None = None
+    accuracy_m: float | None = None
+    shift_m: float | None = None
+    search: Search | None = field(default=None, repr=False)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the verdict as it is in ``summary.json``."""
+        figures = {key: getattr(self, key) for key in ("map", "sigma_factor", "accuracy_m", "shift_m", "checked")}
+        return figures | {"causes": [vars(cause) for cause in self.causes]}
+
+
+def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
+    """Return the verdict on a run, from about so many of its observations; it is kept in the run's summary.
+
+    A bar on standard error tells how far it is if `progress`.  Raises KalmarkError if the log of the run cannot be read
+    again.
+    """
+    log = log_of(run)
+    log = log if isinstance(log, Log) else Log(run.log.name, run.log.robots, list(log))
+    summary = run.summary or run.evaluate()
+    mistake = gross(run, log)
+    if mistake is not None:
+        cause = Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
+        verdict = Verdict("wrong", (cause, *gaps(summary)), "the log filtered again without the mistake")
+    else:
+        verdict = _judged(run, log, most, progress)
+        if run.stopped or summary.get("diverged"):
+            verdict = replace(verdict, map="wrong")
+    summary["verdict"] = verdict.as_dict()
+    return verdict
+
+
+def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
+    """Return the verdict by the batch solution, by the innovations alone where there is none."""
+    first = gaps(run.summary)
+    try:
+        found = _searched(run, log, most, progress)
+    except KalmarkError as error:
+        signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
+        why = str(error).removeprefix("batch solution: ")
+        checked = f"innovations alone, no batch solution: {why}"
+        return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
+    effect, causes = effect_of(run, found), causes_of(run, found.search)
+    causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
+    checked = f"batch solution of {len(found.given.associations.landmark)} observations"
+    figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
+    return Verdict(effect.status, (*first, *causes), checked, *figures, found.search)
+
+
+def begin_s(run: Run) -> float:
+    """Return the time of the first scan in the log."""
+    return float(run.history.t_ns[0]) * 1e-9 if len(run.history.t_ns) else 0.0
+
+
+# ------------------------------------------------------------------ the search
+class Searched(NamedTuple):
+    """A search for causes that is done, and the batch solution that it began at."""
+
+    search: Search
+    batch: Batch
+    given: Given
+
+
+def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
+    """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none."""
+    every = given_by(run)
+    given = thinned(run, every, most)
+    try:
+        problem = replayed(given, log)
+        batch = optimum(problem, tolerance=NEAR)
+    except KalmarkError:
+        if given is every:
+            raise
+        return _searched(run, log, MORE * most, progress)
+    search = Search(Linear.of(problem, batch.state), sensors_of(run), given.robot, given.t_ns)
+    search.run(progress)
+    return Searched(search, batch, given)
 
 
 def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
@@ -19,9 +149,104 @@ def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
     return {(r.name, name): tuple(m.sensor.columns) for r in robots for name, m in r.sensors.items()}
 
 
-def findings(run: Run) -> tuple[Search, list[Finding]]:
-    """Return the causes that explain a run, the one that explains most first, and the search that found them."""
-    problem = replayed(given_by(run), log_of(run))
-    batch = optimum(problem, tolerance=NEAR)
-    search = Search(Linear.of(problem, batch.state), sensors_of(run), run.history.robot, run.history.t_ns)
-    return search, search.run()
+def thinned(run: Run, given: Given, most: int) -> Given:
+    """Return about `most` of the observations: segments of successive scans, evenly over the run."""
+    used, t_ns = given.associations, given.t_ns
+    events = len(t_ns) + sum(controls.number for controls in run.history.controls.values())
+    share = most / max(len(used.landmark), events / EVENTS, 1)
+    if share >= 1.0:
+        return given
+    number = max(len(t_ns) // SEGMENT, 2)
+    first = np.unique(np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)) * SEGMENT
+    segments = np.stack([t_ns[first], t_ns[np.minimum(first + SEGMENT, len(t_ns)) - 1]], axis=1)
+    within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
+    kept = (within >= 0) & (t_ns <= segments[within, 1])
+    renumbered, rows = np.cumsum(kept) - 1, np.flatnonzero(kept[used.scan])
+    names = [used.landmark[k] for k in rows]
+    some = Associations(renumbered[used.scan[rows]], used.sensor[rows], used.index[rows], names, used.e[rows])
+    return replace(
+        given, t_ns=t_ns[kept], robot=given.robot[kept], poses=given.poses[kept], associations=some, segments=segments
+    )
+
+
+# ------------------------------------------------------------------ the causes
+def causes_of(run: Run, search: Search) -> list[Cause]:
+    """Return the causes that a search found."""
+    return [_cause(run, finding) for finding in search.found]
+
+
+def _cause(run: Run, finding: Finding) -> Cause:
+    since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.unit == TIMES and finding.value < 1.0
+    return Cause(finding.name, since_s, finding.gain, *words(finding, run.config), harmless)
+
+
+def gaps(summary: dict[str, Any]) -> list[Cause]:
+    """Return the gaps in the controls after which the pose was not known again, or was not widened."""
+    found = []
+    for gap in summary.get("gaps", ()):
+        if gap["known_s"] is None or gap["action"] == "ignore":
+            lasts = gap["end_s"] - gap["start_s"]
+            cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
+            evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s"
+            found.append(Cause("gap", gap["start_s"], lasts, evidence, cure))
+    return found
+
+
+def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
+    """Yield that the filter claims smaller sigmas than the same data allow, if it does."""
+    if effect.claimed is None:
+        return
+    score = 0.5 * effect.dof * float(effect.claimed**-2 - 1.0 + 2.0 * np.log(effect.claimed))
+    if effect.claimed >= TOO_SURE or score < LEAST_GAIN:
+        return
+    share = figure(effect.claimed, 2)
+    evidence = f"the filter's sigmas are {share} of what the same data allow: its linearisation, not the noise"
+    yield Cause("estimator", begin_s(run), score, evidence, "--set estimator.type=invariant")
+
+
+# ------------------------------------------------------------------ what they do to the map
+@dataclass(frozen=True)
+class Effect:
+    """What the causes do to a map: as in `Verdict`; `claimed` is the filter's sigma over what the data allow."""
+
+    status: str = "ok"
+    sigma_factor: float | None = None
+    accuracy_m: float | None = None
+    shift_m: float | None = None
+    claimed: float | None = None
+    dof: int = 0
+
+
+def effect_of(run: Run, found: Searched) -> Effect:
+    """Return what the causes do to the shape of a run's map and to its sigmas."""
+    rows = list(_shared(run, found.search))
+    if not rows:
+        return Effect()
+    mine, its = (np.array(column) for column in zip(*rows, strict=True))
+    d, first, cured = found.batch.state.d, found.search.first, found.search.linear
+    places, moved = (state.groups[LANDMARKS][its, :d] for state in (found.batch.state, cured.moved()))
+    off, extent = rigid(places, moved)(places) - moved, rmse(moved - moved.mean(axis=0))
+    filtered = _sigma(np.array([run.landmarks.covariances[k][:d, :d] for k in mine]))
+    stated, honest = (_sigma(linear.reduced.covariances()[its, :d, :d]) for linear in (first, cured))
+    shift_m = float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0)))
+    share, free = shift_m / max(extent, TINY_M), (filtered > 0) & (stated > 0)
+    if not free.any():
+        return Effect(shift_m=shift_m)
+    off_it = share > LEAST and shift_m > SIGMAS * float(np.median(filtered[free]))
+    status = "ok" if not off_it else "doubtful" if share < WRONG else "wrong"
+    ratio, all_of_it = filtered[free] / stated[free], found.given.segments is None
+    claimed = float(np.median(ratio)) if all_of_it else None
+    over = 1.0 / claimed if claimed is not None and claimed < TOO_SURE else 1.0
+    factors = np.hypot(honest[free] / stated[free] * over, shift_m / filtered[free])
+    accuracy_m = float(np.median(factors * filtered[free]))
+    return Effect(status, float(np.median(factors)), accuracy_m, shift_m, claimed, d * int(free.sum()))
+
+
+def _shared(run: Run, search: Search) -> Iterator[tuple[int, int]]:
+    """Yield the numbers of each landmark in the map and in the batch solution."""
+    at = {id_: k for k, id_ in enumerate(run.landmarks.ids)}
+    return ((at[id_], k) for k, id_ in enumerate(search.linear.problem.ids) if id_ in at)
+
+
+def _sigma(P: Array) -> Array:
+    return np.asarray(np.sqrt(np.trace(P, axis1=1, axis2=2)))

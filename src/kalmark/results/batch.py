@@ -43,7 +43,7 @@ def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dic
     if not np.isnan(run.history.left_px).all():
         problem = tag_problem(run)
         return compare_tags(run, problem, optimum(problem))
-    return compare(run, solve_batch(run, log_of(run) if log is None else log))
+    return compare(run, solve_batch(run, log or log_of(run)))
 
 
 def solve_batch(
@@ -215,7 +215,9 @@ def compare_tags(run: Recording, problem: Problem, batch: Batch) -> dict[str, An
 
 
 def log_of(run: Recording) -> Iterable[Event]:
-    """Read again the log a run was made from, as its configuration says."""
+    """Return the log a run was made from, read again as its configuration says if the run does not hold it."""
+    if run.source is not None:
+        return run.source
     from kalmark.config.opening import open_config_log
     from kalmark.config.schema import Config
 

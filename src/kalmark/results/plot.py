@@ -21,6 +21,7 @@ from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.landmarks import LINES, TAG
 from kalmark.results.recording import Recording
 from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares
+from kalmark.results.verdict import alarm
 
 VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "front": (0.0, 0.0)}
 LANDMARK_COLOUR = "#d2691e"
@@ -80,7 +81,8 @@ def draw_map(run: Recording, step: int | None = None, view: str | tuple[float, f
     width = max(sum(aspects) * tall + 0.2 + 0.65 * len(spans), 6.0)
     title, figures = headline(run)
     lines, handles = _lines(figures, int(CHARACTERS * width)), legend(scene)
-    alarms = [part for line in summary_of(run)["warnings"] for part in textwrap.wrap(line, int(CHARACTERS * width))]
+    told = [*summary_of(run)["warnings"], *alarm(summary_of(run).get("verdict"))]
+    alarms = [part for line in told for part in textwrap.wrap(line, int(CHARACTERS * width))]
     columns = max(1, int(width / 1.9))
     below, above = 0.6 + 0.25 * -(-len(handles) // columns), 0.55 + LINE_INCHES * (len(lines) + len(alarms))
     figure = Figure(figsize=(width, tall + below + above), facecolor="white")

@@ -38,6 +38,7 @@ from kalmark.results.scene import (
     steps_of,
     stretches_of,
 )
+from kalmark.results.verdict import verdict_lines
 from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words
 
 BINS = 120
@@ -68,7 +69,8 @@ def report_html(run: Recording) -> str:
 
     title, figures = headline(run)
     summary = summary_of(run)
-    notes = [*summary.get("notes", ()), *summary.get("advice", ())]
+    verdict = summary.get("verdict")
+    notes = [*summary.get("notes", ()), *summary.get("advice", ()), *(verdict_lines(verdict) if verdict else ())]
     return _resource("report.html").format(
         title=html.escape(title),
         style=_resource("report.css"),
@@ -129,7 +131,7 @@ def show(value: Any, unit: str = "") -> str:
 def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
-        if (key in ("robots", "warnings", "advice", "notes", "gaps") and not prefix) or key == "directions":
+        if (key in ("robots", "warnings", "advice", "notes", "gaps", "verdict") and not prefix) or key == "directions":
             continue
         out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
     return out

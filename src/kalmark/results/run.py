@@ -24,8 +24,9 @@ class Run(Recording):
             from kalmark.results.batch import batch_entry  # heavy, and seldom wanted
 
             summary["batch"] = batch_entry(self, self.source)
-        elif "batch" in self.summary:
-            summary["batch"] = self.summary["batch"]
+        for key in ("batch", "verdict"):
+            if key in self.summary and key not in summary:
+                summary[key] = self.summary[key]
         self.summary.clear()
         self.summary.update(summary)
         return summary

@@ -154,8 +154,8 @@ def _windows(history: History, step: Ints, value: Array, weight: Ints, least: in
     return out
 
 
-def window_warnings(run: Recording, _: Any = None) -> Iterator[str]:
-    """Return a line for each sign that the map is wrong."""
+def window_warnings(run: Recording) -> Iterator[str]:
+    """Yield a line for each sign in the innovations alone that the map is wrong."""
     history = run.history
     begin_s = float(history.t_ns[0]) * 1e-9 if len(history.t_ns) else 0.0
     signs = ((nis_windows, _high_nis), (left_out_windows, _left_out), (autocorrelations, _correlated))
@@ -192,7 +192,7 @@ def _left_out(worst: Window, median: float, count: int) -> str:
 
 def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
-    parts = (_lost, window_warnings, _observations, _robots, _sensors, _truth, _fixes, _noise, mount_warnings)
+    parts = (_lost, _observations, _robots, _sensors, _truth, _fixes, _noise, mount_warnings)
     return [*gap_warnings(summary["gaps"]), *(line for part in parts for line in part(run, summary))]
 
 

@@ -1,0 +1,47 @@
+"""`kalmark diagnose`: whether the map of a run can be trusted, to what accuracy, and if not, why."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from kalmark.cli.shared import RunFolder, computing, print_table
+
+
+def diagnose(
+    run: RunFolder,
+    observations: Annotated[
+        int, typer.Option(min=100, help="About how many observations to take; more is slower.")
+    ] = 20_000,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
+) -> None:
+    """Say whether the map of a run can be trusted, and if not, why and what would cure it: without any truth."""
+    from kalmark.diagnosis.breakdown import breakdown, nees_parts
+    from kalmark.diagnosis.picture import draw_diagnosis
+    from kalmark.diagnosis.verdict import diagnose as diagnosed
+    from kalmark.results.plot import save_figure
+    from kalmark.results.recording import replace_file, write
+    from kalmark.results.run import Run
+    from kalmark.results.verdict import verdict_lines
+
+    with computing():
+        loaded = Run.load(run)
+        verdict = diagnosed(loaded, observations, progress=True)
+        write(run / "summary.json", json.dumps(loaded.summary, indent=2, allow_nan=False) + "\n")
+        picture = run / "diagnosis.png"
+        replace_file(picture, lambda path: save_figure(draw_diagnosis(loaded, verdict), path))
+    if as_json:
+        typer.echo(json.dumps(verdict.as_dict(), indent=2))
+        return
+    for line in verdict_lines(verdict.as_dict(), shown=None):
+        typer.echo(line)
+    typer.echo(f"(by the {verdict.checked})")
+    rows = [row.cells() for row in breakdown(loaded)]
+    print_table("innovations", ("of", "", "observations", "NIS per dof", "mean (sigma)", ""), rows, align="<<>>><")
+    parts = list(nees_parts(loaded))
+    if parts:
+        columns = ("robot", "part", "NEES per dof", "outside its band from t (s)")
+        print_table("against the truth", columns, parts, align="<<>>")
+    typer.echo(str(picture))

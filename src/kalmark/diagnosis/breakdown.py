@@ -1,0 +1,132 @@
+"""The innovations of a run by sensor, landmark, range, bearing, time and speed; the NEES by its parts.
+
+Bar-Shalom, Li, Kirubarajan 2001, section 5.4: sums of NIS against chi-square, and the mean of innovations against its
+sigma, each at a level divided by the number of groups (Bonferroni).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from kalmark.arrays import Array
+from kalmark.results.history import History, Ints
+from kalmark.results.measures import nees, nis
+from kalmark.results.run import Run
+from kalmark.results.words import figure
+
+BINS = 4
+LEVEL = 0.01  # of false alarms in a whole table
+LEAST = 20  # observations in a group
+WORST = 3  # landmarks that are shown
+BAND = 0.997
+WINDOW = 50  # scans, over which a NEES is averaged
+
+
+class Group(NamedTuple):
+    """The innovations of a group: how many, NIS per degree of freedom, the largest mean in sigmas, an alarm or not."""
+
+    of: str
+    which: str
+    number: int
+    nis: float
+    mean: float
+    alarm: bool
+
+    def cells(self) -> tuple[str, ...]:
+        """Return the row of a table."""
+        told = "not as stated" if self.alarm else ""
+        return self.of, self.which, str(self.number), figure(self.nis), figure(self.mean, 2), told
+
+
+def breakdown(run: Run) -> list[Group]:
+    """Return the groups of a run's innovations, with the alarm of those that contradict the noise stated."""
+    history = run.history
+    rows = np.flatnonzero((history.outcome == "associated") & np.isfinite(history.z).any(axis=1))
+    if len(rows) < LEAST:
+        return []
+    groups = [(of, which, mine) for of, which, mine in _groups(run, rows) if len(mine) >= LEAST]
+    level = LEVEL / max(2 * len(groups), 1)
+    found = [_judged(history, *group, level) for group in groups]
+    landmarks = sorted((g for g in found if g.of == "landmark"), key=lambda g: -abs(np.log(max(g.nis, 1e-12))))
+    return [g for g in found if g.of != "landmark"] + landmarks[:WORST]
+
+
+def _judged(history: History, of: str, which: str, rows: Ints, level: float) -> Group:
+    value, dof = nis(history.z[rows], history.Z[rows])
+    total, number = float(np.nansum(value)), int(dof.sum())
+    p = 2.0 * min(float(chi2.sf(total, number)), float(chi2.cdf(total, number)))
+    sigma = np.sqrt(np.diagonal(history.Z[rows], axis1=1, axis2=2))
+    some = np.isfinite(history.z[rows]) & (sigma > 0)
+    white = np.where(some, history.z[rows] / np.where(some, sigma, 1.0), 0.0)
+    means = white.sum(axis=0) / np.sqrt(np.maximum(some.sum(axis=0), 1))
+    mean = float(means[np.argmax(np.abs(means))])
+    alarm = p < level or 2.0 * float(norm.sf(abs(mean))) < level
+    return Group(of, which, len(rows), total / max(number, 1), mean, alarm)
+
+
+def _groups(run: Run, rows: Ints) -> Iterator[tuple[str, str, Ints]]:
+    history = run.history
+    robots, sensors = history.robot[history.step[rows]], history.sensor[rows]
+    for key in sorted({*zip(robots.tolist(), sensors.tolist(), strict=True)}):
+        mine = rows[(robots == key[0]) & (sensors == key[1])]
+        yield "sensor", ".".join(key), mine
+        kind = str(run.section(*key).get("type", ""))
+        columns = [name for name in ("range", "bearing") if name in kind]
+        for k, name in enumerate(columns):
+            yield from _bins(name, "m" if name == "range" else "rad", history.y[mine, k], mine)
+    t = history.t_s[history.step[rows]]
+    yield from _bins("time", "s", t, rows)
+    yield from _bins("speed", "m/s", _speeds(history)[history.step[rows]], rows)
+    for name in dict.fromkeys(history.landmark[rows].tolist()):
+        yield "landmark", name, rows[history.landmark[rows] == name]
+
+
+def _bins(of: str, unit: str, values: Array, rows: Ints) -> Iterator[tuple[str, str, Ints]]:
+    """Yield groups of as many rows each, by their values."""
+    edges = np.unique(np.nanquantile(values, np.linspace(0, 1, BINS + 1))) if len(values) else np.zeros(0)
+    for low, high in pairwise(edges):
+        mine = (values >= low) & ((values < high) | (high == edges[-1]))
+        yield of, f"{figure(low, 2)} to {figure(high, 2)} {unit}", rows[mine]
+
+
+def _speeds(history: History) -> Array:
+    """Return how fast each robot was at its scans (S,), m/s."""
+    out = np.zeros(len(history.t_ns))
+    for name in history.robots:
+        mine = np.flatnonzero(history.robot == name)
+        if len(mine) > 1:
+            way = np.linalg.norm(np.diff(history.poses[mine][:, : history.d], axis=0), axis=1)
+            out[mine[1:]] = way / np.maximum(np.diff(history.t_s[mine]), 1e-3)
+    return out
+
+
+def nees_parts(run: Run) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the NEES per degree of freedom of position and heading of each robot and of the map, if there is truth.
+
+    And the time from which its mean over `WINDOW` scans is above what a consistent filter has.
+    """
+    history, truth = run.history, run.truth.poses_in_map()
+    d = history.d
+    for name in history.robots:
+        mine = np.flatnonzero((history.robot == name) & np.isfinite(truth).all(axis=1))
+        if len(mine) < WINDOW or history.in_space:
+            continue
+        errors = history.poses[mine] - truth[mine]
+        errors[:, d] = np.angle(np.exp(1j * errors[:, d]))
+        P = history.covariance[mine]
+        for part, at in (("position", slice(0, d)), ("heading", slice(d, d + 1)), ("pose", slice(0, d + 1))):
+            value, dof = nees(errors[:, at], P[:, at, at]), at.stop - at.start
+            yield name, part, figure(float(np.nanmean(value)) / dof), _since(history.t_s[mine], value, dof)
+
+
+def _since(t_s: Array, value: Array, dof: int) -> str:
+    """Return when the mean of a window leaves the band that the NEES of one step has, for good "" if it never does."""
+    bound = float(chi2.ppf(BAND, dof))
+    means = np.convolve(np.nan_to_num(value), np.full(WINDOW, 1.0 / WINDOW), mode="valid")
+    above = np.flatnonzero(means > bound)
+    return f"{t_s[above[0]]:.1f}" if len(above) else ""

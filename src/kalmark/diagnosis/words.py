@@ -1,0 +1,168 @@
+"""What a cause is in words, with its figure, and the line of a configuration that takes it out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from kalmark.diagnosis.causes import TIMES, Finding
+from kalmark.results.words import figure
+
+Words = tuple[str, str]  # evidence, cure
+MOST_SIGMAS = 1e4
+
+
+def words(finding: Finding, config: Mapping[str, Any]) -> Words:
+    """Return what was found, in a sentence, and the line that would cure it, "" if no key does.
+
+    `config` is the configuration of the run: a new noise is given as a number where it states the old one.
+    """
+    tell = _TELL.get(finding.name) or (_noise if finding.unit == TIMES else _offset)
+    evidence, cure = tell(finding, config)
+    if finding.alike:
+        others = ", ".join(f"{other.name} {_value(other)}" for other in finding.alike)
+        evidence += f"; the log cannot tell this from {others}"
+    return evidence, cure
+
+
+def _value(finding: Finding) -> str:
+    """Return a size with its unit."""
+    if finding.unit in ("rad", "rad/s", "rad/m"):
+        return f"{figure(math.degrees(finding.value))} {finding.unit.replace('rad', 'deg')}"
+    return f"{finding.value:+.2%}" if not finding.unit else f"{figure(finding.value)} {finding.unit}"
+
+
+def _sure(finding: Finding) -> str:
+    return f"{figure(min(abs(finding.value) / finding.sigma, MOST_SIGMAS), 2)} sigma" if finding.sigma > 0 else ""
+
+
+def _sensor(finding: Finding) -> str:
+    return f"{'.'.join(finding.of[:2])}"
+
+
+def _size(value: float, unit: str) -> str:
+    if unit.startswith("rad"):
+        return f"{figure(math.degrees(value))} {unit.replace('rad', 'deg')}"
+    return f"{value:.2%}" if not unit else f"{figure(value)} {unit}"
+
+
+def _current(config: Mapping[str, Any], robot: str, *path: str) -> Any:
+    """Return a value of a robot's section, None where the configuration does not state it."""
+    robots = config.get("robots") or {}
+    for name in (robot, "each"):
+        section: Any = robots.get(name)
+        for key in path:
+            section = section.get(key) if isinstance(section, Mapping) else None
+        if section is not None:
+            return section
+    return None
+
+
+def _set(robot: str, path: str, value: float) -> str:
+    return f"--set robots.{robot}.{path}={figure(value)}"
+
+
+def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, sensor, _ = finding.of
+    scale = _current(config, robot, "sensors", sensor, "scale") or 1.0
+    how = "long" if finding.value > 0 else "short"
+    evidence = f"ranges of {_sensor(finding)} are {abs(finding.value):.2%} too {how} ({_sure(finding)})"
+    return evidence, _set(robot, f"sensors.{sensor}.scale", scale * (1.0 + finding.value))
+
+
+def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, sensor, _ = finding.of
+    bias = _current(config, robot, "sensors", sensor, "bias_m") or 0.0
+    how = "long" if finding.value > 0 else "short"
+    evidence = f"ranges of {_sensor(finding)} are {_size(abs(finding.value), 'm')} too {how} ({_sure(finding)})"
+    return evidence, _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value)
+
+
+def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, sensor, _ = finding.of
+    theta = _current(config, robot, "sensors", sensor, "mount", "theta_rad") or 0.0
+    evidence = f"bearings of {_sensor(finding)} are off by {_value(finding)} ({_sure(finding)})"
+    return evidence, _set(robot, f"sensors.{sensor}.mount.theta_rad", theta - finding.value)
+
+
+def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    early = "later" if finding.value > 0 else "earlier"
+    by = f"{figure(abs(finding.value))} s"
+    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say ({_sure(finding)})"
+    return evidence, f"stamp the scans {by} {early}"
+
+
+def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, column, kind = finding.of
+    little = "little" if finding.value > 0 else "much"
+    verb = "steers" if column == "steering_rad" else "turns" if column.endswith(("_rad", "_radps")) else "drives"
+    each = " for each metre driven" if kind == "per_way" else ""
+    size = _size(abs(finding.value), finding.unit.removesuffix("/m") if each else finding.unit)
+    evidence = f"{column} of {robot} says that it {verb} {size}{each} too {little} ({_sure(finding)})"
+    key = f"sigma_{column.rsplit('_', 1)[0]}_bias_{column.rsplit('_', 1)[1]}"
+    known = _current(config, robot, "motion", key)
+    cure = "" if known is None or kind != "offset" else _set(robot, f"motion.{key}", abs(finding.value))
+    return evidence, cure or f"correct {column} by {_value(finding)}{each} in the log"
+
+
+def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, *of = finding.of
+    if finding.name == "start":
+        return f"the start is {figure(finding.value, 2)} times as uncertain as stated", ""
+    if finding.name == "control_sigma":
+        what, path = f"the noise of {robot}'s {of[0] or 'motion'}", ["motion", f"sigma_{of[0]}"]
+    else:
+        what, path = f"the noise of {robot}.{of[0]} {of[1]}", ["sensors", of[0], f"sigma_{of[1]}"]
+    now = _current(config, robot, *path)
+    low, high = (max(finding.value + k * 2 * finding.sigma, 0.0) for k in (-1, 1))
+    evidence = f"{what} is {figure(finding.value)} times as large as stated ({figure(low)} to {figure(high)})"
+    cure = _set(robot, ".".join(path), now * finding.value) if isinstance(now, float) and now > 0 else ""
+    return evidence, cure
+
+
+def _offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"{finding.name} of {'.'.join(finding.of)} is {_value(finding)} ({_sure(finding)})", ""
+
+
+def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
+    factor = math.sqrt(max((1.0 + finding.value) / (1.0 - finding.value), 1.0))
+    evidence = (
+        f"errors of {_sensor(finding)} {finding.of[2]} last from sighting to sighting (correlation"
+        f" {figure(finding.value, 2)}): they say as little as white noise of {figure(factor, 2)} times the sigma"
+    )
+    return evidence, ""
+
+
+def _moving(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"landmark {finding.of[0]} moves at {_value(finding)} ({_sure(finding)})", f"leave out {finding.of[0]}"
+
+
+def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"{finding.value:.1%} of the observations are far off where their landmark is", ""
+
+
+def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
+    evidence = f"{finding.value:.1%} of the observations are far off where their landmark is, and fit another one"
+    return evidence, "--set log.ids=hidden --set association.type=auto"
+
+
+def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"{finding.of[0]} moves in a way that its controls do not show ({figure(finding.value, 2)} sigma)", ""
+
+
+_TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
+    "range_scale": _range_scale,
+    "range_offset": _range_offset,
+    "bearing_offset": _bearing_offset,
+    "time_offset": _time_offset,
+    "odometry_scale": _odometry,
+    "odometry_turn": _odometry,
+    "odometry_offset": _odometry,
+    "steering_offset": _odometry,
+    "correlated_noise": _correlated,
+    "moving_landmark": _moving,
+    "outliers": _outliers,
+    "wrong_ids": _wrong_ids,
+    "kidnapped": _kidnapped,
+}
