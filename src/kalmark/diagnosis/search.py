@@ -28,10 +28,13 @@ LOOKED_AT = 200  # outliers whose landmarks are looked for
 def best(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
-    A systematic error goes before a noise that would take it up.  Of those that explain as much, one in the sensors
-    goes before one in the controls.
+    A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
+    as much, one in the sensors goes before one in the controls.
     """
     first = max(sure, key=lambda f: f.gain)
+    jump = [f for f in sure if f.name == "kidnapped" and f.gain > TAKEN_UP * first.gain]
+    if jump and first.unit == causes.TIMES:
+        return jump
     steady = [f for f in sure if f.Z is not None and f.gain > TAKEN_UP * first.gain]
     if not steady or (first.unit != causes.TIMES and first.Z is None):
         return [first]

@@ -1,0 +1,193 @@
+"""Does the diagnosis name what is wrong with a log, and nothing where nothing is?"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.batch.data import replayed
+from kalmark.batch.solver import optimum
+from kalmark.cli.app import main
+from kalmark.config import build_slam, config_dict
+from kalmark.diagnosis.breakdown import breakdown, nees_parts
+from kalmark.diagnosis.linear import Linear
+from kalmark.diagnosis.verdict import Verdict
+from kalmark.events import Control, Event, Scan
+from kalmark.logs.log import Log
+from kalmark.results.batch import given_by
+from kalmark.results.run import Run
+from kalmark.results.verdict import verdict_lines
+from kalmark.simulate import load_world, simulate
+
+WORLD = ("world.count=30", "world.size_m=24", "steps=400", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")
+SIGMA = "robots.rover.sensors.lidar.sigma_range_m"
+Change = Callable[[Event], Event]
+
+
+def world_of(*settings: str) -> Any:
+    return load_world("random_field", [*WORLD, *settings])
+
+
+def run_of(change: Change | None = None, settings: tuple[str, ...] = (), seed: int = 3) -> Run:
+    """Return the run of a world's log, changed, by a filter with other settings."""
+    log, config = simulate(world_of(), seed), world_of(*settings).config()
+    if change is not None:
+        log = replace(log, events=sorted(map(change, log.events), key=lambda e: e.t_ns))
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+
+
+def seen(scan: Scan, y: Any = None, t_ns: int | None = None) -> Scan:
+    return Scan(t_ns=scan.t_ns if t_ns is None else t_ns, robot=scan.robot, sensor=scan.sensor,
+                y=scan.y if y is None else y, ids=scan.ids)  # fmt: skip
+
+
+def measuring(change: Callable[[Any], Any]) -> Change:
+    return lambda e: seen(e, y=change(e.y)) if isinstance(e, Scan) and len(e.y) else e
+
+
+def controlling(change: Callable[[Any], Any]) -> Change:
+    return lambda e: Control(t_ns=e.t_ns, robot=e.robot, u=change(e.u)) if isinstance(e, Control) else e
+
+
+FAULTS: dict[str, tuple[Change | None, tuple[str, ...], float | None]] = {
+    "range_sigma": (None, (f"{SIGMA}=0.05",), 2.0),
+    "bearing_offset": (measuring(lambda y: np.add(y, [0.0, 0.02])), (), 0.02),
+    "range_scale": (measuring(lambda y: y * [1.06, 1.0]), (), 0.06),
+    "time_offset": (lambda e: seen(e, t_ns=e.t_ns + 100_000_000) if isinstance(e, Scan) else e, (), -0.1),
+    "odometry_turn": (controlling(lambda u: np.add(u, [0.0, 0.02])), (), -0.02),
+}
+MISTAKES: dict[str, tuple[Change | None, tuple[str, ...]]] = {
+    "bearing_sign": (measuring(lambda y: y * [1.0, -1.0]), ()),
+    "units": (measuring(lambda y: y * [1.0, 180 / np.pi]), ()),
+    "mount": (None, ("robots.rover.sensors.lidar.mount.theta_rad=3.14159",)),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_named_first_with_its_size(name: str) -> None:
+    change, settings, size = FAULTS[name]
+    verdict = km.diagnose(run_of(change, settings))
+    assert verdict.causes[0].name == name, verdict.causes
+    assert verdict.search is not None
+    finding = next(f for f in verdict.search.found if f.name == name)
+    assert finding.value == pytest.approx(size, abs=4 * finding.sigma + 0.1 * abs(size or 0.0))
+    assert verdict.causes[0].cure
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_named_first_and_makes_the_map_wrong(name: str) -> None:
+    verdict = km.diagnose(run_of(*MISTAKES[name]))
+    assert (verdict.map, verdict.causes[0].name) == ("wrong", name)
+
+
+def test_a_clean_log_is_not_accused() -> None:
+    for seed in range(5):
+        verdict = km.diagnose(run_of(seed=seed))
+        assert (verdict.map, verdict.causes) == ("ok", ())
+        assert verdict.sigma_factor == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_part_of_the_observations_is_enough() -> None:
+    run = run_of(*FAULTS["bearing_offset"][:2])
+    verdict = km.diagnose(run, 2000)
+    assert verdict.causes[0].name == "bearing_offset"
+    number = int(verdict.checked.split()[3])
+    assert 1500 < number < 2500 < run.summary["observations"]
+
+
+def test_a_robot_that_was_carried_away_is_noticed_at_that_time() -> None:
+    log = simulate(world_of(), 3)
+    begin, end = (log.events[k * len(log.events) // 5].t_ns for k in (2, 3))
+    events: list[Event] = [e for e in log.events if e.t_ns < begin]
+    for e in log.events:
+        t_ns = e.t_ns - end + begin
+        if isinstance(e, Scan) and t_ns >= begin:
+            events.append(seen(e, t_ns=t_ns))
+        elif isinstance(e, Control) and t_ns >= begin:
+            events.append(Control(t_ns=t_ns, robot=e.robot, u=e.u))
+    log = replace(log, events=events, truth={})
+    config = world_of().config()
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    assert verdict.causes[0].name == "kidnapped"
+    assert (verdict.sigma_factor or 0.0) > 2
+    assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=5.0)
+
+
+def test_what_is_left_of_data_is_their_projection_in_textbook_form() -> None:
+    run = run_of(settings=("steps=12",))
+    log = Log("", ("rover",), simulate(world_of("steps=12"), 3).events)
+    run = km.record(build_slam(world_of().config(), log), log, progress=False)
+    problem = replayed(given_by(run), log)
+    linear = Linear.of(problem, optimum(problem).state)
+    rng, n, q = np.random.default_rng(1), len(linear.at.z), len(linear.at.w)
+    z, e = rng.normal(size=n), rng.normal(size=linear.root.shape[1])
+    left = linear.left(z, linear.root @ e)
+    # textbook: the white errors e and the data z by generalised least squares, motion as constraints of J dx = root e
+    H, J, Q = linear.at.H.toarray(), linear.at.J.toarray(), (linear.root @ linear.root.T).toarray()
+    free = problem.free
+    kkt = np.block([[H.T @ H, J.T], [J, -Q]])[:, np.r_[free, np.ones(q, bool)]][np.r_[free, np.ones(q, bool)]]
+    rhs = np.concatenate([(H.T @ z)[free], -(linear.root @ e)])
+    x = np.linalg.lstsq(kkt, rhs, rcond=None)[0]
+    np.testing.assert_allclose(left.r, z - H[:, free] @ x[: free.sum()], atol=1e-7)
+    total = left.r @ left.r + left.m @ Q @ left.m
+    assert total == pytest.approx(z @ left.r + (linear.root @ e) @ left.m, rel=1e-6)  # a projection
+
+
+def test_systematic_errors_of_controls_match_differences() -> None:
+    log = simulate(world_of("steps=12"), 3)
+    config = world_of().config()
+    run = km.record(build_slam(config, log), log, progress=False)
+    given = given_by(run)
+    problem, h = replayed(given, log), 1e-6
+    for k, error in enumerate(problem.motions.errors):
+        c = ("v_mps", "w_radps").index(error.column)
+        way = {"offset": lambda u: 1.0, "scale": lambda u, c=c: u[c], "per_way": lambda u: abs(u[0])}[error.kind]
+
+        def more(u: Any, c: int = c, way: Any = way) -> Any:
+            u = np.array(u)
+            u[c] += h * way(u)
+            return u
+
+        other = replayed(given, map(controlling(more), log.events))
+        w, _ = problem.motions.term.at(problem.start)
+        w_more, _ = other.motions.term.at(problem.start)
+        np.testing.assert_allclose((w - w_more).ravel() / h, problem.motions.systematic[:, k], atol=1e-5)
+
+
+def test_a_run_folder_is_diagnosed_and_keeps_its_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "random_field", "--out", str(tmp_path / "log"), "--seed", "3", "--set", "steps=150"]) == 0
+    config = tmp_path / "log" / "config.yaml"
+    source = [str(config)] if config.is_file() else ["random_field"]
+    assert main(["run", *source, "--log", str(tmp_path / "log"), "--out", str(tmp_path / "run")]) == 0
+    assert "verdict: the map is ok" in capsys.readouterr().out
+    assert main(["diagnose", str(tmp_path / "run")]) == 0
+    told = capsys.readouterr().out
+    assert "the map is ok" in told and "innovations" in told and "against the truth" in told
+    assert (tmp_path / "run" / "diagnosis.png").stat().st_size > 10_000
+    verdict = json.loads((tmp_path / "run" / "summary.json").read_text())["verdict"]
+    assert {"map", "sigma_factor", "causes"} <= verdict.keys()
+    assert main(["evaluate", str(tmp_path / "run"), "--batch"]) == 0
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["verdict"] == verdict
+
+
+def test_the_table_of_innovations_accuses_the_range_that_is_wrong() -> None:
+    clean, biased = (breakdown(run_of(change)) for change in (None, FAULTS["range_scale"][0]))
+    assert not any(group.alarm for group in clean)
+    assert any(group.alarm for group in biased)
+    parts = {part: float(value) for _, part, value, _ in nees_parts(run_of())}
+    assert set(parts) == {"position", "heading", "pose"}
+    assert parts["pose"] < 3
+
+
+def test_a_verdict_in_words_is_short_or_whole() -> None:
+    causes = tuple(km.diagnose(run_of(*FAULTS["bearing_offset"][:2])).causes) * 5
+    verdict = Verdict("doubtful", causes, "", 2.0, 0.1, 0.3).as_dict()
+    assert len([*verdict_lines(verdict)]) == 5
+    assert len([*verdict_lines(verdict, None)]) == 1 + len(causes)
