@@ -2,6 +2,7 @@
 
     python benchmarks/diagnosis.py                       # 5 logs a fault, and 200 clean ones
     python benchmarks/diagnosis.py --runs 1 --clean 5 --only range
+    KALMARK_DATA=... python benchmarks/diagnosis.py --real     # every shipped real log
 
 A robot wanders between 40 landmarks whose ids it knows; a car does for the steering, and the hall of benchmarks/hall.py
 is for the recorder that stops.  A line a log: what was planted, what is named, best first.
@@ -15,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from kalmark.cli.run import run_log
 from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import Cause, diagnose
 from kalmark.events import Control, Scan, order
@@ -176,6 +178,19 @@ FAULTS: dict[str, tuple[tuple[str, ...], Plant, tuple[str, ...], tuple[str, ...]
 }
 
 
+# of each real log: configuration and overrides, and the causes that are known of it; all these maps are right
+REAL: dict[str, tuple[tuple[str, ...], set[str]]] = {
+    "lost_in_the_woods": (("lost_in_the_woods",), {"correlated_noise", "bearing_offset"}),
+    "lost_in_the_woods_bearing": (("lost_in_the_woods_bearing",), set()),
+    "plaza": (("plaza",), {"range_scale"}),
+    **{f"mrclam_{k}": (("mrclam", f"log.robots=[{k}]"), set()) for k in (1, 5)},
+    "mrclam_3": (("mrclam", "log.robots=[3]"), {"time_offset"}),
+    "mrclam_all": (("mrclam", "log.robots=[1, 2, 3, 4, 5]"), set()),
+    "victoria_park_known": (("victoria_park_known",), {"control_sigma"}),
+    **{name: ((name,), set()) for name in ("victoria_park", "dlr", "dlr_unknown", "freiburg_course", "starry_night")},
+}
+
+
 def planted(fault: str, seed: int) -> tuple[Log, Run]:
     """Return the log with a fault, and the run of it."""
     _, plant, of_world, of_filter = FAULTS[fault]
@@ -191,7 +206,11 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--clean", type=int, default=200)
     parser.add_argument("--only", default="")
+    parser.add_argument("--real", action="store_true", help="every shipped real log instead")
     options = parser.parse_args()
+    if options.real:
+        real(options.only)
+        return
     first = third = count = accused = alarmed = 0
     for fault, (names, *_) in FAULTS.items():
         if options.only not in fault:
@@ -199,7 +218,7 @@ def main() -> None:
         for seed in range(options.runs if names else options.clean):
             _, run = planted(fault, seed)
             verdict = diagnose(run)
-            told = [name for cause in verdict.causes for name in named(cause)]
+            told = [cause.name for cause in verdict.causes]
             causes = "; ".join(f"{cause.name} ({cause.score:.0f})" for cause in verdict.causes)
             print(f"{fault:24s} {seed:4d}  {verdict.map:9s} {causes}", flush=True)
             if names:
@@ -210,9 +229,20 @@ def main() -> None:
     print(f"clean: {accused} of {options.clean} accused, the map of {alarmed}")
 
 
-def named(cause: Cause) -> list[str]:
-    """Return the name of a cause."""
-    return [cause.name]
+def real(only: str) -> None:
+    """Print the verdict on each real log beside its true state: all these maps are right."""
+    agree = count = 0
+    for name, (config, known) in REAL.items():
+        if only not in name:
+            continue
+        run = run_log(config[0], overrides=config[1:], progress=False)
+        verdict = diagnose(run)
+        told = [f"{cause.name} ({cause.score:.0f})" for cause in verdict.causes if not cause.harmless]
+        missing = known - {cause.name for cause in verdict.causes}
+        factor = "-" if verdict.sigma_factor is None else f"{verdict.sigma_factor:.2f}"
+        count, agree = count + 1, agree + (verdict.map == "ok" and not missing)
+        print(f"{name:24s} {verdict.map:9s} factor {factor:5s} {'; '.join(told)}  [{verdict.checked}]", flush=True)
+    print(f"real: {agree} of {count} as they are known to be")
 
 
 if __name__ == "__main__":

@@ -255,6 +255,18 @@ def gaps() -> Iterator[Figure]:
     )
 
 
+def diagnosis() -> Iterator[Figure]:
+    """Yield what the diagnosis names."""
+    section, command = "Diagnosis", "python benchmarks/diagnosis.py"
+    read = row("planted:", "{0} first, {5} among the first three, of {2}")
+    yield Figure(section, "simulated logs with one planted fault: it is named first (85 %), among the first three (97 %)",
+                 "85 %, 97 %", command, read)  # fmt: skip
+    yield Figure(section, "clean simulated logs that are accused of anything (200)", "1 % at most", command,
+                 row("clean:", "{0} of {2}"))  # fmt: skip
+    yield Figure(section, "shipped real logs whose verdict is as they are known to be", "all",
+                 "KALMARK_DATA=... python benchmarks/diagnosis.py --real", row("real:", "{0} of {2}"))  # fmt: skip
+
+
 def partial_measurements() -> Iterator[Figure]:
     """Yield the figures of ranges alone and bearings alone."""
     section, command = "Ranges alone", "python benchmarks/range_only.py"
@@ -404,7 +416,18 @@ def structure() -> Iterator[Figure]:
 
 def figures() -> list[Figure]:
     """Return all figures, in the order of the page."""
-    parts = (exactness, campaigns, real_logs, unknown_ids, gaps, partial_measurements, space, speed, structure)
+    parts = (
+        exactness,
+        campaigns,
+        real_logs,
+        unknown_ids,
+        gaps,
+        diagnosis,
+        partial_measurements,
+        space,
+        speed,
+        structure,
+    )
     return [figure for part in parts for figure in part()]
 
 

@@ -101,7 +101,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     first = gaps(run.summary)
     try:
         found = _searched(run, log, most, progress)
-    except KalmarkError as error:
+    except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
         why = str(error).removeprefix("batch solution: ")
         checked = f"innovations alone, no batch solution: {why}"
@@ -133,6 +133,8 @@ def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
     given = thinned(run, every, most)
     try:
         problem = replayed(given, log)
+        if not problem.factors:
+            raise KalmarkError("no observation was of a landmark in the map")
         batch = optimum(problem, tolerance=NEAR)
     except KalmarkError:
         if given is every:
