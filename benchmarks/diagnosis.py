@@ -18,7 +18,7 @@ import numpy as np
 
 from kalmark.cli.run import run_log
 from kalmark.config import build_slam
-from kalmark.diagnosis.verdict import Cause, diagnose
+from kalmark.diagnosis.verdict import diagnose
 from kalmark.events import Control, Scan, order
 from kalmark.geometry import observe
 from kalmark.geometry.frames import compose

@@ -264,7 +264,7 @@ def diagnosis() -> Iterator[Figure]:
     yield Figure(section, "clean simulated logs that are accused of anything (200)", "1 % at most", command,
                  row("clean:", "{0} of {2}"))  # fmt: skip
     yield Figure(section, "shipped real logs whose verdict is as they are known to be", "all",
-                 "KALMARK_DATA=... python benchmarks/diagnosis.py --real", row("real:", "{0} of {2}"))  # fmt: skip
+                 "python benchmarks/diagnosis.py --real", row("real:", "{0} of {2}"))  # fmt: skip
 
 
 def partial_measurements() -> Iterator[Figure]:
