@@ -182,7 +182,8 @@ FAULTS: dict[str, tuple[tuple[str, ...], Plant, tuple[str, ...], tuple[str, ...]
 REAL: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "lost_in_the_woods": (("lost_in_the_woods",), {"correlated_noise", "bearing_offset"}),
     "lost_in_the_woods_bearing": (("lost_in_the_woods_bearing",), set()),
-    "plaza": (("plaza",), {"range_scale"}),
+    "plaza": (("plaza",), set()),  # it estimates the scale of its ranges
+    "plaza_uncalibrated": (("plaza", "robots.each.sensors.radio.sigma_scale=0"), {"range_scale"}),
     **{f"mrclam_{k}": (("mrclam", f"log.robots=[{k}]"), set()) for k in (1, 5)},
     "mrclam_3": (("mrclam", "log.robots=[3]"), {"time_offset"}),
     "mrclam_all": (("mrclam", "log.robots=[1, 2, 3, 4, 5]"), set()),

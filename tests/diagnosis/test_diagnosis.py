@@ -81,6 +81,14 @@ def test_a_fault_is_named_first_with_its_size(name: str) -> None:
     assert verdict.causes[0].cure
 
 
+@pytest.mark.parametrize("name", ["range_sigma", "bearing_offset", "range_scale"])
+def test_the_cure_of_a_fault_takes_it_out(name: str) -> None:
+    change, settings, _ = FAULTS[name]
+    cure = km.diagnose(run_of(change, settings)).causes[0].cure
+    after = km.diagnose(run_of(change, (*settings, cure.removeprefix("--set "))))
+    assert name not in [cause.name for cause in after.causes]
+
+
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_is_named_first_and_makes_the_map_wrong(name: str) -> None:
     verdict = km.diagnose(run_of(*MISTAKES[name]))

@@ -61,9 +61,10 @@ class Course:
     the derivative by the systematic errors.
     """
 
-    def __init__(self, robot: Robot, node: int) -> None:
+    def __init__(self, robot: Robot, node: int, bias: Array | float = 0.0) -> None:
         self.motion, self.columns = robot.motion, tuple(robot.motion.columns)
         self.robot, self.drive = robot, HeldInput(robot.motion, robot.watch())
+        self.bias = bias
         self.held = -1  # which of the split controls is in force
         self.turns = _turns(self.columns)
         self.lengths = [j for j in range(len(self.columns)) if j not in self.turns]
@@ -87,7 +88,7 @@ class Course:
     def add(self, part: Part, roots: list[Array]) -> None:
         """Move by one part.  The error of a control that scans split is kept out of Q, with a root of N in `roots`."""
         self.moves += 1
-        self.moved, F, R_u = self.motion.move(self.moved, part.u, part.dt_s)
+        self.moved, F, R_u = self.motion.move(self.moved, part.u + self.bias, part.dt_s)
         self.Q = F @ self.Q @ F.T
         self._stay(part, F, R_u)
         self.shared = {key: F @ S for key, S in self.shared.items()}
@@ -131,11 +132,12 @@ class Node(NamedTuple):
 class Chain:
     """The nodes of all robots: each follows one of its robot by a step with its errors, the first the origin.
 
-    `starts` are the means and covariances of the robots' starts, where they are not those that the robots state.
-    Raises KalmarkError for a robot with more than a pose, or with a bias.
+    `starts` are the means and covariances of the robots' starts, where they are not those that the robots state, and
+    `biases` what is added to their controls.  Raises KalmarkError for a robot with more than a pose, or with a bias in
+    the map that is not given.
     """
 
-    def __init__(self, robots: Mapping[str, Robot], starts: Starts) -> None:
+    def __init__(self, robots: Mapping[str, Robot], starts: Starts, biases: Mapping[str, Array]) -> None:
         self.nodes: list[Node] = []
         self.shared: list[tuple[int, int, Array]] = []  # node, number of the split control, d w / d root
         self.roots: list[Array] = []
@@ -144,10 +146,10 @@ class Chain:
             space = robot.motion.space
             if space.size not in ORIGIN:
                 raise unsolved(f"robot {name!r} has {space.size} state coordinates, expected a pose alone")
-            if bias_covariance(robot.motion) is not None:
+            if bias_covariance(robot.motion) is not None and name not in biases:
                 raise unsolved(f"the bias of {name!r} is in the map, expected controls without one")
             mean, P = starts.get(name, (robot.start, np.zeros((space.dof,) * 2) if robot.cov is None else robot.cov))
-            course = self.courses[name] = Course(robot, len(self.nodes))
+            course = self.courses[name] = Course(robot, len(self.nodes), biases.get(name, 0.0))
             course.Q[-1] = P
             self._enter(name, -1, np.array(mean), course)
 

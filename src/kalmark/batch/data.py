@@ -61,6 +61,8 @@ class Given:
     known: solved for where another sensor sees something at the same pose, else held.  Sightings with whitened
     residuals beyond `huber` count less.
 
+    `biases` are what is added to the controls of a robot, (m,).
+
     With `segments` (J, 2), from and to in ns, the events between them are left out, and so is how a robot came from one
     to the next.
     """
@@ -78,6 +80,7 @@ class Given:
     motion: bool = True
     mounts: Mapping[tuple[str, str], Array] = field(default_factory=dict)
     huber: float = np.inf
+    biases: Mapping[str, Array] = field(default_factory=dict)
     segments: Ints | None = None
 
 
@@ -100,7 +103,7 @@ class _Replay:
 
     def __init__(self, given: Given) -> None:
         self.given, self.known = given, given.known
-        self.chain = Chain(given.robots if given.motion else {}, given.starts)
+        self.chain = Chain(given.robots if given.motion else {}, given.starts, given.biases)
         self.apart: dict[tuple[str, int], int] = {}  # nodes without motion, by robot and time
         self.sighted: dict[tuple[str, str, int], list[Seen]] = {}  # by robot, sensor and group
         self.fixes: list[tuple[int, Array, Array]] = []

@@ -34,6 +34,7 @@ MOST_CONDITION = 1e12
 SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the end
 SLOW_S = 1e-3
 MOST_RHO = 0.999
+MOST_SCALE = 0.25  # beyond it the problem is not linear
 SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
 TIMES = "times"  # the unit of noise
 
@@ -158,6 +159,8 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
         if not LEAST_INFORMATION * (Z[:, k] @ Z[:, k] + 1.0) < I[k] < math.inf:
             continue
         s = float(g[k] / I[k])
+        if not column.unit and abs(s) > MOST_SCALE:
+            continue
         parts = np.bincount(block, left.r[:, k] * (have.r - s * left.r[:, k]), minlength=BLOCKS)
         parts += np.bincount(motion, left.m[:, k] * (Q @ (have.m - s * left.m[:, k])), minlength=BLOCKS)
         sigma = float(np.sqrt(max(I[k], float(parts @ parts))) / I[k])

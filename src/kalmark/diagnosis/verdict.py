@@ -19,11 +19,14 @@ from kalmark.diagnosis.search import LEAST_GAIN, Search
 from kalmark.diagnosis.words import words
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
+from kalmark.models.protocols import Calibrated
 from kalmark.results.batch import given_by, log_of
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.warnings import window_warnings
 from kalmark.results.words import figure
+from kalmark.slam.robot import Mount
+from kalmark.slam.slam import Slam
 
 NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
@@ -129,7 +132,7 @@ class Searched(NamedTuple):
 
 def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
     """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none."""
-    every = given_by(run)
+    every = calibrated(run, given_by(run))
     given = thinned(run, every, most)
     try:
         problem = replayed(given, log)
@@ -143,6 +146,25 @@ def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
     search = Search(Linear.of(problem, batch.state), sensors_of(run), given.robot, given.t_ns)
     search.run(progress)
     return Searched(search, batch, given)
+
+
+def calibrated(run: Run, given: Given) -> Given:
+    """Return it with the mounts, ranges and controls that calibrate themselves as they were in the end."""
+    slam, robots = run.final_slam(), {}
+    for name, robot in given.robots.items():
+        sensors = {key: _calibrated(slam, f"{name}.{key}", mount) for key, mount in robot.sensors.items()}
+        robots[name] = replace(robot, sensors=sensors)
+    return replace(given, robots=robots, biases={bias.robot: bias.mean for bias in run.history.biases})
+
+
+def _calibrated(slam: Slam, name: str, mount: Mount) -> Mount:
+    """Return a mount as it is in the map, if it is there."""
+    if mount.block(name) is None:
+        return mount
+    mean, pose, sensor = slam.mean(name), len(mount.at), mount.sensor
+    if isinstance(sensor, Calibrated) and len(mean) > pose:
+        sensor = sensor.with_parameters(mean[pose:])
+    return replace(mount, at=mean[:pose], sensor=sensor, cov=None)
 
 
 def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
