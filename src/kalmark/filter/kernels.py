@@ -35,8 +35,11 @@ def _load_blas(module: str) -> str:
 _BLAS = _load_blas("scipy.linalg.cython_blas")
 llvmlite.binding.add_symbol("kalmark_dsyrk", get_cython_function_address(_BLAS, "dsyrk"))
 llvmlite.binding.add_symbol("kalmark_dgemm", get_cython_function_address(_BLAS, "dgemm"))
+_LAPACK = _load_blas("scipy.linalg.cython_lapack")
+llvmlite.binding.add_symbol("kalmark_dpotrf", get_cython_function_address(_LAPACK, "dpotrf"))
 _dsyrk = types.ExternalFunction("kalmark_dsyrk", types.void(*[types.intp] * 10))
 _dgemm = types.ExternalFunction("kalmark_dgemm", types.void(*[types.intp] * 13))
+_dpotrf = types.ExternalFunction("kalmark_dpotrf", types.void(*[types.intp] * 5))
 _UPPER_NO = np.array([ord("U"), ord("N")], dtype=np.uint8)
 _TRANS_NO = np.array([ord("T"), ord("N"), ord("T")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
@@ -333,3 +336,12 @@ def cholesky_inverse(S: Array) -> tuple[Array, bool]:
         for k in range(i + 1):
             M[i, k] = T[i, n + k]
     return M, True
+
+
+@compiled
+def cholesky(S: Array) -> bool:
+    """Replace the lower triangle of S (n, n) by L, L L' = S; return whether S is positive definite."""
+    sizes = np.array([len(S), 0], dtype=np.int32)
+    at = sizes.ctypes.data
+    _dpotrf(_UPPER_NO.ctypes.data, at, S.ctypes.data, at, at + 4)
+    return sizes[1] == 0
