@@ -76,40 +76,40 @@ class Noise(NamedTuple):
 def refusal(world: Any, configs: Mapping[str, Config]) -> str:
     """Return why the engine does not run a scene with these filters; empty if it does."""
     if not isinstance(world, World):
-        return "it replays a log"
+        return "the batched engine does not replay logs"
     if world.dimensions != 2 or len(world.robots) != 1:
-        return "it runs one robot of the plane"
+        return "the batched engine runs one robot of the plane"
     ((name, simulated),) = world.robots.items()
     if len(simulated.sensors) != 1:
-        return "it runs one sensor"
+        return "the batched engine runs one sensor"
     robot = build_robot(world.models(), name)
     ((key, mount),) = robot.sensors.items()
     why = _odd_models(robot.motion, mount)
     sensing = simulated.sensing.get(key, Sensing())
     if not why and (sensing.outliers or sensing.swapped or sensing.hidden):
-        why = "it simulates no outliers, swapped or hidden ids"
+        why = "the batched engine simulates no outliers, swapped or hidden ids"
     if not why and not isinstance(simulated.route, Constant | Drive):
-        why = f"it does not drive a {type(simulated.route).__name__}"
+        why = f"the batched engine does not drive a {type(simulated.route).__name__}"
     if not why and isinstance(simulated.route, Constant) and not any(simulated.route.u):
-        why = "its robot stands still"
+        why = "the batched engine has no robot that stands still"
     if not why and not world.ids:
-        why = "its landmarks have no ids"
+        why = "the batched engine needs known ids"
     things = scenery_of(world, np.random.default_rng(0))
     if not why and sum(len(sort.values) for sort in things.values()) > len(things[POINTS].values):
-        why = "it has other landmarks than points"
+        why = "the batched engine has no landmarks but points"
     return why or next(filter(None, (_odd_filter(c, name, len(things[POINTS].values)) for c in configs.values())), "")
 
 
 def _odd_models(motion: Any, mount: Mount) -> str:
     """Return what of a motion and a mounted sensor the engine does not run."""
     if type(motion) not in MOTIONS or bias_covariance(motion) is not None:
-        return "it runs velocities and increments of the plane without a bias"
+        return "the batched engine has velocities and increments of the plane without a bias"
     if (
         type(mount.sensor) is not RangeBearing
         or parameter_covariance(mount.sensor) is not None
         or mount.cov is not None
     ):
-        return "it runs a sensor of ranges and bearings whose calibration is known"
+        return "the batched engine has ranges and bearings, of a sensor whose calibration is known"
     return ""
 
 
@@ -122,14 +122,14 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
     if why := _odd_models(robot.motion, mount):
         return why
     if type(slam.estimator) not in (Ekf, Invariant):
-        return f"it has no estimator {config.estimator.type}"
+        return f"the batched engine has no estimator {config.estimator.type}"
     if type(policy.association) is not ByIdentity or type(channel.landmark) is not Point2D:
-        return "it takes points with known ids"
+        return "the batched engine has points with known ids"
     plain = mount.attention == EVERYTHING and mount.detector is None and mount.initialization is None
     if not plain or policy.upkeep.p_detect is not None:
-        return "it takes all that is seen, and keeps it"
+        return "the batched engine uses all that is seen, and keeps it"
     if slam.map_type == "postponed" or (slam.map_type == "auto" and landmarks > DENSE):
-        return f"it has dense maps, of up to {DENSE} landmarks"
+        return f"the batched engine has dense maps, of up to {DENSE} landmarks"
     return ""
 
 
