@@ -186,29 +186,36 @@ def driven(
 
 @compiled
 def in_sight(
-    states: Array, at: Array, points: Array, every: int, limits: tuple[float, float, float]
-) -> tuple[Index, Index, Array]:
-    """Return what a sensor at `at` (3,) sees at each step: the steps (N,), the points, exact ranges and bearings (N, 2).
+    states: Array, at: Array, points: Array, every: int, limits: tuple[float, float, float], most: int
+) -> tuple[Index, Index, Array]:  # fmt: skip
+    """Return what a sensor at `at` (3,) sees: the steps (N,), the points (N,), exact ranges and bearings (N, 2).
 
-    `limits` are the least and the greatest range and half of the field of view.
+    `limits` are the least and the greatest range and half of the field of view; of each scan the nearest `most`.
     """
-    least, most, half = limits
-    steps, things = np.empty((len(states) - 1) * len(points), np.int64), np.empty(len(states) * len(points), np.int64)
-    y, count = np.empty((len(steps), 2)), 0
+    least, greatest, half = limits
+    size, total = len(points), 0
+    steps, things = np.empty((len(states) - 1) * size, np.int64), np.empty((len(states) - 1) * size, np.int64)
+    y, near, p = np.empty((len(steps), 2)), np.empty(size, np.int64), np.empty((size, 3))
     for k in range(every - 1, len(states) - 1, every):
         T = compose(states[k + 1], at)[0]
         c, s = math.cos(T[2]), math.sin(T[2])
-        for i in range(len(points)):
+        count = 0
+        for i in range(size):
             d_x, d_y = points[i, 0] - T[0], points[i, 1] - T[1]
-            p_x, p_y = c * d_x + s * d_y, c * d_y - s * d_x
-            distance = math.hypot(p_x, p_y)
-            if least <= distance <= most:
-                bearing = math.atan2(p_y, p_x)
-                if abs(bearing) <= half:
-                    steps[count], things[count] = k, i
-                    y[count, 0], y[count, 1] = math.sqrt(p_x * p_x + p_y * p_y), bearing
-                    count += 1
-    return steps[:count], things[:count], y[:count]
+            x, y_ahead = c * d_x + s * d_y, c * d_y - s * d_x
+            distance = math.sqrt(x * x + y_ahead * y_ahead)
+            if least <= distance <= greatest and (half >= math.pi or abs(math.atan2(y_ahead, x)) <= half):
+                near[count], p[count, 0], p[count, 1], p[count, 2] = i, x, y_ahead, distance
+                count += 1
+        for a in range(count):
+            nearer = 0
+            for b in range(count if count > most else 0):
+                nearer += p[b, 2] < p[a, 2] or (p[b, 2] == p[a, 2] and b < a)
+            if nearer < most:
+                steps[total], things[total] = k, near[a]
+                y[total, 0], y[total, 1] = p[a, 2], math.atan2(p[a, 1], p[a, 0])
+                total += 1
+    return steps[:total], things[:total], y[:total]
 
 
 class Sightings(NamedTuple):
@@ -249,14 +256,16 @@ def reports(world: World, things: Things, seen: tuple[Index, Index, Array], chan
     These draw from the same source of chance as the noise does.
     """
     steps, numbers, y = seen
-    rows = np.arange(len(steps))
+    rows, at = np.arange(len(steps)), 0
+    if world.new_per_step is None:
+        yield rows
+        return
     if world.max_per_scan is not None:
         order = np.lexsort((y[:, 0], steps))
         rank = np.empty_like(order)
         rank[order] = rows - np.searchsorted(steps, steps[order])
         rows = rows[rank < world.max_per_scan]
-    at = 0
-    while world.new_per_step is not None and at < len(steps):
+    while at < len(steps):
         unseen = np.flatnonzero(~things.seen[numbers[at:]])
         k = steps[at + unseen[0]] if len(unseen) else world.steps
         here, then = np.searchsorted(steps, (k, k + 1)).tolist()
@@ -266,8 +275,6 @@ def reports(world: World, things: Things, seen: tuple[Index, Index, Array], chan
             told = chosen(things, numbers[some], y[some, 0], world.new_per_step, world.max_per_scan, chance.sight)
             yield here + told
         at = then
-    if world.new_per_step is None:
-        yield rows
 
 
 # ---------------------------------------------------------------------- filter
@@ -299,10 +306,10 @@ def noises(
 
 @compiled
 def start(
-    x: Array, x_first: Array, P: Array, slot: int, n: int, at: Array, y: Array,
+    x: Array, x_first: Array, P: Array, n: int, at: Array, y: Array,
     noise: tuple[float, float, float, float, float],
 ) -> None:  # fmt: skip
-    """Add the landmark that explains y (1, 2) from a mount `at` (3,) on a robot.  [S] (32)-(38)."""
+    """Add the landmark that explains y (1, 2) from a mount `at` (3,) to the n rows of a map.  [S] (32)-(38)."""
     T, T_r, _ = compose(x[:3], at)
     seen = y.copy()
     seen[0, 0] = (y[0, 0] - noise[4]) / noise[3]
@@ -314,6 +321,20 @@ def start(
         x[n + i] = x_first[n + i] = l[0, i]
     R[0, 0], R[1, 1] = range_variance(noise, math.hypot(v[0, 0], v[0, 1])), noise[2] ** 2
     kernels.augment(P, n + 2, n, np.arange(3), L_r, kernels.quadratic(L_y, R))
+
+
+@compiled
+def known_ones(slot_of: Index, things: Index, y: Array) -> tuple[Index, Array]:
+    """Return the slots (K,) and the measurements (K, 2) of those observations whose landmarks have a slot."""
+    count = 0
+    for i in range(len(things)):
+        count += slot_of[things[i]] >= 0
+    slots, y_known, to = np.empty(count, np.int64), np.empty((count, 2)), 0
+    for i in range(len(things)):
+        if slot_of[things[i]] >= 0:
+            slots[to], y_known[to, 0], y_known[to, 1] = slot_of[things[i]], y[i, 0], y[i, 1]
+            to += 1
+    return slots, y_known
 
 
 @compiled
@@ -333,72 +354,67 @@ def filtered(
     Returns whether all went well, the pose (steps, 3) after each scan and its covariance, the scores of the map
     (steps, 5), the mean in the end, the numbers of the landmarks in it, the sum of d2 and how many were fused.
     """
-    predict_at, correct_at, generator_at = ways
     blocks, atoms, capacity = tables
     u, dt_s, N, density, held = controls
     first, things, y = sightings
     at, noise = sensed
-    gate, most, tolerance = rules
-    steps, axes, robot, mount, d = len(u), 1, 0, -1, 2
+    steps, axes, robot, mount, d, never = len(u), 1, 0, -1, 2, False
     x, x_first, P = np.zeros(capacity), np.zeros(capacity), np.zeros((capacity, capacity))
     x[:3] = x_first[:3] = started[0]
     P[:3, :3] = started[1]
     mean, cov, scores = np.full((steps, 3), np.nan), np.full((steps, 3, 3), np.nan), np.full((steps, 5), np.nan)
     slot_of, order = np.full(len(blocks), -1), np.empty(len(blocks), np.int64)
-    none, count, n, nis, fused, never = np.empty(0, np.int64), 0, 3, 0.0, 0, False
-    nothing, ok = np.zeros((0, 0)), True
+    none, nothing, count, nis, fused, ok = np.empty(0, np.int64), np.zeros((0, 0)), 0, 0.0, 0, True
     for k in range(steps):
         low, high = first[k], first[k + 1]
         if held and k == steps - 1 and high == low:
             break  # no later event asks where the robot is
+        n = 3 + 2 * count
         D = density * dt_s[k] if len(density) and u[k].any() else nothing
-        map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], generator_at
-        if not call_predict(predict_at, (map_, (motion, robot, none, never, u[k], N, D, dt_s[k]), never)):
-            return False, mean, cov, scores, x, order[:count], nis, fused
-        known = 0
-        for i in range(low, high):
-            known += slot_of[things[i]] >= 0
-        if known > 0:
-            slots, y_known, to = np.empty(known, np.int64), np.empty((known, 2)), 0
-            for i in range(low, high):
-                if slot_of[things[i]] >= 0:
-                    slots[to], y_known[to, 0], y_known[to, 1] = slot_of[things[i]], y[i, 0], y[i, 1]
-                    to += 1
+        map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
+        ok = call_predict(ways[0], (map_, (motion, robot, none, never, u[k], N, D, dt_s[k]), never))
+        slots, y_known = known_ones(slot_of, things[low:high], y[low:high])
+        if ok and len(slots):
             whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines
-            scan = robot, mount, slots, d, y_known, noises(x, slots, at, noise), gate
-            _e, _z, _Z, d2, near, ok = call_correct(correct_at, (view, whole, scan, (most, tolerance)))
-            for i in range(known):
-                if near[i]:
-                    nis += d2[i]
-                    fused += 1
+            scan = robot, mount, slots, d, y_known, noises(x, slots, at, noise), rules[0]
+            _e, _z, _Z, d2, near, ok = call_correct(ways[1], (view, whole, scan, (rules[1], rules[2])))
+            for i in range(len(slots)):
+                nis += d2[i] if near[i] else 0.0
+                fused += near[i]
         if not ok:
-            return False, mean, cov, scores, x, order[:count], nis, fused
-        for i in range(low, high):
+            break
+        for i in range(low, high if len(slots) < high - low else low):
             if slot_of[things[i]] < 0:
                 order[count], slot_of[things[i]] = things[i], count + 1
-                start(x, x_first, P, count + 1, n, at, y[i : i + 1], noise)
-                count, n = count + 1, n + 2
+                start(x, x_first, P, 3 + 2 * count, at, y[i : i + 1], noise)
+                count += 1
         if high > low:
-            for i in range(3):
-                mean[k, i] = x[i]
-                for j in range(3):
-                    cov[k, i, j] = P[max(i, j), min(i, j)]
+            keep_pose(x, P, mean[k], cov[k])
             if (k + 1) % scored[0] == 0 or k == steps - 1:
-                score_map(x, P, n, order[:count], scored[1], scored[2][k + 1], scored[3], scores[k])
-    return True, mean, cov, scores, x, order[:count], nis, fused
+                score_map(x, P, order[:count], scored[1], scored[2][k + 1], scored[3], scores[k])
+    return ok, mean, cov, scores, x, order[:count], nis, fused
 
 
 # ---------------------------------------------------------------------- scores
 @compiled
+def keep_pose(x: Array, P: Array, mean: Array, cov: Array) -> None:
+    """Write the mean (3,) and the covariance (3, 3) of the robot's pose."""
+    for i in range(3):
+        mean[i] = x[i]
+        for j in range(3):
+            cov[i, j] = P[max(i, j), min(i, j)]
+
+
+@compiled
 def score_map(
-    x: Array, P: Array, n: int, order: Index, turns: bool, truth: Array, points: Array, out: Array
+    x: Array, P: Array, order: Index, turns: bool, truth: Array, points: Array, out: Array
 ) -> None:  # fmt: skip
     """Write the NEES of the landmarks (mean) and of the joint state, each in own and in world coordinates, and n.
 
     `turns`: errors are in the invariant filter's coordinates.  `truth` is the true state (3,) of the robot, `points`
     where the landmarks truly are.
     """
-    a = wrap(truth[2] - x[2])
+    n, a = 3 + 2 * len(order), wrap(truth[2] - x[2])
     half = 0.5 * a
     diagonal = 1.0 - half * half / 3.0 if abs(half) < 1e-4 else half / math.tan(half)
     sums, finite, d = np.zeros(2), np.zeros(2), np.empty((2, n))
@@ -561,7 +577,8 @@ class Engine:
         if driven_ is None:
             return None
         states, u = driven_
-        seen = in_sight(states, self.at, things.values, self.sensing.every or 1, self.limits)
+        most = self.landmarks if world.max_per_scan is None or world.new_per_step else world.max_per_scan
+        seen = in_sight(states, self.at, things.values, self.sensing.every or 1, self.limits, most)
         sightings = reported(world, self.sensing, things, self.noise, chance, seen)
         scores = {}
         for label, one in self.filters.items():

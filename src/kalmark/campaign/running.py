@@ -6,7 +6,7 @@ are the same whatever the number of workers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -258,16 +258,14 @@ def results_of(
     """
     if not tasks:
         return
-    groups = grouped(plans, tasks)
     if backend == "loky":
+        groups = grouped(plans, tasks)
         jobs = min(jobs or cpu_count(), len(groups))
         if jobs == 1:
             for cell, numbers in groups:
                 yield from zip(((cell, n) for n in numbers), plans[cell].some(numbers), strict=True)
             return
-        for plan in {id(plans[cell]): plans[cell] for cell, _ in groups}.values():
-            if plan.path == BATCHED:  # compiled once, before there are workers, which then load it
-                list(replace(plan, seed=0).some((0,)))
+        compile_engine(plans[cell] for cell, _ in groups)
     left, tries = dict.fromkeys(tasks), 0
     while left:
         before = len(left)
@@ -287,6 +285,14 @@ def results_of(
                     f"campaign: workers died {TRIES} times ({type(error).__name__}), expected them to finish a run"
                 )
                 raise KalmarkError(message) from error
+
+
+def compile_engine(plans: Iterable[Plan]) -> None:
+    """Do a run of the first plan that the engine does: workers then load what that has compiled."""
+    for plan in plans:
+        if plan.path == BATCHED:
+            next(plan.some((0,)))
+            return
 
 
 def grouped(plans: Sequence[Plan], tasks: Sequence[Task]) -> list[Group]:
