@@ -315,7 +315,8 @@ class _Scorer:
 
 def scores_of(
     series: dict[str, Array], mean: Array, P: Array, truth: Array, coordinates: str,
-    found: tuple[Array, Array, int, int], nis: float, nis_dof: int, stopped: str, nees: Callable[[Array, Array], Array] = nees,
+    found: tuple[Array, Array, int, int], nis: float, nis_dof: int, stopped: str,
+    nees: Callable[[Array, Array], Array] = nees,
 ) -> Scores:  # fmt: skip
     """Return the scores of a run: `series` has those of the map, those of the poses are added.
 
