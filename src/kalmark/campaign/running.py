@@ -43,7 +43,7 @@ DEATHS = {"BrokenProcessPool", "KilledWorker", "CancelledError", "RayActorError"
 TRIES = 3
 ROUND = 4  # groups of runs a worker in one round, where results come in rounds
 BATCHED, FEW = "batched engine", "ordinary path: so few steps are done before the batched engine is compiled"
-WORTH = 100_000  # steps of a campaign from which the engine saves more than it takes to compile
+WORTH = 200_000  # steps of a campaign from which the engine saves more than it takes to compile
 AT_ONCE = 20_000  # steps of the runs that the engine does in one group
 ESTIMATORS = ("invariant", "ekf", "fej")
 

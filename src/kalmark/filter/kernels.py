@@ -197,12 +197,20 @@ def clear(P: Array, n: int, at: int, d: int) -> None:
 def downdate(P: Array, V: Array) -> None:
     """P <- P - V' V, V (q, n), on the lower triangle.  [S] (30) with K Z K' = V' V, V = L^-1 H P.  O(n^2 q)."""
     q, n = V.shape
-    if n <= 40:  # below, the call costs more than the sum
-        for k in range(q):
+    if n <= 40 or (q <= 2 and n <= CACHED):  # the call would cost more than the sum
+        k = 0
+        while k + 2 <= q:
+            for i in range(n):
+                v, w = V[k, i], V[k + 1, i]
+                for j in range(i + 1):
+                    P[i, j] -= v * V[k, j] + w * V[k + 1, j]
+            k += 2
+        while k < q:
             for i in range(n):
                 v = V[k, i]
                 for j in range(i + 1):
                     P[i, j] -= v * V[k, j]
+            k += 1
         return
     sizes = np.array([n, q, P.shape[1]], dtype=np.int32)
     at = sizes.ctypes.data
