@@ -51,10 +51,10 @@ def world_of(landmarks: int, observations: int, steps: int) -> World:
         return load_world(path)
 
 
-def timed(call: Callable[[], Any]) -> tuple[float, Any]:
+def timed(call: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
     """Return the seconds of processor time that a call takes, and its result."""
     begin = time.thread_time()
-    result = call()
+    result = call(*arguments)
     return time.thread_time() - begin, result
 
 
@@ -76,29 +76,34 @@ def measure(world: World, estimator: str, runs: int) -> None:
         inner = getattr(engine, name)
 
         def call(*arguments: Any) -> Any:
-            seconds, result = timed(lambda: inner(*arguments))
+            seconds, result = timed(inner, *arguments)
             spent.setdefault(name, []).append(seconds)
             return result
 
         return call
 
-    list(fast.some((0,)))  # compiles, or loads
-    plan.run(0)
+    made = fast.engine()
+    assert made is not None
+
+    def by_engine(number: int) -> Any:
+        return made.run(np.random.SeedSequence(0, spawn_key=(number,)), plan.map_every)
+
+    by_engine(0), plan.run(0)  # compiles, or loads
     slow_s, fast_s, worst = [], [], 0.0
     for number in range(runs):
-        seconds, ordinary = timed(lambda number=number: plan.run(number))  # type: ignore[misc]
+        seconds, ordinary = timed(plan.run, number)
         slow_s.append(seconds)
-        made = fast.engine()
-        assert made is not None
         for _ in range(5):
-            seed = np.random.SeedSequence(0, spawn_key=(number,))
-            seconds, scores = timed(lambda seed=seed: made.run(seed, 10))  # type: ignore[misc]
+            seconds, scores = timed(by_engine, number)
             fast_s.append(seconds)
         worst = max(worst, difference(scores[estimator], ordinary[estimator]))
+    functions = {name: getattr(engine, name) for name in PARTS}
     for name in PARTS:
         setattr(engine, name, part(name))
     for _ in range(5):
-        made.run(np.random.SeedSequence(0, spawn_key=(0,)), 10)
+        by_engine(0)
+    for name in PARTS:
+        setattr(engine, name, functions[name])
     slow, quick = (1e6 * min(times) / world.steps for times in (slow_s, fast_s))
     shares = ", ".join(f"{name} {1e6 * min(spent[name]) / world.steps:.1f}" for name in PARTS)
     print(f"| {estimator} | {1e6 / slow:,.0f} | {1e6 / quick:,.0f} | {slow / quick:.1f} | {worst:.0e} | {shares} |")
@@ -139,7 +144,9 @@ def main() -> None:
         compilation(world, "invariant")
         return
     print(f"\n{options.landmarks} landmarks, {options.observations} observations a step; steps a core-second\n")
-    print("| estimator | ordinary path | batched engine | ratio | largest difference | parts of the engine, us a step |")
+    print(
+        "| estimator | ordinary path | batched engine | ratio | largest difference | parts of the engine, us a step |"
+    )
     print("|---|---|---|---|---|---|")
     for estimator in ESTIMATORS:
         measure(world, estimator, options.runs)

@@ -285,9 +285,9 @@ def textbook(view: Any, map_: Any, scan: Any, limits: tuple[int, float]) -> Any:
 
 
 @compiled
-def range_variance(noise: tuple[float, float, float, float, float], distance: float) -> float:
-    """Return the variance of a range at a distance, as `RangeBearing.noise_at`."""
-    return noise[0] ** 2 + (noise[1] * (noise[3] * distance + noise[4])) ** 2
+def range_variance(noise: tuple[float, float, float, float, float], x: float, y: float) -> float:
+    """Return the variance of the range of a point at x, y in the sensor's frame, as `RangeBearing.noise_at`."""
+    return noise[0] ** 2 + (noise[1] * (noise[3] * math.sqrt(x * x + y * y) + noise[4])) ** 2
 
 
 @compiled
@@ -297,9 +297,11 @@ def noises(
     """Return the noise R (K, 2, 2) of observing the landmarks on `slots` (K,), at their expected ranges."""
     R = np.zeros((len(slots), 2, 2))
     T = compose(x[:3], at)[0]
+    c, s = math.cos(T[2]), math.sin(T[2])
     for i in range(len(slots)):
         j = 1 + 2 * slots[i]
-        R[i, 0, 0] = range_variance(noise, math.hypot(x[j] - T[0], x[j + 1] - T[1]) if noise[1] > 0.0 else 0.0)
+        d_x, d_y = x[j] - T[0], x[j + 1] - T[1]
+        R[i, 0, 0] = range_variance(noise, c * d_x + s * d_y, c * d_y - s * d_x)
         R[i, 1, 1] = noise[2] ** 2
     return R
 
@@ -315,11 +317,11 @@ def start(
     seen[0, 0] = (y[0, 0] - noise[4]) / noise[3]
     v, V_y = inv_scan_many(seen)
     l, L_T, L_v = from_frame_many(T, v)
-    L_r, L_y, R = kernels.product(L_T[0], T_r), kernels.product(L_v[0], V_y[0]), np.zeros((2, 2))
     for i in range(2):
-        L_y[i, 0] /= noise[3]
+        V_y[0, i, 0] /= noise[3]
         x[n + i] = x_first[n + i] = l[0, i]
-    R[0, 0], R[1, 1] = range_variance(noise, math.hypot(v[0, 0], v[0, 1])), noise[2] ** 2
+    L_r, L_y, R = kernels.product(L_T[0], T_r), kernels.product(L_v[0], V_y[0]), np.zeros((2, 2))
+    R[0, 0], R[1, 1] = range_variance(noise, v[0, 0], v[0, 1]), noise[2] ** 2
     kernels.augment(P, n + 2, n, np.arange(3), L_r, kernels.quadratic(L_y, R))
 
 
