@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.random import SeedSequence
@@ -47,6 +47,8 @@ MOTIONS = (Unicycle, Odometry2D, Ackermann)
 REGULAR = 1e-6  # determinant of a correlation matrix above which the compiled NEES is as exact as LAPACK's
 ALL_TARGETS = 100  # places to drive to, a step, before a run is left to the ordinary path
 
+NO_CONTROL = np.zeros(0)  # the noise of controls does not depend on them
+
 PREDICT = signature_of(
     "b1(Tuple((f8[::1], f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8)), "
     "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1)"
@@ -57,19 +59,14 @@ CORRECT = signature_of(
 call_predict, call_correct = by_address(PREDICT), by_address(CORRECT)
 
 
-class Noise(NamedTuple):
-    """The noise of a range and bearing: range_variance = sigma_m^2 + (rel range)^2, of scale * distance + bias."""
+# of ranges and bearings: sigma_range_m, sigma_range_rel, sigma_bearing_rad, scale and bias_m
+Noise = tuple[float, float, float, float, float]
+Sightings = tuple[Index, Index, Array]  # numbers of steps or where each step begins, the points (N,), and y (N, 2)
 
-    sigma_m: float
-    rel: float
-    sigma_rad: float
-    scale: float
-    bias_m: float
 
-    @classmethod
-    def of(cls, sensor: RangeBearing) -> Noise:
-        """Return that of a sensor."""
-        return cls(sensor.sigma_range_m, sensor.sigma_range_rel, sensor.sigma_bearing_rad, sensor.scale, sensor.bias_m)
+def noise_of(sensor: RangeBearing) -> Noise:
+    """Return the noise of a sensor as compiled code takes it."""
+    return sensor.sigma_range_m, sensor.sigma_range_rel, sensor.sigma_bearing_rad, sensor.scale, sensor.bias_m
 
 
 # ---------------------------------------------------------------------- what the engine runs
@@ -187,7 +184,7 @@ def driven(
 @compiled
 def in_sight(
     states: Array, at: Array, points: Array, every: int, limits: tuple[float, float, float], most: int
-) -> tuple[Index, Index, Array]:  # fmt: skip
+) -> Sightings:  # fmt: skip
     """Return what a sensor at `at` (3,) sees: the steps (N,), the points (N,), exact ranges and bearings (N, 2).
 
     `limits` are the least and the greatest range and half of the field of view; of each scan the nearest `most`.
@@ -218,16 +215,8 @@ def in_sight(
     return steps[:total], things[:total], y[:total]
 
 
-class Sightings(NamedTuple):
-    """The observations of a run: `first` (steps + 1,) of each step, the landmarks' numbers (N,) and y (N, 2)."""
-
-    first: Index
-    things: Index
-    y: Array
-
-
 def reported(
-    world: World, sensing: Sensing, things: Things, noise: Noise, chance: Chance, seen: tuple[Index, Index, Array]
+    world: World, sensing: Sensing, things: Things, noise: Noise, chance: Chance, seen: Sightings
 ) -> Sightings:
     """Return what is reported of all that is seen, with noise: as `sights.chosen`, `faulty`, `noisy` and `possible`."""
     steps, numbers, e = seen
@@ -241,16 +230,17 @@ def reported(
         rows.append(kept)
         normals.append(chance.sight.standard_normal((len(kept), 2)))
     of, n = np.concatenate(rows), np.concatenate(normals)
+    sigma_m, rel, sigma_rad, scale, bias_m = noise
     y = e[of]
-    y[:, 0] = noise.scale * y[:, 0] + noise.bias_m
-    y[:, 0] += np.sqrt(noise.sigma_m**2 + (noise.rel * y[:, 0]) ** 2) * n[:, 0]
-    y[:, 1] = wrap(y[:, 1] + np.sqrt(noise.sigma_rad**2) * n[:, 1])
+    y[:, 0] = scale * y[:, 0] + bias_m
+    y[:, 0] += np.sqrt(sigma_m**2 + (rel * y[:, 0]) ** 2) * n[:, 0]
+    y[:, 1] = wrap(y[:, 1] + np.sqrt(sigma_rad**2) * n[:, 1])
     possible = y[:, 0] >= 0
     of, y = of[possible], y[possible]
-    return Sightings(np.searchsorted(steps[of], np.arange(world.steps + 1)), numbers[of], y)
+    return np.searchsorted(steps[of], np.arange(world.steps + 1)), numbers[of], y
 
 
-def reports(world: World, things: Things, seen: tuple[Index, Index, Array], chance: Chance) -> Iterator[Index]:
+def reports(world: World, things: Things, seen: Sightings, chance: Chance) -> Iterator[Index]:
     """Yield rows of what is seen that are reported, many steps at once: alone are those that start new landmarks.
 
     These draw from the same source of chance as the noise does.
@@ -285,14 +275,14 @@ def textbook(view: Any, map_: Any, scan: Any, limits: tuple[int, float]) -> Any:
 
 
 @compiled
-def range_variance(noise: tuple[float, float, float, float, float], x: float, y: float) -> float:
+def range_variance(noise: Noise, x: float, y: float) -> float:
     """Return the variance of the range of a point at x, y in the sensor's frame, as `RangeBearing.noise_at`."""
     return noise[0] ** 2 + (noise[1] * (noise[3] * math.sqrt(x * x + y * y) + noise[4])) ** 2
 
 
 @compiled
 def noises(
-    x: Array, slots: Index, at: Array, noise: tuple[float, float, float, float, float]
+    x: Array, slots: Index, at: Array, noise: Noise
 ) -> Array:  # fmt: skip
     """Return the noise R (K, 2, 2) of observing the landmarks on `slots` (K,), at their expected ranges."""
     R = np.zeros((len(slots), 2, 2))
@@ -309,7 +299,7 @@ def noises(
 @compiled
 def start(
     x: Array, x_first: Array, P: Array, n: int, at: Array, y: Array,
-    noise: tuple[float, float, float, float, float],
+    noise: Noise,
 ) -> None:  # fmt: skip
     """Add the landmark that explains y (1, 2) from a mount `at` (3,) to the n rows of a map.  [S] (32)-(38)."""
     T, T_r, _ = compose(x[:3], at)
@@ -343,7 +333,7 @@ def known_ones(slot_of: Index, things: Index, y: Array) -> tuple[Index, Array]:
 def filtered(
     ways: tuple[int, int, int], routines: corrections.Routines, view: Any, motion: tuple[int, Array],
     tables: tuple[Table, Table, int], started: tuple[Array, Array], controls: tuple[Array, Array, Array, Array, bool],
-    sightings: tuple[Index, Index, Array], sensed: tuple[Array, tuple[float, float, float, float, float]],
+    sightings: Sightings, sensed: tuple[Array, Noise],
     rules: tuple[float, int, float], scored: tuple[int, bool, Array, Array],
 ) -> tuple[bool, Array, Array, Array, Array, Index, float, int]:  # fmt: skip
     """Filter a run: predict, correct and start landmarks step by step, as `Slam.process` does with known ids.
@@ -522,9 +512,9 @@ class _Filter:
     def __init__(self, slam: Slam, name: str, landmarks: int) -> None:
         robot, estimator = slam.robots[name], slam.estimator
         ((key, mount),) = robot.sensors.items()
-        channel = slam._channels[name, key]
-        invariant = isinstance(estimator, Invariant)
-        correct = corrections.compiled_invariant if invariant else textbook
+        channel, motion = slam._channels[name, key], robot.motion
+        assert isinstance(motion, MOTIONS) and isinstance(mount.sensor, RangeBearing)
+        correct = corrections.compiled_invariant if isinstance(estimator, Invariant) else textbook
         self.ways = (
             address_of(prediction.compiled_predicted, PREDICT), address_of(correct, CORRECT),
             corrections.generator_address(1),
@@ -540,11 +530,17 @@ class _Filter:
         self.capacity = capacity_for(3 + 2 * landmarks)
         cov = np.zeros((3, 3)) if robot.cov is None else np.asarray(robot.cov)
         self.start = np.array(robot.start), np.array(cov)
-        density = robot.motion._density
-        self.noise_of_control = robot.motion._N, np.zeros((0, 0)) if density is None else density, robot.motion.held
-        self.sensed = np.array(mount.at), tuple(Noise.of(mount.sensor))
-        self.rules = (channel.gate, *((estimator.iterations, float(estimator.tolerance)) if invariant else (1, 0.0)))
+        self.control = motion.control_noise(NO_CONTROL), density_of(motion), motion.held
+        self.sensed = np.array(mount.at), noise_of(mount.sensor)
+        limits = (estimator.iterations, float(estimator.tolerance)) if isinstance(estimator, Invariant) else (1, 0.0)
+        self.rules = (float(channel.gate), *limits)
         self.coordinates = estimator.coordinates
+
+
+def density_of(motion: Any) -> Array:
+    """Return the diffusion of a motion that moves, (3, 3) a second; (0, 0) if it has none."""
+    D: Array | None = motion.diffusion(np.ones(len(motion.columns)), 1.0)
+    return np.zeros((0, 0)) if D is None else D
 
 
 def capacity_for(rows: int) -> int:
@@ -566,7 +562,8 @@ class Engine:
         self.filters = {label: _Filter(build_slam(c), name, self.landmarks) for label, c in configs.items()}
         motion, sensor = self.robot.motion, self.mount.sensor
         self.motion, self.kind = step_of(motion), MOTIONS.index(type(motion))
-        self.noise, self.at = Noise.of(sensor), np.array(self.mount.at)
+        assert isinstance(motion, MOTIONS) and isinstance(sensor, RangeBearing)
+        self.noise, self.at = noise_of(sensor), np.array(self.mount.at)
         self.limits = sensor.range_min_m, sensor.range_max_m, sensor.fov_rad / 2
 
     def run(self, seed: SeedSequence, map_every: int) -> dict[str, Scores] | None:
@@ -594,9 +591,8 @@ class Engine:
         """Return the true states (steps + 1, 3) and the controls (steps, m) that the filters are given."""
         world, motion = self.world, self.robot.motion
         state = drawn_start(self.robot, chance.route)
-        variances, density = np.diagonal(motion.control_noise(np.zeros(0))), motion._density
-        if density is not None:
-            variances = np.append(variances, np.diagonal(density * world.dt_s))
+        walks = np.diagonal(density_of(motion) * world.dt_s)
+        variances = np.append(np.diagonal(motion.control_noise(NO_CONTROL)), walks)
         draws = np.sqrt(variances) * chance.control.standard_normal((world.steps, len(variances)))
         m, route = len(motion.columns), self.route
         told, walk = np.ascontiguousarray(draws[:, :m]), np.ascontiguousarray(draws[:, m:])
@@ -630,11 +626,11 @@ class Engine:
         self, f: _Filter, states: Array, u: Array, sightings: Sightings, points: Array, map_every: int
     ) -> Scores | None:
         """Filter and score a run; None if the filter diverges."""
-        N, density, held = f.noise_of_control
+        N, density, held = f.control
         scored = map_every, f.coordinates == "log", states, points
         ok, mean, P, of_map, x, order, nis, fused = filtered(
             f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
-            (u, self._seconds, N, density, held), tuple(sightings), f.sensed, f.rules, scored,
+            (u, self._seconds, N, density, held), sightings, f.sensed, f.rules, scored,
         )  # fmt: skip
         if not ok:
             return None
