@@ -336,6 +336,9 @@ def speed() -> Iterator[Figure]:
     for world, wanted in (("plane", "20 s"), ("space, one camera", "30 s")):
         yield Figure(section, f"first step with an empty cache, {world}: here / be0e13e / ratio", wanted,
                      "python benchmarks/start.py be0e13e", row(f"{world}, cold:", "{0} s / {3} s / {7}"))  # fmt: skip
+    for name in ("invariant", "invariant:iterations=1", "ekf"):
+        yield Figure(section, f"campaign, 50 landmarks, 6 observed, `{name}`, steps a core-second: ordinary path / batched engine / ratio / largest difference",
+                     "- / 50,000 / - / 1e-9", "python benchmarks/campaign.py", row(name, "{0} / {1} / {2} / {3}"))  # fmt: skip
     for name in ("Trunks", "Walls", "Corners"):
         yield Figure(
             section,

@@ -45,6 +45,7 @@ _FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
 SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` calls them
     "models": ("compiled.py", "geometry/*.py", "models/*.py"),
     "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py"),
+    "campaign": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py", "campaign/engine.py"),
 }
 
 
@@ -62,7 +63,8 @@ def cache_folder(part: str) -> str:
 def compiled(function: F) -> F:
     """Compile `function` with numba in nopython mode, cached on disk."""
     before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = cache_folder("filter" if function.__module__.startswith("kalmark.filter.") else "models")
+    part = function.__module__.split(".")[1]
+    numba.config.CACHE_DIR = cache_folder(part if part in SOURCES else "models")
     try:
         return numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     finally:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -128,13 +129,13 @@ def test_estimators_and_a_sweep_over_them_do_not_go_together(file: Path) -> None
 def ran(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Return the steps of the world and the number of each run that was run."""
     done: list[tuple[int, int]] = []
-    run = Plan.run
+    some = Plan.some
 
-    def counted(plan: Plan, number: int) -> Any:
-        done.append((len(plan.world.times()), number))
-        return run(plan, number)
+    def counted(plan: Plan, numbers: Sequence[int]) -> Any:
+        done.extend((len(plan.world.times()), number) for number in numbers)
+        return some(plan, numbers)
 
-    monkeypatch.setattr(Plan, "run", counted)
+    monkeypatch.setattr(Plan, "some", counted)
     return done
 
 

@@ -198,7 +198,7 @@ class Campaign:
     """N runs of a world, each estimator on the same logs: `scores[estimator][run]`, `t_s` the time of each step.
 
     `kind` is "world", or "config" of a log's replay; `description` is it as it was in force, in YAML.  Averages of NEES
-    leave out the first `skip` steps.
+    leave out the first `skip` steps.  `path` says what computed the runs: `running.path_of`.
     """
 
     world: str
@@ -211,6 +211,7 @@ class Campaign:
     scores: dict[str, tuple[Scores, ...]]
     skip: int = 0
     kind: str = "world"
+    path: str = "ordinary path"
 
     def ideal(self, name: str) -> float:
         """Return what the ANEES of a consistent filter would be: its degrees of freedom, 1 for the joint state."""
@@ -233,7 +234,7 @@ class Campaign:
     def summary(self) -> dict[str, Any]:
         """Return the figures of ``summary.json``: a section for each estimator."""
         head = {self.kind: self.world, "seed": self.seed, "runs": self.runs, "steps": len(self.t_s)}
-        head |= {"map_every": self.map_every, "skip": self.skip}
+        head |= {"map_every": self.map_every, "skip": self.skip, "path": self.path}
         dof, band = ({name: of(name) for name in self._names()} for of in (self.ideal, self.band))
         estimators = {name: figures(scores, self.skip) for name, scores in self.scores.items()}
         return none_for_nan({**head, "dof": dof, "band": band, "estimators": estimators})

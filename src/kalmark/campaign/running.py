@@ -6,9 +6,9 @@ are the same whatever the number of workers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from kalmark.campaign.campaign import Campaign
 from kalmark.campaign.cells import Cell, Scene, open_scene
+from kalmark.campaign.engine import Engine, refusal
 from kalmark.campaign.keeping import Kept, cell_digest
 from kalmark.campaign.replay import Replay
 from kalmark.campaign.scoring import Scores, score
@@ -34,34 +35,71 @@ from kalmark.simulate.robots import simulation
 from kalmark.simulate.worlds import World
 
 Task = tuple[int, int]  # the number of a cell, and of a run of it
+Group = tuple[int, list[int]]  # the number of a cell, and of some runs of it
 Result = dict[str, Scores]  # by estimator
 
 BACKENDS = ("loky", "dask", "ray")
 DEATHS = {"BrokenProcessPool", "KilledWorker", "CancelledError", "RayActorError", "WorkerCrashedError"}
 TRIES = 3
-ROUND = 4  # runs a worker in one round, where results come in rounds
+ROUND = 4  # groups of runs a worker in one round, where results come in rounds
+BATCHED, FEW = "batched engine", "ordinary path: so few steps are done before the batched engine is compiled"
+WORTH = 200_000  # steps of a campaign from which the engine saves more than it takes to compile
+AT_ONCE = 20_000  # steps of the runs that the engine does in one group
 ESTIMATORS = ("invariant", "ekf", "fej")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What every run of a cell does; sent to the workers."""
+    """What every run of a cell does; sent to the workers.  `path` is how: `path_of`."""
 
     world: Scene
     configs: dict[str, Config]
     seed: int
     map_every: int
+    path: str = ""
+
+    @property
+    def steps(self) -> int:
+        """The filter's steps in a run, of all estimators."""
+        return len(self.world.times()) * len(self.configs)
+
+    def engine(self) -> Engine | None:
+        """Return the engine for its runs, compiled, if it is the one that does them."""
+        return Engine(self.world, self.configs) if self.path == BATCHED and isinstance(self.world, World) else None
 
     def run(self, number: int) -> Result:
         """Simulate run `number` and score every estimator on it."""
+        return next(self.some((number,)))
+
+    def some(self, numbers: Sequence[int]) -> Iterator[Result]:
+        """Yield what `run` returns for each of some numbers; a run that the engine leaves takes the ordinary path."""
         with threadpool_limits(1):
-            seed = np.random.SeedSequence(self.seed, spawn_key=(number,))
-            scene, steps = self.world, self.world.times()
-            simulated = scene.simulation(seed) if isinstance(scene, Replay) else simulation(scene, seed)
-            return {
-                name: score(build_slam(config, simulated.log), simulated, steps, self.map_every)
-                for name, config in self.configs.items()
-            }
+            engine = self.engine()
+            for number in numbers:
+                seed = np.random.SeedSequence(self.seed, spawn_key=(number,))
+                result = None if engine is None else engine.run(seed, self.map_every)
+                yield self._ordinary(number) if result is None else result
+
+    def _ordinary(self, number: int) -> Result:
+        """Return the scores of a run by `Slam.process`."""
+        seed = np.random.SeedSequence(self.seed, spawn_key=(number,))
+        scene, steps = self.world, self.world.times()
+        simulated = scene.simulation(seed) if isinstance(scene, Replay) else simulation(scene, seed)
+        return {
+            name: score(build_slam(config, simulated.log), simulated, steps, self.map_every)
+            for name, config in self.configs.items()
+        }
+
+
+def path_of(plan: Plan, runs: int) -> str:
+    """Return how so many runs of a plan are done: `BATCHED`, or the ordinary path and why.
+
+    That depends on nothing but the world, its filters and the number of runs: so do the last digits of the numbers.
+    """
+    if plan.steps * runs < WORTH:
+        return FEW
+    why = refusal(plan.world, plan.configs)
+    return f"ordinary path: {why}" if why else BATCHED
 
 
 def run_campaign(
@@ -124,6 +162,7 @@ def run_sweep(
                 "campaign: got estimators and a sweep over keys of the estimator, expected one of the two"
             )
     plans = [Plan(cell.scene, configs_of(cell.scene, estimators), seed, map_every) for cell in cells]
+    plans = [replace(plan, path=path_of(plan, runs)) for plan in plans]
     kept = None
     digests = [cell_digest(plan.world, plan.configs) for plan in plans]
     if folder is not None:
@@ -143,7 +182,9 @@ def _campaign_of(plan: Plan, scores: dict[str, tuple[Scores, ...]], runs: int, s
     world = plan.world
     robots, t_s = tuple(world.robots), tuple(t * 1e-9 for t in world.times())
     kind = "world" if isinstance(world, World) else "config"
-    return Campaign(world.name, world.to_yaml(), plan.seed, runs, plan.map_every, robots, t_s, scores, skip, kind)
+    return Campaign(
+        world.name, world.to_yaml(), plan.seed, runs, plan.map_every, robots, t_s, scores, skip, kind, plan.path
+    )
 
 
 def refuse_unknown(estimators: Sequence[str] | None) -> None:
@@ -218,16 +259,19 @@ def results_of(
     if not tasks:
         return
     if backend == "loky":
-        jobs = min(jobs or cpu_count(), len(tasks))
+        groups = grouped(plans, tasks)
+        jobs = min(jobs or cpu_count(), len(groups))
         if jobs == 1:
-            yield from (_done(plans[task[0]], task) for task in tasks)
+            for cell, numbers in groups:
+                yield from zip(((cell, n) for n in numbers), plans[cell].some(numbers), strict=True)
             return
+        compile_engine(plans[cell] for cell, _ in groups)
     left, tries = dict.fromkeys(tasks), 0
     while left:
         before = len(left)
         try:
             with joblib_backend(backend, address):
-                for task, result in _in_parallel(plans, [*left], jobs or -1):
+                for task, result in _in_parallel(plans, grouped(plans, [*left]), jobs or -1):
                     del left[task]
                     yield task, result
         except KalmarkError:
@@ -243,18 +287,40 @@ def results_of(
                 raise KalmarkError(message) from error
 
 
-def _done(plan: Plan, task: Task) -> tuple[Task, Result]:
-    return task, plan.run(task[1])
+def compile_engine(plans: Iterable[Plan]) -> None:
+    """Do a run of the first plan that the engine does: workers then load what that has compiled."""
+    for plan in plans:
+        if plan.path == BATCHED:
+            next(plan.some((0,)))
+            return
 
 
-def _in_parallel(plans: Sequence[Plan], tasks: Sequence[Task], jobs: int) -> Iterator[tuple[Task, Result]]:
+def grouped(plans: Sequence[Plan], tasks: Sequence[Task]) -> list[Group]:
+    """Return tasks as groups that a worker does at once: of the engine many short runs, else each alone."""
+    groups: list[Group] = []
+    for cell, number in tasks:
+        plan = plans[cell]
+        size = AT_ONCE // plan.steps if plan.path == BATCHED else 1
+        if not groups or groups[-1][0] != cell or len(groups[-1][1]) >= size:
+            groups.append((cell, []))
+        groups[-1][1].append(number)
+    return groups
+
+
+def _done(plan: Plan, group: Group) -> list[tuple[Task, Result]]:
+    cell, numbers = group
+    return [((cell, number), result) for number, result in zip(numbers, plan.some(numbers), strict=True)]
+
+
+def _in_parallel(plans: Sequence[Plan], groups: Sequence[Group], jobs: int) -> Iterator[tuple[Task, Result]]:
     """Yield results as they become ready; in rounds where the backend of joblib gives only whole lists."""
     backend = get_active_backend()[0]
     each = backend.supports_return_generator
-    size = len(tasks) if each else ROUND * backend.effective_n_jobs(jobs)
+    size = len(groups) if each else ROUND * backend.effective_n_jobs(jobs)
     parallel = Parallel(n_jobs=jobs, batch_size=1, return_as="generator_unordered" if each else "list")
-    for start in range(0, len(tasks), size):
-        yield from parallel(delayed(_done)(plans[task[0]], task) for task in tasks[start : start + size])
+    for start in range(0, len(groups), size):
+        for done in parallel(delayed(_done)(plans[group[0]], group) for group in groups[start : start + size]):
+            yield from done
 
 
 def died(error: BaseException | None) -> bool:

@@ -13,7 +13,7 @@ tag      its pose                                                              6
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -302,22 +302,40 @@ class _Scorer:
 
     def scores(self, stopped: str) -> Scores:
         """Return the scores."""
-        s, coordinates, d = self.series, self.slam.estimator.coordinates, self.d
-        own, world = (pose_error(self.mean, self.truth, c) for c in (coordinates, "world"))
-        s["pose"], s["pose_world"] = nees(own, self.P), nees(world, self.P)
-        s["heading"] = nees(world[..., d:], self.P[..., d:, d:])
-        for name, size in (("pose", own.shape[-1]), ("heading", own.shape[-1] - d)):
-            s[f"{name}_dof"] = np.where(np.isfinite(s[name]), float(size), np.nan)
-        s["position_m"], s["heading_rad"] = (np.linalg.norm(e, axis=-1) for e in (world[..., :d], world[..., d:]))
-        robot = self.log.robots[0]
+        d, robot = self.d, self.log.robots[0]
         mean = self.slam.mean(robot)
         judged = [j for _, j in self._landmarks(robot_turn(mean, self._state(robot, self.last)), mean[:d])]
         place, true = (np.concatenate([np.empty((0, d)), *(j[i] for j in judged)]) for i in (3, 4))
-        aligned = rmse(rigid(place, true)(place) - true) if len(judged) >= d else float("nan")
-        count = sum(true is not None for true in self.true_id.values())
-        parts = zip(own[..., :d], self.P[..., :d, :d], s["position_m"], self.truth[..., :d], strict=True)
-        lost = any(diverged(e, P, error_m, truth) for e, P, error_m, truth in parts)
-        return Scores(s, aligned, rmse(place - true), count, self.nis, self.nis_dof, lost or bool(stopped), stopped)
+        found = place, true, len(judged), sum(true is not None for true in self.true_id.values())
+        coordinates = self.slam.estimator.coordinates
+        return scores_of(
+            self.series, self.mean, self.P, self.truth, coordinates, found, self.nis, self.nis_dof, stopped
+        )  # fmt: skip
+
+
+def scores_of(
+    series: dict[str, Array], mean: Array, P: Array, truth: Array, coordinates: str,
+    found: tuple[Array, Array, int, int], nis: float, nis_dof: int, stopped: str,
+    nees: Callable[[Array, Array], Array] = nees,
+) -> Scores:  # fmt: skip
+    """Return the scores of a run: `series` has those of the map, those of the poses are added.
+
+    The poses are `mean` (robots, steps, 3 or 7) with covariances P and `truth`; `found` are the points of the map,
+    where they truly are (both (N, 2 or 3)), of how many landmarks they are, and how many landmarks have a truth.
+    """
+    d = 2 if mean.shape[-1] == 3 else 3
+    own, world = (pose_error(mean, truth, c) for c in (coordinates, "world"))
+    series["pose"] = nees(own, P)
+    series["pose_world"] = series["pose"].copy() if coordinates == "world" else nees(world, P)
+    series["heading"] = nees(world[..., d:], P[..., d:, d:])
+    for name, size in (("pose", own.shape[-1]), ("heading", own.shape[-1] - d)):
+        series[f"{name}_dof"] = np.where(np.isfinite(series[name]), float(size), np.nan)
+    series["position_m"], series["heading_rad"] = (np.linalg.norm(e, axis=-1) for e in (world[..., :d], world[..., d:]))
+    place, true, judged, count = found
+    aligned = rmse(rigid(place, true)(place) - true) if judged >= d else float("nan")
+    parts = zip(own[..., :d], P[..., :d, :d], series["position_m"], truth[..., :d], strict=True)
+    lost = any(diverged(e, P_e, error_m, path, nees) for e, P_e, error_m, path in parts)
+    return Scores(series, aligned, rmse(place - true), count, nis, nis_dof, lost or bool(stopped), stopped)
 
 
 def on_diagonal(blocks: list[Array]) -> Array:

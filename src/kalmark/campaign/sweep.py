@@ -80,7 +80,7 @@ class Sweep:
             return summaries[0]
         head = {key: summaries[0][key] for key in (self.campaigns[0].kind, "seed", "runs", "map_every", "skip")}
         grid = {key: list({shown(v): v for v in (c.settings[key] for c in self.cells)}.values()) for key in self.keys}
-        own = ("steps", "dof", "band", "estimators")
+        own = ("steps", "path", "dof", "band", "estimators")
         pairs = zip(self.cells, summaries, strict=True)
         cells = [{"settings": cell.settings, **{key: summary[key] for key in own}} for cell, summary in pairs]
         return {**head, "sweep": grid, "cells": cells}

@@ -71,6 +71,8 @@ def campaign(
         print_sweep(result)
     else:
         print_campaign(result.campaigns[0])
+    for path in dict.fromkeys(campaign.path for campaign in result.campaigns):
+        typer.echo(f"computed by the {path}")
     typer.echo(f"{out}: report.html, summary.json, runs.parquet and, of each step, anees.csv and anees.png")
 
 

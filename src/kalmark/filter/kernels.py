@@ -35,8 +35,11 @@ def _load_blas(module: str) -> str:
 _BLAS = _load_blas("scipy.linalg.cython_blas")
 llvmlite.binding.add_symbol("kalmark_dsyrk", get_cython_function_address(_BLAS, "dsyrk"))
 llvmlite.binding.add_symbol("kalmark_dgemm", get_cython_function_address(_BLAS, "dgemm"))
+_LAPACK = _load_blas("scipy.linalg.cython_lapack")
+llvmlite.binding.add_symbol("kalmark_dpotrf", get_cython_function_address(_LAPACK, "dpotrf"))
 _dsyrk = types.ExternalFunction("kalmark_dsyrk", types.void(*[types.intp] * 10))
 _dgemm = types.ExternalFunction("kalmark_dgemm", types.void(*[types.intp] * 13))
+_dpotrf = types.ExternalFunction("kalmark_dpotrf", types.void(*[types.intp] * 5))
 _UPPER_NO = np.array([ord("U"), ord("N")], dtype=np.uint8)
 _TRANS_NO = np.array([ord("T"), ord("N"), ord("T")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
@@ -194,12 +197,20 @@ def clear(P: Array, n: int, at: int, d: int) -> None:
 def downdate(P: Array, V: Array) -> None:
     """P <- P - V' V, V (q, n), on the lower triangle.  [S] (30) with K Z K' = V' V, V = L^-1 H P.  O(n^2 q)."""
     q, n = V.shape
-    if n <= 40:  # below, the call costs more than the sum
-        for k in range(q):
+    if n <= 40 or (q <= 2 and n <= CACHED):  # the call would cost more than the sum
+        k = 0
+        while k + 2 <= q:
+            for i in range(n):
+                v, w = V[k, i], V[k + 1, i]
+                for j in range(i + 1):
+                    P[i, j] -= v * V[k, j] + w * V[k + 1, j]
+            k += 2
+        while k < q:
             for i in range(n):
                 v = V[k, i]
                 for j in range(i + 1):
                     P[i, j] -= v * V[k, j]
+            k += 1
         return
     sizes = np.array([n, q, P.shape[1]], dtype=np.int32)
     at = sizes.ctypes.data
@@ -333,3 +344,12 @@ def cholesky_inverse(S: Array) -> tuple[Array, bool]:
         for k in range(i + 1):
             M[i, k] = T[i, n + k]
     return M, True
+
+
+@compiled
+def cholesky(S: Array) -> bool:
+    """Replace the lower triangle of S (n, n) by L, L L' = S; return whether S is positive definite."""
+    sizes = np.array([len(S), 0], dtype=np.int32)
+    at = sizes.ctypes.data
+    _dpotrf(_UPPER_NO.ctypes.data, at, S.ctypes.data, at, at + 4)
+    return sizes[1] == 0

@@ -22,9 +22,10 @@ def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
     """Return c = a o b (frame b given in frame a), C_a (3, 3) and C_b (3, 3).  [S] (55)."""
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x, y = cos * b[0] - sin * b[1], sin * b[0] + cos * b[1]
-    c = np.array([a[0] + x, a[1] + y, wrap(a[2] + b[2])])
-    C_a = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-    C_b = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    c, C_a, C_b = np.empty(3), np.eye(3), np.eye(3)
+    c[0], c[1], c[2] = a[0] + x, a[1] + y, wrap(a[2] + b[2])
+    C_a[0, 2], C_a[1, 2] = -y, x
+    C_b[0, 0], C_b[0, 1], C_b[1, 0], C_b[1, 1] = cos, -sin, sin, cos
     return c, C_a, C_b
 
 

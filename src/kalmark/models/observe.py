@@ -75,7 +75,13 @@ def landmark_at(
         v, V_y, N = landmark.complete(v, V_y, depth)
     l, L_T, L_v = landmark.from_view(T, v)
     prior = np.zeros((len(l), L_v.shape[1], L_v.shape[1])) if N is None else L_v @ N @ L_v.swapaxes(1, 2)
-    return l, L_T @ T_r, L_T @ T_s, L_v @ V_y, prior
+    return l, _product(L_T, T_r), _product(L_T, T_s), _product(L_v, V_y), prior
+
+
+def _product(A: Array, B: Array) -> Array:
+    """Return A B of K matrices A (K, a, b) and B (K, b, c) or (b, c), to the last bit as compiled code has it."""
+    B = np.broadcast_to(B, (len(A), *B.shape[-2:]))
+    return chained(np.array(A, dtype=np.float64), np.array(B, dtype=np.float64))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ an orientation is the rotation vector in the world's frame that turns the estima
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -194,7 +195,9 @@ def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tu
     return float(quantile(tail, dof * runs)) / runs, float(quantile(1.0 - tail, dof * runs)) / runs
 
 
-def diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:
+def diverged(
+    d: Array, P: Array, error_m: Array, truth: Array, nees: Callable[[Array, Array], Array] = nees
+) -> bool:  # fmt: skip
     """Tell whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
 
     `d` (N, 2 or 3) is the position error in the estimator's coordinates, `P` its covariance, `error_m` (N,) its

@@ -12,7 +12,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.errors import ModelError
-from kalmark.filter import corrections
+from kalmark.filter import corrections, kernels
 from kalmark.filter.map import AT_ONCE, Map, StochasticMap
 from kalmark.filter.neighbours import has_place
 from kalmark.models import landmarks as kinds
@@ -225,7 +225,7 @@ class Channel:
         L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
         if len(own):  # y = h(v, p) stays what it is: V_p = -V_y E_p
             L_h = np.concatenate([L_h, -L_y[0] @ sensor.parameters_jacobian(v)[0]], axis=1)
-        return l[0], L_h, L_y[0] @ R @ L_y[0].T + prior[0]
+        return l[0], L_h, kernels.quadratic(L_y[0], np.array(R, dtype=np.float64)) + prior[0]
 
 
 def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool) -> Landmark:

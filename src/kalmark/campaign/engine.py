@@ -1,0 +1,645 @@
+"""The batched engine: runs of one world in compiled code, simulated, filtered and scored without Python in a step.
+
+A run has the numbers of the ordinary path (`simulation`, `score`) up to rounding.  The random numbers are those of the
+simulator, drawn in its order, many at a time.  The filter calls the compiled prediction and correction that
+`Slam.process` calls, by their addresses.  `refusal` says why the engine does not run a world; a run that it cannot
+finish, such as one whose filter diverges, is left to the ordinary path, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.random import SeedSequence
+
+from kalmark.arrays import Array, Index
+from kalmark.association import ByIdentity
+from kalmark.campaign.scoring import SERIES, Scores, scores_of
+from kalmark.compiled import address_of, by_address, compiled, signature_of
+from kalmark.config.building import build_robot, build_slam
+from kalmark.config.schema import Config
+from kalmark.filter import corrections, kernels, prediction
+from kalmark.filter.estimators import Ekf, Invariant
+from kalmark.filter.maps import DENSE
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.frames import compose, from_frame_many, inv_scan_many
+from kalmark.geometry.spaces import HEADING, VECTOR, Table
+from kalmark.management.attention import EVERYTHING
+from kalmark.models.landmarks import Point2D
+from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
+from kalmark.models.observe import call_move, step_of
+from kalmark.models.protocols import bias_covariance, parameter_covariance
+from kalmark.models.sensors import RangeBearing
+from kalmark.results.measures import SINGULAR, nees
+from kalmark.simulate.robots import Chance, drawn_start, scenery_of
+from kalmark.simulate.routes import Constant, Drive
+from kalmark.simulate.sights import POINTS, Sensing, Things, chosen
+from kalmark.simulate.worlds import World
+from kalmark.slam.robot import Mount
+from kalmark.slam.slam import Slam
+
+MOTIONS = (Unicycle, Odometry2D, Ackermann)
+REGULAR = 1e-6  # determinant of a correlation matrix above which the compiled NEES is as exact as LAPACK's
+ALL_TARGETS = 100  # places to drive to, a step, before a run is left to the ordinary path
+
+NO_CONTROL = np.zeros(0)  # the noise of controls does not depend on them
+
+PREDICT = signature_of(
+    "b1(Tuple((f8[::1], f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8)), "
+    "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1)"
+)
+CORRECT = signature_of(
+    f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], b1[::1], b1))({corrections.TO_CORRECT}, Tuple((i8, f8)))"
+)
+call_predict, call_correct = by_address(PREDICT), by_address(CORRECT)
+
+
+# of ranges and bearings: sigma_range_m, sigma_range_rel, sigma_bearing_rad, scale and bias_m
+Noise = tuple[float, float, float, float, float]
+Sightings = tuple[Index, Index, Array]  # numbers of steps or where each step begins, the points (N,), and y (N, 2)
+
+
+def noise_of(sensor: RangeBearing) -> Noise:
+    """Return the noise of a sensor as compiled code takes it."""
+    return sensor.sigma_range_m, sensor.sigma_range_rel, sensor.sigma_bearing_rad, sensor.scale, sensor.bias_m
+
+
+# ---------------------------------------------------------------------- what the engine runs
+def refusal(world: Any, configs: Mapping[str, Config]) -> str:
+    """Return why the engine does not run a scene with these filters; empty if it does."""
+    if not isinstance(world, World):
+        return "the batched engine does not replay logs"
+    if world.dimensions != 2 or len(world.robots) != 1:
+        return "the batched engine runs one robot of the plane"
+    ((name, simulated),) = world.robots.items()
+    if len(simulated.sensors) != 1:
+        return "the batched engine runs one sensor"
+    robot = build_robot(world.models(), name)
+    ((key, mount),) = robot.sensors.items()
+    why = _odd_models(robot.motion, mount)
+    sensing = simulated.sensing.get(key, Sensing())
+    if not why and (sensing.outliers or sensing.swapped or sensing.hidden):
+        why = "the batched engine simulates no outliers, swapped or hidden ids"
+    if not why and not isinstance(simulated.route, Constant | Drive):
+        why = f"the batched engine does not drive a {type(simulated.route).__name__}"
+    if not why and isinstance(simulated.route, Constant) and not any(simulated.route.u):
+        why = "the batched engine has no robot that stands still"
+    if not why and not world.ids:
+        why = "the batched engine needs known ids"
+    things = scenery_of(world, np.random.default_rng(0))
+    if not why and sum(len(sort.values) for sort in things.values()) > len(things[POINTS].values):
+        why = "the batched engine has no landmarks but points"
+    return why or next(filter(None, (_odd_filter(c, name, len(things[POINTS].values)) for c in configs.values())), "")
+
+
+def _odd_models(motion: Any, mount: Mount) -> str:
+    """Return what of a motion and a mounted sensor the engine does not run."""
+    if type(motion) not in MOTIONS or bias_covariance(motion) is not None:
+        return "the batched engine has velocities and increments of the plane without a bias"
+    if (
+        type(mount.sensor) is not RangeBearing
+        or parameter_covariance(mount.sensor) is not None
+        or mount.cov is not None
+    ):
+        return "the batched engine has ranges and bearings, of a sensor whose calibration is known"
+    return ""
+
+
+def _odd_filter(config: Config, name: str, landmarks: int) -> str:
+    """Return what of a filter the engine does not run."""
+    slam = build_slam(config)
+    robot = slam.robots[name]
+    ((key, mount),) = robot.sensors.items()
+    policy, channel = slam._policies[name, key], slam._channels[name, key]
+    if why := _odd_models(robot.motion, mount):
+        return why
+    if type(slam.estimator) not in (Ekf, Invariant):
+        return f"the batched engine has no estimator {config.estimator.type}"
+    if type(policy.association) is not ByIdentity or type(channel.landmark) is not Point2D:
+        return "the batched engine has points with known ids"
+    plain = mount.attention == EVERYTHING and mount.detector is None and mount.initialization is None
+    if not plain or policy.upkeep.p_detect is not None:
+        return "the batched engine uses all that is seen, and keeps it"
+    if slam.map_type == "postponed" or (slam.map_type == "auto" and landmarks > DENSE):
+        return f"the batched engine has dense maps, of up to {DENSE} landmarks"
+    return ""
+
+
+# ---------------------------------------------------------------------- simulation
+@compiled
+def driven(
+    model: tuple[int, Array], kind: int, start: Array, dt_s: float, errors: Array, walk: Array, u: Array, places: Array,
+    limits: tuple[float, float], on_robot: bool,
+) -> tuple[Array, Array, bool]:  # fmt: skip
+    """Drive to `places` (T, 2), or by a constant control u (m,); return the states (steps + 1, 3) and what is told.
+
+    `errors` (steps, m) are those of the controls, `walk` (steps, 3 or 0) is the diffusion in the robot's frame; `kind`
+    is the motion's number among `MOTIONS`, `limits` speed and turning radius.  The last answer is whether the places
+    were enough.  As `simulate.robots.step` and `simulate.routes`.
+    """
+    steps, m = errors.shape
+    speed, radius = limits
+    states, told, control, done = np.empty((steps + 1, 3)), np.empty((steps, m)), np.empty(m), np.empty(m)
+    r, at = start.copy(), 0
+    states[0] = r
+    for k in range(steps):
+        for j in range(len(u)):
+            control[j] = u[j]
+        if len(u) == 0:
+            for _ in range(1000):
+                if math.hypot(places[at, 0] - r[0], places[at, 1] - r[1]) > 2 * radius:
+                    break
+                at += 1
+                if at == len(places):
+                    return states, told, False
+            error = wrap(math.atan2(places[at, 1] - r[1], places[at, 0] - r[0]) - r[2])
+            limit = speed / radius
+            w = min(limit, max(-limit, error / dt_s))
+            if kind == 0:
+                control[0], control[1] = speed, w
+            elif kind == 1:
+                a = 0.5 * w * dt_s
+                chord = speed * dt_s * (math.sin(a) / a if a != 0.0 else 1.0)
+                control[0], control[1], control[2] = chord * math.cos(a), chord * math.sin(a), 2 * a
+            else:
+                tan = w * model[1][0] / speed
+                control[0], control[1] = speed * (1.0 - tan * model[1][1] / model[1][0]), math.atan(tan)
+        for j in range(m):
+            disturbed = control[j] + errors[k, j]
+            told[k, j], done[j] = (control[j], disturbed) if on_robot else (disturbed, control[j])
+        r = call_move(model[0], (r, done, model[1], dt_s))[0]
+        if walk.shape[1] == 3:
+            c, s = math.cos(r[2]), math.sin(r[2])
+            r[0], r[1] = r[0] + (c * walk[k, 0] - s * walk[k, 1]), r[1] + (s * walk[k, 0] + c * walk[k, 1])
+            r[2] = wrap(r[2] + walk[k, 2])
+        states[k + 1] = r
+    return states, told, True
+
+
+@compiled
+def in_sight(
+    states: Array, at: Array, points: Array, every: int, limits: tuple[float, float, float], most: int
+) -> Sightings:  # fmt: skip
+    """Return what a sensor at `at` (3,) sees: the steps (N,), the points (N,), exact ranges and bearings (N, 2).
+
+    `limits` are the least and the greatest range and half of the field of view; of each scan the nearest `most`.
+    """
+    least, greatest, half = limits
+    size, total = len(points), 0
+    steps, things = np.empty((len(states) - 1) * size, np.int64), np.empty((len(states) - 1) * size, np.int64)
+    y, near, p = np.empty((len(steps), 2)), np.empty(size, np.int64), np.empty((size, 3))
+    for k in range(every - 1, len(states) - 1, every):
+        T = compose(states[k + 1], at)[0]
+        c, s = math.cos(T[2]), math.sin(T[2])
+        count = 0
+        for i in range(size):
+            d_x, d_y = points[i, 0] - T[0], points[i, 1] - T[1]
+            x, y_ahead = c * d_x + s * d_y, c * d_y - s * d_x
+            distance = math.sqrt(x * x + y_ahead * y_ahead)
+            if least <= distance <= greatest and (half >= math.pi or abs(math.atan2(y_ahead, x)) <= half):
+                near[count], p[count, 0], p[count, 1], p[count, 2] = i, x, y_ahead, distance
+                count += 1
+        for a in range(count):
+            nearer = 0
+            for b in range(count if count > most else 0):
+                nearer += p[b, 2] < p[a, 2] or (p[b, 2] == p[a, 2] and b < a)
+            if nearer < most:
+                steps[total], things[total] = k, near[a]
+                y[total, 0], y[total, 1] = p[a, 2], math.atan2(p[a, 1], p[a, 0])
+                total += 1
+    return steps[:total], things[:total], y[:total]
+
+
+def reported(
+    world: World, sensing: Sensing, things: Things, noise: Noise, chance: Chance, seen: Sightings
+) -> Sightings:
+    """Return what is reported of all that is seen, with noise: as `sights.chosen`, `faulty`, `noisy` and `possible`."""
+    steps, numbers, e = seen
+    rows, normals = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    for kept in reports(world, things, seen, chance):
+        if sensing.dropouts:
+            late = steps[kept] + 1 >= sensing.faults_from_step
+            lost = np.zeros(len(kept), dtype=np.bool_)
+            lost[late] = chance.faults.random(int(late.sum())) < sensing.dropouts
+            kept = kept[~lost]  # noqa: PLW2901
+        rows.append(kept)
+        normals.append(chance.sight.standard_normal((len(kept), 2)))
+    of, n = np.concatenate(rows), np.concatenate(normals)
+    sigma_m, rel, sigma_rad, scale, bias_m = noise
+    y = e[of]
+    y[:, 0] = scale * y[:, 0] + bias_m
+    y[:, 0] += np.sqrt(sigma_m**2 + (rel * y[:, 0]) ** 2) * n[:, 0]
+    y[:, 1] = wrap(y[:, 1] + np.sqrt(sigma_rad**2) * n[:, 1])
+    possible = y[:, 0] >= 0
+    of, y = of[possible], y[possible]
+    return np.searchsorted(steps[of], np.arange(world.steps + 1)), numbers[of], y
+
+
+def reports(world: World, things: Things, seen: Sightings, chance: Chance) -> Iterator[Index]:
+    """Yield rows of what is seen that are reported, many steps at once: alone are those that start new landmarks.
+
+    These draw from the same source of chance as the noise does.
+    """
+    steps, numbers, y = seen
+    rows, at = np.arange(len(steps)), 0
+    if world.new_per_step is None:
+        yield rows
+        return
+    if world.max_per_scan is not None:
+        order = np.lexsort((y[:, 0], steps))
+        rank = np.empty_like(order)
+        rank[order] = rows - np.searchsorted(steps, steps[order])
+        rows = rows[rank < world.max_per_scan]
+    while at < len(steps):
+        unseen = np.flatnonzero(~things.seen[numbers[at:]])
+        k = steps[at + unseen[0]] if len(unseen) else world.steps
+        here, then = np.searchsorted(steps, (k, k + 1)).tolist()
+        yield rows[slice(*np.searchsorted(rows, (at, here)))]
+        if then > here:
+            some = slice(here, then)
+            told = chosen(things, numbers[some], y[some, 0], world.new_per_step, world.max_per_scan, chance.sight)
+            yield here + told
+        at = then
+
+
+# ---------------------------------------------------------------------- filter
+@compiled
+def textbook(view: Any, map_: Any, scan: Any, limits: tuple[int, float]) -> Any:
+    """Correct as `Ekf` does, with the arguments of `invariant`."""
+    return corrections.compiled_textbook(view, map_, scan, None)
+
+
+@compiled
+def range_variance(noise: Noise, x: float, y: float) -> float:
+    """Return the variance of the range of a point at x, y in the sensor's frame, as `RangeBearing.noise_at`."""
+    return noise[0] ** 2 + (noise[1] * (noise[3] * math.sqrt(x * x + y * y) + noise[4])) ** 2
+
+
+@compiled
+def noises(
+    x: Array, slots: Index, at: Array, noise: Noise
+) -> Array:  # fmt: skip
+    """Return the noise R (K, 2, 2) of observing the landmarks on `slots` (K,), at their expected ranges."""
+    R = np.zeros((len(slots), 2, 2))
+    T = compose(x[:3], at)[0]
+    c, s = math.cos(T[2]), math.sin(T[2])
+    for i in range(len(slots)):
+        j = 1 + 2 * slots[i]
+        d_x, d_y = x[j] - T[0], x[j + 1] - T[1]
+        R[i, 0, 0] = range_variance(noise, c * d_x + s * d_y, c * d_y - s * d_x)
+        R[i, 1, 1] = noise[2] ** 2
+    return R
+
+
+@compiled
+def start(
+    x: Array, x_first: Array, P: Array, n: int, at: Array, y: Array,
+    noise: Noise,
+) -> None:  # fmt: skip
+    """Add the landmark that explains y (1, 2) from a mount `at` (3,) to the n rows of a map.  [S] (32)-(38)."""
+    T, T_r, _ = compose(x[:3], at)
+    seen = y.copy()
+    seen[0, 0] = (y[0, 0] - noise[4]) / noise[3]
+    v, V_y = inv_scan_many(seen)
+    l, L_T, L_v = from_frame_many(T, v)
+    for i in range(2):
+        V_y[0, i, 0] /= noise[3]
+        x[n + i] = x_first[n + i] = l[0, i]
+    L_r, L_y, R = kernels.product(L_T[0], T_r), kernels.product(L_v[0], V_y[0]), np.zeros((2, 2))
+    R[0, 0], R[1, 1] = range_variance(noise, v[0, 0], v[0, 1]), noise[2] ** 2
+    kernels.augment(P, n + 2, n, np.arange(3), L_r, kernels.quadratic(L_y, R))
+
+
+@compiled
+def known_ones(slot_of: Index, things: Index, y: Array) -> tuple[Index, Array]:
+    """Return the slots (K,) and the measurements (K, 2) of those observations whose landmarks have a slot."""
+    count = 0
+    for i in range(len(things)):
+        count += slot_of[things[i]] >= 0
+    slots, y_known, to = np.empty(count, np.int64), np.empty((count, 2)), 0
+    for i in range(len(things)):
+        if slot_of[things[i]] >= 0:
+            slots[to], y_known[to, 0], y_known[to, 1] = slot_of[things[i]], y[i, 0], y[i, 1]
+            to += 1
+    return slots, y_known
+
+
+@compiled
+def filtered(
+    ways: tuple[int, int, int], routines: corrections.Routines, view: Any, motion: tuple[int, Array],
+    tables: tuple[Table, Table, int], started: tuple[Array, Array], controls: tuple[Array, Array, Array, Array, bool],
+    sightings: Sightings, sensed: tuple[Array, Noise],
+    rules: tuple[float, int, float], scored: tuple[int, bool, Array, Array],
+) -> tuple[bool, Array, Array, Array, Array, Index, float, int]:  # fmt: skip
+    """Filter a run: predict, correct and start landmarks step by step, as `Slam.process` does with known ids.
+
+    `ways` are the addresses of the prediction, the correction and the generator, `tables` the blocks and the atoms of a
+    robot and all landmarks and the capacity of a covariance, `controls` u (steps, m), seconds (steps,), the covariance
+    N of a control's error, the diffusion (3 or 0, .) a second and whether controls are held, `sensed` the mount and
+    its noise, `rules` the gate and the limits of the iterations, `scored` what `score_map` takes.
+
+    Returns whether all went well, the pose (steps, 3) after each scan and its covariance, the scores of the map
+    (steps, 5), the mean in the end, the numbers of the landmarks in it, the sum of d2 and how many were fused.
+    """
+    blocks, atoms, capacity = tables
+    u, dt_s, N, density, held = controls
+    first, things, y = sightings
+    at, noise = sensed
+    steps, axes, robot, mount, d, never = len(u), 1, 0, -1, 2, False
+    x, x_first, P = np.zeros(capacity), np.zeros(capacity), np.zeros((capacity, capacity))
+    x[:3] = x_first[:3] = started[0]
+    P[:3, :3] = started[1]
+    mean, cov, scores = np.full((steps, 3), np.nan), np.full((steps, 3, 3), np.nan), np.full((steps, 5), np.nan)
+    slot_of, order = np.full(len(blocks), -1), np.empty(len(blocks), np.int64)
+    none, nothing, count, nis, fused, ok = np.empty(0, np.int64), np.zeros((0, 0)), 0, 0.0, 0, True
+    for k in range(steps):
+        low, high = first[k], first[k + 1]
+        if held and k == steps - 1 and high == low:
+            break  # no later event asks where the robot is
+        n = 3 + 2 * count
+        D = density * dt_s[k] if len(density) and u[k].any() else nothing
+        map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
+        ok = call_predict(ways[0], (map_, (motion, robot, none, never, u[k], N, D, dt_s[k]), never))
+        slots, y_known = known_ones(slot_of, things[low:high], y[low:high])
+        if ok and len(slots):
+            whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines
+            scan = robot, mount, slots, d, y_known, noises(x, slots, at, noise), rules[0]
+            _e, _z, _Z, d2, near, ok = call_correct(ways[1], (view, whole, scan, (rules[1], rules[2])))
+            for i in range(len(slots)):
+                nis += d2[i] if near[i] else 0.0
+                fused += near[i]
+        if not ok:
+            break
+        for i in range(low, high if len(slots) < high - low else low):
+            if slot_of[things[i]] < 0:
+                order[count], slot_of[things[i]] = things[i], count + 1
+                start(x, x_first, P, 3 + 2 * count, at, y[i : i + 1], noise)
+                count += 1
+        if high > low:
+            keep_pose(x, P, mean[k], cov[k])
+            if (k + 1) % scored[0] == 0 or k == steps - 1:
+                score_map(x, P, order[:count], scored[1], scored[2][k + 1], scored[3], scores[k])
+    return ok, mean, cov, scores, x, order[:count], nis, fused
+
+
+# ---------------------------------------------------------------------- scores
+@compiled
+def keep_pose(x: Array, P: Array, mean: Array, cov: Array) -> None:
+    """Write the mean (3,) and the covariance (3, 3) of the robot's pose."""
+    for i in range(3):
+        mean[i] = x[i]
+        for j in range(3):
+            cov[i, j] = P[max(i, j), min(i, j)]
+
+
+@compiled
+def score_map(
+    x: Array, P: Array, order: Index, turns: bool, truth: Array, points: Array, out: Array
+) -> None:  # fmt: skip
+    """Write the NEES of the landmarks (mean) and of the joint state, each in own and in world coordinates, and n.
+
+    `turns`: errors are in the invariant filter's coordinates.  `truth` is the true state (3,) of the robot, `points`
+    where the landmarks truly are.
+    """
+    n, a = 3 + 2 * len(order), wrap(truth[2] - x[2])
+    half = 0.5 * a
+    diagonal = 1.0 - half * half / 3.0 if abs(half) < 1e-4 else half / math.tan(half)
+    sums, finite, d = np.zeros(2), np.zeros(2), np.empty((2, n))
+    for i in range(len(order) + 1):
+        j = 0 if i == 0 else 2 * i + 1
+        d[1, j] = (truth[0] if i == 0 else points[order[i - 1], 0]) - x[j]
+        d[1, j + 1] = (truth[1] if i == 0 else points[order[i - 1], 1]) - x[j + 1]
+        d[0, j], d[0, j + 1] = d[1, j], d[1, j + 1]
+        if turns:
+            d[0, j], d[0, j + 1] = diagonal * d[1, j] + half * d[1, j + 1], diagonal * d[1, j + 1] - half * d[1, j]
+        for c in range(2 if i > 0 else 0):
+            value = nees_of_two(d[c, j], d[c, j + 1], P[j, j], P[j + 1, j], P[j + 1, j + 1])
+            if np.isfinite(value):
+                sums[c] += value
+                finite[c] += 1.0
+    d[0, 2] = d[1, 2] = a
+    for c in range(2):
+        if finite[c] > 0.0:
+            out[c] = sums[c] / finite[c]
+    joint, joint_world = joint_nees(P, d)
+    out[2], out[3] = joint, joint_world
+    if np.isfinite(joint):
+        out[4] = float(n)
+
+
+@compiled
+def nees_of_two(d_x: float, d_y: float, xx: float, yx: float, yy: float) -> float:
+    """Return the NEES of an error (2,) whose covariance has these numbers; NaN if it is singular."""
+    if not (xx > 0.0 and yy > 0.0):
+        return np.nan
+    s_x, s_y = math.sqrt(xx), math.sqrt(yy)
+    r, a, b = yx / (s_x * s_y), d_x / s_x, d_y / s_y
+    if not 1.0 - abs(r) > SINGULAR:
+        return np.nan
+    b -= r * a
+    return a * a + b * b / ((1.0 - r) * (1.0 + r))
+
+
+@compiled
+def joint_nees(P: Array, d: Array) -> tuple[float, float]:
+    """Return the NEES of two errors d (2, n) of one state with the lower triangle P; NaN if it is singular.
+
+    By the Cholesky factor of the correlation with both scaled errors as two more rows: there it has L^-1 d.
+    """
+    n = d.shape[1]
+    S, sigma = np.zeros((n + 2, n + 2)), np.empty(n)
+    for i in range(n):
+        sigma[i] = math.sqrt(P[i, i])
+        for j in range(i + 1):
+            S[i, j] = P[i, j] / (sigma[i] * sigma[j])
+        for c in range(2):
+            S[n + c, i] = d[c, i] / sigma[i]
+    S[n, n] = S[n + 1, n + 1] = 1e300
+    if not kernels.cholesky(S):
+        return np.nan, np.nan
+    value = np.zeros(2)
+    for i in range(n):
+        if not S[i, i] ** 2 > SINGULAR:
+            return np.nan, np.nan
+        for c in range(2):
+            value[c] += S[n + c, i] ** 2
+    return value[0], value[1]
+
+
+@compiled
+def small_nees(d: Array, P: Array) -> tuple[Array, Array]:
+    """Return the NEES (N,) of errors d (N, n) with covariances P (N, n, n), n up to 3, and how regular these are."""
+    count, n = d.shape
+    value, determinant, L, w = np.zeros(count), np.zeros(count), np.zeros((n, n)), np.empty(n)
+    for k in range(count):
+        product = 1.0
+        for i in range(n):
+            w[i] = d[k, i] / math.sqrt(P[k, i, i])
+            for j in range(i + 1):
+                s = P[k, i, j] / math.sqrt(P[k, i, i] * P[k, j, j])
+                for a in range(j):
+                    s -= L[i, a] * L[j, a]
+                L[i, j] = math.sqrt(s) if i == j else s / L[j, j]
+            for j in range(i):
+                w[i] -= L[i, j] * w[j]
+            product *= L[i, i] ** 2
+            w[i] /= L[i, i]
+            value[k] += w[i] ** 2
+        determinant[k] = product
+    return value, determinant
+
+
+def fast_nees(d: Array, P: Array) -> Array:
+    """Return what `measures.nees` does: compiled where that is as exact."""
+    n = d.shape[-1]
+    rows, blocks = np.ascontiguousarray(d.reshape(-1, n)), np.ascontiguousarray(P.reshape(-1, n, n))
+    value, determinant = small_nees(rows, blocks)
+    odd = ~(determinant > REGULAR)
+    if odd.any():
+        value[odd] = nees(rows[odd], blocks[odd])
+    return value.reshape(d.shape[:-1])
+
+
+# ---------------------------------------------------------------------- runs
+class _Filter:
+    """An estimator of the engine: the arguments of `filtered` that are the same in all runs."""
+
+    def __init__(self, slam: Slam, name: str, landmarks: int) -> None:
+        robot, estimator = slam.robots[name], slam.estimator
+        ((key, mount),) = robot.sensors.items()
+        channel, motion = slam._channels[name, key], robot.motion
+        assert isinstance(motion, MOTIONS) and isinstance(mount.sensor, RangeBearing)
+        correct = corrections.compiled_invariant if isinstance(estimator, Invariant) else textbook
+        self.ways = (
+            address_of(prediction.compiled_predicted, PREDICT), address_of(correct, CORRECT),
+            corrections.generator_address(1),
+        )  # fmt: skip
+        self.routines = corrections.routines(1, False)
+        self.view, self.motion = channel.models["point"].model, step_of(robot.motion)
+        rows = 3 + 2 * np.arange(landmarks)
+        columns = (rows, 2, rows, 2, np.arange(landmarks) + 2, 1)
+        blocks = np.column_stack(np.broadcast_arrays(*columns))
+        atoms = np.column_stack(np.broadcast_arrays(VECTOR, rows, rows))
+        self.blocks = np.concatenate([[[0, 3, 0, 3, 0, 2]], blocks])
+        self.atoms = np.concatenate([[[VECTOR, 0, 0], [HEADING, 2, 2]], atoms])
+        self.capacity = capacity_for(3 + 2 * landmarks)
+        cov = np.zeros((3, 3)) if robot.cov is None else np.asarray(robot.cov)
+        self.start = np.array(robot.start), np.array(cov)
+        self.control = motion.control_noise(NO_CONTROL), density_of(motion), motion.held
+        self.sensed = np.array(mount.at), noise_of(mount.sensor)
+        limits = (estimator.iterations, float(estimator.tolerance)) if isinstance(estimator, Invariant) else (1, 0.0)
+        self.rules = (float(channel.gate), *limits)
+        self.coordinates = estimator.coordinates
+
+
+def density_of(motion: Any) -> Array:
+    """Return the diffusion of a motion that moves, (3, 3) a second; (0, 0) if it has none."""
+    D: Array | None = motion.diffusion(np.ones(len(motion.columns)), 1.0)
+    return np.zeros((0, 0)) if D is None else D
+
+
+def capacity_for(rows: int) -> int:
+    """Return a width of a covariance of so many rows: an odd number of cache lines, see `layout.CAPACITY`."""
+    return 16 * (rows // 16) + 8 if rows % 16 <= 8 else 16 * (rows // 16) + 24
+
+
+class Engine:
+    """Runs of a world under several filters.  Made once for many runs: it compiles, or loads, what they call."""
+
+    def __init__(self, world: World, configs: Mapping[str, Config]) -> None:
+        self.world, self.times = world, world.times()
+        ((name, simulated),) = world.robots.items()
+        self.robot, self.route = build_robot(world.models(), name), simulated.route
+        ((key, self.mount),) = self.robot.sensors.items()
+        self.sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
+        things = scenery_of(world, np.random.default_rng(0))
+        self.landmarks = len(things[POINTS].values)
+        self.filters = {label: _Filter(build_slam(c), name, self.landmarks) for label, c in configs.items()}
+        motion, sensor = self.robot.motion, self.mount.sensor
+        self.motion, self.kind = step_of(motion), MOTIONS.index(type(motion))
+        assert isinstance(motion, MOTIONS) and isinstance(sensor, RangeBearing)
+        self.noise, self.at = noise_of(sensor), np.array(self.mount.at)
+        self.limits = sensor.range_min_m, sensor.range_max_m, sensor.fov_rad / 2
+
+    def run(self, seed: SeedSequence, map_every: int) -> dict[str, Scores] | None:
+        """Simulate and score one run under every filter; None if that is left to the ordinary path."""
+        world, chance = self.world, Chance(seed)
+        things = scenery_of(world, chance.layout)[POINTS]
+        if len(things.values) != self.landmarks:
+            return None
+        driven_ = self._drive(things, chance)
+        if driven_ is None:
+            return None
+        states, u = driven_
+        most = self.landmarks if world.max_per_scan is None or world.new_per_step else world.max_per_scan
+        seen = in_sight(states, self.at, things.values, self.sensing.every or 1, self.limits, most)
+        sightings = reported(world, self.sensing, things, self.noise, chance, seen)
+        scores = {}
+        for label, one in self.filters.items():
+            score = self._filter(one, states, u, sightings, things.values, map_every)
+            if score is None:
+                return None
+            scores[label] = score
+        return scores
+
+    def _drive(self, things: Things, chance: Chance) -> tuple[Array, Array] | None:
+        """Return the true states (steps + 1, 3) and the controls (steps, m) that the filters are given."""
+        world, motion = self.world, self.robot.motion
+        state = drawn_start(self.robot, chance.route)
+        walks = np.diagonal(density_of(motion) * world.dt_s)
+        variances = np.append(np.diagonal(motion.control_noise(NO_CONTROL)), walks)
+        draws = np.sqrt(variances) * chance.control.standard_normal((world.steps, len(variances)))
+        m, route = len(motion.columns), self.route
+        told, walk = np.ascontiguousarray(draws[:, :m]), np.ascontiguousarray(draws[:, m:])
+        u, places, limits = np.zeros(0), np.zeros((0, 2)), (0.0, 1.0)
+        area = np.array([things.values.min(axis=0), things.values.max(axis=0)])
+        ahead: Iterator[Array] = iter(())
+        if isinstance(route, Constant):
+            u = np.array(route.u)
+        else:
+            limits, ahead = (route.speed_mps, route.turn_radius_m), route.places(area, chance.route)
+        while True:
+            more = max(64, len(places)) if not len(u) else 0
+            places = np.concatenate([places, np.reshape([p[:2] for p in islice(ahead, more)], (-1, 2))])
+            on_robot = world.noise_on == "robot"
+            args = self.motion, self.kind, state, world.dt_s, told, walk, u, places, limits, on_robot
+            states, controls, enough = driven(*args)
+            if enough:
+                return states, controls
+            if len(places) > ALL_TARGETS * world.steps:
+                return None
+
+    @cached_property
+    def _seconds(self) -> Array:
+        """The seconds (steps,) of each control: an increment's first one has none before it."""
+        dt_s = np.diff([0, *self.times]) * 1e-9
+        if not self.robot.motion.held:
+            dt_s[0] = 0.0
+        return dt_s
+
+    def _filter(
+        self, f: _Filter, states: Array, u: Array, sightings: Sightings, points: Array, map_every: int
+    ) -> Scores | None:
+        """Filter and score a run; None if the filter diverges."""
+        N, density, held = f.control
+        scored = map_every, f.coordinates == "log", states, points
+        ok, mean, P, of_map, x, order, nis, fused = filtered(
+            f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
+            (u, self._seconds, N, density, held), sightings, f.sensed, f.rules, scored,
+        )  # fmt: skip
+        if not ok:
+            return None
+        series = {key: np.full((1, len(u)), np.nan) for key in SERIES}
+        for i, key in enumerate(("landmarks", "landmarks_world", "joint", "joint_world", "joint_dof")):
+            series[key][0] = of_map[:, i]
+        series["landmarks_dof"][0] = np.where(np.isfinite(of_map[:, 0]), 2.0, np.nan)
+        place = x[3 : 3 + 2 * len(order)].reshape(-1, 2)
+        found = place, points[order], len(order), len(order)
+        return scores_of(
+            series, mean[None], P[None], states[None, 1:], f.coordinates, found, nis, 2 * fused, "", fast_nees
+        )
