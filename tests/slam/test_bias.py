@@ -84,6 +84,69 @@ def test_a_robot_with_a_bias_is_tracked_consistently_only_if_the_bias_is_in_the_
     assert np.mean(nees[False]) > 2 * np.mean(nees[True])
 
 
+INCREMENTS = {
+    "sigma_scale": 0.05,
+    "sigma_turn_scale": 0.05,
+    "sigma_turn_bias_radps": 0.02,
+    "sigma_turn_rad_per_m": 0.02,
+}
+CALIBRATING = [
+    km.motion.Unicycle(
+        sigma_v_bias_mps=1, sigma_w_bias_radps=1, sigma_v_scale=1, sigma_w_scale=1, sigma_turn_rad_per_m=1
+    ),
+    km.motion.Ackermann(sigma_v_bias_mps=1, sigma_steering_bias_rad=1, sigma_v_scale=1, sigma_steering_scale=1),
+    km.motion.Odometry2D(**dict.fromkeys(INCREMENTS, 1.0)),
+    km.motion.Odometry3D(sigma_scale=1, sigma_turn_scale=1, sigma_turn_bias_radps=1),
+    km.motion.Velocity3D(sigma_v_bias_mps=1, sigma_w_bias_radps=1, sigma_v_scale=1, sigma_w_scale=1),
+]
+
+
+@pytest.mark.parametrize("motion", CALIBRATING, ids=lambda m: type(m).__name__)
+def test_constants_of_a_control_change_it_as_they_are_named(motion: Any) -> None:
+    u, dt = np.random.default_rng(2).uniform(0.5, 1.0, len(motion.columns)), 0.2
+    B, names = motion.calibration_effect(u, dt), motion.calibration
+    assert B.shape == (len(u), len(names)) == (len(u), len(motion.calibration_cov))
+    for column, name in zip(B.T, names, strict=True):
+        changed = np.flatnonzero(column)
+        turns = [j for j, of in enumerate(motion.columns) if of.endswith(("_rad", "_radps"))]
+        if name in ("scale", "v_scale"):
+            assert [*changed] == [j for j in range(len(u)) if j not in turns]
+            np.testing.assert_allclose(column[changed], u[changed])
+        elif name in ("turn_scale", "w_scale", "steering_scale"):
+            assert [*changed] == turns
+            np.testing.assert_allclose(column[changed], u[changed])
+        elif name == "turn_rad_per_m":
+            way = np.linalg.norm(np.delete(u, turns))
+            assert column[turns] == pytest.approx(way)
+        else:
+            assert len(changed) == 1
+            assert column[changed] == pytest.approx(1.0 if motion.held else dt)
+
+
+def test_increments_calibrate_themselves_consistently() -> None:
+    nees = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        constants, truth, events = rng.normal(size=4) * [*INCREMENTS.values()], np.array(START), []
+        motion, noise = km.motion.Odometry2D(0.01, 0.0, 0.005, **INCREMENTS), np.array([0.01, 0.0, 0.005])
+        for t in range(1, 400):
+            u = np.array([0.1, 0.0, 0.05 * np.sin(t / 20)]) if t % 50 > 10 else np.array([0.0, 0.0, 0.1])
+            truth = km.geometry.compose(truth, u)[0]
+            told = u
+            for _ in range(5):  # until u = told + B(told) constants
+                told = u - motion.calibration_effect(told, 0.1) @ constants
+            events.append(km.Control(t * 0.1, "r", told + rng.normal(size=3) * noise))
+            near = np.flatnonzero(np.hypot(*(WORLD - truth[:2]).T) < 5.0)[:6]
+            y = km.geometry.observe(truth, WORLD[near])[0] + rng.normal(size=(len(near), 2)) * [0.05, 0.01]
+            events.append(km.Scan(t * 0.1, "r", "lidar", np.abs(y) * [1, 0] + y * [0, 1], near.tolist()))
+        lidar = km.Mount(km.sensors.RangeBearing(0.05, 0.01))
+        slam = run(km.Slam([km.Robot("r", motion, START, {"lidar": lidar})], km.association.ByIdentity("off")), events)
+        e, P = slam.mean("r bias") - constants, slam.covariance("r bias")
+        nees.append(float(e @ np.linalg.solve(P, e)))
+    assert 2.5 < np.mean(nees) < 6.0, "4 is consistent; 99.7 % of means of 20 are within 2.3 and 6.1"
+    assert (np.sqrt(np.diag(P)) < 0.5 * np.array([*INCREMENTS.values()])).all()
+
+
 def test_a_bias_stays_right_in_a_postponed_map() -> None:
     events, _ = drive(300, 3, BIAS)
     dense, postponed = (

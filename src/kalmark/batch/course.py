@@ -15,7 +15,7 @@ from kalmark.batch.state import ORIGIN, Ints, unsolved
 from kalmark.events import Control
 from kalmark.geometry import frames, frames3d
 from kalmark.models.observe import composed
-from kalmark.models.protocols import Motion, bias_covariance
+from kalmark.models.protocols import Motion, SelfCalibrating, calibrating
 from kalmark.slam.motion import HeldInput, Part
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Course:
     the derivative by the systematic errors.
     """
 
-    def __init__(self, robot: Robot, node: int, bias: Array | float = 0.0) -> None:
+    def __init__(self, robot: Robot, node: int, bias: Array | None = None) -> None:
         self.motion, self.columns = robot.motion, tuple(robot.motion.columns)
         self.robot, self.drive = robot, HeldInput(robot.motion, robot.watch())
         self.bias = bias
@@ -88,7 +88,7 @@ class Course:
     def add(self, part: Part, roots: list[Array]) -> None:
         """Move by one part.  The error of a control that scans split is kept out of Q, with a root of N in `roots`."""
         self.moves += 1
-        self.moved, F, R_u = self.motion.move(self.moved, part.u + self.bias, part.dt_s)
+        self.moved, F, R_u = self.motion.move(self.moved, self._control(part), part.dt_s)
         self.Q = F @ self.Q @ F.T
         self._stay(part, F, R_u)
         self.shared = {key: F @ S for key, S in self.shared.items()}
@@ -106,6 +106,12 @@ class Course:
             if D is not None:
                 axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
                 self.Q[-1] += axes @ D @ axes.T
+
+    def _control(self, part: Part) -> Array:
+        """Return the control of a part, as it is with the constants that are known."""
+        if self.bias is None or not isinstance(self.motion, SelfCalibrating):
+            return part.u
+        return part.u + self.motion.calibration_effect(part.u, part.dt_s) @ self.bias
 
     def _stay(self, part: Part, F: Array, R_u: Array) -> None:
         """Carry the systematic errors on, in the order of `systematic_errors`."""
@@ -133,7 +139,7 @@ class Chain:
     """The nodes of all robots: each follows one of its robot by a step with its errors, the first the origin.
 
     `starts` are the means and covariances of the robots' starts, where they are not those that the robots state, and
-    `biases` what is added to their controls.  Raises KalmarkError for a robot with more than a pose, or with a bias in
+    `biases` the constants of their controls.  Raises KalmarkError for a robot with more than a pose, or with a bias in
     the map that is not given.
     """
 
@@ -146,10 +152,10 @@ class Chain:
             space = robot.motion.space
             if space.size not in ORIGIN:
                 raise unsolved(f"robot {name!r} has {space.size} state coordinates, expected a pose alone")
-            if bias_covariance(robot.motion) is not None and name not in biases:
+            if calibrating(robot.motion) is not None and name not in biases:
                 raise unsolved(f"the bias of {name!r} is in the map, expected controls without one")
             mean, P = starts.get(name, (robot.start, np.zeros((space.dof,) * 2) if robot.cov is None else robot.cov))
-            course = self.courses[name] = Course(robot, len(self.nodes), biases.get(name, 0.0))
+            course = self.courses[name] = Course(robot, len(self.nodes), biases.get(name))
             course.Q[-1] = P
             self._enter(name, -1, np.array(mean), course)
 

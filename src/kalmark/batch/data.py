@@ -61,7 +61,7 @@ class Given:
     known: solved for where another sensor sees something at the same pose, else held.  Sightings with whitened
     residuals beyond `huber` count less.
 
-    `biases` are what is added to the controls of a robot, (m,).
+    `biases` are the constants (c,) of the controls of a robot.
 
     With `segments` (J, 2), from and to in ns, the events between them are left out, and so is how a robot came from one
     to the next.

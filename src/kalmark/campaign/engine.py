@@ -33,7 +33,7 @@ from kalmark.management.attention import EVERYTHING
 from kalmark.models.landmarks import Point2D
 from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
 from kalmark.models.observe import call_move, step_of
-from kalmark.models.protocols import bias_covariance, parameter_covariance
+from kalmark.models.protocols import calibrating, parameter_covariance
 from kalmark.models.sensors import RangeBearing
 from kalmark.results.measures import SINGULAR, nees
 from kalmark.simulate.robots import Chance, drawn_start, scenery_of
@@ -51,7 +51,7 @@ NO_CONTROL = np.zeros(0)  # the noise of controls does not depend on them
 
 PREDICT = signature_of(
     "b1(Tuple((f8[::1], f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8)), "
-    "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1)"
+    "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1)"
 )
 CORRECT = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], b1[::1], b1))({corrections.TO_CORRECT}, Tuple((i8, f8)))"
@@ -99,8 +99,8 @@ def refusal(world: Any, configs: Mapping[str, Config]) -> str:
 
 def _odd_models(motion: Any, mount: Mount) -> str:
     """Return what of a motion and a mounted sensor the engine does not run."""
-    if type(motion) not in MOTIONS or bias_covariance(motion) is not None:
-        return "the batched engine has velocities and increments of the plane without a bias"
+    if type(motion) not in MOTIONS or calibrating(motion) is not None:
+        return "the batched engine has velocities and increments of the plane that do not calibrate themselves"
     if (
         type(mount.sensor) is not RangeBearing
         or parameter_covariance(mount.sensor) is not None
@@ -351,6 +351,7 @@ def filtered(
     first, things, y = sightings
     at, noise = sensed
     steps, axes, robot, mount, d, never = len(u), 1, 0, -1, 2, False
+    no_effect = np.empty((u.shape[1], 0))
     x, x_first, P = np.zeros(capacity), np.zeros(capacity), np.zeros((capacity, capacity))
     x[:3] = x_first[:3] = started[0]
     P[:3, :3] = started[1]
@@ -364,7 +365,7 @@ def filtered(
         n = 3 + 2 * count
         D = density * dt_s[k] if len(density) and u[k].any() else nothing
         map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
-        ok = call_predict(ways[0], (map_, (motion, robot, none, never, u[k], N, D, dt_s[k]), never))
+        ok = call_predict(ways[0], (map_, (motion, robot, none, never, no_effect, u[k], N, D, dt_s[k]), never))
         slots, y_known = known_ones(slot_of, things[low:high], y[low:high])
         if ok and len(slots):
             whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines

@@ -29,7 +29,7 @@ from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
-from kalmark.models.protocols import bias_covariance
+from kalmark.models.protocols import SelfCalibrating, calibrating
 from kalmark.report import Report
 from kalmark.results.landmarks import MapLandmarks, refuse_other_than_points
 from kalmark.results.progress import track
@@ -239,7 +239,7 @@ class _Driven:
 
     motion: Any
     state: Array
-    bias: Array | float
+    constants: Array  # of its controls
     sensors: dict[str, tuple[Any, Array]]
     drive: HeldInput
     told: Array = field(default_factory=lambda: np.zeros(0))
@@ -264,10 +264,11 @@ class _Replaying:
         self.robots: dict[str, _Driven] = {}
         for name in replay.robots:
             robot = build_robot(replay.settings, name)
-            motion, cov, start = robot.motion, bias_covariance(robot.motion), drawn_start(robot, chance.route)
-            bias = 0.0 if cov is None else gaussian(cov, chance.route)
+            motion, start = robot.motion, drawn_start(robot, chance.route)
+            model = calibrating(motion)
+            constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.route)
             sensors = {key: drawn_mount(mount, chance.mounts) for key, mount in robot.sensors.items()}
-            self.robots[name] = _Driven(motion, start, bias, sensors, HeldInput(motion))
+            self.robots[name] = _Driven(motion, start, constants, sensors, HeldInput(motion))
         self.events: list[Event] = []
         self.origins: dict[Key, tuple[Id | None, ...]] = {}
 
@@ -300,7 +301,8 @@ class _Replaying:
         robot.advance(event.t_ns, rng, last=True)
         N = robot.motion.control_noise(event.u) if event.cov is None else event.cov
         u = steered(robot.motion, robot.state, steer, N)
-        robot.told = u - robot.bias + gaussian(N, rng)
+        off = calibrated(robot.motion, u, steer.dt_s) @ robot.constants
+        robot.told = u - off + gaussian(N, rng)
         self.events.append(Control(t_ns=event.t_ns, robot=event.robot, u=robot.told, cov=event.cov))
         for part in robot.drive.accept(Control(t_ns=event.t_ns, robot=event.robot, u=u)):
             robot.move(part, rng)
@@ -322,6 +324,12 @@ class _Replaying:
         self.origins[event.t_ns, event.robot, event.sensor] = tuple(look.real[i] for i in rows)
 
 
+def calibrated(motion: Any, u: Array, dt_s: float) -> Array:
+    """Return the effect (m, c) of the constants of a motion's controls, (m, 0) if it has none."""
+    has = isinstance(motion, SelfCalibrating) and motion.calibration
+    return motion.calibration_effect(u, dt_s) if has else np.zeros((len(u), 0))
+
+
 def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
     """Return the control (m,) between the log's and the one from r (size,) to the path at the end of the interval.
 
@@ -332,9 +340,10 @@ def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
     if motion.held and not dt_s:
         return u
     end, _, R_u = motion.move(r, u, dt_s)
-    M, D, bias = N, motion.diffusion(u, dt_s), bias_covariance(motion)
-    if bias is not None:
-        M = M + bias
+    M, D, model = N, motion.diffusion(u, dt_s), calibrating(motion)
+    if model is not None:
+        B = model.calibration_effect(u, dt_s)
+        M = M + B @ model.calibration_cov @ B.T
     if D is not None:  # as a control; one that hardly moves the robot, like the steering at rest, is left alone
         A = np.linalg.solve(R_u.T @ R_u + (0.1 * dt_s) ** 2 * np.eye(len(u)), R_u.T) @ body_axes(r, len(D))
         M = M + A @ D @ A.T

@@ -11,6 +11,19 @@ from kalmark.results.words import figure
 
 Words = tuple[str, str]  # evidence, cure
 MOST_SIGMAS = 1e4
+CALIBRATIONS = {  # the keys that put an error of a column of the controls into the map, by its kind
+    ("v_mps", "offset"): "sigma_v_bias_mps",
+    ("w_radps", "offset"): "sigma_w_bias_radps",
+    ("steering_rad", "offset"): "sigma_steering_bias_rad",
+    ("v_mps", "scale"): "sigma_v_scale",
+    ("w_radps", "scale"): "sigma_w_scale",
+    ("steering_rad", "scale"): "sigma_steering_scale",
+    ("w_radps", "per_way"): "sigma_turn_rad_per_m",
+    ("dx_m", "scale"): "sigma_scale",
+    ("dtheta_rad", "scale"): "sigma_turn_scale",
+    ("dtheta_rad", "offset"): "sigma_turn_bias_radps",
+    ("dtheta_rad", "per_way"): "sigma_turn_rad_per_m",
+}
 
 
 def words(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -100,10 +113,9 @@ def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
     each = " for each metre driven" if kind == "per_way" else ""
     size = _size(abs(finding.value), finding.unit.removesuffix("/m") if each else finding.unit)
     evidence = f"{column} of {robot} says that it {verb} {size}{each} too {little} ({_sure(finding)})"
-    key = f"sigma_{column.rsplit('_', 1)[0]}_bias_{column.rsplit('_', 1)[1]}"
-    known = _current(config, robot, "motion", key)
-    cure = "" if known is None or kind != "offset" else _set(robot, f"motion.{key}", abs(finding.value))
-    return evidence, cure or f"correct {column} by {_value(finding)}{each} in the log"
+    key = CALIBRATIONS.get((column, kind))
+    cure = _set(robot, f"motion.{key}", abs(finding.value)) if key else f"correct {column} by {_value(finding)}{each}"
+    return evidence, cure
 
 
 def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:

@@ -36,15 +36,16 @@ class Update(NamedTuple):
 class Movement(NamedTuple):
     """One part of a robot's motion: the control u (m,), held for `dt_s` seconds, with the covariance N of its error.
 
-    `model` is the motion, compiled (a tuple) or in Python; `added` are the slots of constant blocks that are added to
-    the control, of which one has its error where it is `shared` with other parts.  D is the noise gathered in the
-    robot's frame, (0, 0) for none.
+    `model` is the motion, compiled (a tuple) or in Python; `added` are the slots of constant blocks that change the
+    control: their numbers (c,), one after the other, add B (m, c) times them to it.  One has its error where that is
+    `shared` with other parts.  D is the noise gathered in the robot's frame, (0, 0) for none.
     """
 
     model: Any
     robot: int
     added: Sequence[int]
     shared: bool
+    B: Array
     u: Array
     N: Array
     D: Array

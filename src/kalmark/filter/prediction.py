@@ -19,7 +19,7 @@ from kalmark.geometry.spaces import Table
 from kalmark.models.observe import step
 
 Map = tuple[Array, Array, Array, int, Table, Table, int]  # x, x_first, P, n, blocks, atoms, the generator's address
-Motion = tuple[Any, int, Index, bool, Array, Array, Array, float]  # as `estimators.Movement`
+Motion = tuple[Any, int, Index, bool, Array, Array, Array, Array, float]  # as `estimators.Movement`
 
 
 @compiled
@@ -41,21 +41,21 @@ def in_world(state: Array, D: Array) -> Array:
 
 
 @compiled
-def joined(F: Array, R_u: Array, Q: Array, added: int, shared: bool) -> tuple[Array, Array]:
-    """Return F and Q (n + k added, .) of a robot and `added` constant blocks (k,) that are added to its control.
+def joined(F: Array, R_a: Array, Q: Array, shared: bool) -> tuple[Array, Array]:
+    """Return F and Q (n + c, .) of a robot and the constants that change its control, R_a (n, c) by these.
 
-    With a `shared` error the control's noise is in one of these blocks.
+    With a `shared` error the control's noise is among the constants.
     """
-    n, k = R_u.shape
-    size = n + k * added
+    n, c = R_a.shape
+    size = n + c
     F_all, Q_all = np.eye(size), np.zeros((size, size))
     for i in range(n):
         for j in range(n):
             F_all[i, j] = F[i, j]
             if not shared:
                 Q_all[i, j] = Q[i, j]
-        for j in range(k * added):
-            F_all[i, n + j] = R_u[i, j % k]
+        for j in range(c):
+            F_all[i, n + j] = R_a[i, j]
     return F_all, Q_all
 
 
@@ -77,16 +77,17 @@ def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
     `from_first`: displacements count from the first estimates, F (I + (generator(x) - generator(x_first)) e_theta').
     """
     x, x_first, P, n, blocks, atoms, turns = map_
-    model, robot, added, shared, u, N, D, dt_s = motion
+    model, robot, added, shared, B, u, N, D, dt_s = motion
     at, size, p_at, dof = blocks[robot, 0], blocks[robot, 1], blocks[robot, 2], blocks[robot, 3]
-    k = len(u)
-    index, total = np.empty(dof + k * len(added), np.int64), u.copy()
+    index, total, c = np.empty(dof + B.shape[1], np.int64), u.copy(), 0
     for i in range(dof):
         index[i] = p_at + i
     for b in range(len(added)):
-        for i in range(k):
-            index[dof + b * k + i] = blocks[added[b], 2] + i
-            total[i] += x[blocks[added[b], 0] + i]
+        for j in range(blocks[added[b], 1]):
+            index[dof + c] = blocks[added[b], 2] + j
+            for i in range(len(u)):
+                total[i] += B[i, c] * x[blocks[added[b], 0] + j]
+            c += 1
     r = x[at : at + size].copy()
     moved, F, R_u = step(model, r, total, dt_s)  # [S] (14)
     if from_first:
@@ -97,7 +98,7 @@ def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
     Q, valid = kernels.moved_noise(moved, F, R_u, N)  # the last term of [S] (15)
     if not valid:
         return False
-    F, Q = joined(F, R_u, Q, len(added), shared)
+    F, Q = joined(F, kernels.product(R_u, B), Q, shared)
     if len(D):
         Q_D = in_world(moved, D)
         for i in range(len(D)):

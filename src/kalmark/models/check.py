@@ -95,8 +95,10 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
     diffusion = [D for D in map(model.diffusion, u, dt_s) if D is not None]
     if diffusion:
         found.covariance("diffusion", diffusion, space.dof if space.world == "space" else SE2.dof, at)
-    if (bias := protocols.bias_covariance(model)) is not None:
-        found.covariance("bias_cov", [bias], k, {})
+    if (calibrating := protocols.calibrating(model)) is not None:
+        c = len(calibrating.calibration)
+        found.covariance("calibration_cov", [calibrating.calibration_cov], c, {})
+        _shape("calibration_effect", np.array(calibrating.calibration_effect(u[0], dt_s[0])), (k, c))
 
 
 # ------------------------------------------------------------------ sensors

@@ -1,9 +1,10 @@
 """Motion models: odometry increments ([S] A.3), held velocities on exact arcs ([F]), Ackermann, constant velocity.
 
 Three kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
-displacement is sigma times the duration.  Its *bias* (`sigma_v_bias_mps`, ...), what is to be added to all of them, is
-in the map and estimated.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with time; in the plane along,
-across and about the robot, while the control is not zero (a robot told to stand does not wander).
+displacement is sigma times the duration.  What *all controls lack*, a constant or a share of them (`sigma_v_bias_mps`,
+`sigma_scale`, ...), is in the map and estimated.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with
+time; in the plane along, across and about the robot, while the control is not zero (a robot told to stand does not
+wander).
 """
 
 from __future__ import annotations
@@ -116,11 +117,26 @@ def coast(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Arra
     return moved, R_r, R_u
 
 
+Scale = Annotated[
+    NotNegative, "Share of the way that is missing in all controls; above 0 it is in the map and is estimated."
+]
+TurnScale = Annotated[
+    NotNegative, "Share of the turn that is missing in all controls; above 0 it is in the map and is estimated."
+]
+TurnPerMetre = Annotated[
+    NotNegative, "Turn that is missing for each metre (unequal wheels); above 0 it is in the map and is estimated."
+]
+
+
 class _Motion(Compiled):
-    """What the motions share: white noise of a control and of its bias, both by the names of their parameters."""
+    """What the motions share: white noise of a control, by the names of its parameters, and its calibration.
+
+    `calibrations` are the name and the parameter, a sigma, of each constant by which a control may be wrong.  Those
+    with a sigma above 0 are in the map and are estimated.
+    """
 
     sigmas: ClassVar[tuple[str, ...]]
-    biases: ClassVar[tuple[str, ...]] = ()
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @cached_property
     def _N(self) -> Array:
@@ -130,15 +146,38 @@ class _Motion(Compiled):
         """Return N (m, m) of a control (m,): of an increment, of an impulse or of what is held."""
         return self._N
 
+    @cached_property
+    def _unknown(self) -> list[int]:
+        return [k for k, (_, sigma) in enumerate(self.calibrations) if vars(self)[sigma] > 0]
+
     @property
-    def bias_cov(self) -> Array | None:
-        """The covariance (m, m) of the bias of a control, None if there is none."""
-        sigmas = [vars(self)[name] for name in self.biases]
-        return np.diag(np.square(sigmas)) if any(sigmas) else None
+    def calibration(self) -> tuple[str, ...]:
+        """The names of the c constants that are in the map."""
+        return tuple(self.calibrations[k][0] for k in self._unknown)
+
+    @property
+    def calibration_cov(self) -> Array:
+        """Their covariance (c, c)."""
+        return np.diag([vars(self)[self.calibrations[k][1]] ** 2 for k in self._unknown])
+
+    def calibration_effect(self, u: Array, dt_s: float) -> Array:
+        """Return B (m, c): with the constants a, a control u (m,) of `dt_s` is u + B a in truth."""
+        return np.ascontiguousarray(self._effects(u, dt_s)[:, self._unknown])
+
+    def _effects(self, u: Array, dt_s: float) -> Array:
+        """Return B by all `calibrations`: by default an offset of each component, then its share."""
+        return np.hstack([np.eye(len(u)), np.diag(u)])
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
         """Return the covariance (dof, dof) of the white noise gathered in `dt_s`, None: all noise is in u (m,)."""
         return None
+
+
+def _halves(u: Array) -> Array:
+    """Return the first and the last three numbers of a control (6,) in a column each."""
+    out = np.zeros((6, 2))
+    out[:3, 0], out[3:, 1] = u[:3], u[3:]
+    return out
 
 
 @declared
@@ -177,12 +216,24 @@ class Unicycle(_Planar):
     sigma_w_bias_radps: Annotated[
         NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
     ] = 0.0
+    sigma_v_scale: Scale = 0.0
+    sigma_w_scale: TurnScale = 0.0
+    sigma_turn_rad_per_m: TurnPerMetre = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
     held: ClassVar[bool] = True
     moves: ClassVar[Any] = unicycle
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_w_radps")
-    biases: ClassVar[tuple[str, ...]] = ("sigma_v_bias_mps", "sigma_w_bias_radps")
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("v_mps", "sigma_v_bias_mps"),
+        ("w_radps", "sigma_w_bias_radps"),
+        ("v_scale", "sigma_v_scale"),
+        ("w_scale", "sigma_w_scale"),
+        ("turn_rad_per_m", "sigma_turn_rad_per_m"),
+    )
+
+    def _effects(self, u: Array, dt_s: float) -> Array:
+        return np.array([[1.0, 0.0, u[0], 0.0, 0.0], [0.0, 1.0, 0.0, u[1], abs(u[0])]])
 
 
 @register("motion", "odometry_2d")
@@ -196,11 +247,26 @@ class Odometry2D(_Planar):
     sigma_x_m: Annotated[NotNegative, "Error of one increment, forward."] = 0.01
     sigma_y_m: Annotated[NotNegative, "Error of one increment, to the left."] = 0.0
     sigma_theta_rad: Annotated[NotNegative, "Error of one increment, heading."] = 0.02
+    sigma_scale: Scale = 0.0
+    sigma_turn_scale: TurnScale = 0.0
+    sigma_turn_bias_radps: Annotated[
+        NotNegative, "Turn that all increments lack, in a second; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_turn_rad_per_m: TurnPerMetre = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
     held: ClassVar[bool] = False
     moves: ClassVar[Any] = increment_in_plane
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_theta_rad")
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("scale", "sigma_scale"),
+        ("turn_scale", "sigma_turn_scale"),
+        ("turn_radps", "sigma_turn_bias_radps"),
+        ("turn_rad_per_m", "sigma_turn_rad_per_m"),
+    )
+
+    def _effects(self, u: Array, dt_s: float) -> Array:
+        return np.array([[u[0], 0, 0, 0], [u[1], 0, 0, 0], [0, u[2], dt_s, math.hypot(u[0], u[1])]])
 
 
 @register("motion", "ackermann")
@@ -222,12 +288,21 @@ class Ackermann(_Planar):
     sigma_steering_bias_rad: Annotated[
         NotNegative, "Constant part of the steering angle's error; above 0 it is in the map and is estimated."
     ] = 0.0
+    sigma_v_scale: Scale = 0.0
+    sigma_steering_scale: Annotated[
+        NotNegative, "Share that the steering angle lacks; above 0 it is in the map and is estimated."
+    ] = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
     held: ClassVar[bool] = True
     moves: ClassVar[Any] = ackermann
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_steering_rad")
-    biases: ClassVar[tuple[str, ...]] = ("sigma_v_bias_mps", "sigma_steering_bias_rad")
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("v_mps", "sigma_v_bias_mps"),
+        ("steering_rad", "sigma_steering_bias_rad"),
+        ("v_scale", "sigma_v_scale"),
+        ("steering_scale", "sigma_steering_scale"),
+    )
 
     @cached_property
     def parameters(self) -> Array:
@@ -246,12 +321,25 @@ class Odometry3D(_Motion):
     sigma_y_m: Annotated[NotNegative, "Error of one increment, to the left."] = 0.01
     sigma_z_m: Annotated[NotNegative, "Error of one increment, upwards."] = 0.01
     sigma_rotation_rad: Annotated[NotNegative, "Error of one increment, rotation about each axis."] = 0.005
+    sigma_scale: Scale = 0.0
+    sigma_turn_scale: TurnScale = 0.0
+    sigma_turn_bias_radps: Annotated[
+        NotNegative, "Turn about each axis that they lack, in a second; above 0 it is in the map and is estimated."
+    ] = 0.0
 
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
     held: ClassVar[bool] = False
     moves: ClassVar[Any] = increment_in_space
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_z_m", *3 * ("sigma_rotation_rad",))
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("scale", "sigma_scale"),
+        ("turn_scale", "sigma_turn_scale"),
+        *((f"turn_{axis}_radps", "sigma_turn_bias_radps") for axis in "xyz"),
+    )
+
+    def _effects(self, u: Array, dt_s: float) -> Array:
+        return np.hstack([_halves(u), np.vstack([np.zeros((3, 3)), dt_s * np.eye(3)])])
 
 
 @register("motion", "velocity_3d")
@@ -274,13 +362,23 @@ class Velocity3D(_Motion):
         NotNegative,
         "Constant part of the turn rate's error about each axis; above 0 it is in the map and is estimated.",
     ] = 0.0
+    sigma_v_scale: Scale = 0.0
+    sigma_w_scale: TurnScale = 0.0
 
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
     held: ClassVar[bool] = True
     moves: ClassVar[Any] = twist
     sigmas: ClassVar[tuple[str, ...]] = tuple(f"sigma_{column}" for column in columns)
-    biases: ClassVar[tuple[str, ...]] = (*3 * ("sigma_v_bias_mps",), *3 * ("sigma_w_bias_radps",))
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+        *((name, "sigma_v_bias_mps") for name in columns[:3]),
+        *((name, "sigma_w_bias_radps") for name in columns[3:]),
+        ("v_scale", "sigma_v_scale"),
+        ("w_scale", "sigma_w_scale"),
+    )
+
+    def _effects(self, u: Array, dt_s: float) -> Array:
+        return np.hstack([np.eye(6), _halves(u)])
 
 
 @register("motion", "constant_velocity_3d")

@@ -145,8 +145,19 @@ class _Coasts(Protocol):
 
 
 @runtime_checkable
-class _Biased(Protocol):
-    bias_cov: Array | None
+class SelfCalibrating(Protocol):
+    """A motion of which constants may be in the map, and estimated."""
+
+    @property
+    def calibration(self) -> tuple[str, ...]:
+        """The names of the c constants that are in the map."""
+
+    @property
+    def calibration_cov(self) -> Array:
+        """Their covariance (c, c)."""
+
+    def calibration_effect(self, u: Array, dt_s: float) -> Array:
+        """Return B (m, c): with the constants a, a control u (m,) of `dt_s` is u + B a in truth."""
 
 
 @runtime_checkable
@@ -189,9 +200,9 @@ def coasts(motion: object) -> bool:
     return motion.coasts if isinstance(motion, _Coasts) else False
 
 
-def bias_covariance(motion: object) -> Array | None:
-    """Return the covariance (k, k) of the constant error of a control; by default None: there is none."""
-    return motion.bias_cov if isinstance(motion, _Biased) else None
+def calibrating(motion: object) -> SelfCalibrating | None:
+    """Return a motion of which constants are in the map; by default None: it has none."""
+    return motion if isinstance(motion, SelfCalibrating) and motion.calibration else None
 
 
 def parameter_covariance(sensor: object) -> Array | None:
@@ -378,7 +389,7 @@ def place_of(landmark: Landmark, l: Array) -> tuple[Array, Array] | None:
 
 # ------------------------------------------------------------------ spelling
 _OF: dict[type, tuple[type, ...]] = {
-    Motion: (Motion, _OfWorld, _Coasts, _Biased),
+    Motion: (Motion, _OfWorld, _Coasts, SelfCalibrating),
     Sensor: (
         FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
         _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,

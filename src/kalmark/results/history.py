@@ -114,7 +114,7 @@ class Mounted(NamedTuple):
 
 
 class Biased(NamedTuple):
-    """The bias of a robot's controls at the end: `mean` (k,) of the control's `columns`, and its covariance (k, k)."""
+    """The constants of a robot's controls at the end: their names `columns`, `mean` (c,) and covariance (c, c)."""
 
     robot: str
     columns: Names

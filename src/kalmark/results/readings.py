@@ -15,6 +15,7 @@ from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import to_euler
 from kalmark.logs import FORMATS
 from kalmark.logs.log import Log
+from kalmark.models.protocols import calibrating
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import Biased, Camera, Mounted
@@ -170,9 +171,9 @@ def mounts(slam: Slam) -> tuple[Mounted, ...]:
 def biases(slam: Slam) -> tuple[Biased, ...]:
     """Return the biases of the robots' controls that are in the map, as estimated."""
     return tuple(
-        Biased(robot.name, tuple(robot.motion.columns), slam.mean(name), slam.covariance(name))
+        Biased(robot.name, model.calibration, slam.mean(name), slam.covariance(name))
         for robot in slam.robots.values()
-        if _in_map(slam, name := bias_name(robot.name))
+        if (model := calibrating(robot.motion)) is not None and _in_map(slam, name := bias_name(robot.name))
     )
 
 

@@ -4,14 +4,15 @@ A rate acts from its time until the robot's next control, so a scan in between s
 motion that ended at its time.  A robot that coasts moves without a control, which changes its velocity at its time.
 
 A control's error is white from one control to the next and needs no block of the map.  Two kinds do: the error of a
-control whose interval a scan has split, common to both parts until the next control; and the *bias*, common to all
-controls (`sigma_v_bias_mps` and the like).  Both add to the control, and the scans correct them like all else.
+control whose interval a scan has split, common to both parts until the next control; and the constants by which all
+controls are wrong, offsets and scales (`sigma_v_bias_mps`, `sigma_scale` and the like).  Both change the control, and
+the scans correct them like all else.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -24,7 +25,7 @@ from kalmark.filter.kernels import moved_noise
 from kalmark.filter.map import Map
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.observe import step, step_of
-from kalmark.models.protocols import Motion, bias_covariance, coasts
+from kalmark.models.protocols import Motion, SelfCalibrating, calibrating, coasts
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
 
@@ -149,7 +150,7 @@ class HeldInput:
 class Moving:
     """A robot in the map: its motion, its slot, the control it holds.
 
-    `bias` and `error` are the slots of the bias of its controls and of a shared error, None where there is none.
+    `bias` and `error` are the slots of the constants of its controls and of a shared error, None where there is none.
     """
 
     motion: Motion
@@ -163,13 +164,21 @@ class Moving:
         """The motion as the filter takes it."""
         return step_of(self.motion)
 
-    def added(self) -> list[int]:
-        """Return the slots of the blocks that are added to the control."""
-        return [block for block in (self.error, self.bias) if block is not None]
+    def added(self, part: Part) -> tuple[list[int], Array]:
+        """Return the slots of the blocks that change a control, and how, B (m, c) by their numbers together."""
+        if self.error is None and self.bias is None:
+            return [], nothing(len(part.u))
+        slots, columns = [], []
+        if self.error is not None:
+            slots, columns = [self.error], [np.eye(len(part.u))]
+        if self.bias is not None and isinstance(self.motion, SelfCalibrating):
+            slots, columns = [*slots, self.bias], [*columns, self.motion.calibration_effect(part.u, part.dt_s)]
+        return slots, np.hstack(columns)
 
     def leads_somewhere(self, map_: Map, part: Part) -> bool:
         """Return whether one part of its control leads to a finite place, with a finite covariance."""
-        u = part.u + sum(map_.mean(block) for block in self.added())
+        slots, B = self.added(part)
+        u = part.u + (B @ np.concatenate([map_.mean(block) for block in slots]) if slots else 0.0)
         return moved_noise(*step(self.model, map_.mean(self.slot), u, part.dt_s), part.N)[1]
 
     def movement(self, part: Part) -> Movement:
@@ -177,9 +186,9 @@ class Moving:
         D = self.motion.diffusion(part.u, part.dt_s)
         if part.unknown is not None:
             D = part.unknown if D is None else part.unknown + D
-        shared = self.error is not None
+        shared, (slots, B) = self.error is not None, self.added(part)
         return Movement(
-            self.model, self.slot, self.added(), shared, part.u, part.N, NO_NOISE if D is None else D, part.dt_s
+            self.model, self.slot, slots, shared, B, part.u, part.N, NO_NOISE if D is None else D, part.dt_s
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -188,11 +197,19 @@ class Moving:
 
 
 def bias_name(robot: str) -> str:
-    """Return the name of the bias of a robot's controls in the map."""
+    """Return the name of the constants of a robot's controls in the map."""
     return f"{robot} bias"
 
 
 def bias_block(motion: Motion) -> tuple[Space, Array, Array] | None:
-    """Return the space, the mean (k,) and the covariance (k, k) of the bias of a motion's controls, or None."""
-    cov = bias_covariance(motion)
-    return None if cov is None else (Rn(len(cov)), np.zeros(len(cov)), cov)
+    """Return the space, the mean (c,) and the covariance (c, c) of the constants of a motion's controls, or None."""
+    model = calibrating(motion)
+    return (
+        None if model is None else (Rn(len(model.calibration)), np.zeros(len(model.calibration)), model.calibration_cov)
+    )
+
+
+@lru_cache
+def nothing(size: int) -> Array:
+    """Return the effect (size, 0) of no constants."""
+    return np.zeros((size, 0))

@@ -34,7 +34,7 @@ from kalmark.management.hypotheses import POLAR
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark
 from kalmark.slam.gaps import Gaps
-from kalmark.slam.motion import Moving, bias_name
+from kalmark.slam.motion import Moving, bias_block, bias_name
 from kalmark.slam.robot import Mount, Robot, mount_name
 from kalmark.tracks.clones import Clone, Clones, Measurement
 from kalmark.tracks.track import Pending, Status, Track, Tracks
@@ -379,8 +379,8 @@ def _owners(robots: Mapping[str, Robot], state: State) -> list[tuple[str, int, S
     spaces: dict[Id, Space] = {name: robot.motion.space for name, robot in robots.items()}
     mounts = {mount_name(name, key): mount.block(key) for name, r in robots.items() for key, mount in r.sensors.items()}
     spaces |= {name: block[0] for name, block in mounts.items() if block is not None}
-    biased = [name for name in robots if bias_name(name) in tracks.slots]
-    spaces |= {bias_name(name): Rn(len(robots[name].motion.columns)) for name in biased}
+    biased = {name: block for name, r in robots.items() if (block := bias_block(r.motion)) is not None}
+    spaces |= {bias_name(name): block[0] for name, block in biased.items()}
     spaces |= {name: track.model.space for name, track in tracks.confirmed.items()}
     if robots.keys() & tracks.confirmed.keys() or spaces.keys() != tracks.slots.keys():
         raise MapError("the slots' names are not those of the robots and landmarks")
