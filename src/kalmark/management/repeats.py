@@ -34,13 +34,15 @@ NEAREST = 6  # landmarks seen together with one, of which triangles are made
 AROUND = 16  # landmarks seen together with a corner of a triangle, by which a hypothesis is judged at first
 ALIKE = 8  # triangles that one is compared with
 MOST_TRIANGLES, MOST_MATCHES, TRIES = 60_000, 20_000, 24
+JUDGED = 6  # constellations, the largest
 FEWEST = 5  # pairs
 SIGMAS = 4.0  # by which landmarks that agree may miss, and
 SLACK = 0.04  # of the spacing of landmarks, for what the filter does not know of its errors
 LOOSE = 0.25  # of the spacing, above which a landmark is not paired
 ROUNDS = 12
+DEBUG = False
 FALSE_ALARMS = 1e-3  # expected of a map without repeats
-SAMPLE, MOVES = 40, 2000  # landmarks of a part, and transforms, by which it is compared with itself
+SAMPLE, MOVES = 40, 600  # landmarks of a part, and transforms, by which it is compared with itself
 WEIGHED = 40  # pairs that are weighed together
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
 
@@ -76,10 +78,13 @@ def repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
         tried.append(grown)
         if len(tried) == TRIES:
             break
-    tried.sort(key=lambda each: -len(each.pairs))
+    tried.sort(key=lambda each: each.missing - len(each.pairs))
+    judged = 0
     for each in tried:
-        repeat = _judged(look, each, tried) if len(each.pairs) >= FEWEST else None
-        if repeat is not None and not any(each.overlaps(other) for other, _ in found):
+        if judged == JUDGED or len(each.pairs) < FEWEST or any(each.overlaps(other) for other, _ in found):
+            continue
+        repeat, judged = _judged(look, each, tried), judged + 1
+        if repeat is not None:
             found.append((each, repeat))
     return sorted((repeat for _, repeat in found), key=lambda repeat: repeat.p)
 
@@ -340,9 +345,11 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     if area <= 0.0:
         return None
     density = m / area
-    chance = max(min(density * math.pi * look.tolerance**2, 1.0), _self_similarity(look, found.pairs[:, 0]))
-    edges = sum(min(len(near), NEAREST) for near in look.near) / 2
-    p = 2.0 * edges**2 * float(betainc(k - 2, m - k + 1, chance))
+    alike = max(_self_similarity(look, part) for part in found.pairs.T)
+    chance = max(min(density * math.pi * look.tolerance**2, 1.0), alike)
+    edges, few = sum(min(len(near), NEAREST) for near in look.near) / 2, min(1.0, SAMPLE / m)
+    p = 2.0 * edges**2 * float(betainc(few * k - 2, few * (m - k) + 1, chance))
+    if DEBUG: print(k, m, round(alike, 2), chance, p)
     if p > FALSE_ALARMS:
         return None
     pairs = found.pairs
@@ -383,25 +390,24 @@ def _self_similarity(look: _Look, part: Index) -> float:
     rank = np.argsort(np.argsort(far.reshape(len(part), -1), axis=1), axis=1).ravel()
     edges = np.flatnonzero((a != b) & (rank <= NEAREST))
     one, two = (x.ravel() for x in np.meshgrid(edges, edges, indexing="ij"))
-    hypotheses = len(one)
     alike = (np.abs(far[one] - far[two]) <= 2.0 * look.tolerance) & (a[one] != a[two]) & (b[one] != b[two])
     alike &= ~look.may_be(part[a[one]], part[a[two]]) & ~look.may_be(part[b[one]], part[b[two]])
-    chosen = np.flatnonzero(alike)
+    chosen, number = np.flatnonzero(alike), int(alike.sum())
     chosen = chosen[:: max(1, -(-len(chosen) // MOVES))]
     if not len(chosen):
         return 0.0
     one, two = one[chosen], two[chosen]
     T = _transforms(np.stack([p[a[one]], p[b[one]]], axis=1), np.stack([p[a[two]], p[b[two]]], axis=1))
     moved = _moved(T, p)  # (M, K, 2)
-    gaps = np.linalg.norm(moved[:, :, None] - p, axis=3)
+    gaps = (moved[:, :, None, 0] - p[:, 0]) ** 2 + (moved[:, :, None, 1] - p[:, 1]) ** 2
     gaps[:, np.arange(len(p)), np.arange(len(p))] = np.inf
-    k = (gaps.min(axis=2) <= look.tolerance).sum(axis=1) - 2
+    k = (gaps.min(axis=2) <= look.tolerance**2).sum(axis=1) - 2
     m = _inside(p, moved.reshape(-1, 2)).reshape(len(T), -1).sum(axis=1) - 2
     some = (k > 0) & (m > 0)
     if not some.any():
         return 0.0
     k, m = k[some], np.maximum(m[some], k[some])
-    return float(betaincinv(k, m - k + 1, 1.0 / hypotheses).max())
+    return float(betaincinv(k, m - k + 1, 1.0 / number).max())
 
 
 def _weighed(look: _Look, T: Array, pairs: Index, density: float) -> tuple[float, bool]:
