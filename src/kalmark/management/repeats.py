@@ -5,9 +5,9 @@ different.  So the covariance of the map cannot find it: shapes do.  Triangles o
 compared by their sides; a match is a hypothesis T, l_b = T l_a, which is extended to all landmarks it maps on others.
 
 Which of them are chance?  Desolneux, Moisan, Morel 2008, ch. 3: the number of false alarms of a hypothesis with k
-agreeing landmarks of m is the number of hypotheses times the binomial tail of k in m.  Landmarks without a partner where
-one should be count among the m.  The probability that one agrees by chance is that of landmarks at random, or, where it
-is larger, as much as landmarks agree that are certainly different: a grid agrees with itself at many places.
+agreeing landmarks of m is the number of hypotheses times the binomial tail of k in m.  Landmarks without a partner
+where one should be count among the m.  The probability that one agrees by chance is that of landmarks at random, or,
+where it is larger, as much as landmarks agree that are certainly different: a grid agrees with itself at many places.
 """
 
 from __future__ import annotations
@@ -40,7 +40,6 @@ SIGMAS = 4.0  # by which landmarks that agree may miss, and
 SLACK = 0.04  # of the spacing of landmarks, for what the filter does not know of its errors
 LOOSE = 0.25  # of the spacing, above which a landmark is not paired
 ROUNDS = 12
-DEBUG = False
 FALSE_ALARMS = 1e-3  # expected of a map without repeats
 SAMPLE, MOVES = 40, 600  # landmarks of a part, and transforms, by which it is compared with itself
 WEIGHED = 40  # pairs that are weighed together
@@ -93,8 +92,8 @@ def repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
 class _Look:
     """Landmarks (N,) that may be repeated: names, slots, places (N, 2), the `codes` a N + b of what is not one.
 
-    `near` are the landmarks seen with each, the nearest first; `sigma` (N,) is how well each is known relative to
-    them.  `tolerance` [m] is by how much two that are one may miss, `spacing` [m] the distance to the nearest.
+    `near` are the landmarks seen with each, the nearest first.
+    `tolerance` [m] is by how much two that are one may miss, `spacing` [m] the distance to the nearest.
     """
 
     map: Map
@@ -167,7 +166,7 @@ def _relative_sigma(map_: Map, slots: Index, near: list[Index]) -> float:
 
 # ---------------------------------------------------------------------- hypotheses
 def _hypotheses(look: _Look) -> list[tuple[Array, Index]]:
-    """Return transforms T (3,) and the three pairs (3, 2) that each is of, those with most agreeing neighbours first."""
+    """Return transforms T (3,), each with the three pairs (3, 2) it is of; those first that fit most neighbours."""
     from scipy.spatial import cKDTree
 
     triangles, shape = _triangles(look)
@@ -276,7 +275,8 @@ def _grown(look: _Look, T: Array, pairs: Index) -> _Constellation:
         a = np.flatnonzero(sides > 0)
         lever = np.linalg.norm(look.places[a] - middle, axis=1) / max(spread, look.tolerance)
         reach = look.tolerance * (1.0 + lever)
-        a, reach = a[reach <= LOOSE * look.spacing + look.tolerance], reach[reach <= LOOSE * look.spacing + look.tolerance]
+        near = reach <= LOOSE * look.spacing + look.tolerance
+        a, reach = a[near], reach[near]
         far, b = look.tree.query(from_frame(T, look.places[a])[0])
         fits = (far <= reach) & look.may_be(a, b) & (sides[b] < 0)
         a, b, far = a[fits], b[fits], far[fits]
@@ -349,7 +349,6 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     chance = max(min(density * math.pi * look.tolerance**2, 1.0), alike)
     edges, few = sum(min(len(near), NEAREST) for near in look.near) / 2, min(1.0, SAMPLE / m)
     p = 2.0 * edges**2 * float(betainc(few * k - 2, few * (m - k) + 1, chance))
-    if DEBUG: print(k, m, round(alike, 2), chance, p)
     if p > FALSE_ALARMS:
         return None
     pairs = found.pairs
