@@ -106,12 +106,12 @@ def sight(pose: Array, places: Array, rng: np.random.Generator) -> Array:
     return np.where(rng.random(len(y))[:, None] < SPURIOUS, spurious, y)
 
 
-def mapped(log: Log, held: bool = False, gaps: str = "widen") -> Run:
+def mapped(log: Log, held: bool = False, gaps: str = "widen", repeats: str = "off") -> Run:
     """Return the run of a log through the filter."""
     laser = km.Mount(km.sensors.RangeBearing(SIGMA_RANGE_M, SIGMA_BEARING_RAD, range_max_m=REACH_M))
     start = log.truth["rover"].poses[0]
     rover = km.Robot("rover", MOTIONS[held], start, {"laser": laser}, gaps=gaps)
-    return record(km.Slam([rover], km.association.Automatic()), log, progress=False)
+    return record(km.Slam([rover], km.association.Automatic(), upkeep=km.Upkeep(repeats=repeats)), log, progress=False)
 
 
 def right(run: Run, log: Log) -> bool:

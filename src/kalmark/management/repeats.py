@@ -26,8 +26,10 @@ from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.geometry.frames import from_frame
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.geometry.spaces import SCALAR, VECTOR
+from kalmark.geometry.angles import rotation
+from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR
 from kalmark.management.merge import EQUAL_M, GATE
+from kalmark.report import Repeat
 from kalmark.tracks.track import Tracks
 
 NEAREST = 6  # landmarks seen together with one, of which triangles are made
@@ -43,24 +45,12 @@ ROUNDS = 12
 FALSE_ALARMS = 1e-3  # expected of a map without repeats
 SAMPLE, MOVES = 40, 600  # landmarks of a part, and transforms, by which it is compared with itself
 WEIGHED = 40  # pairs that are weighed together
+SURE = 1e-9  # expected of a map without repeats, below which a repeat is beyond doubt
+FITS = 0.9999  # of right shapes pass
+GROWN, GROWN_BY = 8, 0.125  # landmarks that have come or gone, or so many of all, until a map is searched again
+TURNED_RAD = 0.1  # a sigma of the turn that is allowed for at least
+CLEAR = 0.3  # from a half, the share of landmarks observed last that says in which part a robot is
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
-
-
-class Repeat(NamedTuple):
-    """Landmarks (a, b) that seem to be one, the first of each pair in the older part: l_b = T l_a, T (3,).
-
-    `score` is their log-likelihood ratio against chance, `p` how many such are expected by chance in this map.
-    `shift` (2,) [m] is that in their middle.  `agrees`: the map's own covariance lets them be one.  `rivals`: others
-    could be one instead.
-    """
-
-    pairs: list[tuple[Id, Id]]
-    T: Array
-    shift: Array
-    score: float
-    p: float
-    agrees: bool
-    rivals: bool
 
 
 def repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
@@ -355,7 +345,7 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     if np.median(pairs[:, 0]) > np.median(pairs[:, 1]):  # the order of landmarks is that of their age
         pairs = pairs[:, ::-1]
     T = aligned(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(k))
-    score, agrees = _weighed(look, T, pairs, density)
+    score, fits, agrees = _weighed(look, T, pairs, density)
     score += MISSED * found.missing
     rivals = any(
         other is not found and 2 * len(other.pairs) > k and other.overlaps(found) and _differ(found, other)
@@ -363,7 +353,17 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     )
     named = [(look.names[a], look.names[b]) for a, b in pairs.tolist()]
     shift = (look.places[pairs[:, 1]] - look.places[pairs[:, 0]]).mean(axis=0)
-    return Repeat(named, T, shift, score, p, agrees, rivals) if score > 0.0 else None
+    if score <= 0.0:
+        return None
+    middle = look.places[pairs[:, 1]].mean(axis=0)
+    return Repeat(named, T, middle, shift, score, p, agrees, bool(p <= SURE and fits and not rivals), _newer(look, pairs))
+
+
+def _newer(look: _Look, pairs: Index) -> list[Id]:
+    """Return the landmarks of the newer part: by those that they were seen with, else by age."""
+    sides = _sides(look, pairs)
+    mine = (sides < 0) | ((sides == 0) & (np.arange(len(sides)) >= pairs[:, 1].min()))
+    return [look.names[i] for i in np.flatnonzero(mine).tolist()]
 
 
 def _differ(one: _Constellation, other: _Constellation) -> bool:
@@ -409,8 +409,8 @@ def _self_similarity(look: _Look, part: Index) -> float:
     return float(betaincinv(k, m - k + 1, 1.0 / number).max())
 
 
-def _weighed(look: _Look, T: Array, pairs: Index, density: float) -> tuple[float, bool]:
-    """Return the log-likelihood ratio of pairs that are one, T unknown, and whether the map lets them be one."""
+def _weighed(look: _Look, T: Array, pairs: Index, density: float) -> tuple[float, bool, bool]:
+    """Return the log-likelihood ratio of pairs that are one, T unknown, whether their shapes fit, and places do."""
     some = pairs[:: max(1, -(-len(pairs) // WEIGHED))]
     k, rows = len(some), np.concatenate([some[:, 0], some[:, 1]])
     P, p = look.covariance(rows), look.places[rows]
@@ -423,8 +423,71 @@ def _weighed(look: _Look, T: Array, pairs: Index, density: float) -> tuple[float
     extent = float(np.ptp(look.places, axis=0).max())
     prior = np.diag([extent**2, extent**2, math.pi**2 / 3.0])
     Z = J @ P @ J.T + slack + G @ prior @ G.T
-    score = float(log_ratios(p[k:] - moved, Z, np.full(k, math.log(density))).ratio.sum())
+    z = p[k:] - moved
+    score = float(log_ratios(z, Z, np.full(k, math.log(density))).ratio.sum())
+    fits = z.ravel() @ np.linalg.solve(Z, z.ravel()) <= chi2_gate(FITS, 2 * k - 3)
     J = np.hstack([-np.eye(2 * k), np.eye(2 * k)])
     Z = J @ P @ J.T + EQUAL_M**2 * np.eye(2 * k) + slack
     z = (p[k:] - p[:k]).ravel()
-    return score, bool(z @ np.linalg.solve(Z, z) <= chi2_gate(GATE, 2 * k))
+    return score, bool(fits), bool(z @ np.linalg.solve(Z, z) <= chi2_gate(GATE, 2 * k))
+
+
+# ---------------------------------------------------------------------- merging
+def is_due(tracks: Tracks) -> bool:
+    """Return whether so many landmarks have come or gone that a map should be searched again."""
+    return tracks.changes - tracks.searched >= max(GROWN, GROWN_BY * len(tracks.confirmed))
+
+
+def is_in(part: list[Id], tracks: Tracks) -> bool | None:
+    """Return whether the landmarks observed last are of a part of the map; None if only some are."""
+    newer = {*part}
+    inside = [name in newer for name in tracks.recent if name in tracks.confirmed]
+    share = sum(inside) / max(len(inside), 1)
+    return None if not inside or abs(share - 0.5) < CLEAR else share > 0.5
+
+
+class Displacement(NamedTuple):
+    """Blocks `slots` whose means move to `means`, and the covariance of their rows to F P F' + Q."""
+
+    slots: list[int]
+    means: list[Array]
+    F: Array
+    Q: Array
+
+
+def displacement(map_: Map, slots: list[int], repeat: Repeat) -> Displacement:
+    """Return the move of blocks of the newer part of a repeat onto the older one, of an error unknown until now.
+
+    The shift and the turn of the whole part, about the middle of its pairs, have sigmas as large as they are: a robot
+    that lost its way by so much might have lost it so.
+    """
+    R, turn = rotation(-repeat.T[2]), -float(repeat.T[2])
+    t = -R @ repeat.T[:2]
+    middle = from_frame(np.array([*t, turn]), repeat.middle)[0]
+    means, F, G = [], [], []
+    for slot in slots:
+        space, x = map_.spaces[slot], map_.mean(slot)
+        assert space is not None
+        moved, F_x = space.rotated(x, turn), np.eye(space.dof)
+        G_x = np.zeros((space.dof, 3))
+        for kind, at, k in space.atoms.tolist():
+            if kind == VECTOR:
+                moved[at : at + 2] += t
+                off = moved[at : at + 2] - middle
+                F_x[k : k + 2, k : k + 2] = R
+                G_x[k : k + 2] = [[1.0, 0.0, -off[1]], [0.0, 1.0, off[0]]]
+            elif kind == HEADING:
+                G_x[k] = [0.0, 0.0, 1.0]
+        means.append(moved)
+        F.append(F_x)
+        G.append(G_x)
+    far, all_ = float(repeat.shift @ repeat.shift), np.concatenate(G)
+    return Displacement(slots, means, _block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T)
+
+
+def _block_diagonal(blocks: list[Array]) -> Array:
+    ends = np.cumsum([len(block) for block in blocks])
+    out = np.zeros((ends[-1], ends[-1]))
+    for block, end in zip(blocks, ends.tolist(), strict=True):
+        out[end - len(block) : end, end - len(block) : end] = block
+    return out
