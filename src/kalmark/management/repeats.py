@@ -47,9 +47,9 @@ SAMPLE, MOVES = 40, 600  # landmarks of a part, and transforms, by which it is c
 WEIGHED = 40  # pairs that are weighed together
 SURE = 1e-9  # expected of a map without repeats, below which a repeat is beyond doubt
 FITS = 0.9999  # of right shapes pass
-GROWN, GROWN_BY = 8, 0.125  # landmarks that have come or gone, or so many of all, until a map is searched again
+GROWN, GROWN_BY = 5, 0.1  # landmarks that have come or gone, or so many of all, until a map is searched again
 TURNED_RAD = 0.1  # a sigma of the turn that is allowed for at least
-CLEAR = 0.3  # from a half, the share of landmarks observed last that says in which part a robot is
+CLEAR = 0.2  # from a half, the share of the last scan's landmarks that says in which part a robot is
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
 
 
@@ -439,9 +439,9 @@ def is_due(tracks: Tracks) -> bool:
 
 
 def is_in(part: list[Id], tracks: Tracks) -> bool | None:
-    """Return whether the landmarks observed last are of a part of the map; None if only some are."""
+    """Return whether the landmarks of the last scan are of a part of the map; None if only some are."""
     newer = {*part}
-    inside = [name in newer for name in tracks.recent if name in tracks.confirmed]
+    inside = [name in newer for name in tracks.last_scan if name in tracks.confirmed]
     share = sum(inside) / max(len(inside), 1)
     return None if not inside or abs(share - 0.5) < CLEAR else share > 0.5
 
