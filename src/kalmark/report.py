@@ -136,8 +136,8 @@ class Report:
     `merged` are those that are gone, the ones they turned out to be, and why.  `late` are earlier
     observations, tentative then, that this scan has let be fused: time, robot, sensor and number in its scan of each.
     `compared` are the landmarks that observations were compared with, `seen_at` (K, 2 or 3) is where these seemed to
-    come from.  `gaps` are times without controls, up to now, for which the pose was widened.  `repeats` were found in the
-    map after the scan, and not merged.
+    come from.  `gaps` are times without controls, up to now, for which the pose was widened.
+    `repeats` were found in the map after the scan, and not merged.
     """
 
     __slots__ = (

@@ -13,6 +13,7 @@ where it is larger, as much as landmarks agree that are certainly different: a g
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -24,9 +25,9 @@ from kalmark.association.ratio import log_ratios
 from kalmark.association.relocalization import aligned
 from kalmark.events import Id
 from kalmark.filter.map import Map
+from kalmark.geometry.angles import rotation
 from kalmark.geometry.frames import from_frame
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.geometry.angles import rotation
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR
 from kalmark.management.merge import EQUAL_M, GATE
 from kalmark.report import Repeat
@@ -80,10 +81,10 @@ def repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """Landmarks (N,) that may be repeated: names, slots, places (N, 2), the `codes` a N + b of what is not one.
+    """Landmarks (N,) that may be repeated: names, slots, places (N, 2), the `codes` a N + b of those seen in one scan.
 
-    `near` are the landmarks seen with each, the nearest first.
-    `tolerance` [m] is by how much two that are one may miss, `spacing` [m] the distance to the nearest.
+    `given` (N,) have an id of the log.  `near` are the landmarks seen with each, the nearest first.  `tolerance` [m] is
+    by how much two that are one may miss, `spacing` [m] the distance to the nearest.
     """
 
     map: Map
@@ -91,6 +92,7 @@ class _Look:
     slots: Index
     places: Array
     codes: Index
+    given: Flags
     near: list[Index]
     spacing: float
     tolerance: float
@@ -100,33 +102,32 @@ class _Look:
     def of(cls, map_: Map, tracks: Tracks) -> _Look | None:
         from scipy.spatial import cKDTree
 
-        names = [name for name, track in tracks.confirmed.items() if len(track.covisible) > 2 and _is_point(track)]
+        points = [track for track in tracks.confirmed.values() if len(track.covisible) > 2 and _is_point(track)]
+        kinds = Counter(track.model.kind for track in points)
+        names = [track.id for track in points if track.model.kind == kinds.most_common(1)[0][0]]
         if len(names) < 2 * FEWEST or not any(map(tracks.is_invented, names)):
             return None
         slots, at = tracks.slots_of(names), {name: i for i, name in enumerate(names)}
         places, near, codes = map_.means(slots, 2), [], []
-        given = np.array([i for i, name in enumerate(names) if not tracks.is_invented(name)], dtype=np.int64)
+        given = np.array([not tracks.is_invented(name) for name in names])
         for i, name in enumerate(names):
             seen = np.array([at[n] for n in tracks.confirmed[name].covisible if n in at and n != name], dtype=np.int64)
             far = np.linalg.norm(places[seen] - places[i], axis=1)
             near.append(seen[np.argsort(far, kind="stable")])
             codes += [i * len(names) + seen, np.array([i * len(names) + i])]
-            if not tracks.is_invented(name):
-                codes.append(i * len(names) + given)
         nearest = [float(np.linalg.norm(places[n[0]] - places[i])) for i, n in enumerate(near) if len(n)]
         if len(nearest) < 2 * FEWEST:
             return None
         spacing, sigma = float(np.median(nearest)), _relative_sigma(map_, slots, near)
         tolerance = SIGMAS * math.sqrt(2.0) * sigma + SLACK * spacing
-        return cls(
-            map_, names, slots, places, np.unique(np.concatenate(codes)), near, spacing, tolerance, cKDTree(places)
-        )  # fmt: skip
+        tree, together = cKDTree(places), np.unique(np.concatenate(codes))
+        return cls(map_, names, slots, places, together, given, near, spacing, tolerance, tree)
 
     def may_be(self, a: Index, b: Index) -> Flags:
         """Return whether landmarks a and b may be one: they were not seen together and have not two ids."""
         wanted = a * len(self.names) + b
         at = np.minimum(np.searchsorted(self.codes, wanted), len(self.codes) - 1)
-        return np.asarray(self.codes[at] != wanted)
+        return np.asarray((self.codes[at] != wanted) & ~(self.given[a] & self.given[b]))
 
     def covariance(self, rows: Index) -> Array:
         """Return the joint covariance (2 K, 2 K) of the places of some landmarks."""
@@ -259,29 +260,35 @@ def _grown(look: _Look, T: Array, pairs: Index) -> _Constellation:
     """
     before: set[tuple[int, int]] = set()
     for _ in range(ROUNDS):
-        sides = _sides(look, pairs)
-        middle = look.places[pairs[:, 0]].mean(axis=0)
-        spread = math.sqrt(float(((look.places[pairs[:, 0]] - middle) ** 2).sum()))
-        a = np.flatnonzero(sides > 0)
-        lever = np.linalg.norm(look.places[a] - middle, axis=1) / max(spread, look.tolerance)
-        reach = look.tolerance * (1.0 + lever)
-        near = reach <= LOOSE * look.spacing + look.tolerance
-        a, reach = a[near], reach[near]
-        far, b = look.tree.query(from_frame(T, look.places[a])[0])
-        fits = (far <= reach) & look.may_be(a, b) & (sides[b] < 0)
-        a, b, far = a[fits], b[fits], far[fits]
-        order = np.argsort(far, kind="stable")
-        _, first = np.unique(b[order], return_index=True)
-        chosen = order[first]
-        if len(chosen) < 3:
+        a, b = _agreeing(look, T, pairs)
+        free = look.may_be(a, b)
+        if free.sum() < 3:
             break
-        pairs = np.column_stack([a[chosen], b[chosen]])
+        pairs = np.column_stack([a[free], b[free]])
         T = aligned(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(len(pairs)))
         now = {*map(tuple, pairs.tolist())}
         if now == before:
             break
         before = now
     return _Constellation(T, pairs, _missing(look, T, pairs))
+
+
+def _agreeing(look: _Look, T: Array, pairs: Index) -> tuple[Index, Index]:
+    """Return the landmarks of the part of the first of pairs, and those of the other part, on which T moves them."""
+    sides = _sides(look, pairs)
+    middle = look.places[pairs[:, 0]].mean(axis=0)
+    spread = math.sqrt(float(((look.places[pairs[:, 0]] - middle) ** 2).sum()))
+    a = np.flatnonzero(sides > 0)
+    lever = np.linalg.norm(look.places[a] - middle, axis=1) / max(spread, look.tolerance)
+    reach = look.tolerance * (1.0 + lever)
+    near = reach <= LOOSE * look.spacing + look.tolerance
+    a, reach = a[near], reach[near]
+    far, b = look.tree.query(from_frame(T, look.places[a])[0])
+    fits = (far <= reach) & (sides[b] < 0)
+    a, b, far = a[fits], b[fits], far[fits]
+    order = np.argsort(far, kind="stable")
+    _, first = np.unique(b[order], return_index=True)
+    return a[order[first]], b[order[first]]
 
 
 def _sides(look: _Look, pairs: Index) -> Index:
@@ -351,12 +358,16 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
         other is not found and 2 * len(other.pairs) > k and other.overlaps(found) and _differ(found, other)
         for other in all_
     )
-    named = [(look.names[a], look.names[b]) for a, b in pairs.tolist()]
-    shift = (look.places[pairs[:, 1]] - look.places[pairs[:, 0]]).mean(axis=0)
     if score <= 0.0:
         return None
+    sure = bool(p <= SURE and fits and not rivals)
+    if sure:  # then two of a pair that were seen in one scan were so by a wrong association
+        a, b = _agreeing(look, T, pairs)
+        pairs = np.column_stack([a, b])[~(look.given[a] & look.given[b])]
+    named = [(look.names[a], look.names[b]) for a, b in pairs.tolist()]
     middle = look.places[pairs[:, 1]].mean(axis=0)
-    return Repeat(named, T, middle, shift, score, p, agrees, bool(p <= SURE and fits and not rivals), _newer(look, pairs))
+    shift = middle - look.places[pairs[:, 0]].mean(axis=0)
+    return Repeat(named, T, middle, shift, score, p, agrees, sure, _newer(look, pairs))
 
 
 def _newer(look: _Look, pairs: Index) -> list[Id]:
@@ -482,7 +493,9 @@ def displacement(map_: Map, slots: list[int], repeat: Repeat) -> Displacement:
         F.append(F_x)
         G.append(G_x)
     far, all_ = float(repeat.shift @ repeat.shift), np.concatenate(G)
-    return Displacement(slots, means, _block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T)
+    return Displacement(
+        slots, means, _block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T
+    )
 
 
 def _block_diagonal(blocks: list[Array]) -> Array:

@@ -20,8 +20,8 @@ class Upkeep:
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
     (`association/ratio.py`); what is held back by that is mapped anew until then, as is what a robot that is lost sees.
 
-    With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are searched
-    while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those beyond doubt.
+    With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are
+    searched while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those beyond doubt.
 
     With `p_detect`, the probability that the sensor sees a landmark in its view, one that should be seen and is not is
     removed when it is `odds` times likelier that it is gone (`existence.py`); `p_false` is the probability that

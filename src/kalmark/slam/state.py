@@ -43,7 +43,14 @@ Description = dict[str, Any]
 
 VERSION = 9
 DESCRIPTION, SUMS = "slam.json", "sha256"
-OF_TRACKS = ("recent", "last_scan", "changes", "searched", "unnamed", "experience")  # what `Tracks` knows beside the tracks
+OF_TRACKS = (
+    "recent",
+    "last_scan",
+    "changes",
+    "searched",
+    "unnamed",
+    "experience",
+)  # what `Tracks` knows beside the tracks
 PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 OF_MOVING = ("t_ns", "fresh")
