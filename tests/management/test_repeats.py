@@ -2,73 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hall import hall, mapped
+from hall import hall, mapped, right, slam_of
+from repeats import SIGMA_M, WORLDS, World, empty, part
 
 import kalmark as km
 from kalmark.geometry.frames import from_frame
-from kalmark.management.repeats import FALSE_ALARMS, repeats
+from kalmark.management.repeats import FALSE_ALARMS, displacement, repeats
 from kalmark.results.run import Run
-
-REACH_M, SIGMA_M = 8.0, 0.03
-World = Callable[[np.random.Generator], np.ndarray]
-
-
-def part(slam: km.Slam, places: np.ndarray, rng: np.random.Generator) -> list[str]:
-    """Map places (N, 2) as if observed from everywhere among them; return their names."""
-    first = len(slam.landmarks())
-    names = [f"u{first + i + 1}" for i in range(len(places))]
-    for name, place in zip(names, places + SIGMA_M * rng.normal(size=places.shape), strict=True):
-        slam.add_landmark(name, place, SIGMA_M**2 * np.eye(2))
-    slam.tracks.reserved.clear()  # as if all had been made up
-    low, high = places.min(axis=0), places.max(axis=0)
-    for pose in rng.uniform(low, high, (int(np.prod((high - low) / REACH_M * 2)) + 10, 2)):
-        slam.tracks.note_scan([names[i] for i in np.flatnonzero(np.linalg.norm(places - pose, axis=1) < REACH_M)])
-    return names
-
-
-def empty(map_: str = "dense") -> km.Slam:
-    laser = {"laser": km.Mount(km.sensors.RangeBearing(0.03, 0.01))}
-    return km.Slam(km.Robot("cart", km.motion.Odometry2D(), sensors=laser), map=map_)
 
 
 def found(slam: km.Slam) -> list[list[tuple[object, object]]]:
     return [each.pairs for each in repeats(slam.map, slam.tracks)]
-
-
-def orchard(columns: int, rows: int, off_m: float, gone: float) -> World:
-    def trees(rng: np.random.Generator) -> np.ndarray:
-        places = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2) * (4.0, 3.0)
-        places = places[rng.random(len(places)) >= gone]
-        return places + off_m * rng.normal(size=places.shape)
-
-    return trees
-
-
-def clusters(rng: np.random.Generator) -> np.ndarray:
-    return (rng.uniform(0, 60, (12, 1, 2)) + 1.5 * rng.normal(size=(12, 8, 2))).reshape(-1, 2)
-
-
-def pallets(rng: np.random.Generator) -> np.ndarray:
-    feet = np.array([[-0.6, -0.4], [0.6, -0.4], [0.6, 0.4], [-0.6, 0.4]])
-    return (rng.uniform(0, 60, (30, 1, 2)) + feet).reshape(-1, 2)
-
-
-WORLDS: dict[str, World] = {
-    "at random": lambda rng: rng.uniform(0, 40, (120, 2)),
-    "many at random": lambda rng: rng.uniform(0, 120, (800, 2)),
-    "an orchard": orchard(12, 8, 0.0, 0.0),
-    "an orchard with trees off their places": orchard(12, 8, 0.1, 0.0),
-    "an orchard with gaps": orchard(14, 10, 0.05, 0.1),
-    "an orchard with many gaps": orchard(14, 10, 0.05, 0.3),
-    "an avenue": orchard(40, 2, 0.05, 0.1),
-    "clusters": clusters,
-    "pallets": pallets,
-}
 
 
 @pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS.keys())
@@ -95,7 +43,7 @@ def test_a_place_that_was_mapped_twice_is_found_with_its_shift_and_turn(share: f
     np.testing.assert_allclose(repeat.T, T, atol=0.1)
     assert repeat.p < 1e-3 * FALSE_ALARMS
     assert not repeat.agrees, "the map is sure that they are two"
-    assert not repeat.rivals
+    assert repeat.sure
 
 
 def test_a_mirrored_place_is_another_one() -> None:
@@ -145,3 +93,63 @@ def test_a_hall_mapped_twice_is_reported_with_its_time_and_drawn(seed: int, tmp_
 def test_a_hall_mapped_once_has_no_repeats() -> None:
     for seed in range(3):
         assert mapped(hall(seed)).evaluate()["repeats"] == []
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_a_hall_mapped_twice_becomes_one_where_repeats_are_merged(seed: int) -> None:
+    log = hall(seed, gap_s=4.0)
+    run = mapped(log, gaps="ignore", repeats="merge")
+    summary = run.evaluate()
+    assert right(run, log)
+    assert summary["repeats"] == []
+    assert summary["nis_per_dof"] < 1.1
+    (note,) = [line for line in summary["notes"] if "merged at" in line]
+    assert "landmarks mapped twice, in a map that repeated itself: merged at t=" in note
+
+
+@pytest.mark.parametrize("estimator", [km.estimators.Ekf(), km.estimators.Fej()], ids=["ekf", "fej"])
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+def test_a_repeat_is_merged_in_every_map_by_every_estimator(estimator: km.estimators.Estimator, map_: str) -> None:
+    log = hall(2, gap_s=4.0)
+    run = mapped(log, gaps="ignore", repeats="merge", estimator=estimator, map=map_)
+    assert right(run, log)
+
+
+def test_a_report_has_the_repeats_that_are_not_merged_and_a_saved_map_resumes_bit_for_bit(tmp_path: Path) -> None:
+    log, slams = hall(0, gap_s=4.0), []
+    for repeats_ in ("warn", "merge"):
+        slam = slam_of(log, gaps="ignore", upkeep=km.Upkeep(repeats=repeats_))
+        told = [repeat for event in log.events for repeat in slam.process(event).repeats]
+        assert any(repeat.sure for repeat in told) is (repeats_ == "warn")
+        assert len(slam.landmarks()) == (48 if repeats_ == "warn" else 24)
+    half = len(log.events) // 2
+    slams = [slam_of(log, gaps="ignore", upkeep=km.Upkeep(repeats="merge"))]
+    for event in log.events[:half]:
+        slams[0].process(event)
+    slams[0].save(tmp_path / "map.kmk")
+    slams.append(km.Slam.load(tmp_path / "map.kmk"))
+    told = [[slam.process(event).merged for event in log.events[half:]] for slam in slams]
+    assert told[0] == told[1]
+    assert any(told[0])
+    np.testing.assert_array_equal(slams[0].covariance("rover"), slams[1].covariance("rover"))
+
+
+def test_a_displaced_part_is_as_uncertain_as_it_was_off_and_keeps_its_shape() -> None:
+    rng, slam, T = np.random.default_rng(1), empty(), np.array([5.0, 3.0, 0.4])
+    places = rng.uniform(0, 30, (60, 2))
+    older, newer = part(slam, places, rng), part(slam, from_frame(T, places)[0], rng)
+    (repeat,) = repeats(slam.map, slam.tracks)
+    assert sorted(repeat.newer) == sorted(newer)
+    slots = [slam.slot(name) for name in newer]
+    moved = displacement(slam.map, slots, repeat)
+    back = np.array([slam.mean(name) for name in older])
+    np.testing.assert_allclose(np.array(moved.means), back, atol=0.3)
+    P = moved.F @ slam.covariance(*newer) @ moved.F.T + moved.Q
+    middle = int(np.argmin(np.linalg.norm(np.array(moved.means) - places.mean(axis=0), axis=1)))
+    sigma = np.sqrt(P[2 * middle, 2 * middle])
+    assert sigma == pytest.approx(np.linalg.norm(repeat.shift), rel=0.2)
+    a, b = 0, 1
+    apart = np.array(moved.means)[a] - np.array(moved.means)[b]
+    J = np.hstack([apart, -apart]) / np.linalg.norm(apart)
+    both = np.r_[2 * a : 2 * a + 2, 2 * b : 2 * b + 2]
+    assert J @ P[np.ix_(both, both)] @ J == pytest.approx(2 * SIGMA_M**2), "a rigid motion changes no distance"

@@ -50,6 +50,7 @@ SURE = 1e-9  # expected of a map without repeats, below which a repeat is beyond
 FITS = 0.9999  # of right shapes pass
 GROWN, GROWN_BY = 5, 0.1  # landmarks that have come or gone, or so many of all, until a map is searched again
 TURNED_RAD = 0.1  # a sigma of the turn that is allowed for at least
+IN_A_REPEAT = "in a repeat"  # ends the reason of a merge
 CLEAR = 0.2  # from a half, the share of the last scan's landmarks that says in which part a robot is
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
 

@@ -18,7 +18,7 @@ from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
 from kalmark.results.matching import association_figures, best_known, by_position, no_ids
 from kalmark.results.measures import Rigid, diverged, identity, nees, nis, path_m, pose_error, rigid, rigid_robust, rmse
 from kalmark.results.recording import Recording
-from kalmark.results.repeats import repeat_figures
+from kalmark.results.repeats import repeat_figures, repeat_notes
 from kalmark.results.truth import Truth, fitted
 from kalmark.results.warnings import POSE_NEES, advice, fix_nis_per_dof, warnings, window_figures
 from kalmark.results.words import count, figure
@@ -80,7 +80,7 @@ def evaluate(run: Recording) -> dict[str, Any]:
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
     summary["advice"] = advice(run, summary)
-    summary["notes"] = list(gap_notes(summary["gaps"]))
+    summary["notes"] = [*gap_notes(summary["gaps"]), *repeat_notes(history)]
     return summary
 
 

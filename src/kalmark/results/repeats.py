@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kalmark.management.repeats import repeats
+from kalmark.management.repeats import IN_A_REPEAT, repeats
 from kalmark.results.history import History, Repeated
 from kalmark.results.recording import Recording
 from kalmark.results.words import count, figure
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 NAMED = 3  # pairs that a warning names
+SOME = 3  # landmarks of a part
 
 
 def repeated(slam: Slam) -> tuple[Repeated, ...]:
@@ -30,7 +31,7 @@ def repeated(slam: Slam) -> tuple[Repeated, ...]:
 def repeat_figures(run: Recording) -> list[dict[str, Any]]:
     """Return the repeats as they are in ``summary.json``, the surest first.
 
-    `start_s` is when the first landmark of the newer part was observed, in seconds of the log.
+    `start_s` is when three landmarks of the newer part had been observed, in seconds of the log.
     """
     rows, out = run.history.repeats, []
     for number in dict.fromkeys(row.number for row in rows):
@@ -49,9 +50,20 @@ def repeat_figures(run: Recording) -> list[dict[str, Any]]:
     return out
 
 
+def repeat_notes(history: History) -> Iterator[str]:
+    """Tell of the repeats that were merged while the map grew."""
+    steps = [change.step for change in history.changes if change.reason.endswith(IN_A_REPEAT)]
+    for step in dict.fromkeys(steps):
+        when = float(history.t_ns[step]) * 1e-9
+        what = f"{count(steps.count(step), 'landmark')} mapped twice, in a map that repeated itself"
+        yield f"{what}: merged at t={when:.1f} s in the log"
+
+
 def _start_s(history: History, landmarks: list[str]) -> float | None:
-    steps = history.step[np.isin(history.landmark, landmarks)]
-    return float(history.t_ns[steps.min()]) * 1e-9 if len(steps) else None
+    """Return when some of these landmarks had been observed: one or two may be of the older part."""
+    mine = np.isin(history.landmark, landmarks)
+    first = np.sort(history.step[mine][np.unique(history.landmark[mine], return_index=True)[1]])
+    return float(history.t_ns[first[min(len(first), SOME) - 1]]) * 1e-9 if len(first) else None
 
 
 def repeat_warnings(found: list[dict[str, Any]]) -> Iterator[str]:
@@ -63,5 +75,5 @@ def repeat_warnings(found: list[dict[str, Any]]) -> Iterator[str]:
         yield (
             f"the map repeats itself: {count(len(pairs), 'landmark')} seem to be mapped twice, {figure(far)} m and "
             f"{figure(float(np.degrees(each['turn_rad'])), 2)} deg apart{since} ({named}); if they are, the robot lost "
-            "its way before that: robots.each.gaps=widen, or more noise of its controls"
+            "its way before that: robots.each.gaps=widen, upkeep.repeats=merge, or more noise of its controls"
         )

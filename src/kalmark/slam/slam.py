@@ -719,7 +719,7 @@ class Slam:
         for repeat in found:
             if policy.upkeep.repeats == "merge" and repeat.sure and (repeat.agrees or self._displace(scan, repeat)):
                 merged = self._merge_pairs(scan, merge.Merge(repeat.pairs, repeat.score))
-                scan.report.merged += tuple((gone, kept, f"{why}, in a repeat") for gone, kept, why in merged)
+                scan.report.merged += tuple((gone, kept, f"{why}, {of_map.IN_A_REPEAT}") for gone, kept, why in merged)
                 found = [other for other in found if other is not repeat]
                 break
         scan.report.repeats = tuple(found)
