@@ -36,7 +36,7 @@ from kalmark.tracks.track import Tracks
 NEAREST = 6  # landmarks seen together with one, of which triangles are made
 AROUND = 16  # landmarks seen together with a corner of a triangle, by which a hypothesis is judged at first
 ALIKE = 8  # triangles that one is compared with
-MOST_TRIANGLES, MOST_MATCHES, TRIES = 60_000, 20_000, 24
+MOST_TRIANGLES, MOST_MATCHES, TRIES = 60_000, 8_000, 24
 JUDGED = 6  # constellations, the largest
 FEWEST = 5  # pairs
 SIGMAS = 4.0  # by which landmarks that agree may miss, and
@@ -48,7 +48,7 @@ SAMPLE, MOVES = 40, 600  # landmarks of a part, and transforms, by which it is c
 WEIGHED = 40  # pairs that are weighed together
 SURE = 1e-9  # expected of a map without repeats, below which a repeat is beyond doubt
 FITS = 0.9999  # of right shapes pass
-GROWN, GROWN_BY = 5, 0.1  # landmarks that have come or gone, or so many of all, until a map is searched again
+GROWN, GROWN_BY = 5, 0.2  # landmarks that have come or gone, or so many of all, until a map is searched again
 TURNED_RAD = 0.1  # a sigma of the turn that is allowed for at least
 IN_A_REPEAT = "in a repeat"  # ends the reason of a merge
 CLEAR = 0.2  # from a half, the share of the last scan's landmarks that says in which part a robot is
@@ -185,12 +185,13 @@ def _triangles(look: _Look) -> tuple[Index, Array]:
 
     The corners are ordered by the sides opposite to them.
     """
-    found = {
-        tuple(sorted((i, int(a), int(b))))
-        for i, near in enumerate(look.near)
-        for a, b in combinations(near[:NEAREST].tolist(), 2)
-    }
-    corners = np.array(sorted(found), dtype=np.int64).reshape(-1, 3)
+    near = np.full((len(look.near), NEAREST), -1)
+    for i, mine in enumerate(look.near):
+        near[i, : len(mine)] = mine[:NEAREST]
+    two = np.array([*combinations(range(NEAREST), 2)])
+    first = np.broadcast_to(np.arange(len(near))[:, None, None], (len(near), len(two), 1))
+    corners = np.concatenate([first, near[:, two]], axis=2).reshape(-1, 3)
+    corners = np.unique(np.sort(corners[(corners >= 0).all(axis=1)], axis=1), axis=0)
     corners = corners[:: max(1, -(-len(corners) // MOST_TRIANGLES))]
     p = look.places[corners]
     sides = np.linalg.norm(np.roll(p, -1, axis=1) - np.roll(p, -2, axis=1), axis=2)
