@@ -738,7 +738,7 @@ class Slam:
             slots += [scan.robot, *(track.slot for track in self.tracks.tentative.values())]
             slots += [clone.slot for clone in self.clones.clones.values()]
         moved = of_map.displacement(self.map, slots, repeat)
-        rows = self._rows([(slot, self.map.spaces[slot].dof) for slot in slots])
+        rows = self._rows(tuple((slot, len(self.map.rows(slot))) for slot in slots))
         self.map.predict(rows, moved.F, moved.Q)
         for slot, mean in zip(moved.slots, moved.means, strict=True):
             self.map.set_predicted(slot, mean)
