@@ -98,7 +98,7 @@ def halls(runs: int, gap_s: float, gaps: str, action: str) -> tuple[int, int]:
 def worlds(runs: int) -> int:
     """Print a line about each world without repeats; return in how many one is found."""
     total = 0
-    for name, world in WORLDS.items():
+    for name, world in WORLDS.items() if runs else ():
         found, lasts = 0, []
         for seed in range(runs):
             rng, slam = np.random.default_rng(seed), empty()
