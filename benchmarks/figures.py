@@ -253,6 +253,13 @@ def gaps() -> Iterator[Figure]:
     yield Figure(
         section, "wrong maps without an alarm / right maps with one", "0 / 0", command, row("total", "{2} / {3}")
     )
+    section, command = "Repeats", "python benchmarks/repeats.py"
+    yield Figure(section, "halls mapped twice (gaps of 2, 4 and 16 s ignored): found at the end / merged to 24 pillars",
+                 "95 %", command, row("mapped twice", "{0} / {1} of {2}"))  # fmt: skip
+    yield Figure(section, "halls mapped once, repeats merged: found at the end / maps that are right", "0 / 95 %", command,
+                 row("mapped once", "{0} / {1} of {2}"))  # fmt: skip
+    yield Figure(section, "maps at random, orchards, avenues, clusters, pallets: repeats found", ".001", command,
+                 row("without repeats", "{0} of {1}"))  # fmt: skip
 
 
 def diagnosis() -> Iterator[Figure]:

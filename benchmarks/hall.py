@@ -16,6 +16,7 @@ import argparse
 import itertools
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -106,12 +107,18 @@ def sight(pose: Array, places: Array, rng: np.random.Generator) -> Array:
     return np.where(rng.random(len(y))[:, None] < SPURIOUS, spurious, y)
 
 
-def mapped(log: Log, held: bool = False, gaps: str = "widen") -> Run:
-    """Return the run of a log through the filter."""
+def slam_of(log: Log, held: bool = False, gaps: str = "widen", **of_slam: Any) -> km.Slam:
+    """Return the filter for a log; `of_slam` are further arguments of it."""
     laser = km.Mount(km.sensors.RangeBearing(SIGMA_RANGE_M, SIGMA_BEARING_RAD, range_max_m=REACH_M))
     start = log.truth["rover"].poses[0]
     rover = km.Robot("rover", MOTIONS[held], start, {"laser": laser}, gaps=gaps)
-    return record(km.Slam([rover], km.association.Automatic()), log, progress=False)
+    return km.Slam([rover], km.association.Automatic(), **of_slam)
+
+
+def mapped(log: Log, held: bool = False, gaps: str = "widen", repeats: str = "off", **of_slam: Any) -> Run:
+    """Return the run of a log through the filter."""
+    slam = slam_of(log, held, gaps, upkeep=km.Upkeep(repeats=repeats), **of_slam)
+    return record(slam, log, progress=False)
 
 
 def right(run: Run, log: Log) -> bool:

@@ -107,6 +107,26 @@ class Gap(NamedTuple):
         return (self.end_ns - self.start_ns) * 1e-9
 
 
+class Repeat(NamedTuple):
+    """Landmarks (a, b) that seem to be one, the first of each pair in the older part: l_b = T l_a, T (3,).
+
+    `middle` (2,) [m] is that of the newer ones, `shift` (2,) [m] what they are off by there.  `score` is the
+    log-likelihood ratio of all pairs against chance, `p` how many such repeats are expected by chance in this map.
+    `agrees`: the map's own covariance lets them be one.  `sure`: beyond doubt, by shape alone.  `newer` are all
+    landmarks of the newer part.
+    """
+
+    pairs: list[tuple[Id, Id]]
+    T: Array
+    middle: Array
+    shift: Array
+    score: float
+    p: float
+    agrees: bool
+    sure: bool
+    newer: list[Id]
+
+
 class Report:
     """The answer to one event.
 
@@ -117,6 +137,7 @@ class Report:
     observations, tentative then, that this scan has let be fused: time, robot, sensor and number in its scan of each.
     `compared` are the landmarks that observations were compared with, `seen_at` (K, 2 or 3) is where these seemed to
     come from.  `gaps` are times without controls, up to now, for which the pose was widened.
+    `repeats` were found in the map after the scan, and not merged.
     """
 
     __slots__ = (
@@ -130,6 +151,7 @@ class Report:
         "late",
         "merged",
         "removed",
+        "repeats",
         "seen_at",
         "y",
         "z",
@@ -143,6 +165,7 @@ class Report:
         self.merged: tuple[tuple[Id, Id, str], ...] = ()
         self.late: tuple[Late, ...] = ()
         self.gaps: tuple[Gap, ...] = ()
+        self.repeats: tuple[Repeat, ...] = ()
         self.compared: Compared | None = None
         self.seen_at: Array = NOTHING
         self.y = y

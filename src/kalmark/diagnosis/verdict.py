@@ -90,10 +90,10 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     mistake = gross(run, log)
     if mistake is not None:
         cause = Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
-        verdict = Verdict("wrong", (cause, *gaps(summary)), "the log filtered again without the mistake")
+        verdict = Verdict("wrong", (cause, *_structural(summary)), "the log filtered again without the mistake")
     else:
         verdict = _judged(run, log, most, progress)
-        if run.stopped or summary.get("diverged"):
+        if run.stopped or summary.get("diverged") or repeats(summary):
             verdict = replace(verdict, map="wrong")
     summary["verdict"] = verdict.as_dict()
     return verdict
@@ -101,7 +101,7 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
 
 def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first = gaps(run.summary)
+    first = _structural(run.summary)
     try:
         found = _searched(run, log, most, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
@@ -204,6 +204,11 @@ def _cause(run: Run, finding: Finding) -> Cause:
     return Cause(finding.name, since_s, finding.gain, *words(finding, run.config), harmless)
 
 
+def _structural(summary: dict[str, Any]) -> list[Cause]:
+    """Return what residuals cannot show: a place that is mapped twice still fits its data."""
+    return [*repeats(summary), *gaps(summary)]
+
+
 def gaps(summary: dict[str, Any]) -> list[Cause]:
     """Return the gaps in the controls after which the pose was not known again, or was not widened."""
     found = []
@@ -213,6 +218,16 @@ def gaps(summary: dict[str, Any]) -> list[Cause]:
             cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
             evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s"
             found.append(Cause("gap", gap["start_s"], lasts, evidence, cure))
+    return found
+
+
+def repeats(summary: dict[str, Any]) -> list[Cause]:
+    """Return the parts of the map that agree, as if one place were mapped twice."""
+    found = []
+    for repeat in summary.get("repeats", ()):
+        number, shift = len(repeat["landmarks"]), figure(repeat["shift_m"])
+        evidence = f"{number} landmarks repeat {number} others {shift} m away: one place is mapped twice"
+        found.append(Cause("map_repeats", repeat["start_s"], repeat["score"], evidence, "--set upkeep.repeats=merge"))
     return found
 
 

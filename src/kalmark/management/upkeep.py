@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from kalmark.declare import Count, Probability, Within, refuse, register
 
@@ -20,6 +20,9 @@ class Upkeep:
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
     (`association/ratio.py`); what is held back by that is mapped anew until then, as is what a robot that is lost sees.
 
+    With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are
+    searched while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those beyond doubt.
+
     With `p_detect`, the probability that the sensor sees a landmark in its view, one that should be seen and is not is
     removed when it is `odds` times likelier that it is gone (`existence.py`); `p_false` is the probability that
     something else is taken for a landmark that is gone.
@@ -30,6 +33,10 @@ class Upkeep:
     ] = 3
     within: Annotated[Count, "It is dropped if that did not happen in so many scans in which it was in view."] = 10
     merge: Annotated[bool, "Merge landmarks that turn out to be one."] = True
+    repeats: Annotated[
+        Literal["off", "warn", "merge"],
+        "Search the map for parts that agree under a shift and a turn while it grows: report or merge them.",
+    ] = "off"
     hold_back: Annotated[
         bool,
         "Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it anew.",

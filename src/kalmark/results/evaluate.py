@@ -18,6 +18,7 @@ from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
 from kalmark.results.matching import association_figures, best_known, by_position, no_ids
 from kalmark.results.measures import Rigid, diverged, identity, nees, nis, path_m, pose_error, rigid, rigid_robust, rmse
 from kalmark.results.recording import Recording
+from kalmark.results.repeats import repeat_figures, repeat_notes
 from kalmark.results.truth import Truth, fitted
 from kalmark.results.warnings import POSE_NEES, advice, fix_nis_per_dof, warnings, window_figures
 from kalmark.results.words import count, figure
@@ -72,14 +73,14 @@ def evaluate(run: Recording) -> dict[str, Any]:
         summary["mounts"] = {mount.name: mount_figures(mount) for mount in history.mounts}
     if history.biases:
         summary["biases"] = {bias.robot: bias_figures(bias) for bias in history.biases}
-    summary["gaps"] = gap_figures(run)
+    summary["gaps"], summary["repeats"] = gap_figures(run), repeat_figures(run)
     summary |= run.reference
     if run.truth.fixes and not np.isfinite(run.truth.poses).any():
         summary |= fix_figures(np.concatenate([fix_distances(run, name) for name in run.truth.fixes]))
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
     summary["advice"] = advice(run, summary)
-    summary["notes"] = list(gap_notes(summary["gaps"]))
+    summary["notes"] = [*gap_notes(summary["gaps"]), *repeat_notes(history)]
     return summary
 
 

@@ -122,6 +122,22 @@ class Biased(NamedTuple):
     covariance: Matrix
 
 
+class Repeated(NamedTuple):
+    """A pair of landmarks, the older one first, of the repeat `number` in the map at the end: they seem to be one.
+
+    `shift` (2,) [m] and `turn_rad` move the older part of the map onto the newer one, in the middle of them; `score`
+    is the log-likelihood ratio of all its pairs against chance, `p` how many such repeats are expected by chance.
+    """
+
+    number: int
+    landmark: str
+    other: str
+    shift: Vector
+    turn_rad: float
+    score: float
+    p: float
+
+
 ROWS: dict[
     str, tuple[str, Any, bool]
 ] = {  # fields of a history: their prefix in the file, and whether texts are joined
@@ -132,6 +148,7 @@ ROWS: dict[
     "mounts": ("mount", Mounted, True),
     "biases": ("bias", Biased, True),
     "gaps": ("gap", Gap, False),
+    "repeats": ("repeat", Repeated, False),
 }
 
 
@@ -153,7 +170,8 @@ class History:
     Observations `candidate_row` (C,) were compared with landmarks, `candidate_landmark` (C,), of distance
     `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks
     `share_landmark` with weights `share_weight`.  `changes` is what became of landmarks, `fixes` are those used, in the
-    order they came, `controls` those of each robot that had any, `gaps` the times without.
+    order they came, `controls` those of each robot that had any, `gaps` the times without, `repeats` pairs of
+    landmarks that seem to be one.
     """
 
     t_ns: Ints
@@ -196,6 +214,7 @@ class History:
     mounts: tuple[Mounted, ...] = ()
     biases: tuple[Biased, ...] = ()
     gaps: tuple[Gap, ...] = ()
+    repeats: tuple[Repeated, ...] = ()
 
     @property
     def fused(self) -> Flags:

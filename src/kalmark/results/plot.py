@@ -150,6 +150,9 @@ def strokes(scene: Scene) -> list[Stroke]:
     out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
     out += [Stroke(fixes, cross, "fixes used", cross | {"markersize": 5}) for fixes in scene.used.values()]
     out += _true_strokes(scene, truth, crowded) + _landmark_strokes(scene, crowded) + _robot_strokes(scene)
+    if len(scene.repeats):
+        twice = {"color": ALARM_COLOUR, "linewidth": 0.9, "alpha": 0.8, "zorder": 5}
+        out.append(Stroke(scene.repeats, twice, "landmarks mapped twice", twice))
     for robot, path in scene.dead.items():
         dead = {"color": scene.colour(robot), "linewidth": 0.7, "alpha": 0.5, "linestyle": (0, (5, 3)), "zorder": 3}
         if np.isfinite(path).any():

@@ -22,6 +22,7 @@ from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
 from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, stated_noise
 from kalmark.results.recording import LogReference
+from kalmark.results.repeats import repeated
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
 from kalmark.slam.motion import HeldInput
@@ -236,6 +237,7 @@ class _Recorder:
             mounts=mounts(self.slam),
             biases=biases(self.slam),
             gaps=joined(self.gaps),
+            repeats=repeated(self.slam),
             **decisions(reports, 3 if n > 3 else 2),
         )
 

@@ -41,6 +41,7 @@ from kalmark.results.scene import (
 from kalmark.results.verdict import verdict_lines
 from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words
 
+NOT_FIGURES = ("robots", "warnings", "advice", "notes", "gaps", "repeats", "verdict")
 BINS = 120
 POINTS = 2000  # of a curve
 LANDMARKS = 40_000  # in all the maps of a page together
@@ -131,7 +132,7 @@ def show(value: Any, unit: str = "") -> str:
 def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
-        if (key in ("robots", "warnings", "advice", "notes", "gaps", "verdict") and not prefix) or key == "directions":
+        if (key in NOT_FIGURES and not prefix) or key == "directions":
             continue
         out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
     return out
@@ -174,6 +175,7 @@ def series(run: Recording) -> dict[str, Any]:
         "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
         "trueLines": xy(joined(scene.true_lines())),
         "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
+        "repeats": xy(scene.repeats),
         "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.used.items()},
         "bodies": {robot: xy(joined(scene.body(robot))) for robot in scene.paths if scene.d == 3},
         "cameras": [_camera(run, camera, maps, t) for camera in run.history.cameras],

@@ -56,7 +56,8 @@ class Scene:
     By robot: poses (N, 3|7) and their covariances up to the step, `stretches` (S,), the gaps in time up to each of all
     its steps, positions by `dead` reckoning (N, d), true ones (S, d; NaN: unknown), fixes (F, 2) to score with and
     those `used` by the filter (F, d).
-    `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places.  `low` and `high` (d,) are the
+    `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
+    `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
     corners of the box to draw, the same for all steps.
     """
 
@@ -74,6 +75,7 @@ class Scene:
     cameras: tuple[Camera, ...]
     low: Array
     high: Array
+    repeats: Array
 
     @classmethod
     def of(cls, run: Recording, step: int | None = None) -> Scene:
@@ -108,7 +110,12 @@ class Scene:
             to_fixes, _, offset, xy = aligned_fixes(run, robot)
             fixes[robot] = to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
         cameras = history.cameras
-        return cls(d, paths, covariances, stretches, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high)
+        at = {str(name): now.means[k] for k, name in enumerate(ids)}
+        twice = [np.array([at[row.landmark], at[row.other]]) for row in history.repeats if {*row[1:3]} <= at.keys()]
+        return cls(
+            d, paths, covariances, stretches, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
+            joined(twice, d),
+        )  # fmt: skip
 
     @property
     def size(self) -> float:

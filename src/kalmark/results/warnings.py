@@ -32,6 +32,7 @@ from kalmark.results.history import History, Ints, UsedFix
 from kalmark.results.matching import LEAST, no_ids
 from kalmark.results.measures import nis
 from kalmark.results.recording import Recording
+from kalmark.results.repeats import repeat_warnings
 from kalmark.results.words import count, figure
 
 DEGREES = 100  # of freedom in a window, at least
@@ -193,7 +194,8 @@ def _left_out(worst: Window, median: float, count: int) -> str:
 def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
     parts = (_lost, _observations, _robots, _sensors, _truth, _fixes, _noise, mount_warnings)
-    return [*gap_warnings(summary["gaps"]), *(line for part in parts for line in part(run, summary))]
+    of_map = *gap_warnings(summary["gaps"]), *repeat_warnings(summary["repeats"])
+    return [*of_map, *(line for part in parts for line in part(run, summary))]
 
 
 def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:

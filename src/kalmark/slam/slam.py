@@ -36,13 +36,14 @@ from kalmark.filter.maps import DENSE, grown, new_map
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import RHO, SE2, SE3, Rn
 from kalmark.management import confirm, delayed, existence, merge, reparametrize, tags
+from kalmark.management import repeats as of_map
 from kalmark.management.attention import chosen, left_out
 from kalmark.management.pending import Initialization, Step
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, place_of
-from kalmark.report import Gap, Judged, LandmarkTable, Observation, Report, outcomes_of
+from kalmark.report import Gap, Judged, LandmarkTable, Observation, Repeat, Report, outcomes_of
 from kalmark.slam.checks import (
     covariance,
     instance,
@@ -659,6 +660,8 @@ class Slam:
                 report.removed += ((track.id, why),)
         if ids is None or None in ids:
             self._merge(scan, policy)
+            if policy.upkeep.repeats != "off" and of_map.is_due(self.tracks):
+                self._search_repeats(scan, policy)
         if self.tracks.tentative:
             self._drop_tentative(scan, policy)
         for key in self.clones.users() if self.clones.clones else ():
@@ -705,6 +708,41 @@ class Slam:
             why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
             merged.append((gone, kept, why))
         return merged
+
+    def _search_repeats(self, scan: ScanContext, policy: Policy) -> None:
+        """Search the map for parts that are one; merge those beyond doubt, where that is wanted, and report the others.
+
+        One is merged at a time: it changes the map.
+        """
+        self.tracks.searched = self.tracks.changes
+        found = of_map.repeats(self.map, self.tracks)
+        for repeat in found:
+            if policy.upkeep.repeats == "merge" and repeat.sure and (repeat.agrees or self._displace(scan, repeat)):
+                merged = self._merge_pairs(scan, merge.Merge(repeat.pairs, repeat.score))
+                scan.report.merged += tuple((gone, kept, f"{why}, {of_map.IN_A_REPEAT}") for gone, kept, why in merged)
+                found = [other for other in found if other is not repeat]
+                break
+        scan.report.repeats = tuple(found)
+
+    def _displace(self, scan: ScanContext, repeat: Repeat) -> bool:
+        """Move the newer part of a repeat, of an error that is unknown until now, onto the older one.
+
+        It has the robot and all that it has not finished if it is there.  Not with several robots, nor where blocks
+        of the map may belong to either part.
+        """
+        inside = of_map.is_in(repeat.newer, self.tracks)
+        if len(self.robots) > 1 or inside is None or self.tracks.pending:
+            return False
+        slots = [self.tracks.slot(name) for name in repeat.newer]
+        if inside:
+            slots += [scan.robot, *(track.slot for track in self.tracks.tentative.values())]
+            slots += [clone.slot for clone in self.clones.clones.values()]
+        moved = of_map.displacement(self.map, slots, repeat)
+        rows = self._rows(tuple((slot, len(self.map.rows(slot))) for slot in slots))
+        self.map.predict(rows, moved.F, moved.Q)
+        for slot, mean in zip(moved.slots, moved.means, strict=True):
+            self.map.set_predicted(slot, mean)
+        return True
 
     def _let_grow(self) -> None:
         """Compress the map from so many landmarks on that it pays; not where matchings are averaged."""

@@ -41,9 +41,16 @@ from kalmark.tracks.track import Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 8
+VERSION = 9
 DESCRIPTION, SUMS = "slam.json", "sha256"
-OF_TRACKS = ("recent", "last_scan", "changes", "unnamed", "experience")  # what `Tracks` knows beside the tracks
+OF_TRACKS = (
+    "recent",
+    "last_scan",
+    "changes",
+    "searched",
+    "unnamed",
+    "experience",
+)  # what `Tracks` knows beside the tracks
 PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 OF_MOVING = ("t_ns", "fresh")
@@ -207,7 +214,8 @@ class Saved:
         for name in OF_TRACKS:
             setattr(tracks, name, s[name])
         tracks.experience = float(s["experience"][0]), float(s["experience"][1])
-        tracks.changes, tracks.unnamed = _count(s["changes"], "changes"), _count(s["unnamed"], "unnamed")
+        for name in ("changes", "searched", "unnamed"):
+            setattr(tracks, name, _count(s[name], name))
         for number, c in s["clones"]:
             users = {(str(robot), str(sensor)) for robot, sensor in c["users"]}
             clones.clones[_count(number, "number of a clone")] = Clone(c["slot"], c["robot"], c["t_ns"], users)

@@ -98,7 +98,8 @@ class Tracks:
 
     `slots` has robots, mounts and biases, too; `names` are the landmarks by slot.  `sorts` has the words by which a
     `Channel` finds its observation models: a landmark's kind, or ROBOT.  `recent` are the landmarks observed last,
-    `last_scan` those of the last scan; `changes` counts landmarks that have come or gone.  `candidates` are pending
+    `last_scan` those of the last scan; `changes` counts landmarks that have come or gone,
+    `searched` those until the map was last searched for repeats.  `candidates` are pending
     measurements without a landmark, by channel.  `reserved` are ids of the log or of a survey that look like invented
     names: u1, u2, ...  `experience` counts observations without ids that were of landmarks of the map, and were not.
     """
@@ -114,7 +115,7 @@ class Tracks:
         self.sorts: dict[Id, str] = {}
         self.recent: list[Id] = []
         self.last_scan: list[Id] = []
-        self.changes = 0
+        self.changes = self.searched = 0
         self.unnamed = 0
         self.reserved: set[Id] = set()
         self.experience = (0.0, 0.0)

@@ -1,7 +1,7 @@
 "use strict";
 /* The map of a run, in the plane or in space, where it turns under the mouse, and the images of cameras at the slider. */
 const AXES = DATA.dof === 3 ? ["x", "y"] : ["x", "y", "z"], SPACE = AXES.length === 3;
-const TRUTH = SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)", FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = "#8c1c13";
+const TRUTH = SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)", FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = "#8c1c13", ALARM = "#b3261e";
 const MEASURED = "#7d838d", SEGMENT = "rgba(58,104,200,0.55)";
 const GROUPS = !SPACE ? [["#d2691e", "landmarks, 3 sigma"]] :
   [["#1f5fa8", "landmarks, 3 sigma"], ["#c8412f", "landmarks that are not Euclidean, 3 sigma"], [LINE, "lines, 3 sigma of their ends"]];
@@ -91,6 +91,7 @@ function still() {
   const thinly = r => { const s = stroke(r.dead, r.colour, 0.9, {opacity: 0.5}); return {...s, line: {...s.line, dash: "dash"}}; };
   each(DATA.robots.filter(r => r.dead), "dead reckoning", thinly);
   each(DATA.robots.filter(r => r.truth), "true path", r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
+  if (DATA.repeats.x.length) traces.push(stroke(DATA.repeats, ALARM, 1.2, {...skip, name: "landmarks mapped twice"}));
   if (DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: "true lines"}));
   if (l.x.length)
     traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],

@@ -1,0 +1,155 @@
+"""A place that was mapped twice is found by its shape; what is built regularly, or at random, is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hall import hall, mapped, right, slam_of
+from repeats import SIGMA_M, WORLDS, World, empty, part
+
+import kalmark as km
+from kalmark.geometry.frames import from_frame
+from kalmark.management.repeats import FALSE_ALARMS, displacement, repeats
+from kalmark.results.run import Run
+
+
+def found(slam: km.Slam) -> list[list[tuple[object, object]]]:
+    return [each.pairs for each in repeats(slam.map, slam.tracks)]
+
+
+@pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS.keys())
+@pytest.mark.parametrize("seed", range(3))
+def test_a_map_without_repeats_has_none(world: World, seed: int) -> None:
+    rng, slam = np.random.default_rng(seed), empty()
+    part(slam, world(rng), rng)
+    assert found(slam) == []
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_a_place_that_was_mapped_twice_is_found_with_its_shift_and_turn(share: float, map_: str) -> None:
+    rng, slam, T = np.random.default_rng(1), empty(map_), np.array([5.0, 3.0, 0.4])
+    places = rng.uniform(0, 30, (60, 2))
+    again = places[: round(share * len(places))]
+    again = places[np.argsort(np.linalg.norm(places - 15.0, axis=1))[: len(again)]]
+    true = {tuple(place): name for place, name in zip(places.tolist(), part(slam, places, rng), strict=True)}
+    names = part(slam, from_frame(T, again)[0], rng)
+    (repeat,) = repeats(slam.map, slam.tracks)
+    wanted = {(true[tuple(place)], name) for place, name in zip(again.tolist(), names, strict=True)}
+    assert {*repeat.pairs} <= wanted
+    assert len(repeat.pairs) >= 0.9 * len(wanted)
+    np.testing.assert_allclose(repeat.T, T, atol=0.1)
+    assert repeat.p < 1e-3 * FALSE_ALARMS
+    assert not repeat.agrees, "the map is sure that they are two"
+    assert repeat.sure
+
+
+def test_a_mirrored_place_is_another_one() -> None:
+    rng, slam = np.random.default_rng(1), empty()
+    places = rng.uniform(0, 20, (30, 2))
+    part(slam, places, rng)
+    part(slam, places * np.array([-1.0, 1.0]) - 5.0, rng)
+    assert found(slam) == []
+
+
+def test_landmarks_with_two_ids_are_two() -> None:
+    rng, slam = np.random.default_rng(1), empty()
+    places = rng.uniform(0, 20, (30, 2))
+    names = part(slam, places, rng) + part(slam, places + np.array([25.0, 0.0]), rng)
+    assert len(found(slam)) == 1
+    slam.tracks.reserve(names)
+    assert found(slam) == []
+
+
+def test_places_of_which_one_has_landmarks_that_the_other_has_not_are_two() -> None:
+    rng, slam = np.random.default_rng(1), empty()
+    places = rng.uniform(0, 20, (40, 2))
+    part(slam, places, rng)
+    part(
+        slam,
+        np.concatenate([places[:12] + np.array([25.0, 0.0]), rng.uniform(0, 20, (28, 2)) + np.array([25.0, 0.0])]),
+        rng,
+    )
+    assert found(slam) == []
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_hall_mapped_twice_is_reported_with_its_time_and_drawn(seed: int, tmp_path: Path) -> None:
+    run = mapped(hall(seed, gap_s=4.0), gaps="ignore")
+    summary = run.evaluate()
+    (repeat,), (gap,) = summary["repeats"], summary["gaps"]
+    assert len(repeat["landmarks"]) >= 22
+    assert gap["end_s"] - 0.1 <= repeat["start_s"] < gap["end_s"] + 2.0
+    (line,) = [line for line in summary["warnings"] if line.startswith("the map repeats itself: ")]
+    assert f"{len(repeat['landmarks'])} landmarks seem to be mapped twice" in line
+    run.save(tmp_path)
+    again = Run.load(tmp_path)
+    assert again.evaluate()["repeats"] == summary["repeats"]
+    assert "landmarks mapped twice" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_hall_mapped_once_has_no_repeats() -> None:
+    for seed in range(3):
+        assert mapped(hall(seed)).evaluate()["repeats"] == []
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_a_hall_mapped_twice_becomes_one_where_repeats_are_merged(seed: int) -> None:
+    log = hall(seed, gap_s=4.0)
+    run = mapped(log, gaps="ignore", repeats="merge")
+    summary = run.evaluate()
+    assert right(run, log)
+    assert summary["repeats"] == []
+    assert summary["nis_per_dof"] < 1.1
+    (note,) = [line for line in summary["notes"] if "merged at" in line]
+    assert "landmarks mapped twice, in a map that repeated itself: merged at t=" in note
+
+
+@pytest.mark.parametrize("estimator", [km.estimators.Ekf(), km.estimators.Fej()], ids=["ekf", "fej"])
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+def test_a_repeat_is_merged_in_every_map_by_every_estimator(estimator: km.estimators.Estimator, map_: str) -> None:
+    log = hall(2, gap_s=4.0)
+    run = mapped(log, gaps="ignore", repeats="merge", estimator=estimator, map=map_)
+    assert right(run, log)
+
+
+def test_a_report_has_the_repeats_that_are_not_merged_and_a_saved_map_resumes_bit_for_bit(tmp_path: Path) -> None:
+    log, slams = hall(0, gap_s=4.0), []
+    for repeats_ in ("warn", "merge"):
+        slam = slam_of(log, gaps="ignore", upkeep=km.Upkeep(repeats=repeats_))
+        told = [repeat for event in log.events for repeat in slam.process(event).repeats]
+        assert any(repeat.sure for repeat in told) is (repeats_ == "warn")
+        assert len(slam.landmarks()) == (48 if repeats_ == "warn" else 24)
+    half = len(log.events) // 2
+    slams = [slam_of(log, gaps="ignore", upkeep=km.Upkeep(repeats="merge"))]
+    for event in log.events[:half]:
+        slams[0].process(event)
+    slams[0].save(tmp_path / "map.kmk")
+    slams.append(km.Slam.load(tmp_path / "map.kmk"))
+    told = [[slam.process(event).merged for event in log.events[half:]] for slam in slams]
+    assert told[0] == told[1]
+    assert any(told[0])
+    np.testing.assert_array_equal(slams[0].covariance("rover"), slams[1].covariance("rover"))
+
+
+def test_a_displaced_part_is_as_uncertain_as_it_was_off_and_keeps_its_shape() -> None:
+    rng, slam, T = np.random.default_rng(1), empty(), np.array([5.0, 3.0, 0.4])
+    places = rng.uniform(0, 30, (60, 2))
+    older, newer = part(slam, places, rng), part(slam, from_frame(T, places)[0], rng)
+    (repeat,) = repeats(slam.map, slam.tracks)
+    assert sorted(repeat.newer) == sorted(newer)
+    slots = [slam.slot(name) for name in newer]
+    moved = displacement(slam.map, slots, repeat)
+    back = np.array([slam.mean(name) for name in older])
+    np.testing.assert_allclose(np.array(moved.means), back, atol=0.3)
+    P = moved.F @ slam.covariance(*newer) @ moved.F.T + moved.Q
+    middle = int(np.argmin(np.linalg.norm(np.array(moved.means) - places.mean(axis=0), axis=1)))
+    sigma = np.sqrt(P[2 * middle, 2 * middle])
+    assert sigma == pytest.approx(np.linalg.norm(repeat.shift), rel=0.2)
+    a, b = 0, 1
+    apart = np.array(moved.means)[a] - np.array(moved.means)[b]
+    J = np.hstack([apart, -apart]) / np.linalg.norm(apart)
+    both = np.r_[2 * a : 2 * a + 2, 2 * b : 2 * b + 2]
+    assert J @ P[np.ix_(both, both)] @ J == pytest.approx(2 * SIGMA_M**2), "a rigid motion changes no distance"
