@@ -21,8 +21,8 @@ from kalmark.filter.prefault import Prefault
 
 ROWS = 8  # of the active blocks, to write at once
 WRITING = 60  # multiplications that take as long as to write a number there
-GATHERING = 1500  # and as to gather a number from the storage
-TOUCHING = 30  # and as to read and write a number of a tile
+GATHERING = 400  # and as to gather a number from the storage
+TOUCHING = 20  # and as to read and write a number of a tile
 NO_WIDTHS = np.zeros(0, dtype=np.int64)
 MORE = 1.5  # times the memory that a full update has needed: the next one may
 
@@ -133,7 +133,8 @@ class FullUpdate:
         self.where[interval.A] = np.arange(len(interval.A))
         self.known = self.where >= 0
         self.inactive = _in_use(map_, self.n) & (self.where < 0)
-        self.L = self._root()
+        self.L = _root(interval.Psi, storage.diagonal(interval.A0))
+        self.rotated = self.n < ranks.FEWEST
         self.q, self.turns = self.L.shape[1], 2 * len(interval.P_TT)
         panels, columns = range(0, self.n, PANEL), self.turns + self.q
         self.R = workspace.array("R", (self.n, columns))
@@ -227,6 +228,8 @@ class FullUpdate:
 
     def _know(self, slots: Index) -> None:
         """Work out the means of some blocks, their rows of R = [w, a, W], and their covariances V with A."""
+        if not self.rotated:
+            self._rotate()
         p = self.interval
         _, atoms, numbers, rows = laid_out(self.map.blocks[slots], self.map.atoms)
         G = self.storage.get(rows, p.A0)
@@ -237,16 +240,16 @@ class FullUpdate:
         self.known[rows] = True
         self.map.x[numbers] = x
 
-    def _root(self) -> Array:
-        """Return L (A0, q) with L L' = Psi; in a large map with columns in an order that makes far rows short."""
-        A0 = self.interval.A0
-        L, inactive = _root(self.interval.Psi, self.storage.diagonal(A0)), np.flatnonzero(self.inactive)
-        if self.n < ranks.FEWEST or len(inactive) < ranks.SAMPLE or L.shape[1] <= ranks.ROUGH:
-            return L
+    def _rotate(self) -> None:
+        """Make far rows short, by a sample of the inactive blocks as they are stored."""
+        self.rotated, inactive = True, np.flatnonzero(self.inactive)
+        if len(inactive) < ranks.SAMPLE or self.q <= ranks.ROUGH:
+            return
         rows = inactive[np.linspace(0, len(inactive) - 1, ranks.SAMPLE).astype(np.int64)]
-        sigmas = np.sqrt(np.maximum(self.storage.diagonal(rows), 0.0))
-        W = (self.storage.get(rows, A0) @ L)[sigmas > 0] / sigmas[sigmas > 0, None]
-        return np.ascontiguousarray(L @ ranks.rotation(W))
+        variances = self.storage.diagonal(rows)
+        rows, variances = rows[variances > 0.0], variances[variances > 0.0]
+        W = self.storage.get(rows, self.interval.A0) @ self.L / np.sqrt(variances)[:, None]
+        self.L = ranks.rotated(self.L, W)
 
 
 def _in_use(map_: Layout, n: int) -> Flags:

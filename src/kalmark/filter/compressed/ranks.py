@@ -19,15 +19,20 @@ ROUGH = SAMPLE // 8  # directions beyond which a row near the active blocks has 
 FEWEST = 2000  # rows of a map: in a smaller one all tiles are about as wide as W
 
 
-def rotation(W: Array) -> Array:
-    """Return Q (q, q) that gives the rows far from the active blocks few columns: of rows W (N, q) of unit sigma."""
-    from scipy.linalg import qr
+def rotated(L: Array, W: Array) -> Array:
+    """Return L Q (n, q) with a rotation Q that leaves rows far from the active blocks few columns.
 
-    T, order = qr(W.T, mode="r", pivoting=True, check_finite=False)
+    W (N, q) are rows of P0_BA L, in units of their sigmas.
+    """
+    from scipy.linalg.lapack import dgeqp3, dormqr
+
+    T, order, *_ = dgeqp3(W.T)
     rough = np.empty(len(W))
-    rough[order] = np.sqrt((T[ROUGH:] ** 2).sum(axis=0))
+    rough[order - 1] = np.sqrt((np.triu(T)[ROUGH:] ** 2).sum(axis=0))
     far = np.sort(np.argsort(rough, kind="stable")[:FAR])
-    return np.asarray(qr(W[far].T, pivoting=True, check_finite=False)[0])
+    T, _, tau, *_ = dgeqp3(W[far].T)
+    k = len(tau)
+    return np.ascontiguousarray(dormqr("R", "N", T[:, :k], tau, L, 64 * len(L))[0])
 
 
 @compiled
