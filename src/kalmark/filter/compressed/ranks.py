@@ -2,7 +2,7 @@
 
 Of P_BB - W W' any rotation of the columns of W is free.  Here it is one after which the rows of most blocks are nearly
 zero from some column on; a tile of the product needs only the columns before that.  What is left out of an element is
-below its rounding error: `EXACT` times the sigmas of its row and its column.
+at most `EXACT` times the sigmas of its row and its column.
 """
 
 from __future__ import annotations
