@@ -17,18 +17,20 @@ Step = tuple[km.Control, km.Scan]
 class Field:
     """A field of landmarks, 2 m apart, and a robot's true pose in it; makes the events of its way."""
 
-    def __init__(self, columns: int, rows: int) -> None:
+    def __init__(self, columns: int, rows: int, lane_m: float = LANE_M, reach_m: float = REACH_M) -> None:
         self.rng, self.columns, self.rows = np.random.default_rng(0), columns, rows
+        self.lane_m, self.reach_m = lane_m, reach_m
         grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
         corners = (grid.reshape(-1, 2) + 0.5) * SPACING_M
         self.landmarks = corners + self.rng.uniform(-0.5, 0.5, corners.shape)
         self.tree, self.t = cKDTree(self.landmarks), 0
-        self.truth = self.start = np.array([0.0, LANE_M / 2, 0.0])
+        self.truth = self.start = np.array([0.0, lane_m / 2, 0.0])
 
     def step(self, u: Any, most: int | None = None) -> Step:
         """Move by u and look around: at all landmarks in reach or at the nearest ones."""
         self.truth, self.t = km.geometry.compose(self.truth, np.array(u, dtype=float))[0], self.t + 1
-        near = self.tree.query(self.truth[:2], most)[1] if most else self.tree.query_ball_point(self.truth[:2], REACH_M)
+        p = self.truth[:2]
+        near = self.tree.query(p, most)[1] if most else self.tree.query_ball_point(p, self.reach_m)
         ids = sorted(int(i) for i in near)
         y = km.geometry.observe(self.truth, self.landmarks[ids])[0] if ids else np.zeros((0, 2))
         y = y + self.rng.normal(size=y.shape) * SIGHT
@@ -38,12 +40,12 @@ class Field:
 
     def mission(self, step_m: float = STEP_M) -> list[Step]:
         """Return lanes to and fro, joined by half circles."""
-        length = self.columns * SPACING_M
-        lanes, turn = int(np.ceil(self.rows * SPACING_M / LANE_M)), int(np.ceil(np.pi * LANE_M / 2 / step_m))
+        length, half = self.columns * SPACING_M, np.pi * self.lane_m / 2
+        lanes, turn = int(np.ceil(self.rows * SPACING_M / self.lane_m)), int(np.ceil(half / step_m))
         steps = []
         for lane in range(lanes):
             steps += [self.step((step_m, 0, 0)) for _ in range(int(length / step_m))]
-            bend = (np.pi * LANE_M / 2 / turn, 0, (-1) ** lane * np.pi / turn)
+            bend = (half / turn, 0, (-1) ** lane * np.pi / turn)
             steps += [self.step(bend) for _ in range(turn if lane < lanes - 1 else 0)]
         return steps
 
@@ -61,7 +63,7 @@ class Field:
         steps, heading, side = [], 0.0, self.columns * SPACING_M
         for _ in range(count):
             p = self.truth[:2] + 10 * np.array([np.cos(self.truth[2]), np.sin(self.truth[2])])
-            heading = 2.0 if (p < REACH_M).any() or (p > side - REACH_M).any() else 0.0
+            heading = 2.0 if (p < self.reach_m).any() or (p > side - self.reach_m).any() else 0.0
             steps.append(self.step((0.0 if heading else 10.0, 0, heading), VIEW))
         return steps
 

@@ -3,8 +3,9 @@
     make bench-growth      or      python benchmarks/map_growth.py [--sides 7 32 100] [--out out/map_growth]
 
 A field of side x side landmarks, 2 m apart, is mowed in lanes 6 m apart by a robot that sees 4 m: a third of what it
-sees in a lane it knows from the last one.  Every event goes through `Slam.process`, every outcome is read.  Times are
-processor time of the thread, so that other work on the machine counts less; the ratios are the result.
+sees in a lane it knows from the last one.  The quick robot moves .7 m a step instead of .2 m, in lanes 3 m apart, and
+sees 3.2 m: half of what it sees is from the last lane.  Every event goes through `Slam.process`, every outcome is read.
+Times are processor time of the thread, so that other work on the machine counts less; the ratios are the result.
 
 ordinary    median step in a place that is known, 10 landmarks in view, after 2,000 steps there: as it comes, with what
             is still active of the way there, and after a full update, with the neighbourhood alone active
@@ -34,13 +35,15 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy
-from field import ODOMETRY, SIGHT, Field, Step
+from field import ODOMETRY, SIGHT, STEP_M, Field, Step
 
 import kalmark as km
 from kalmark.filter import kernels
 from kalmark.filter.compressed.map import CompressedMap
 
 GIB = 2.0**30
+QUICK = {"lane_m": 3.0, "reach_m": 3.2}
+QUICK_STEP_M = 0.7
 
 
 def take(slam: km.Slam, steps: Iterable[Step]) -> np.ndarray:
@@ -55,14 +58,13 @@ def take(slam: km.Slam, steps: Iterable[Step]) -> np.ndarray:
     return np.array(spent)
 
 
-def compressed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
-    """Return the figures of a mission with the map that Slam chooses, and where it ended."""
-    field = Field(side, side)
-    slam, steps = field.slam(), field.mission()
+def mission(field: Field, step_m: float = STEP_M) -> tuple[dict[str, Any], km.Slam]:
+    """Return the figures of a mission with the map that Slam chooses, and that map."""
+    slam, steps = field.slam(), field.mission(step_m)
     gc.freeze()  # the log made beforehand is none of the collector's business
     wall = time.perf_counter()
     spent = take(slam, steps)
-    row: dict[str, Any] = {
+    row = {
         "landmarks": len(field.landmarks),
         "steps": len(spent),
         "seen": float(np.mean([len(scan.y) for _, scan in steps])),
@@ -75,6 +77,13 @@ def compressed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
         "worst_ms": np.sort(spent)[-5:][::-1].tolist(),
         "position_error_m": float(np.linalg.norm(slam.mean("r")[:2] - field.truth[:2])),
     }
+    return row, slam
+
+
+def compressed(side: int) -> tuple[dict[str, Any], Field, km.Slam]:
+    """Return the figures of the slow mission and of the place where it ended."""
+    field = Field(side, side)
+    row, slam = mission(field)
     row["ordinary_us"] = float(np.median(take(slam, field.circle(3000))[-1000:])) * 1e3
     row["settled_us"] = row["ordinary_us"]
     if isinstance(slam.map, CompressedMap):
@@ -146,12 +155,25 @@ def report(rows: list[dict[str, Any]], adverse: dict[str, float] | None) -> None
         print(f"| {r['landmarks']:,} | {r['steps']:,} | {r['mission_s']:.1f} s | {r['amortised_ms']:.3f} ms", end=" ")
         print(f"| {r['ordinary_us']:.0f} us, {r['settled_us']:.0f} us | {worst} ms | {r['dense_ms']:.2f} ms", end=" ")
         print(f"| {r['dense_mission_s']:.1f} s = {r['dense_mission_s'] / r['mission_s']:.1f} x |")
+    print()
+    for r in rows:
+        print(line("slow", r))
+        print(line("quick", r["quick"]))
     most, least = rows[-1], rows[0]
     print(f"\nordinary, largest over smallest map: {most['ordinary_us'] / least['ordinary_us']:.2f},", end=" ")
     print(f"after a full update {most['settled_us'] / least['settled_us']:.2f}")
     if adverse:
         print(f"adverse: {adverse['mean_ms']:.1f} ms a step, worst {adverse['worst_ms']:.0f} ms;", end=" ")
         print(f"{adverse['mean_ms'] / rows[-1]['dense_ms']:.2f} times a dense step")
+
+
+def line(pace: str, r: dict[str, Any]) -> str:
+    """Return the figures of a mission in one line."""
+    worst = " / ".join(f"{ms:.1f}" for ms in r["worst_ms"][:3])
+    return (
+        f"{pace}, {r['landmarks']:,} landmarks: {r['mission_s']:.1f} s, wall {r['mission_wall_s']:.1f} s; "
+        f"a step median {r['median_ms']:.3f} ms, mean {r['amortised_ms']:.3f} ms, worst {worst} ms"
+    )
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
@@ -200,11 +222,10 @@ def main() -> None:
             del slam
             half, whole = (dense_step_ms(field, side * side // k) for k in (2, 1))
             row["dense_ms"], row["dense_mission_s"] = whole, row["steps"] * (4 * half + whole) / 6 * 1e-3
+            print(line("slow", row), flush=True)
+            row["quick"] = mission(Field(side, side, **QUICK), QUICK_STEP_M)[0]
+            print(line("quick", row["quick"]), flush=True)
             rows.append(row)
-            print(
-                f"{row['landmarks']:,} landmarks: {row['mission_s']:.1f} s, wall {row['mission_wall_s']:.1f} s",
-                flush=True,
-            )
     report(rows, adverse)
     print("\nmemory of the covariance:")
     options.out.mkdir(parents=True, exist_ok=True)

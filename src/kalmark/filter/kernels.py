@@ -261,11 +261,11 @@ def half_turned(w: Array, a: Array, theta: int) -> None:
 
 
 @compiled
-def subtract_product(C: int, stride: int, L: int, rows: int, R: int, columns: int, q: int) -> None:
-    """C -= L R' for L (rows, q), R (columns, q) and C, of so many numbers a row, at those addresses."""
-    sizes = np.array([columns, rows, q, stride], dtype=np.int32)
+def subtract_product(C: int, stride: int, L: int, rows: int, R: int, columns: int, q: int, n: int) -> None:
+    """C -= L R' for L (rows, q) and R (columns, q), of n numbers a row, and C, of `stride`, at those addresses."""
+    sizes = np.array([columns, rows, q, stride, n], dtype=np.int32)
     at, chars, numbers = sizes.ctypes.data, _TRANS_NO.ctypes.data, _MINUS_ONE_ONE.ctypes.data
-    _dgemm(chars, chars + 1, at, at + 4, at + 8, numbers, R, at + 8, L, at + 8, numbers + 8, C, at + 12)
+    _dgemm(chars, chars + 1, at, at + 4, at + 8, numbers, R, at + 16, L, at + 16, numbers + 8, C, at + 12)
     sizes[0] = rows  # keeps them alive until the call is over
 
 

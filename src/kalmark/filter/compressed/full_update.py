@@ -13,14 +13,17 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import compiled
+from kalmark.filter.compressed import ranks
 from kalmark.filter.compressed.immediate import Displacements, carried
 from kalmark.filter.compressed.storage import PANEL, Stored, Triangle, subtract
-from kalmark.filter.layout import P_AT, P_SIZE, X_SIZE, Layout, laid_out
+from kalmark.filter.layout import P_AT, P_SIZE, Layout, laid_out
 from kalmark.filter.prefault import Prefault
 
 ROWS = 8  # of the active blocks, to write at once
 WRITING = 60  # multiplications that take as long as to write a number there
-GATHERING = 1500  # and as to gather a number from the storage
+GATHERING = 400  # and as to gather a number from the storage
+TOUCHING = 20  # and as to read and write a number of a tile
+NO_WIDTHS = np.zeros(0, dtype=np.int64)
 MORE = 1.5  # times the memory that a full update has needed: the next one may
 
 
@@ -37,6 +40,21 @@ def fill(panel: Stored, begin: int, end: int, A: Index, where: Index, V: Array, 
         for c in range(len(A)):
             if A[c] <= i:
                 row[A[c]] = V[i // PANEL, c, i % PANEL] if own < 0 else P_AA[own, c]
+
+
+@compiled
+def keep(R: Array, V: Array, rows: Index, w: Array, a: Array, W: Array, P_AB: Array) -> None:
+    """Write w and a (N, T), W (N, q) and P_AB (A, N) of so many rows into R and V."""
+    T, q = w.shape[1], W.shape[1]
+    for k in range(len(rows)):
+        row = R[rows[k]]
+        for c in range(T):
+            row[c], row[T + c] = w[k, c], a[k, c]
+        for c in range(q):
+            row[2 * T + c] = W[k, c]
+    for c in range(len(P_AB)):
+        for k in range(len(rows)):
+            V[rows[k] // PANEL, c, rows[k] % PANEL] = P_AB[c, k]
 
 
 @compiled
@@ -57,10 +75,10 @@ def corrected(
                 C[a, b] = V[i // PANEL, where[j], i % PANEL]
             elif i // PANEL > panel or j >= column:
                 s = 0.0
-                for c in range(q):
-                    s += R[i, c] * R[j, c]
                 for c in range(m):
-                    s -= R[i, q + m + c] * R[j, q + c] + R[i, q + c] * R[j, q + m + c]
+                    s -= R[i, c] * R[j, m + c] + R[i, m + c] * R[j, c]
+                for c in range(2 * m, 2 * m + q):
+                    s += R[i, c] * R[j, c]
                 C[a, b] -= s
 
 
@@ -88,6 +106,7 @@ class Workspace:
 
     def __init__(self, prefault: Prefault) -> None:
         self.prefault = prefault
+        self.share = 1.0  # of the columns that a tile of the last full update needed on average
         self._numbers: dict[str, Array] = {}
         self._used: dict[str, int] = {}  # of these, or soon
 
@@ -108,28 +127,30 @@ class FullUpdate:
     """P_BB <- P_BB - W W', P_AB, P_AA and the means, in slices."""
 
     def __init__(self, map_: Layout, storage: Triangle, interval: Interval, workspace: Workspace) -> None:
-        self.map, self.storage, self.interval = map_, storage, interval
+        self.map, self.storage, self.interval, self.workspace = map_, storage, interval, workspace
         self.x_before, self.n = map_.x[: map_.x_n].copy(), map_.n
         self.where: Index = np.full(self.n, -1)
         self.where[interval.A] = np.arange(len(interval.A))
-        self.L = _root(interval.Psi, storage.diagonal(interval.A0))
-        self.q = self.L.shape[1]
-        self.R = workspace.array("R", (self.n, self.q + 2 * len(interval.P_TT)))
-        self.V = workspace.array(
-            "V", (len(range(0, self.n, PANEL)), len(interval.A), PANEL)
-        )  # one panel's after the other
         self.known = self.where >= 0
         self.inactive = _in_use(map_, self.n) & (self.where < 0)
+        self.L = _root(interval.Psi, storage.diagonal(interval.A0))
+        self.rotated = self.n < ranks.FEWEST
+        self.q, self.turns = self.L.shape[1], 2 * len(interval.P_TT)
+        panels, columns = range(0, self.n, PANEL), self.turns + self.q
+        self.R = workspace.array("R", (self.n, columns))
+        self.V = workspace.array("V", (len(panels), len(interval.A), PANEL))  # one panel's after the other
+        self.rests = np.zeros((len(panels), -(-self.q // ranks.STEP)))
         gaps = np.flatnonzero(~self.inactive & (self.where < 0))
         self.R[gaps] = 0.0
         self.V[gaps // PANEL, :, gaps % PANEL] = 0.0
         self.panel = self.column = self.row = 0
-        self.cost = PANEL * max(1, self.R.shape[1])  # of a column of a panel, in multiplications
+        self.widths, self.costs = NO_WIDTHS, NO_WIDTHS  # of the tiles of the panel; costs are sums
         self.aside = PANEL * len(interval.A0) * (len(interval.A) + self.q + GATHERING)  # to know a panel
-        panels = range(0, self.n, PANEL)
-        self.work = float(sum(self.cost * min(k + PANEL, self.n) + self.aside for k in panels))
+        cost = PANEL * (self.turns + workspace.share * self.q + TOUCHING)  # of a column of a panel, in multiplications
+        self.work = float(sum(cost * min(k + PANEL, self.n) + self.aside for k in panels))
         self.work += WRITING * int(interval.A.sum())
         self.spent = 0.0
+        self._wide = self._tiles = 0  # all widths and all tiles so far
 
     @property
     def done(self) -> bool:
@@ -144,9 +165,9 @@ class FullUpdate:
         while self.spent < until and not self.done:
             if self.column == 0 and self.spent > begun and self.spent + self.aside > until:
                 return
-            self.spent += self._step(int((until - self.spent) // (self.cost * PANEL)))
+            self.spent += self._step(until - self.spent)
 
-    def _step(self, tiles: int) -> int:
+    def _step(self, work: float) -> int:
         """Update some tiles of a panel or, when it is done, write some rows of the active blocks; return the work."""
         first = self.panel * PANEL
         last = min(first + PANEL, self.n)
@@ -155,16 +176,31 @@ class FullUpdate:
             begin, self.row = self.row, min(self.row + ROWS, last)
             fill(panel, begin, self.row, self.interval.A, self.where, self.V, self.interval.P_AA)
             if self.row == last:
-                self.panel, self.column = self.panel + 1, 0
+                self._next_panel()
             return WRITING * last * int((self.where[begin : self.row] >= 0).sum())
-        if self.column == 0 and self._know_more(first, last):
-            return self.aside
-        start, self.column = self.column, min(last, self.column + PANEL * max(1, tiles))
-        if self.R.shape[1]:
-            W, m = self.R[first:last, : self.q], len(self.interval.P_TT)
-            L = np.hstack([W, -self.R[first:last, self.q + m :], -self.R[first:last, self.q : self.q + m]])
-            subtract(panel[: last - first], L, self.R, start, self.column)
-        return self.cost * (self.column - start)
+        if self.column == 0:
+            if self._know_more(first, last):
+                return self.aside
+            self._find_widths()
+        begun = self.column // PANEL
+        before = int(self.costs[begun - 1]) if begun else 0
+        end = max(begun + 1, int(np.searchsorted(self.costs, before + work, side="right")))
+        start, self.column = self.column, min(last, end * PANEL)
+        m, R = self.turns // 2, self.R[first:last]
+        if R.shape[1]:
+            L = np.hstack([-R[:, m : 2 * m], -R[:, :m], R[:, 2 * m :]])
+            subtract(panel[: last - first], L, self.R, start, self.column, self.turns + self.widths)
+        return int(self.costs[end - 1]) - before
+
+    def _find_widths(self) -> None:
+        self.widths = ranks.widths_of(self.rests, self.panel, self.q, ranks.EXACT)
+        self.costs = np.cumsum(PANEL * PANEL * (self.turns + self.widths + TOUCHING))
+        self._wide, self._tiles = self._wide + int(self.widths.sum()), self._tiles + len(self.widths)
+
+    def _next_panel(self) -> None:
+        self.panel, self.column = self.panel + 1, 0
+        if self.done and self._tiles:
+            self.workspace.share = self._wide / (self._tiles * max(1, self.q))
 
     def read(self, rows: Index, columns: Index) -> Array:
         """Return elements as they will be when all is done; all rows must be known."""
@@ -184,27 +220,36 @@ class FullUpdate:
 
     def _know_more(self, first: int, last: int) -> bool:
         """Know the inactive blocks among the rows first..last; return whether any were unknown."""
-        unknown = np.flatnonzero(self.inactive[first:last] & ~self.known[first:last])
+        slots = np.arange(*np.searchsorted(self.map.blocks[:, P_AT], [first, last]))
+        unknown = slots[~self.known[self.map.blocks[slots, P_AT]]]
         if len(unknown):
-            self._know(np.arange(*np.searchsorted(self.map.blocks[:, P_AT], [first + unknown[0], last])))
+            self._know(unknown)
         return len(unknown) > 0
 
     def _know(self, slots: Index) -> None:
-        """Work out the means of some blocks, their rows of R = [W, w, a], and their covariances V' with A."""
+        """Work out the means of some blocks, their rows of R = [w, a, W], and their covariances V with A."""
+        if not self.rotated:
+            self._rotate()
         p = self.interval
-        blocks, atoms, numbers, rows = laid_out(self.map.blocks[slots], self.map.atoms)
+        _, atoms, numbers, rows = laid_out(self.map.blocks[slots], self.map.atoms)
         G = self.storage.get(rows, p.A0)
         x, _, a = carried(atoms, self.x_before[numbers], G, *p.displacements)
-        V = G @ p.Phi.T + a @ p.P_TA
-        w = G @ p.Phi_T.T + a @ (0.5 * p.P_TT)
-        R = np.concatenate([G @ self.L, w, a], axis=1)
-        new = ~self.known[rows]
-        here = rows[new]
-        self.R[here] = R[new]
-        self.V[here // PANEL, :, here % PANEL] = V[new]
+        W, w = G @ self.L, G @ p.Phi_T.T + a @ (0.5 * p.P_TT)
+        keep(self.R, self.V, rows, w, a, W, p.Phi @ G.T + p.P_TA.T @ a.T)
+        ranks.add_rests(self.rests, rows // PANEL, W, self.storage.diagonal(rows))
         self.known[rows] = True
-        stored = np.repeat(self.where[self.map.blocks[slots, P_AT]] < 0, blocks[:, X_SIZE])
-        self.map.x[numbers[stored]] = x[stored]
+        self.map.x[numbers] = x
+
+    def _rotate(self) -> None:
+        """Make far rows short, by a sample of the inactive blocks as they are stored."""
+        self.rotated, inactive = True, np.flatnonzero(self.inactive)
+        if len(inactive) < ranks.SAMPLE or self.q <= ranks.ROUGH:
+            return
+        rows = inactive[np.linspace(0, len(inactive) - 1, ranks.SAMPLE).astype(np.int64)]
+        variances = self.storage.diagonal(rows)
+        rows, variances = rows[variances > 0.0], variances[variances > 0.0]
+        W = self.storage.get(rows, self.interval.A0) @ self.L / np.sqrt(variances)[:, None]
+        self.L = ranks.rotated(self.L, W)
 
 
 def _in_use(map_: Layout, n: int) -> Flags:

@@ -316,8 +316,6 @@ class CompressedMap(Layout):
 
         So have all inverse distances where a correction transports: theirs is more than the rotation of the world.
         """
-        if self._full():
-            self.full_update()
         for slot in self._anchored if transports else ():
             self._enter(slot)
         self._enter(robot)
@@ -349,6 +347,8 @@ class CompressedMap(Layout):
         used = m.prepare() or self.storage.prefault.some()
         if (job := self._job) is not None:
             self._advance(self.schedule.due(self._progress(), job.spent, job.work) - PREFAULT * used)
+        if self._full():  # now, since the next correction begins with the work of a new interval
+            self.full_update()
 
     def _enter(self, slot: int) -> None:
         """Make a block active: augment it from the auxiliary states, and give it one of its own.  O(active^2)."""

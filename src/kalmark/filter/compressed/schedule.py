@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-SLICE = 0.9e8  # multiplications of a full update to do after a correction at most, some 6 ms: less falls behind
+SLICE = 1.5e8  # multiplications of a full update to do after a correction at most, some 9 ms: less falls behind
 LEAST = 2e7  # and at least, if any: to begin takes time, too
 ELEMENT = 80.0  # multiplications of a full update that take as long as to correct one more active element
 PREFAULT = 45.0  # multiplications that take as long as the page fault of one byte

@@ -58,6 +58,16 @@ def gather(addresses: Index, like: Stored, rows: Index, columns: Index) -> Array
 
 
 @compiled
+def diagonal(addresses: Index, like: Stored, rows: Index) -> Array:
+    """Return the elements [i, i] of `rows` (N,) of the panels at `addresses`, of type `like`."""
+    d = np.empty(len(rows))
+    for a in range(len(rows)):
+        k = rows[a] // PANEL
+        d[a] = carray(_pointer(addresses[k]), (PANEL, (k + 1) * PANEL), like.dtype)[rows[a] - k * PANEL, rows[a]]
+    return d
+
+
+@compiled
 def scatter(addresses: Index, like: Stored, rows: Index, columns: Index, C: Array) -> None:
     """Write the elements C (M, N) of `rows` (M,) and `columns` (N,), those above the diagonal to their mirror."""
     for a in range(len(rows)):
@@ -69,16 +79,21 @@ def scatter(addresses: Index, like: Stored, rows: Index, columns: Index, C: Arra
 
 
 @compiled
-def subtract(panel: Stored, L: Array, R: Array, first: int, last: int) -> None:
-    """Subtract L R[first:last]' from panel[:, first:last], in place; panel (p, n), L (p, k), R (n, k)."""
-    if panel.itemsize == 8:
-        r, c = R.ctypes.data + first * R.strides[0], panel.ctypes.data + first * panel.itemsize
-        subtract_product(c, panel.shape[1], L.ctypes.data, len(L), r, last - first, L.shape[1])
-        return
-    product = L @ np.ascontiguousarray(R[first:last]).T
-    for i in range(len(L)):
-        for j in range(last - first):
-            panel[i, first + j] -= product[i, j]
+def subtract(panel: Stored, L: Array, R: Array, first: int, last: int, widths: Index) -> None:
+    """Subtract L R[first:last]' from panel[:, first:last], in place; panel (p, n), L (p, k), R (n, k).
+
+    Only the first widths[j] columns of L and R count in the j-th tile of PANEL columns of the panel.
+    """
+    for start in range(first, last, PANEL):
+        end, width = min(start + PANEL, last), widths[start // PANEL]
+        if panel.itemsize == 8:
+            r, c = R.ctypes.data + start * R.strides[0], panel.ctypes.data + start * panel.itemsize
+            subtract_product(c, panel.shape[1], L.ctypes.data, len(L), r, end - start, width, L.shape[1])
+        else:
+            product = np.ascontiguousarray(L[:, :width]) @ np.ascontiguousarray(R[start:end, :width]).T
+            for i in range(len(L)):
+                for j in range(end - start):
+                    panel[i, start + j] -= product[i, j]
 
 
 class Triangle:
@@ -131,7 +146,7 @@ class Triangle:
 
     def diagonal(self, rows: Index) -> Array:
         """Return the elements [i, i] of rows i."""
-        return np.array([self.panels[i // PANEL][i % PANEL, i] for i in rows.tolist()], dtype=np.float64)
+        return diagonal(self.addresses, self.like, rows)
 
     def put(self, rows: Index, columns: Index, C: Array) -> None:
         """Write the elements [rows][:, columns] and their mirror images."""
