@@ -227,7 +227,9 @@ def repeats(summary: dict[str, Any]) -> list[Cause]:
     for repeat in summary.get("repeats", ()):
         number, shift = len(repeat["landmarks"]), figure(repeat["shift_m"])
         evidence = f"{number} landmarks repeat {number} others {shift} m away: one place is mapped twice"
-        found.append(Cause("map_repeats", repeat["start_s"], repeat["score"], evidence, "--set upkeep.repeats=merge"))
+        found.append(
+            Cause("map_repeats", repeat["start_s"] or 0.0, repeat["score"], evidence, "--set upkeep.repeats=merge")
+        )
     return found
 
 
