@@ -140,6 +140,12 @@ def kidnapped(log: Log, rng: np.random.Generator) -> Log:
     return replace(log, events=events)
 
 
+def stopped(log: Log, rng: np.random.Generator) -> Log:
+    """Leave out 4 s of controls and scans in the middle, as a recorder that stops does."""
+    begin = log.events[len(log.events) // 2].t_ns
+    return replace(log, events=[e for e in log.events if not begin <= e.t_ns < begin + 4_000_000_000])
+
+
 def none(log: Log, rng: np.random.Generator) -> Log:
     """Change nothing."""
     return log
@@ -163,6 +169,7 @@ FAULTS: dict[str, tuple[tuple[str, ...], Plant, tuple[str, ...], tuple[str, ...]
     "moving landmark": (("moving_landmark",), moving, (), ()),
     "wrong ids 3 %": (("wrong_ids",), wrong_ids, (), ()),
     "steering bias 1 deg": (("steering_offset",), controlled(lambda u: np.add(u, [0.0, np.radians(1.0)])), CAR, ()),
+    "recorder gap 4 s": (("gap",), stopped, (), ()),
     "kidnapped": (("kidnapped",), kidnapped, (), ()),
     "bearing clockwise": (("bearing_sign",), measured(lambda y: y * [1.0, -1.0]), (), ()),
     "bearing in degrees": (("units",), measured(lambda y: y * [1.0, 180 / np.pi]), (), ()),

@@ -57,7 +57,7 @@ def writable(folder: Path) -> Path:
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
-    from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
+    from kalmark.results.calibration import ESTIMATE_COLUMNS, MOUNT_COLUMNS, estimate_rows, mount_rows
     from kalmark.results.verdict import verdict_lines
     from kalmark.results.warnings import POSE_NEES
 
@@ -83,6 +83,9 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     mounts = mount_rows(summary)
     if mounts:
         print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")
+    estimates = estimate_rows(summary)
+    if estimates:
+        print_table("calibrations, estimated", ESTIMATE_COLUMNS, estimates, align="<<>>")
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
         table = [(label, number(value), unit) for _, label, value, unit in in_words(batch, BATCH)]

@@ -21,6 +21,7 @@ from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.results.batch import given_by, log_of
+from kalmark.results.gaps import matters
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.warnings import window_warnings
@@ -111,9 +112,10 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
     effect, causes = effect_of(run, found), causes_of(run, found.search)
     causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
+    causes = sorted([*first, *causes], key=lambda c: c.harmless)
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
-    return Verdict(effect.status, (*first, *causes), checked, *figures, found.search)
+    return Verdict(effect.status, tuple(causes), checked, *figures, found.search)
 
 
 def begin_s(run: Run) -> float:
@@ -210,14 +212,15 @@ def _structural(summary: dict[str, Any]) -> list[Cause]:
 
 
 def gaps(summary: dict[str, Any]) -> list[Cause]:
-    """Return the gaps in the controls after which the pose was not known again, or was not widened."""
+    """Return the gaps in the controls; one that was bridged, and after which the pose was known, is harmless."""
     found = []
-    for gap in summary.get("gaps", ()):
-        if gap["known_s"] is None or gap["action"] == "ignore":
-            lasts = gap["end_s"] - gap["start_s"]
-            cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
-            evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s"
-            found.append(Cause("gap", gap["start_s"], lasts, evidence, cure))
+    for gap in (gap for gap in summary.get("gaps", ()) if gap["action"] == "ignore" or matters(gap)):
+        lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
+        cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
+        evidence = (
+            f"the control of {gap['robot']} stops for {figure(lasts)} s{', which was bridged' if bridged else ''}"
+        )
+        found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged))
     return found
 
 

@@ -23,6 +23,10 @@ UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m", "gain": ""}  # of the othe
 UNOBSERVED = 0.9  # of its prior sigma: so much is left of a direction that counts as not observed
 SINGULAR = 1e-12  # eigenvalues of a prior's correlations that are zero
 NAMED = 0.01  # the least share of an axis in a direction that is named
+ESTIMATE_COLUMNS = ("of", "constant", "estimate", "sigma")
+_SIGMA_OF = dict.fromkeys(("x_m", "y_m", "z_m"), "sigma_position_m") | dict.fromkeys(
+    ("theta_rad", "roll_deg", "pitch_deg", "yaw_deg"), "sigma_rotation_deg"
+)
 MOUNT_COLUMNS = ("mount", "direction", "sigma before", "after", "ratio (1: not observed)")
 
 
@@ -114,6 +118,19 @@ def _found(summary: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], st
 def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
     return [(name, row["direction"], *sigmas, f"{row['ratio']:.3f}") for name, row, *sigmas in _found(summary)]
+
+
+def estimate_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row of text for every constant of a mount, a range or a control that was estimated."""
+    rows: list[tuple[str, ...]] = []
+    for name, figures in {**summary.get("mounts", {}), **summary.get("biases", {})}.items():
+        for key, value in figures.items():
+            sigma = figures.get(f"sigma_{key}", figures.get(_SIGMA_OF.get(key, ""), 0.0))
+            if key == "theta_rad" and sigma > 0:
+                rows.append((name, "theta_deg", figure(math.degrees(value)), figure(sigma, 2)))
+            elif not key.startswith("sigma_") and isinstance(value, float) and sigma > 0:
+                rows.append((name, key, figure(value), figure(sigma, 2)))
+    return rows
 
 
 def mount_warnings(_: Any, summary: Mapping[str, Any]) -> Iterator[str]:

@@ -63,13 +63,14 @@ def _before(history: History, gap: Gap) -> float:
     return float(np.sqrt(np.trace(history.covariance[earlier[-1], : history.d, : history.d]) / history.d))
 
 
-def _matters(gap: dict[str, Any]) -> bool:
+def matters(gap: dict[str, Any]) -> bool:
+    """Return whether a gap left the pose so uncertain that it is worth a line."""
     return max(gap["sigma_m"], gap["sigma_rad"]) > NOTED and gap["end_s"] - gap["start_s"] > NOTED_S
 
 
 def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
     """Tell of the gaps that were bridged, a line a robot."""
-    noted = [gap for gap in gaps if _matters(gap)]
+    noted = [gap for gap in gaps if matters(gap)]
     for robot in dict.fromkeys(gap["robot"] for gap in noted):
         mine = [gap for gap in noted if gap["robot"] == robot]
         longest = max(mine, key=lambda gap: gap["end_s"] - gap["start_s"])
@@ -89,5 +90,5 @@ def gap_warnings(gaps: list[dict[str, Any]]) -> Iterator[str]:
         since = f"from t={gap['start_s']:.1f} s in the log"
         if gap["action"] == "ignore":
             yield f"{lasts} {since}, which was ignored: the map may be wrong from there on; robots.each.gaps=widen"
-        elif gap["known_s"] is None and _matters(gap):
+        elif gap["known_s"] is None and matters(gap):
             yield f"{lasts} {since}: it was not localized again, the map may be wrong from there on"
