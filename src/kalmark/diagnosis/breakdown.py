@@ -11,9 +11,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import ndtr
 
 from kalmark.arrays import Array
+from kalmark.geometry.gaussian import quantile
 from kalmark.results.history import History, Ints
 from kalmark.results.measures import nees, nis
 from kalmark.results.run import Run
@@ -67,7 +68,7 @@ def _judged(history: History, of: str, which: str, rows: Ints, level: float) -> 
     sums = [np.bincount(scan, column) for column in (np.nan_to_num(value) - dof, *white.T)]
     excess, *means = (float(s.sum() / max(np.sqrt(s @ s), 1e-300)) for s in sums)
     mean = max(means, key=abs) if of != SPEED else 0.0  # a speed has the errors in it that innovations have
-    alarm = 2.0 * float(norm.sf(max(abs(excess), abs(mean)))) < level
+    alarm = 2.0 * float(ndtr(-max(abs(excess), abs(mean)))) < level
     return Group(of, which, len(rows), float(np.nansum(value)) / max(int(dof.sum()), 1), mean, alarm)
 
 
@@ -128,7 +129,7 @@ def nees_parts(run: Run) -> Iterator[tuple[str, str, str, str]]:
 
 def _since(t_s: Array, value: Array, dof: int) -> str:
     """Return when the mean of a window leaves the band that the NEES of one step has, for good "" if it never does."""
-    bound = float(chi2.ppf(BAND, dof))
+    bound = float(quantile(BAND, dof))
     means = np.convolve(np.nan_to_num(value), np.full(WINDOW, 1.0 / WINDOW), mode="valid")
     above = np.flatnonzero(means > bound)
     return f"{t_s[above[0]]:.1f}" if len(above) else ""

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import expit
-from scipy.stats import chi2, norm
+from scipy.special import chdtr, chdtrc, expit, ndtr
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.course import START, UNKNOWN
@@ -170,7 +169,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
                 column.name,
                 column.of,
                 0.5 * s * s * float(I[k]),
-                float(chi2.sf(t2, 1)),
+                float(chdtrc(1, t2)),
                 s,
                 sigma,
                 column.unit,
@@ -231,7 +230,7 @@ def _noise(
 ) -> Finding:
     """Return the finding of a group of residuals, or of errors of the motion, of `ratio` times the variance."""
     gain = 0.5 * dof * (ratio - 1.0 - math.log(ratio))
-    p = 2.0 * min(float(chi2.sf(ratio * dof, dof)), float(chi2.cdf(ratio * dof, dof)))
+    p = 2.0 * min(float(chdtrc(dof, ratio * dof)), float(chdtr(dof, ratio * dof)))
     value = math.sqrt(ratio)
     factors = [None if group is None else np.where(group, value, 1.0) for group in (noise, errors)]
     sigma = value / math.sqrt(2.0 * dof)
@@ -262,7 +261,7 @@ def correlations(
             sigma = float(usual.std() / number)
             column = names[c] if len(names) == factor.R.shape[1] else f"component {c}"
             gain = -0.5 * number * math.log(1.0 - rho**2)
-            p = 2.0 * float(norm.sf(abs(rho) / sigma))
+            p = 2.0 * float(ndtr(-abs(rho) / sigma))
             mine = (rows.factor == f) & (rows.column == c)
             noise = np.where(mine, math.sqrt(max((1.0 + rho) / (1.0 - rho), 1.0)), 1.0)
             found.append(Finding("correlated_noise", (*factor.sensor, column), gain, p, rho, sigma, noise=noise))
@@ -286,7 +285,7 @@ def outliers(linear: Linear, t_s: Array) -> list[Finding]:
         best = max(best, (gain, share))
     gain, share = best
     far = d2 > FAR**2 + m
-    p, sigma = float(chi2.sf(2 * gain, 2)), math.sqrt(max(share, 1e-9) / len(d2))
+    p, sigma = float(chdtrc(2, 2 * gain)), math.sqrt(max(share, 1e-9) / len(d2))
     noise, when = np.where(far[of], OUT, 1.0), t_s[linear.rows.node[far[of]]]
     return [Finding("outliers", (), gain, p, share, sigma, "of the observations", noise=noise, rows=far,
                     since_s=float(when.min(initial=np.inf)))]  # fmt: skip
@@ -315,7 +314,7 @@ def landmarks(linear: Linear, t_s: Array) -> list[Finding]:
         parts = np.bincount(block, (left @ v / speed) * (have - left @ v))
         information = float(v @ I @ v) / speed**2
         sigma = math.sqrt(max(information, float(parts @ parts))) / information
-        p = float(chi2.sf((speed / sigma) ** 2, d))
+        p = float(chdtrc(d, (speed / sigma) ** 2))
         noise = np.where(rows.landmark == l, OUT, 1.0)
         since_s = float(t_s[rows.node[mine]].min())
         name, gain = str(linear.problem.ids[l]), 0.5 * float(g @ v)
@@ -354,7 +353,7 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     if not len(squares):
         return []
     node = int(np.argmax(squares))
-    p = min(1.0, n * float(chi2.sf(squares[node], max(int(numbers[node]), 1))))
+    p = min(1.0, n * float(chdtrc(max(int(numbers[node]), 1), squares[node])))
     errors = np.where((owner == node) & counts, OUT, 1.0)
     return [
         Finding("kidnapped", (linear.problem.robots[node],), 0.5 * float(squares[node]), p, math.sqrt(squares[node]),
