@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 SNAPSHOTS = 60
+SMALL = 5000  # landmarks in all snapshots, up to which the map is kept whenever it grows, too
 
 
 def record(
@@ -132,6 +133,7 @@ class _Recorder:
         self.kinds: list[str] = []
         self.left = [np.empty(0)]
         self.maps: list[MapSnapshot] = []
+        self.due = self.kept = 0  # snapshots that were due, and landmarks in all of them
         self.compiler = _Compiler()
         self.spent_ns = 0
 
@@ -163,8 +165,11 @@ class _Recorder:
         ]
         self.kinds += ["" if model is None else model.kind for model in models]
         self.left.append(left_px(self.slam, event, report))
-        if len(self.maps) < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[len(self.maps)]:
+        due = self.due < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[self.due]
+        grown = self.kept < SMALL and any(o.outcome == "new" for o in report.observations)
+        if due or grown:
             self.maps.append(self._snapshot())
+            self.due, self.kept = self.due + due, self.kept + len(self.maps[-1].ids)
 
     def _snapshot(self) -> MapSnapshot:
         landmarks = MapLandmarks.of(self.slam)

@@ -240,7 +240,17 @@ def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]
         true = scene.truth[robot]
         out["truth"] = xy(broken(true[thin(len(true))], stretches))
         out |= _errors(run, rows)
+    else:
+        out["sigma"] = [significant(column) for column in _sigmas(run, rows).T]
     return out
+
+
+def _sigmas(run: Recording, rows: Ints) -> Array:
+    """Return the sigmas of the pose (N, dof), m and degrees."""
+    P, metres = run.history.pose_covariances[rows], 3 if run.history.in_space else 2
+    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", P), 0.0))
+    sigma[:, metres:] *= 180.0 / np.pi
+    return np.asarray(sigma)
 
 
 def _errors(run: Recording, rows: Ints) -> dict[str, Any]:
@@ -250,10 +260,9 @@ def _errors(run: Recording, rows: Ints) -> dict[str, Any]:
     metres, turns = (3, 3) if run.history.in_space else (2, 1)
     scale = np.repeat([1.0, 180.0 / np.pi], [metres, turns])
     error = -pose_error(mean, truth) * scale
-    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", P), 0.0)) * scale
     return {
         "error": [significant(column) for column in error.T],
-        "sigma": [significant(column) for column in sigma.T],
+        "sigma": [significant(column) for column in _sigmas(run, rows).T],
         "nees": significant(nees(pose_error(mean, truth, run.coordinates), P)),
     }
 

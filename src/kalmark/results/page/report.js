@@ -118,6 +118,15 @@ function drawErrors(robot) {
     layout({height: 280, showlegend: false, xaxis: timeAxis(), yaxis: logAxis("NEES", [...robot.nees, low, high])}), CONFIG);
 }
 
+function drawSigmas(robot) {
+  const metres = robot.sigma.length > 3 ? 3 : 2, names = metres > 2 ? ["x", "y", "z", "about x", "about y", "about z"] : ["x", "y", "heading"];
+  const traces = robot.sigma.map((sigma, i) => ({...curve(robot.t, sigma, robot.gaps, {name: names[i],
+    hovertemplate: `%{x:.1f} s: %{y:.3g}<extra>${names[i]}</extra>`}), ...(i < metres ? {} : {yaxis: "y2"})}));
+  Plotly.react("sigmas", traces, layout({height: 380, showlegend: true, xaxis: {...timeAxis(), anchor: "y2"},
+    yaxis: {...axis("position (m)"), domain: [0.53, 1]}, yaxis2: {...axis("heading (deg)"), domain: [0, 0.47]},
+    legend: {orientation: "h", y: 1.02, yanchor: "bottom"}}), CONFIG);
+}
+
 function drawNis() {
   const nis = DATA.nis;
   const meaning = "the band would hold 95 % of them if observations were independent; those of a scan share the error of the pose, so more are outside";
@@ -216,6 +225,7 @@ function drawOutcomes() {
 
 drawMap();
 ofEach(DATA.robots.filter(r => r.error), "robot", "against-truth", drawErrors);
+ofEach(DATA.robots.filter(r => !r.error), "blind", "sigma-section", drawSigmas);
 ofEach(DATA.innovations, "fixed", "fixes-section", drawFixes);
 if (DATA.nis.t.length) drawNis(); else el("nis-section").remove();
 if (Object.keys(DATA.outcomes.counts).length) drawOutcomes(); else el("association").remove();
