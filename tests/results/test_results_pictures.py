@@ -168,7 +168,7 @@ def test_long_logs_are_thinned_but_keep_their_end() -> None:
     assert POINTS / 2 < len(robot["t"]) <= POINTS + 1
     assert len(robot["error"]) == len(robot["sigma"]) == 3
     assert robot["t"][-1] == pytest.approx((run.history.t_ns[-1] - run.history.t_ns[0]) * 1e-9)
-    assert len(data["maps"]) <= 61
+    assert len(data["maps"]) <= 61 + 3  # and one for each landmark
     assert data["maps"][-1]["t"] == pytest.approx(robot["t"][-1], abs=1e-3)
     assert sum(sum(column) for column in data["outcomes"]["counts"].values()) == len(run.history.step)
 

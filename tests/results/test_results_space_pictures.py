@@ -180,7 +180,7 @@ def test_any_camera_s_measurements_are_points_of_its_images(run: Run, columns: A
 def test_the_page_has_the_map_and_the_images_of_every_position_of_the_slider(run: Run) -> None:
     data = page_data(report_html(run))
     (camera,) = data["cameras"]
-    assert len(camera["frames"]) == len(data["maps"]) <= 61
+    assert len(camera["frames"]) == len(data["maps"]) <= 61 + len(run.landmarks)
     assert camera["frames"][-1] == len(camera["scans"]) - 1
     seen = camera["scans"][-1]["images"][0]["seen"]
     assert {"name", "outcome", "y", "e", "Z", "colour"} <= set(seen[0])
