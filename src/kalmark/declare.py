@@ -27,6 +27,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 import numpy as np
 
 from kalmark.errors import KalmarkError, ModelError
+from kalmark.events import bound, most, shown
 from kalmark.geometry.spaces import Space
 
 Class = TypeVar("Class", bound=type)
@@ -127,9 +128,13 @@ class Parameter:
         if self.type in (int, float):
             if truth or not isinstance(value, Integral if self.type is int else Real):
                 return self.wanted if self.type is int or self.words else "a number"
-            if self.within.holds(float(value)):
-                return ""
-            return self.wanted if math.isfinite(value) or self.within.infinite else "a finite number"
+            try:
+                number = float(value)
+            except OverflowError:
+                number = math.inf if value > 0 else -math.inf
+            if self.within.holds(number):
+                return f"a number of {bound(self.name)}" if most(self.name)[0] < abs(number) < math.inf else ""
+            return self.wanted if math.isfinite(number) or self.within.infinite else "a finite number"
         if get_origin(self.type) is tuple:
             kind, *more = get_args(self.type)
             size = None if more == [...] else 1 + len(more)
@@ -181,7 +186,7 @@ def _parameter(field: dataclasses.Field[Any], hint: Any) -> Parameter:
 
 def refuse(model: Any, key: str, wanted: str) -> ModelError:
     """Return the error of a model's parameter that is not what is `wanted`, which has `key` and `wanted`, too."""
-    error = ModelError(f"{type(model).__name__}: {key} is {vars(model)[key]!r}, expected {wanted}")
+    error = ModelError(f"{type(model).__name__}: {key} is {shown(vars(model)[key])}, expected {wanted}")
     error.key, error.wanted = key, wanted
     return error
 

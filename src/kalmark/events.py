@@ -20,8 +20,38 @@ from kalmark.errors import EventError, KalmarkError
 Id = int | str
 
 FLOAT = np.dtype(np.float64)
-LATEST_NS = 2**63  # times are int64
+LATEST_NS = 2**63  # times are int64: about 292 years either side of 0
 LONGEST = 80  # characters of a value in a message
+LONGEST_ID = 200  # characters or digits of a landmark's id
+_SHORT = 2**63  # ids that need no second look
+
+MOST = {"m": 1e9, "mps": 1e6, "rad": 1e6, "radps": 1e6, "px": 1e9}
+"""The largest magnitudes that mean anything, by unit: m, m/s, rad, rad/s and pixels.
+
+What is larger leaves no digits for the rest of a map: a double that holds 1e9 m resolves 1e-7 m.
+"""
+MOST_OTHER = 1e12  # of what has no unit, or another one: signatures, logarithms, a user's own
+SYMBOLS = {"mps": "m/s", "radps": "rad/s"}
+
+
+def most(column: str) -> tuple[float, str]:
+    """Return the largest magnitude of a column, or of a parameter, by the unit that its name ends in; and that unit."""
+    unit = column.rpartition("_")[2]
+    return (MOST[unit], SYMBOLS.get(unit, unit)) if unit in MOST else (MOST_OTHER, "")
+
+
+def bound(column: str) -> str:
+    """Return in words what is expected of a number that is too large."""
+    limit, unit = most(column)
+    return f"at most {limit:.0e} {unit}".strip()
+
+
+def refuse_huge(value: Array, columns: tuple[str, ...], where: str) -> None:
+    """Refuse numbers (..., m) in these columns that are larger than mean anything.  Raises EventError."""
+    for column, numbers in zip(columns, value.reshape(-1, len(columns)).T, strict=True):
+        worst = float(np.abs(numbers).max(initial=0.0))
+        if worst > most(column)[0]:
+            raise EventError(f"{where}: {column} is {worst:.3g}, expected {bound(column)}")
 
 
 def seconds(t_ns: int) -> str:
@@ -70,11 +100,8 @@ def _nanoseconds(t_s: Any, t_ns: Any) -> int:
     return time
 
 
-HUGE = 1e15  # a control: no robot's
-
-
-def finite(value: Any, what: str, error: type[KalmarkError] = EventError) -> Array:
-    """Return a copy of `value` as a float array (..., n), or raise `error` if a number in it is not finite."""
+def finite(value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkError] = EventError) -> Array:
+    """Return a copy of `value` as a float array (..., n); raise `error` if it is not finite or larger than `limit`."""
     try:
         array = np.array(value, order="C")
     except (TypeError, ValueError):
@@ -85,15 +112,12 @@ def finite(value: Any, what: str, error: type[KalmarkError] = EventError) -> Arr
         with np.errstate(over="ignore"):
             array = array.astype(FLOAT)
     flat = array.ravel()
-    if not math.isfinite(sum(flat.tolist())) and not np.isfinite(flat).all():
+    values = flat.tolist()
+    if not math.isfinite(sum(values)) and not np.isfinite(flat).all():
         raise error(f"{what} holds {flat[~np.isfinite(flat)][0]}, expected finite numbers")
-    return array
-
-
-def _below(most: float, array: Array, what: str) -> Array:
-    """Return a control's numbers; what is larger would move a robot out of all numbers later, when it is too late."""
-    if np.abs(array).max(initial=0.0) > most:
-        raise EventError(f"{what} holds {array.flat[np.abs(array).argmax()]:.3g}, expected at most {most:.0e}")
+    worst = max(map(abs, values), default=0.0)
+    if worst > limit:
+        raise error(f"{what} holds {worst:.3g}, expected at most {limit:.0e}")
     return array
 
 
@@ -102,8 +126,12 @@ def checked_id(value: Any, what: str) -> Id:
     if isinstance(value, np.generic) and value.dtype.kind in "iufU":
         value = value.item()
     if isinstance(value, str) and value:
+        if len(value) > LONGEST_ID:
+            raise EventError(f"{what} is {shown(value)}, expected at most {LONGEST_ID} characters")
         return str(value)
     if isinstance(value, int) and not isinstance(value, bool):
+        if abs(value) >= 10**LONGEST_ID:
+            raise EventError(f"{what} is {shown(value)}, expected at most {LONGEST_ID} digits")
         return int(value)
     if isinstance(value, float) and value.is_integer():
         return int(value)
@@ -120,7 +148,7 @@ def checked_ids(ids: Any, count: int) -> tuple[Id | None, ...]:
         raise EventError(f"ids is {shown(ids)}, expected a list with one id for each observation") from None
     if len(ids) != count:
         raise EventError(f"{len(ids)} ids for {count} observations, expected one id each")
-    ids = tuple([i if type(i) is int or i is None else checked_id(i, "an id") for i in ids])
+    ids = tuple([i if i is None or (type(i) is int and -_SHORT < i < _SHORT) else checked_id(i, "an id") for i in ids])
     known = [i for i in ids if i is not None]
     if len(set(known)) != len(known):
         twice = next(i for i in known if known.count(i) > 1)
@@ -163,8 +191,8 @@ class Control:
         try:
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
-            set_(self, "u", _below(HUGE, finite(u, "u"), "u"))
-            set_(self, "cov", None if cov is None else _below(HUGE**2, finite(cov, "cov"), "cov"))
+            set_(self, "u", finite(u, "u", MOST_OTHER))
+            set_(self, "cov", None if cov is None else finite(cov, "cov", MOST_OTHER**2))
         except EventError as error:
             raise EventError(f"control of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
 
@@ -205,14 +233,14 @@ class Scan:
         set_ = object.__setattr__
         t_ns = nanoseconds(t_s, t_ns, "scan", robot)
         try:
-            y = _rows(finite(y, "y"))
+            y = _rows(finite(y, "y", MOST_OTHER))
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
             set_(self, "sensor", _text(sensor, "sensor"))
             set_(self, "width", y.shape[1])
             set_(self, "y", y if len(y) else y.reshape(0, 0))
             set_(self, "ids", None if ids is None else checked_ids(ids, len(y)))
-            set_(self, "cov", None if cov is None else finite(cov, "cov"))
+            set_(self, "cov", None if cov is None else finite(cov, "cov", MOST_OTHER**2))
         except EventError as error:
             what = f"scan of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
             raise EventError(f"{what}: {error}") from None
@@ -242,8 +270,8 @@ class Fix:
                 raise EventError("cov is missing, expected a covariance in m^2")
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
-            set_(self, "y", finite(y, "y"))
-            set_(self, "cov", finite(cov, "cov"))
+            set_(self, "y", finite(y, "y", MOST["m"]))
+            set_(self, "cov", finite(cov, "cov", MOST["m"] ** 2))
         except EventError as error:
             raise EventError(f"fix of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
 

@@ -198,12 +198,57 @@ def test_a_long_value_is_cut_and_stays_on_one_line() -> None:
 def test_numbers_of_any_width_are_taken_without_a_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for y in ([[1e200, -1e200]], [[1.7e308, 1.7e308]], np.array([[1, 2]], ">f4"), np.array([[1, 2]], np.uint8)):
+        for y in ([[1e9, -1e9]], [[1e12, 0.0]], np.array([[1, 2]], ">f4"), np.array([[1, 2]], np.uint8)):
             event = scan(y)
             assert event.y.dtype == np.float64
             np.testing.assert_array_equal(event.y, y)
     for y in ([[1e308, INF]], [[INF, -INF]], [[1e308, NAN]], np.array([["1e400", "0"]]).astype(np.longdouble)):
         assert "expected finite numbers" in refusal(lambda: scan(y), EventError)
+    for y in ([[1e13, 0.0]], [[1e155, -1e155]], [[1.7e308, 1.7e308]]):
+        assert "expected at most 1e+12" in refusal(lambda: scan(y), EventError)
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        (km.Control(2.0, "rover", [1.1e6, 0]), "control at t=2 s: v_mps is 1.1e+06, expected at most 1e+06 m/s"),
+        (km.Control(2.0, "rover", [0, -2e6]), "control at t=2 s: w_radps is 2e+06, expected at most 1e+06 rad/s"),
+        (km.Control(2.0, "rover", [0, 0], np.eye(2) * 1e13), "cov: sigma_v_mps is 3.16e+06, expected at most 1e+06 m"),
+        (scan([[1, 0], [2e9, 0]]), "scan at t=2 s: range_m is 2e+09, expected at most 1e+09 m"),
+        (scan([[1, -1e7]]), "scan at t=2 s: bearing_rad is 1e+07, expected at most 1e+06 rad"),
+        (scan([[1, 0]], cov=np.eye(2) * 1e13), "cov: sigma_bearing_rad is 3.16e+06, expected at most 1e+06 rad"),
+        (scan([[1, 0]], ["rover.lidar"]), "id 'rover.lidar' names a robot's bias or mount, expected another"),
+        (scan([[1, 0]], ["rover bias"]), "id 'rover bias' names a robot's bias or mount, expected another"),
+    ],
+)
+def test_an_event_beyond_what_means_anything_is_refused_with_its_column_and_bound(event: Any, message: str) -> None:
+    slam = km.Slam([km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(LIDAR)})])
+    assert message in refusal(lambda: slam.process(event), EventError)
+    slam.process(km.Scan(1.0, "rover", "lidar", [[1e9, 1e6]], [1]))
+    assert slam.t_ns == 1_000_000_000
+
+
+def test_a_fix_and_a_landmark_are_at_most_a_million_kilometres_away() -> None:
+    assert "y holds 1e+10, expected at most 1e+09" in refusal(lambda: km.Fix(1, "r", (1e10, 0), np.eye(2)), EventError)
+    assert "cov holds 1e+19" in refusal(lambda: km.Fix(1, "r", (1, 0), np.eye(2) * 1e19), EventError)
+    slam = km.Slam([km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(LIDAR)})])
+    assert "mean holds 1e+10" in refusal(lambda: slam.add_landmark(1, (1e10, 0)), MapError)
+    for name in ("rover bias", "rover.lidar"):
+        assert "names a robot's bias or mount" in refusal(lambda: slam.add_landmark(name, (1, 0)), MapError)
+    for make in (
+        lambda: km.Robot("r", km.motion.Unicycle(), start=(1e10, 0, 0)),
+        lambda: km.Robot("r", km.motion.Unicycle(), cov=np.eye(3) * 1e19),
+        lambda: km.Mount(LIDAR, at=(0, 1e10, 0)),
+        lambda: km.sensors.RangeBearing(sigma_range_m=1e300),
+        lambda: km.sensors.RangeBearing(sigma_range_m=10**400),
+    ):
+        assert "expected" in refusal(make, ModelError)
+
+
+def test_ids_have_at_most_200_digits_or_characters() -> None:
+    assert checked_id(10**199, "id") == 10**199
+    for long in (10**200, -(10**5000), "7" * 201):
+        assert refusal(lambda: checked_id(long, "id"), EventError).endswith(("200 digits", "200 characters"))
 
 
 def test_events_keep_their_numbers_when_the_callers_change() -> None:
@@ -262,7 +307,7 @@ def test_a_covariance_is_a_copy() -> None:
         (NAN, "expected finite numbers"),
         ([[1, NAN], [NAN, 1]], "expected finite numbers"),
         ([[1, 0.5], [0, 1]], "symmetric"),
-        ([[1e308, 1e308], [-1e308, 1e308]], "symmetric"),
+        ([[1e17, 1e17], [-1e17, 1e17]], "symmetric"),
         ([[1, 0], [0, -1]], "eigenvalue -1"),
         ([[1, 2], [2, 1]], "eigenvalue -1"),
     ],

@@ -146,8 +146,8 @@ def _path(loc: tuple[int | str, ...], values: Any) -> tuple[str, ...]:
     path: tuple[str, ...] = ()
     node = values
     for part in loc:
-        here = part in node and part != node.get("type") if isinstance(node, dict) else isinstance(node, list)
-        if here:
+        here = part in node and part != node.get("type") if isinstance(node, dict) else False
+        if here or (isinstance(node, list) and isinstance(part, int) and part < len(node)):
             node = node[part]
             path = (*path, str(part))
     return path
@@ -155,7 +155,10 @@ def _path(loc: tuple[int | str, ...], values: Any) -> tuple[str, ...]:
 
 def _at(values: Any, path: tuple[str, ...]) -> Any:
     for part in path:
-        values = values.get(part) if isinstance(values, dict) else values[int(part)]
+        if isinstance(values, dict):
+            values = values.get(part)
+        else:
+            values = values[int(part)] if isinstance(values, list) and part.isdecimal() else None
     return values
 
 

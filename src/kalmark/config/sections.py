@@ -35,10 +35,12 @@ from kalmark.declare import (
     world_of_class,
 )
 from kalmark.errors import ModelError
+from kalmark.events import MOST
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+FAR = MOST["m"]
+Number = Annotated[float, Field(ge=-FAR, le=FAR, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, le=FAR, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=FAR, allow_inf_nan=False)]
 
 # What the contract names and later versions bring: refused by name, not as a spelling mistake.
 LATER = {"motion": ("inertial",), "sensor": ("position_fix",)}
@@ -76,9 +78,10 @@ def _is_number(value: Any) -> bool:
 
 def _sigmas(value: Any) -> float | tuple[float, ...]:
     three = value if isinstance(value, list | tuple) else [value] * 3
-    if len(three) == 3 and all(_is_number(v) and 0 <= v < math.inf for v in three):
+    if len(three) == 3 and all(_is_number(v) and 0 <= v <= FAR for v in three):
         return tuple(map(float, three)) if isinstance(value, list | tuple) else float(value)
-    raise expected("a number >= 0, or a list of three: one for each axis")
+    far = f" and <= {FAR:.0e}" if any(_is_number(v) and FAR < v < math.inf for v in three) else ""
+    raise expected(f"a number >= 0{far}, or a list of three: one for each axis")
 
 
 Sigmas = Annotated[float | tuple[float, ...], PlainValidator(_sigmas)]

@@ -11,12 +11,13 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.constructor import DuplicateKeyError
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.error import MarkedYAMLError
 from ruamel.yaml.reader import ReaderError
 
 from kalmark.errors import ConfigError
 
 OVERRIDE = "--set "  # how the place begins of what was set on the command line
+_MOST = 100_000  # aliases can repeat a few lines more often than memory holds
 _DEEPEST = 12  # a configuration is 5 levels deep; an alias to its own parent has no end
 
 
@@ -76,7 +77,10 @@ def show(value: Any) -> str:
         return "nothing"
     if isinstance(value, bool):
         return str(value).lower()
-    text = repr(value)
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more than 4,300 digits
+        text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
 
 
@@ -96,7 +100,7 @@ def _parse(text: str, name: str) -> Any:
         line = text.count("\n", 0, error.position) + 1
         column = error.position - text.rfind("\n", 0, error.position)
         raise ConfigError(f"{name}:{line}:{column}: got {text[error.position]!r}, expected printable text") from None
-    except (YAMLError, ValueError) as error:
+    except Exception as error:  # of odd YAML the parser raises anything: unhashable keys, dates, integers, recursion
         raise ConfigError(f"{name}: {_one_line(error)}") from None
 
 
@@ -104,7 +108,7 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, DuplicateKeyError):
         key = str(error.problem).split('"')[1]
         return f"{key}: got this key a second time, expected each key once"
-    problem = str(getattr(error, "problem", None) or error).strip().splitlines()[0]
+    problem = next(iter(str(getattr(error, "problem", None) or error).strip().splitlines()), type(error).__name__)
     context = getattr(error, "context", None)
     return f"{problem} ({context}), expected YAML" if context else f"{problem}, expected YAML"
 
@@ -113,6 +117,8 @@ def _plain(node: Any, path: tuple[str, ...], tree: Tree, name: str) -> Any:
     """Return `node` as plain dict, list and scalars, noting where each stood."""
     if len(path) > _DEEPEST:
         raise ConfigError(f"{tree.place(path)}: {'.'.join(path[:4])}...: nested deeper than {_DEEPEST} levels")
+    if len(tree.places) > _MOST:
+        raise ConfigError(f"{name}: more than {_MOST} values, expected a configuration")
     if isinstance(node, CommentedMap):
         return {str(key): _item(node, key, path, tree, name) for key in node}
     if isinstance(node, CommentedSeq):

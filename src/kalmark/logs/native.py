@@ -21,14 +21,15 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Id, Scan, order
+from kalmark.events import Control, Event, Fix, Id, Scan, order, shown
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.source import Format, Request, folder_of, landmark_id, mapping, nearest, seconds
+from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
 from kalmark.logs.table import CONTROL, OBSERVATION, Refused, Row, read_table
 
 RIG = "rig.yaml"
@@ -57,7 +58,7 @@ def read(path: Path, request: Request) -> Log:
     for name, read_file in zip(FILES, reader.readers, strict=True):
         if (path / name).is_file():
             read_file(path / name)
-    describes = mapping(path / RIG) if (path / RIG).is_file() else {}
+    describes = read_rig(path / RIG) if (path / RIG).is_file() else {}
     seen = {name for event in reader.events if isinstance(event, Scan) for name in event.ids or ()}
     known = {*reader.truth, *describes.get("robots", ()), *map(str, seen)}
     strays = refuse_misspelt(reader.places, known, request)
@@ -71,6 +72,18 @@ def read(path: Path, request: Request) -> Log:
         sensor_columns={key: names for key, names in columns.items() if key[1]},
         places={(robot, sensor): (file, line) for (file, robot, sensor), line in reversed(reader.places.items())},
     )  # fmt: skip
+
+
+def read_rig(path: Path) -> dict[str, Any]:
+    """Return what `rig.yaml` describes.  Raises LogError if it is no mapping with a mapping of robots."""
+    content = mapping(path)
+    robots = content.get("robots", {})
+    if not isinstance(robots, dict):
+        raise LogError(f"{path}: robots: got {shown(robots)}, expected a mapping of keys")
+    for name, robot in robots.items():
+        if not isinstance(robot, dict):
+            raise LogError(f"{path}: robots.{name}: got {shown(robot)}, expected a mapping of keys")
+    return content
 
 
 @dataclass
@@ -149,8 +162,7 @@ class _Reader:
         if empty:
             return
         y = row.values(self.columns)
-        cov, text = row.own_noise(self.columns[row.key], definite=True), row.text("id")
-        name = landmark_id(text) if text else None
+        cov, name = row.own_noise(self.columns[row.key], definite=True), row.id()
         if name is not None and name in rows.ids:
             first = rows.lines[rows.ids.index(name)]
             raise Refused(f"id {name!r} is in this scan already (line {first}), expected each landmark once")
@@ -204,14 +216,14 @@ class _Reader:
 
         def take(row: Row) -> None:
             given = tuple(name for name in row.table.value_columns if row.text(name) or name in LANDMARK3[:2])
-            name, values = row.text("id"), row.numbers(given)
-            if not name:
+            name, values = row.id(), row.numbers(given)
+            if name is None:
                 raise Refused("id is empty, expected the landmark's id")
-            if landmark_id(name) in self.landmarks:
+            if name in self.landmarks:
                 raise Refused(f"id {name} is in this file already, expected each landmark once")
             if given not in LANDMARKS:
                 raise Refused(f"{', '.join(given)}, expected a point, both ends of a line or the pose of a tag")
-            self.landmarks[landmark_id(name)] = np.array(values)
+            self.landmarks[name] = np.array(values)
 
         read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:]).each(self.request, take, timed=False)
 

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Event, Id, order
+from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, order, shown
 from kalmark.geometry import rotations
 from kalmark.logs.log import Log
 
@@ -26,6 +25,7 @@ Refuse = Callable[[str], None]
 
 _PLAIN_TIME = re.compile(r"(-?)([0-9]+)(?:\.([0-9]{0,9}))?")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
+_LONGEST_TIME = 60  # characters; 2**63 ns in seconds has 20
 _T_MAX_NS = 2**63 - 1
 STEP_NS = 1_000_000_000
 """Formats whose steps carry no time get one second a step."""
@@ -123,11 +123,13 @@ def quantity(value: Any, name: str, low: float = float("-inf")) -> float:
     """Return an option's value as a finite number of at least `low`.  Raises LogError."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = float("nan")
     if isinstance(value, bool) or not low <= number < float("inf"):
         wanted = "a finite number" if low == float("-inf") else f"a finite number of at least {low:g}"
-        raise LogError(f"log option {name} is {value!r}, expected {wanted}")
+        raise LogError(f"log option {name} is {shown(value)}, expected {wanted}")
+    if abs(number) > MOST["m"]:
+        raise LogError(f"log option {name} is {shown(value)}, expected at most {MOST['m']:.0e}")
     return number
 
 
@@ -139,6 +141,8 @@ def raising(line: str) -> None:
 
 def nanoseconds(text: str) -> int:
     """Return the seconds in `text` as integer nanoseconds, exactly (nearest beyond nine decimals), or ValueError."""
+    if len(text) > _LONGEST_TIME:
+        raise ValueError(text)
     plain = _PLAIN_TIME.fullmatch(text)
     if plain:
         sign, whole, fraction = plain.groups()
@@ -146,7 +150,10 @@ def nanoseconds(text: str) -> int:
         t_ns = -t_ns if sign else t_ns
     else:
         try:
-            t_ns = int((Decimal(text) * 1_000_000_000).to_integral_value())
+            t_s = Decimal(text if "_" not in text else "")
+            if not abs(t_s) < _T_MAX_NS:  # of 1e999990 an integer has a million digits
+                raise ValueError(text)
+            t_ns = int((t_s * 1_000_000_000).to_integral_value())
         except (InvalidOperation, OverflowError, ValueError):
             raise ValueError(text) from None
     if abs(t_ns) > _T_MAX_NS:
@@ -161,14 +168,16 @@ def seconds(t_ns: int) -> str:
 
 
 def landmark_id(text: str) -> Id:
-    """Return an id from a file: int if the text is an integer, otherwise the text."""
+    """Return an id from a file: int if the text is an integer, otherwise the text; or ValueError if it is too long."""
+    if len(text) > LONGEST_ID:
+        raise ValueError(f"{shown(text)} is an id of {len(text)} characters, expected at most {LONGEST_ID}")
     return int(text) if _INTEGER.fullmatch(text) else text
 
 
-def number(text: str) -> float:
-    """Return a finite number, or ValueError."""
+def number(text: str, limit: float = MOST_OTHER**2) -> float:
+    """Return a finite number of at most `limit` (of a variance, as the widest), or ValueError."""
     value = float(text)
-    if not math.isfinite(value) or "_" in text:
+    if not math.isfinite(value) or abs(value) > limit or "_" in text:
         raise ValueError(text)
     return value
 
@@ -234,9 +243,7 @@ def timed_rows(
             refuse(f"{path}:{line}: {len(cells)} numbers in the row, expected {len(names) + 1}: {columns}")
             continue
         try:
-            t_ns, values = nanoseconds(cells[0]), [float(cell) for cell in cells[1:]]
-            if not all(map(math.isfinite, values)):
-                raise ValueError
+            t_ns, values = nanoseconds(cells[0]), [number(cell) for cell in cells[1:]]
         except ValueError:
             odd = next((n for n, cell in enumerate(cells) if not is_number(cell)), 0)
             refuse(f"{path}:{line}: {('t_s', *names)[odd]} is {cells[odd]!r}, expected a finite number")
@@ -272,12 +279,33 @@ def placed(pose: Array) -> dict[str, float]:
 
 def mapping(path: Path) -> dict[str, Any]:
     """Return the content of a YAML file.  Raises LogError if it is none."""
+    text = read_text(path)
     try:
-        content = YAML(typ="safe").load(read_text(path))
-    except YAMLError as error:
+        content = YAML(typ="safe", pure=True).load(text)
+    except Exception as error:  # of odd YAML the parser raises anything: unhashable keys, dates, integers, recursion
         where = getattr(error, "problem_mark", None)
         line = where.line + 1 if where is not None else 1
-        raise LogError(f"{path}:{line}: not YAML ({getattr(error, 'problem', error)}), expected a mapping") from None
+        problem = " ".join(str(getattr(error, "problem", None) or error).split()) or type(error).__name__
+        raise LogError(f"{path}:{line}: not YAML ({problem[:80]}), expected a mapping") from None
     if not isinstance(content, dict):
         raise LogError(f"{path}:1: holds {type(content).__name__}, expected a mapping")
+    if not _is_plain(content):
+        raise LogError(f"{path}:1: nested deeper than {DEEPEST} levels, or more than {MOST_VALUES} values")
     return content
+
+
+DEEPEST = 12
+MOST_VALUES = 100_000
+
+
+def _is_plain(content: Any) -> bool:
+    """Return whether a YAML file ends: aliases can nest it in itself, or repeat it more often than memory holds."""
+    waiting, count = [(content, 0)], 0
+    while waiting:
+        node, depth = waiting.pop()
+        count += 1
+        if depth > DEEPEST or count > MOST_VALUES:
+            return False
+        below = node.values() if isinstance(node, dict) else node if isinstance(node, list | tuple | set) else ()
+        waiting += [(each, depth + 1) for each in below]
+    return True

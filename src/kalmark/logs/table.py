@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.logs.source import Request, nanoseconds, nearest, number, read_text
+from kalmark.events import MOST, Id, bound, most, shown
+from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
 
 NAMES = ("t_s", "robot", "sensor", "id")
 CONTROL = (
@@ -163,19 +165,30 @@ class Row:
         try:
             self.t_ns = nanoseconds(self.text("t_s"))
         except ValueError:
-            raise Refused(f"t_s is {self.text('t_s')!r}, expected a finite number of seconds") from None
+            wanted = "a finite number of seconds, within 292 years of 0"
+            raise Refused(f"t_s is {shown(self.text('t_s'))}, expected {wanted}") from None
         self.robot, self.sensor = self.text("robot"), self.text("sensor") if with_sensor else ""
         if not self.robot or (with_sensor and not self.sensor):
             raise Refused(f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
+
+    def id(self) -> Id | None:
+        """Return the landmark's id, None for an empty cell.  Raises Refused."""
+        try:
+            return landmark_id(self.text("id")) if self.text("id") else None
+        except ValueError as error:
+            raise Refused(f"id: {error}") from None
 
     def numbers(self, columns: tuple[str, ...]) -> list[float]:
         """Return the finite numbers in these columns.  Raises Refused."""
         values = []
         for column in columns:
             try:
-                values.append(number(self.cells[self.table.index[column]]))
+                values.append(number(self.cells[self.table.index[column]], math.inf))
             except ValueError:
-                raise Refused(f"{column} is {self.text(column)!r}, expected a finite number") from None
+                raise Refused(f"{column} is {shown(self.text(column))}, expected a finite number") from None
+            if abs(values[-1]) > (MOST["m"] ** 2 if column.startswith("cov_") else most(column)[0]):
+                wanted = f"at most {MOST['m'] ** 2:.0e}" if column.startswith("cov_") else bound(column)
+                raise Refused(f"{column} is {shown(self.text(column))}, expected {wanted}")
             if values[-1] < 0 and column in NOT_NEGATIVE:
                 raise Refused(f"{column} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
         return values

@@ -9,14 +9,14 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError, ModelError
-from kalmark.events import Control, Fix, Scan, finite, shown, when
+from kalmark.events import MOST, Control, Fix, Scan, finite, refuse_huge, shown, when
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
 
 
 def covariance(value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError) -> Array:
     """Return a copy of a (size, size) covariance; raise `error` if it is asymmetric or not positive (semi)definite."""
-    cov = finite(value, what, error)
+    cov = finite(value, what, MOST["m"] ** 2, error)
     if cov.shape != (size, size):
         raise error(f"{what} has shape {cov.shape}, expected ({size}, {size})")
     _refuse_indefinite(cov[None], what, definite, error)
@@ -74,19 +74,37 @@ def numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -> Arra
     """Return a copy of (size,) finite numbers; raise `error` if it is anything else."""
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise error(f"{what} is {value!r}, expected {size} finite numbers") from None
+    except (TypeError, ValueError, OverflowError):
+        raise error(f"{what} is {shown(value)}, expected {size} finite numbers") from None
     if array.shape != (size,) or not np.isfinite(array).all():
-        raise error(f"{what} is {array.tolist()}, expected {size} finite numbers")
-    return array
+        raise error(f"{what} is {shown(array.tolist())}, expected {size} finite numbers")
+    return finite(array, what, error=error)
+
+
+SMALLEST_BOUND = min(MOST.values())
+
+
+def largest(values: Array) -> float:
+    """Return the largest magnitude of an event's numbers."""
+    return max(map(abs, values.ravel().tolist()), default=0.0)
+
+
+def refuse_vague(cov: Array, columns: tuple[str, ...], what: str) -> None:
+    """Refuse covariances (..., m, m) of these columns, of which a standard deviation is larger than means anything."""
+    if cov.size and cov.max() > SMALLEST_BOUND**2 and cov.shape[-1] == len(columns):
+        sigmas = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+        refuse_huge(sigmas, tuple(f"sigma_{column}" for column in columns), f"{what}: cov")
 
 
 def refuse_bad_control(event: Control, columns: tuple[str, ...]) -> None:
     """Refuse a control that is not of these components, or whose own noise is no covariance."""
     if event.u.shape != (len(columns),):
         raise EventError(f"{when(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
+    if largest(event.u) > SMALLEST_BOUND:
+        refuse_huge(event.u, columns, when(event))
     if event.cov is not None:
         covariance(event.cov, len(columns), f"{when(event)}: cov", definite=False)
+        refuse_vague(event.cov, columns, when(event))
 
 
 def refuse_bad_fix(event: Fix, size: int) -> None:
@@ -106,6 +124,8 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
     if event.width != m and (count or event.width):
         expected = f"expected {m}: {', '.join(sensor.columns)}"
         raise EventError(f"{when(event)}: y has {event.width} columns, {expected}")
+    if count and largest(event.y) > SMALLEST_BOUND:
+        refuse_huge(event.y, sensor.columns, when(event))
     if check is not None and count:
         try:
             check(event.y)
@@ -117,5 +137,6 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
     if event.cov.shape not in ((p, p), (count, p, p)):
         raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
     _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)
+    refuse_vague(event.cov, sensor.columns, when(event))
     covs = np.ascontiguousarray(np.broadcast_to(event.cov, (count, p, p)))
     return sensor.noise_from(event.y, covs) if isinstance(sensor, OwnNoise) else covs

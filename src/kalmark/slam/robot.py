@@ -12,7 +12,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.association.protocol import Association
 from kalmark.errors import ModelError
-from kalmark.events import Scan, finite, shown
+from kalmark.events import MOST, Scan, finite, shown
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
@@ -23,6 +23,7 @@ from kalmark.models.protocols import Landmark, Motion, Sensor, parameter_covaria
 from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
 from kalmark.slam.gaps import ACTIONS, Gaps
 
+INFINITE = math.inf
 IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
 WANTED = {
     3: "three finite numbers: x and y in m, heading in rad",
@@ -33,7 +34,7 @@ WANTED = {
 def _pose(value: Any, what: str, sizes: tuple[int, ...]) -> Array:
     """Return a pose of one of the sizes 3 (plane) and 7 (space), its quaternion normalised."""
     try:
-        pose = finite(value, what, ModelError)
+        pose = finite(value, what, INFINITE, ModelError)
     except ModelError:
         pose = np.empty(0)
     unit = pose.shape == (7,) and abs(np.linalg.norm(pose[3:]) - 1) < 1e-6
@@ -41,6 +42,7 @@ def _pose(value: Any, what: str, sizes: tuple[int, ...]) -> Array:
         raise ModelError(f"{what} is {shown(value)}, expected {' or '.join(WANTED[n] for n in sizes)}")
     if unit:
         pose[3:] /= np.linalg.norm(pose[3:])
+    pose = finite(pose, what, error=ModelError)
     pose.flags.writeable = False
     return pose
 
@@ -173,19 +175,20 @@ def mount_name(robot: str, sensor: str) -> str:
 def _state(value: Any, pose: int, space: Space, what: str) -> Array:
     """Return a start of a motion's space: the whole state, or a pose, the rest of it zero."""
     try:
-        given = finite(value, what, ModelError)
+        given = finite(value, what, INFINITE, ModelError)
     except ModelError:
         given = np.empty(0)
     whole = given.shape == (space.size,)
     rest = given[pose:] if whole else np.zeros(space.size - pose)
     state = np.concatenate([_pose(given[:pose] if whole else value, what, (pose,)), rest])
+    state = finite(state, what, error=ModelError)
     state.flags.writeable = False
     return state
 
 
 def _cov(value: Any, pose: int, space: Space, what: str) -> Array:
     """Return the covariance of a start, of the whole state or of the pose alone, the rest of it known."""
-    given, dof = finite(value, what, ModelError), 3 if pose == 3 else 6
+    given, dof = finite(value, what, MOST["m"] ** 2, ModelError), 3 if pose == 3 else 6
     size = dof if given.shape == (dof, dof) else space.dof
     cov = np.zeros((space.dof, space.dof))
     cov[:size, :size] = covariance(given, size, what, definite=False, error=ModelError)

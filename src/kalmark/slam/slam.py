@@ -107,6 +107,8 @@ class Slam:
         self._channels: dict[ChannelKey, Channel] = {}
         self._policies: dict[ChannelKey, Policy] = {}
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
+        self._inner = {bias_name(name) for name in self.robots}
+        self._inner |= {mount_name(name, key) for name, robot in self.robots.items() for key in robot.sensors}
         for robot in self.robots.values():
             self._place(robot)
         if isinstance(self.estimator, Compiling):
@@ -117,7 +119,7 @@ class Slam:
 
     def _place(self, robot: Robot) -> None:
         """Enter a robot, the bias of its controls and its mounts into the map."""
-        if robot.name in self.tracks.slots:
+        if robot.name in self._inner:
             raise ModelError(f"robot {robot.name!r} has the name of another's bias or mount, expected different names")
         refuse_other_world(self.robots, f"robot {robot.name!r}", robot.motion.space.world)
         slot = self.map.add(robot.motion.space, robot.start, robot.cov)
@@ -176,6 +178,9 @@ class Slam:
         if key not in self._channels:
             names = sorted(self.robots[event.robot].sensors)
             raise EventError(f"{when(event)}: sensor is {event.sensor!r}, expected one of {names}")
+        if event.ids is not None and not self._inner.isdisjoint(event.ids):
+            name = next(i for i in event.ids if i in self._inner)
+            raise EventError(f"{when(event)}: id {name!r} names a robot's bias or mount, expected another")
         channel, policy = self._channels[key], self._policies[key]
         event = event if policy.detector is None else policy.detector(event)
         R = measurements(event, channel.sensor, channel.check)
@@ -822,8 +827,9 @@ class Slam:
         default = next((channel.landmark for channel in self._channels.values()), Point2D())
         model = landmark or reparametrize.surveyed(default, mean)
         refuse_other_world(self.robots, model.kind, model.space.world)
-        if name in self.tracks.slots:
-            raise MapError(f"landmark {name!r} is in the map already, expected a new id")
+        if name in self.tracks.slots or name in self._inner:
+            what = "names a robot's bias or mount" if name in self._inner else "is in the map already"
+            raise MapError(f"landmark {name!r} {what}, expected a new id")
         mean = numbers(mean, model.space.size, f"landmark {name!r}: mean", MapError)
         if cov is not None:
             cov = covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
