@@ -14,6 +14,7 @@ import dataclasses
 import inspect
 import math
 import operator
+import operator
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -131,7 +132,7 @@ class Parameter:
             try:
                 number = float(value)
             except OverflowError:
-                number = math.inf if value > 0 else -math.inf
+                number = -math.inf if operator.lt(value, 0) else math.inf
             if self.within.holds(number):
                 return f"a number of {bound(self.name)}" if most(self.name)[0] < abs(number) < math.inf else ""
             return self.wanted if math.isfinite(number) or self.within.infinite else "a finite number"
