@@ -14,7 +14,6 @@ import dataclasses
 import inspect
 import math
 import operator
-import operator
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
