@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hall import hall, mapped
 
 import kalmark as km
 from kalmark.batch.data import replayed
@@ -194,8 +195,28 @@ def test_the_table_of_innovations_accuses_the_range_that_is_wrong() -> None:
     assert parts["pose"] < 3
 
 
+def test_the_textbook_filter_is_named_as_what_is_too_sure() -> None:
+    for estimator, named, factor in (("ekf", ["estimator"], 2.0), ("invariant", [], 0.9)):
+        world = load_world("loop_b2", [f"filter.estimator.type={estimator}"])
+        log, config = simulate(world, 3), world.config()
+        run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+        verdict = km.diagnose(run)
+        assert [cause.name for cause in verdict.causes] == named
+        assert factor < (verdict.sigma_factor or 0.0) < 3 * factor
+
+
 def test_a_verdict_in_words_is_short_or_whole() -> None:
     causes = tuple(km.diagnose(run_of(*FAULTS["bearing_offset"][:2])).causes) * 5
     verdict = Verdict("doubtful", causes, "", 2.0, 0.1, 0.3).as_dict()
     assert len([*verdict_lines(verdict)]) == 5
     assert len([*verdict_lines(verdict, None)]) == 1 + len(causes)
+
+
+def test_a_hall_that_is_mapped_twice_after_a_gap_is_wrong_and_its_wheel_is_named() -> None:
+    log = hall(1, gap_s=4.0)
+    doubled, bridged = (km.diagnose(mapped(log, gaps=gaps)) for gaps in ("ignore", "widen"))
+    assert (doubled.map, [cause.name for cause in doubled.causes[:2]]) == ("wrong", ["map_repeats", "gap"])
+    assert (bridged.map, bridged.causes[0].name) == ("ok", "odometry_turn")
+    assert "sigma_turn_rad_per_m" in bridged.causes[0].cure
+    assert "estimator" not in [cause.name for cause in bridged.causes]
+    assert [cause.harmless for cause in bridged.causes if cause.name == "gap"] == [True]

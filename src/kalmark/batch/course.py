@@ -43,11 +43,11 @@ class Systematic(NamedTuple):
 def systematic_errors(robot: str, motion: Motion) -> list[Systematic]:
     """Return the errors that the controls of a motion may have all the time."""
     columns = tuple(motion.columns)
-    units = [column.rsplit("_", 1)[-1] for column in columns]
+    units = [column.rsplit("_", 1)[-1].replace("ps", "/s") for column in columns]
     rates = units if motion.held else [f"{unit}/s" for unit in units]
     found = [Systematic(robot, column, "offset", unit) for column, unit in zip(columns, rates, strict=True)]
     found += [Systematic(robot, column, "scale", "") for column in columns]
-    return found + [Systematic(robot, columns[j], "per_way", f"{units[j]}/m") for j in _turns(columns)]
+    return found + [Systematic(robot, columns[j], "per_way", "rad/m") for j in _turns(columns)]
 
 
 def _turns(columns: tuple[str, ...]) -> list[int]:

@@ -228,7 +228,7 @@ def repeats(summary: dict[str, Any]) -> list[Cause]:
     """Return the parts of the map that agree, as if one place were mapped twice."""
     found = []
     for repeat in summary.get("repeats", ()):
-        number, shift = len(repeat["landmarks"]), figure(repeat["shift_m"])
+        number, shift = len(repeat["landmarks"]), figure(float(np.linalg.norm(repeat["shift_m"])))
         evidence = f"{number} landmarks repeat {number} others {shift} m away: one place is mapped twice"
         found.append(
             Cause("map_repeats", repeat["start_s"] or 0.0, repeat["score"], evidence, "--set upkeep.repeats=merge")
@@ -245,7 +245,8 @@ def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
         return
     share = figure(effect.claimed, 2)
     evidence = f"the filter's sigmas are {share} of what the same data allow: its linearisation, not the noise"
-    yield Cause("estimator", begin_s(run), score, evidence, "--set estimator.type=invariant")
+    cure = "" if run.estimator == "invariant" else "--set estimator.type=invariant"
+    yield Cause("estimator", begin_s(run), score, evidence, cure)
 
 
 # ------------------------------------------------------------------ what they do to the map
@@ -278,8 +279,9 @@ def effect_of(run: Run, found: Searched) -> Effect:
         return Effect(shift_m=shift_m)
     off_it = share > LEAST and shift_m > SIGMAS * float(np.median(filtered[free]))
     status = "ok" if not off_it else "doubtful" if share < WRONG else "wrong"
-    ratio, all_of_it = filtered[free] / stated[free], found.given.segments is None
-    claimed = float(np.median(ratio)) if all_of_it else None
+    ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
+    comparable = found.given.segments is None and not waited  # what waited is not in the batch solution
+    claimed = float(np.median(ratio)) if comparable else None
     over = 1.0 / claimed if claimed is not None and claimed < TOO_SURE else 1.0
     factors = np.hypot(honest[free] / stated[free] * over, shift_m / filtered[free])
     accuracy_m = float(np.median(factors * filtered[free]))

@@ -43,7 +43,7 @@ def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dic
     if not np.isnan(run.history.left_px).all():
         problem = tag_problem(run)
         return compare_tags(run, problem, optimum(problem))
-    return compare(run, solve_batch(run, log or log_of(run)))
+    return compare(run, solve_batch(run, log_of(run) if log is None else log))
 
 
 def solve_batch(
