@@ -31,6 +31,7 @@ STEPS, SMALL = 12, 0.005  # of Fisher's scoring, and of the logarithm of a sigma
 LONGEST = math.log(3.0)  # step of the logarithm of a variance
 LEAST, MOST = 0.1, 30.0  # times a stated sigma: beyond, the data only say that it is smaller, or larger
 KNOWN = 0.35  # largest sigma of the logarithm of a sigma that the data determine
+FAINT = 0.1  # information on a t that is as good as none
 NOTHING = 2 * math.log(1e-6)  # the logarithm of the variance of a noise that is not there
 
 
@@ -149,7 +150,8 @@ class Components:
             g, I, spread = self._score(t)
             g, I, spread = g[free], I[np.ix_(free, free)], spread[np.ix_(free, free)]
             inverse = np.linalg.pinv(I, hermitian=True)
-            moved = np.clip(t[free] + np.clip(inverse @ g, -LONGEST, LONGEST), low, high)
+            towards = np.linalg.solve(I + FAINT * np.eye(len(g)), g)
+            moved = np.clip(t[free] + np.clip(towards, -LONGEST, LONGEST), low, high)
             step, t[free] = np.abs(moved - t[free]).max() / 2, moved
             robust = inverse @ spread @ inverse
             sigma[free] = 0.5 * np.sqrt(np.maximum(np.diag(inverse), np.diag(robust)))
