@@ -189,7 +189,9 @@ def stretches(linear: Linear, left: Left, s: Array) -> Array:
     (block, motion), Q, have = _blocks(linear), linear.root @ linear.root.T, linear.residuals
     rows = left.r * (have.r - left.r @ s)[:, None]
     moves = left.m * (Q @ (have.m - left.m @ s))[:, None]
-    parts = [np.bincount(block, r, BLOCKS) + np.bincount(motion, m, BLOCKS) for r, m in zip(rows.T, moves.T, strict=True)]
+    parts = [
+        np.bincount(block, r, BLOCKS) + np.bincount(motion, m, BLOCKS) for r, m in zip(rows.T, moves.T, strict=True)
+    ]
     return np.array(parts)
 
 

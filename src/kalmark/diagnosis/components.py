@@ -160,7 +160,7 @@ class Components:
         return t, sigma
 
     def _score(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return the score (K,) of t (K,), its information (K, K), and its covariance (K, K) by stretches of the run."""
+        """Return the score (K,) of t (K,), its information (K, K), and its covariance by stretches of the run."""
         linear = self.linear(t)
         have, simulated = linear.residuals, linear.simulated(SETS)
         blocks = linear.rows.node * BLOCKS // len(linear.problem.robots)

@@ -9,7 +9,7 @@ the rest likelier, is left as it was.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -92,7 +92,8 @@ class Tuning:
     """What was changed and what was left, and how both parts of the log fit before and after.
 
     `correlations` are those of the errors of successive observations by sensor and column, `sigma_factor` is what the
-    sigmas of the map are to be multiplied by for them.  `windows` are the NIS over time, before and after.
+    sigmas of the map are to be multiplied by for them.  `split_s` is the time between both parts since the first scan,
+    `windows` are the NIS over time, before and after.
     """
 
     changes: tuple[Change, ...]
@@ -134,7 +135,7 @@ def tune(
 
 
 class _Judged(NamedTuple):
-    """A run over the whole log: the outcome, d2 and log-likelihood of each observation (O,), NaN where there is none."""
+    """A run over the whole log: which observations (O,) were used, their d2, degrees of freedom and log-likelihood."""
 
     run: Run
     used: Flags
@@ -211,7 +212,9 @@ class _Task:
         """
         h = judged.run.history
         late = h.t_ns[h.step] > self.split_ns
-        at_edge = before.likelihood + 0.5 * before.d2 - 0.5 * chi2.ppf(self.gate or 1 - WIDER[0], np.maximum(before.dof, 1))
+        at_edge = (
+            before.likelihood + 0.5 * before.d2 - 0.5 * chi2.ppf(self.gate or 1 - WIDER[0], np.maximum(before.dof, 1))
+        )
         values = np.where(judged.used, judged.likelihood, at_edge)
         counts = np.isfinite(values) & np.isfinite(before.likelihood)
         out = []
@@ -219,7 +222,9 @@ class _Task:
             used = part & judged.used & np.isfinite(judged.d2)
             number = max(int(judged.dof[used].sum()), 1)
             left_out = (part & (h.outcome == "rejected")).sum() / max(part.sum(), 1)
-            out.append(Score(float(judged.d2[used].sum()) / number, float(values[part & counts].sum()), float(left_out)))
+            out.append(
+                Score(float(judged.d2[used].sum()) / number, float(values[part & counts].sum()), float(left_out))
+            )
         return out[0], out[1]
 
     @property
@@ -343,7 +348,9 @@ class _Task:
         h = before.run.history
         parts = [int((h.t_ns <= self.split_ns).sum()), int((h.t_ns > self.split_ns).sum())]
         if min(parts) < LEAST_SCANS:
-            raise KalmarkError(f"tune: the parts of the log have {parts[0]} and {parts[1]} scans, expected {LEAST_SCANS}")
+            raise KalmarkError(
+                f"tune: the parts of the log have {parts[0]} and {parts[1]} scans, expected {LEAST_SCANS}"
+            )
         values, fit, offsets = self._rounds()
         changes = self._changes(values, fit, offsets)
         values = {c.path: c.after for c in changes if c.changed}
@@ -357,7 +364,7 @@ class _Task:
         changes += self._gate_change(values)
         last = self.judged({c.path: c.after for c in changes if c.changed})
         windows = nis_windows(before.run.history), nis_windows(last.run.history)
-        split_s = self.split_ns * 1e-9
+        split_s = (self.split_ns - int(h.t_ns[0])) * 1e-9
         return Tuning(tuple(changes), base, self.scores(last, before), split_s, aim, rhos, factor, windows)
 
     def _rounds(self) -> tuple[Values, _Fit, dict[Path_, float]]:
@@ -369,7 +376,9 @@ class _Task:
             fit = self.fit(run, values, {*offsets})
             offsets |= {finding.of: finding.sigma for finding in fit.found}
             new = {noise.path: estimate.value for noise, estimate in fit.noises.items()}
-            moved = [abs(math.log(max(v, 1e-12) / max(values.get(p, self.stated(p) or v), 1e-12))) for p, v in new.items()]
+            moved = [
+                abs(math.log(max(v, 1e-12) / max(values.get(p, self.stated(p) or v), 1e-12))) for p, v in new.items()
+            ]
             moved += [abs(f.value) / max(f.sigma, 1e-12) * SAME for f in fit.found]
             values |= new
             if max(moved, default=0.0) < SAME:
@@ -378,7 +387,11 @@ class _Task:
 
     def _opened(self, values: Values) -> Values:
         """Return the gate that is as wide as it was, in units of the measurements, if sigmas of sensors are smaller."""
-        shrunk = [v / self.stated(p) for p, v in values.items() if p[2] == "sensors" and p[-1].startswith("sigma_") and self.stated(p)]
+        shrunk = [
+            v / self.stated(p)
+            for p, v in values.items()
+            if p[2] == "sensors" and p[-1].startswith("sigma_") and self.stated(p)
+        ]
         if self.gate is None or min(shrunk, default=1.0) >= 1.0:
             return {}
         edge = chi2.ppf(self.gate, 2) / max(min(shrunk), 0.05) ** 2
@@ -420,7 +433,9 @@ class _Task:
         for path, sigma in offsets.items():
             stated = self.stated(path)
             changes.append(Change(path, stated, _short(values[path]), sigma, ""))
-        changes += [Change(p, self.stated(p), self.stated(p), 0.0, why) for p, why in fit.alike.items() if p not in offsets]
+        changes += [
+            Change(p, self.stated(p), self.stated(p), 0.0, why) for p, why in fit.alike.items() if p not in offsets
+        ]
         return changes
 
     def _held_out(self, values: Values, changes: list[Change], before: _Judged) -> tuple[Values, list[Change]]:
@@ -452,7 +467,7 @@ class _Task:
         return [Change(GATE, self.gate, values[GATE], 0.0, why)]
 
     def _correlated(self, fit: _Fit, values: Values) -> tuple[dict[str, float], float, dict[Path_, float]]:
-        """Return the correlations of errors, what the map's sigmas are to be multiplied by, and factors of the noises."""
+        """Return the correlations of errors, the factor of the map's sigmas by them, and those of the noises."""
         components = fit.components
         linear = components.linear(components.t_of({n: values.get(n.path, n.stated) for n in components.noises}))
         sensors, t_s = sensors_of(fit.run), np.zeros(len(linear.problem.robots))
@@ -467,12 +482,21 @@ class _Task:
             robot, sensor, column = finding.of
             stem, unit = column.rsplit("_", 1)
             for noise in components.noises:
-                if robot in noise.robots and noise.path[3:4] == (sensor,) and noise.path[-1] in (f"sigma_{stem}_{unit}", f"sigma_{stem}_rel"):
-                    wide[noise.path] = max(wide.get(noise.path, 1.0), math.sqrt((1 + finding.value) / (1 - finding.value)))
+                if (
+                    robot in noise.robots
+                    and noise.path[3:4] == (sensor,)
+                    and noise.path[-1] in (f"sigma_{stem}_{unit}", f"sigma_{stem}_rel")
+                ):
+                    wide[noise.path] = max(
+                        wide.get(noise.path, 1.0), math.sqrt((1 + finding.value) / (1 - finding.value))
+                    )
         rhos = {".".join(finding.of): finding.value for finding in found}
-        if not found or LANDMARKS >= len(linear.state.groups) or not len(linear.state.groups[LANDMARKS]):
+        if not found or not len(linear.state.groups[LANDMARKS]):
             return rhos, 1.0, wide
-        one, two = (np.trace(x.reduced.covariances()[:, : linear.state.d, : linear.state.d], axis1=1, axis2=2) for x in (linear, honest))
+        one, two = (
+            np.trace(x.reduced.covariances()[:, : linear.state.d, : linear.state.d], axis1=1, axis2=2)
+            for x in (linear, honest)
+        )
         some = one > 0
         return rhos, float(np.median(np.sqrt(two[some] / one[some]))) if some.any() else 1.0, wide
 
