@@ -21,7 +21,7 @@ from scipy.stats import chi2, norm
 from kalmark.arrays import Array, Flags
 from kalmark.batch.data import replayed
 from kalmark.batch.solver import optimum
-from kalmark.batch.state import LANDMARKS
+from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.config.opening import EACH
 from kalmark.config.reading import config_of, resolve_config
@@ -140,7 +140,7 @@ class _Judged(NamedTuple):
     run: Run
     used: Flags
     d2: Array
-    dof: Array
+    dof: Ints
     likelihood: Array
 
 
@@ -194,13 +194,11 @@ class _Task:
         """Return the whole log filtered with some values."""
         run = self.run(values, self.log)
         h = run.history
-        some = np.isfinite(h.z).any(axis=1) & np.isin(h.outcome, ("associated", "rejected"))
-        rows, likelihood, d2, dof = np.flatnonzero(some), np.full(len(some), np.nan), np.full(len(some), np.nan), None
-        value, dof_ = nis(h.z[rows], h.Z[rows])
-        d2[rows], dof = value, np.zeros(len(some), dtype=np.int64)
-        dof[rows] = dof_
-        for m in np.unique(dof_[dof_ > 0]):
-            mine = rows[dof_ == m]
+        rows = np.flatnonzero(np.isfinite(h.z).any(axis=1) & np.isin(h.outcome, ("associated", "rejected")))
+        likelihood, d2, dof = np.full(len(h.z), np.nan), np.full(len(h.z), np.nan), np.zeros(len(h.z), dtype=np.int64)
+        d2[rows], dof[rows] = nis(h.z[rows], h.Z[rows])
+        for m in np.unique(dof[dof > 0]):
+            mine = np.flatnonzero(dof == m)
             logdet = np.linalg.slogdet(h.Z[mine, :m, :m])[1]
             likelihood[mine] = -0.5 * (d2[mine] + logdet + m * math.log(2 * math.pi))
         return _Judged(run, h.outcome == "associated", d2, dof, likelihood)
@@ -253,7 +251,7 @@ class _Task:
         for name, robot in robots.items():
             names = tuple(n for n in run.final_slam().robots if n == name or (name == EACH and n not in robots))
             here = ("robots", self.section(name))
-            parts = [((*here, "motion"), robot["motion"])]
+            parts: list[tuple[Path_, Any]] = [((*here, "motion"), robot["motion"])]
             parts += [((*here, "sensors", s), section) for s, section in robot["sensors"].items()]
             for path, section in parts if names else ():
                 for key, value in section.items():
@@ -274,7 +272,7 @@ class _Task:
         if column.name not in CALIBRATIONS:
             return None
         robot, sensor, _ = column.of
-        path = ("robots", self.section(robot if robot in self.config["robots"] else EACH), "sensors", sensor)
+        path: Path_ = ("robots", self.section(robot if robot in self.config["robots"] else EACH), "sensors", sensor)
         section = run.section(robot, sensor)
         mount = section.get("mount") or {}
         in_map = any(section.get(key) for key in ("sigma_scale", "sigma_bias_m"))

@@ -46,9 +46,9 @@ def new_config(config: str | Path, tuning: Tuning, overrides: Sequence[str] = ()
         if change.changed:
             owner = _put(content, change.path, change.after)
             _note(owner, change)
-    text = io.StringIO()
-    yaml.dump(content, text)
-    return _head(source, tuning) + text.getvalue()
+    dumped = io.StringIO()
+    yaml.dump(content, dumped)
+    return _head(source, tuning) + dumped.getvalue()
 
 
 def _put(content: CommentedMap, path: Sequence[str], value: Any) -> CommentedMap:
