@@ -19,7 +19,7 @@ import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.data import Given, replayed
-from kalmark.batch.problem import Problem
+from kalmark.batch.problem import Motions, Problem
 from kalmark.batch.state import State
 from kalmark.diagnosis.causes import BLOCKS
 from kalmark.diagnosis.linear import Left, Linear
@@ -31,6 +31,7 @@ STEPS, SMALL = 12, 0.005  # of Fisher's scoring, and of the logarithm of a sigma
 LONGEST = math.log(3.0)  # step of the logarithm of a variance
 LEAST, MOST = 0.1, 30.0  # times a stated sigma: beyond, the data only say that it is smaller, or larger
 KNOWN = 0.35  # largest sigma of the logarithm of a sigma that the data determine
+ALMOST, ROUNDING = 0.9, 1e-6  # what makes parts of covariances the same
 FAINT = 0.1  # information on a t that is as good as none
 NOTHING = 2 * math.log(1e-6)  # the logarithm of the variance of a noise that is not there
 
@@ -69,10 +70,14 @@ class Estimate(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What a noise adds to the covariances: R (K, p, p) of each factor, Q (q n, q n) of the motion."""
+    """What a noise adds to the covariances: R (K, p, p) of each factor, Q (q n, q n) of the motion.
+
+    `columns` (r,) are those of the root of the motion's covariance that it scales, None if it does more than that.
+    """
 
     R: list[Array]
     Q: sp.csr_array
+    columns: Flags | None
 
 
 def with_noise(robots: Mapping[str, Robot], values: Mapping[Noise, float]) -> dict[str, Robot]:
@@ -99,7 +104,7 @@ class Components:
     def __init__(self, given: Given, log: Log, state: State, noises: Sequence[Noise]) -> None:
         robots = with_noise(given.robots, {noise: noise.scale for noise in noises})
         self.given, self.log, self.state = replace(given, robots=robots), log, state
-        first = self._problem({})
+        self.first = first = self._problem({})
         parts = [_between(first, self._problem({noise: math.sqrt(2.0) * noise.scale})) for noise in noises]
         acts = [part.Q.nnz > 0 or any(R.any() for R in part.R) for part in parts]
         self.noises = [noise for noise, some in zip(noises, acts, strict=True) if some]
@@ -110,8 +115,16 @@ class Components:
 
     def linear(self, t: Array) -> Linear:
         """Return the problem with the variances exp(t) (K,) times those of the scales."""
-        values = {noise: noise.scale * math.exp(x / 2) for noise, x in zip(self.noises, t, strict=True)}
-        return Linear.of(self._problem(values), self.state)
+        if any(part.columns is None for part in self.parts):
+            values = {noise: noise.scale * math.exp(x / 2) for noise, x in zip(self.noises, t, strict=True)}
+            return Linear.of(self._problem(values), self.state)
+        R, scale = [factor.R for factor in self.first.factors], np.ones(self.first.motions.root.shape[1])
+        for part, x in zip(self.parts, t, strict=True):
+            R = [now + (math.exp(x) - 1.0) * more for now, more in zip(R, part.R, strict=True)]
+            scale[part.columns] *= math.exp(x / 2)
+        motions = replace(self.first.motions, root=sp.csr_array(self.first.motions.root @ sp.diags_array(scale)))
+        factors = tuple(replace(factor, R=now) for factor, now in zip(self.first.factors, R, strict=True))
+        return Linear.of(replace(self.first, motions=motions, factors=factors), self.state)
 
     def t_of(self, values: Mapping[Noise, float]) -> Array:
         """Return t (K,) of the values of some noises, of the others as they are stated."""
@@ -187,7 +200,18 @@ def _between(one: Problem, two: Problem) -> Part:
     Q = sp.csr_array(two.motions.Q - one.motions.Q)
     Q.data[np.abs(Q.data) < 1e-12 * abs(one.motions.Q).max()] = 0.0
     Q.eliminate_zeros()
-    return Part(R, Q)
+    return Part(R, Q, _columns(one.motions, Q))
+
+
+def _columns(motions: Motions, Q: sp.csr_array) -> Flags | None:
+    """Return the columns (r,) of the root of which Q is the square: all those of some kinds; None if it is not one."""
+    kinds, out = np.array(motions.kinds), np.zeros(motions.root.shape[1], dtype=np.bool_)
+    for kind in dict.fromkeys(motions.kinds) if Q.nnz else ():
+        mine = kinds == kind
+        square = motions.root[:, mine] @ motions.root[:, mine].T
+        out |= mine & bool(square.multiply(Q).sum() > ALMOST * square.multiply(square).sum())
+    square = motions.root[:, out] @ motions.root[:, out].T
+    return out if abs(square - Q).max() <= ROUNDING * max(abs(Q).max(), 1e-300) else None
 
 
 def _squares(linear: Linear, part: Part, left: Left) -> tuple[Array, Array]:

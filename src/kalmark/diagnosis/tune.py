@@ -19,7 +19,8 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.data import replayed
+from kalmark.batch.data import Given, replayed
+from kalmark.batch.problem import sightings
 from kalmark.batch.solver import optimum
 from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.config import build_slam, config_dict, open_run
@@ -34,6 +35,7 @@ from kalmark.diagnosis.search import LEAST_GAIN
 from kalmark.diagnosis.verdict import NEAR, calibrated, sensors_of
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
+from kalmark.models.observe import view_of
 from kalmark.results.batch import given_by
 from kalmark.results.measures import nis
 from kalmark.results.progress import track
@@ -44,10 +46,10 @@ from kalmark.results.warnings import Window, nis_windows
 ROUNDS, SAME = 6, 0.03  # of filter and estimates, until no value changes by more
 ALPHA = 0.01  # of right configurations of which anything is changed
 WIDER = (1e-4, 1e-5, 1e-7, 1e-9, 1e-12, 1e-15)  # shares of right observations that a gate may leave out
+MOVED_M = 1e-5  # of a mount, for its derivative
 LEAST_SCANS = 30  # in each part
 INNOVATIONS, MAP = AIMS = ("innovations", "map")
 CALIBRATIONS = {"range_scale": ("scale",), "range_offset": ("bias_m",), "bearing_offset": ("mount", "theta_rad")}
-IN_MAP = {"range_scale": ("sigma_scale",), "range_offset": ("sigma_bias_m",)}
 GATE = ("association", "gate")
 
 Path_ = tuple[str, ...]
@@ -310,13 +312,14 @@ class _Task:
         return _Fit(components.fit(now), found, components, again, alike)
 
     def _calibrations(
-        self, run: Run, linear: Linear, given: Any, sure: set[Path_]
+        self, run: Run, linear: Linear, given: Given, sure: set[Path_]
     ) -> tuple[list[Finding], dict[Path_, str]]:
         """Return the calibrations that are off, and of those that the log cannot tell from another error, from which.
 
         All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
         """
         columns = causes.columns_of(linear, sensors_of(run), causes.rates_of(linear, given.robot, given.t_ns))
+        columns += _mounts(linear, given)
         paths = [self.calibration(run, column) for column in columns]
         joined: dict[Any, Column] = {}
         for column, path in zip(columns, paths, strict=True):
@@ -502,6 +505,27 @@ class _Task:
 def values_of(noises: Mapping[Noise, Estimate]) -> dict[Noise, float]:
     """Return the values of some estimates."""
     return {noise: estimate.value for noise, estimate in noises.items()}
+
+
+def _mounts(linear: Linear, given: Given) -> Iterator[Column]:
+    """Yield what a sensor that sits elsewhere adds to the data, by each coordinate of its place, in 1/m."""
+    none, d = np.zeros(len(linear.at.w)), linear.state.d
+    for f, factor in enumerate(linear.problem.factors):
+        robot, sensor = factor.sensor
+        mount = given.robots[robot].sensors[sensor] if sensor else None
+        if mount is None or (robot, sensor) in given.mounts or factor.term.blocks[-1].group != LANDMARKS:
+            continue
+        z, _ = factor.term.at(linear.state)
+        for axis in range(d):
+            at = np.array(mount.at, dtype=np.float64)
+            at[axis] += MOVED_M
+            view = view_of(mount.sensor, given.landmark, at)
+            moved, _ = sightings(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor).term.at(
+                linear.state
+            )
+            parts = [np.zeros(other.R.shape[:2]) for other in linear.problem.factors]
+            parts[f] += (z - moved) / MOVED_M
+            yield Column("mount", (robot, sensor, "xyz"[axis]), "m", linear.whitened(parts), none)
 
 
 def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list[tuple[float, float]]]:
