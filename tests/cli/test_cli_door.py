@@ -17,7 +17,7 @@ def test_version_and_help(kalmark: Kalmark) -> None:
     assert done.status == 0
     for verb in ("demo", "run", "simulate", "evaluate", "report", "campaign", "config", "convert", "check", "data"):
         assert f" {verb} " in done.out
-    for verb in ("view", "tune", "live"):  # not there yet: they say so when they are called
+    for verb in ("view", "live"):  # not there yet: they say so when they are called
         assert f" {verb} " not in done.out
     assert kalmark().status == 2
 

@@ -187,7 +187,7 @@ def test_a_misspelt_robot_in_one_line_is_refused_or_left_out(
         (["convert", "nowhere", "x"], "log 'nowhere' not found"),
         (["data", "fetch", "mrclm"], "dataset 'mrclm' is unknown, expected one of"),
         (["nonsense"], "No such command 'nonsense'"),
-        *[([verb, "x"], f"{verb} is not available yet") for verb in ("view", "tune", "live")],
+        *[([verb, "x"], f"{verb} is not available yet") for verb in ("view", "live")],
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(

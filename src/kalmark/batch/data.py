@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -109,6 +109,7 @@ class _Replay:
         self.fixes: list[tuple[int, Array, Array]] = []
         self.nodes: list[int] = []
         self.segment: dict[str, int] = {}  # that a robot is in
+        self.varies: dict[tuple[str, str], bool] = {}  # whether the noise of a sensor does
         self.rows: dict[int, list[int]] = {}
         for row, scan in enumerate(given.associations.scan.tolist()):
             self.rows.setdefault(scan, []).append(row)
@@ -163,7 +164,7 @@ class _Replay:
         """Return the noise R of a scan's rows as in the filter: where it varies, that of what was expected."""
         used = self.given.associations
         R, y = measurements(scan, sensor)[used.index[rows]], scan.y[used.index[rows]]
-        if scan.cov is not None or not isinstance(sensor, NonAdditiveSensor) or sensor.additive:
+        if scan.cov is not None or not self._varies(sensor, scan):
             return R
         e = used.e[rows][:, : len(sensor.columns)]
         e = np.where(np.isnan(e), y, e)  # a new landmark is expected where it is seen
@@ -172,6 +173,13 @@ class _Replay:
         if isinstance(sensor, Ranging):
             return sensor.noise(e)
         raise unsolved(f"the noise of {type(sensor).__name__} is not additive, expected one that is")
+
+    def _varies(self, sensor: Sensor, scan: Scan) -> TypeGuard[NonAdditiveSensor]:
+        """Return whether the noise of a scan's sensor varies with the measurement; O(1) after its first scan."""
+        key = scan.robot, scan.sensor
+        if key not in self.varies:
+            self.varies[key] = isinstance(sensor, NonAdditiveSensor) and not sensor.additive
+        return self.varies[key]
 
     # ------------------------------------------------------------------ the problem
     def problem(self) -> Problem:

@@ -15,11 +15,11 @@ from kalmark.cli.diagnose import diagnose
 from kalmark.cli.folders import evaluate, explain, report
 from kalmark.cli.logs import config, convert, data, simulate
 from kalmark.cli.run import demo, run, warm_up
+from kalmark.cli.tune import tune
 from kalmark.errors import KalmarkError
 
 COMING = {  # verbs that are not there yet: not in the help, but they say so when they are called
     "view": "replay a run interactively",
-    "tune": "fit the noise of a configuration",
     "live": "take events as JSON lines, give estimates",
 }
 USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
@@ -43,7 +43,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (demo, run, simulate, evaluate, diagnose, report, explain, campaign, config, convert, check, warm_up):
+for verb in (demo, run, simulate, evaluate, diagnose, tune, report, explain, campaign, config, convert, check, warm_up):
     app.command()(verb)
 app.add_typer(data, name="data")
 for name, what in COMING.items():

@@ -180,6 +180,20 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
     return found
 
 
+def stretches(linear: Linear, left: Left, s: Array) -> Array:
+    """Return the scores (K, `BLOCKS`) of stretches of the run, with systematic errors s (K,) taken out.
+
+    `left` is what the state leaves of one unit of each.
+    """
+    (block, motion), Q, have = _blocks(linear), linear.root @ linear.root.T, linear.residuals
+    rows = left.r * (have.r - left.r @ s)[:, None]
+    moves = left.m * (Q @ (have.m - left.m @ s))[:, None]
+    parts = [
+        np.bincount(block, r, BLOCKS) + np.bincount(motion, m, BLOCKS) for r, m in zip(rows.T, moves.T, strict=True)
+    ]
+    return np.array(parts)
+
+
 def _blocks(linear: Linear) -> tuple[Ints, Ints]:
     """Return of which stretch of the run each residual and each error of the motion is."""
     n = len(linear.problem.robots)

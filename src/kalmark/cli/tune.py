@@ -1,0 +1,74 @@
+"""`kalmark tune`: noise and calibration by the first part of a log, judged by the rest; a new configuration."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from kalmark.cli.shared import Overrides, computing, number, print_table, writable
+from kalmark.errors import KalmarkError
+
+if TYPE_CHECKING:
+    from kalmark.diagnosis.tune import Tuning
+
+
+class Aim(StrEnum):
+    """What the noise is to be right for, where errors last."""
+
+    INNOVATIONS = "innovations"
+    MAP = "map"
+
+
+def tune(
+    config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
+    log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The file to write. (default: out/CONFIG_tuned.yaml)")] = None,
+    share: Annotated[float, typer.Option(help="Part of the log to tune by; the rest judges.")] = 0.5,
+    aim: Annotated[
+        Aim, typer.Option(help="Where errors last: innovations, or a map, as uncertain as they claim.")
+    ] = Aim.INNOVATIONS,
+    keep: Annotated[
+        list[str] | None, typer.Option(metavar="KEY.PATH", help="Do not touch; may be given again.")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Estimate noise and calibration by the first part of a log, and write a configuration that has them."""
+    from kalmark.diagnosis.tune import tune as tuned
+    from kalmark.diagnosis.tune_picture import draw_tuning
+    from kalmark.diagnosis.tuned_file import new_config
+    from kalmark.results.plot import save_figure
+    from kalmark.results.recording import replace_file, write
+
+    out = out or Path("out") / f"{Path(config).stem}_tuned.yaml"
+    if out.suffix not in (".yaml", ".yml"):
+        raise KalmarkError(f"--out {out}: expected a path that ends with .yaml")
+    writable(out.parent)
+    with computing():
+        tuning = tuned(config, log, overrides or (), share=share, aim=aim.value, keep=keep or (), progress=True)
+    text, picture = new_config(config, tuning, overrides or (), log), out.with_suffix(".png")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write(out, text)
+    replace_file(picture, lambda path: save_figure(draw_tuning(tuning, Path(config).stem), path))
+    show(tuning)
+    typer.echo(f"{out}: the new configuration; {picture}: the NIS before and after")
+
+
+def show(tuning: Tuning) -> None:
+    """Print what became of each key, and how both parts of the log fit before and after."""
+    from kalmark.diagnosis.tuned_file import cells, correlation_lines
+
+    columns = ("key", "before", "after", "known to", "second part", "")
+    print_table("", columns, [cells(change) for change in tuning.changes], align="<>>>><")
+    rows = []
+    for label, k in (("the part it was tuned by", 0), ("the part that judges", 1)):
+        one, two = tuning.before[k], tuning.after[k]
+        shares = (number(x.left_out, "%") for x in (one, two))
+        gain = f"{two.likelihood - one.likelihood:+.0f}"
+        rows.append((label, number(one.nis), number(two.nis), gain, *shares))
+    head = ("", "NIS per dof before", "after", "log-likelihood", "left out (%) before", "after")
+    print_table("", head, rows, align="<>>>>>")
+    for line in correlation_lines(tuning):
+        typer.echo(line)
