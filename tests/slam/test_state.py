@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -399,3 +401,11 @@ def test_a_file_that_is_no_map_is_refused(content: bytes, tmp_path: Path) -> Non
     (tmp_path / "map.kmk").write_bytes(content)
     with pytest.raises(MapError, match=r"map\.kmk: .*expected a map written by save"):
         km.Slam.load(tmp_path / "map.kmk")
+
+
+def test_a_map_is_loaded_by_a_process_that_has_imported_kalmark_alone(tmp_path: Path) -> None:
+    km.Slam([km.Robot("r", km.motion.Odometry2D(), sensors={"l": km.Mount(km.sensors.RangeBearing())})]).save(
+        tmp_path / "map.kmk"
+    )
+    told = f"import kalmark as km; print(*km.Slam.load({str(tmp_path / 'map.kmk')!r}).robots)"
+    assert subprocess.check_output([sys.executable, "-c", told], text=True).split() == ["r"]

@@ -21,6 +21,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import kalmark.association
+import kalmark.filter.estimators
+import kalmark.management.attention
+import kalmark.management.initialization
+import kalmark.management.upkeep
+import kalmark.models.landmarks
+import kalmark.models.motion
+import kalmark.models.sensors  # noqa: F401 - all of these register what a file names
 from kalmark.arrays import Array
 from kalmark.association import Association
 from kalmark.declare import by_class_name, registered_name
