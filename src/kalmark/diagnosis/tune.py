@@ -46,6 +46,7 @@ from kalmark.results.warnings import Window, nis_windows
 ROUNDS, SAME = 6, 0.03  # of filter and estimates, until no value changes by more
 ALPHA = 0.01  # of right configurations of which anything is changed
 WIDER = (1e-4, 1e-5, 1e-7, 1e-9, 1e-12, 1e-15)  # shares of right observations that a gate may leave out
+KNOWN_TO = {"": MOST_SCALE, "m": 0.1}  # scales and places of mounts beforehand: what is more is no error
 MOVED_M = 1e-5  # of a mount, for its derivative
 LEAST_SCANS = 30  # in each part
 INNOVATIONS, MAP = AIMS = ("innovations", "map")
@@ -536,8 +537,10 @@ def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list
     Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
     have, left = linear.residuals, linear.left(Z, W)
     g, I = Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m
+    prior = [KNOWN_TO.get(column.unit, np.inf) if column.name != "range_offset" else np.inf for column in columns]
+    I = I + np.diag(np.array(prior) ** -2.0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(I), 1e-300))
-    C = scale[:, None] * np.linalg.pinv(I * np.outer(scale, scale), rcond=1e-9, hermitian=True) * scale
+    C = scale[:, None] * np.linalg.pinv(I * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
     s = C @ g
     P = causes.stretches(linear, left, s)
     sigma = np.sqrt(np.maximum(np.diag(C), np.diag(C @ P @ P.T @ C)))
