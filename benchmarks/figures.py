@@ -274,6 +274,15 @@ def diagnosis() -> Iterator[Figure]:
                  "python benchmarks/diagnosis.py --real", row("real:", "{0} of {2}"))  # fmt: skip
 
 
+def tuning() -> Iterator[Figure]:
+    """Yield how real logs fit on their second half, tuned by the first."""
+    command, shown = "python benchmarks/tuning.py", "{2} / {5} / {9}, {10} m, {11} m to {13}, {14} m, {15} m"
+    for log, start in (("Lost in the Woods", "lost_in_the_woods"), ("MRCLAM 6, robot 3", "mrclam_3")):
+        for aim, wanted in (("innovations", ".9 to 1.1 after"), ("map", "")):
+            name = f"{log}, aim {aim}: NIS of the second half before / after / pose NEES, path, landmarks before and after"
+            yield Figure("Tuning by the first half", name, wanted, command, row(f"{start} {aim}:", shown))
+
+
 def partial_measurements() -> Iterator[Figure]:
     """Yield the figures of ranges alone and bearings alone."""
     section, command = "Ranges alone", "python benchmarks/range_only.py"
@@ -436,6 +445,7 @@ def figures() -> list[Figure]:
         unknown_ids,
         gaps,
         diagnosis,
+        tuning,
         partial_measurements,
         space,
         speed,

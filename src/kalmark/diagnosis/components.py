@@ -27,7 +27,7 @@ from kalmark.logs.log import Log
 from kalmark.slam.robot import Robot
 
 SETS = 60  # of simulated data
-STEPS, SMALL = 12, 0.005  # of Fisher's scoring, and of the logarithm of a sigma: as good as none
+STEPS, SMALL = 12, 0.01  # of Fisher's scoring, and of the logarithm of a sigma: as good as none
 LONGEST = math.log(3.0)  # step of the logarithm of a variance
 LEAST, MOST = 0.1, 30.0  # times a stated sigma: beyond, the data only say that it is smaller, or larger
 KNOWN = 0.35  # largest sigma of the logarithm of a sigma that the data determine

@@ -46,6 +46,8 @@ from kalmark.results.warnings import Window, nis_windows
 ROUNDS, SAME = 6, 0.03  # of filter and estimates, until no value changes by more
 ALPHA = 0.01  # of right configurations of which anything is changed
 WIDER = (1e-4, 1e-5, 1e-7, 1e-9, 1e-12, 1e-15)  # shares of right observations that a gate may leave out
+KNOWN_TO = {"": MOST_SCALE, "m": 0.1}  # scales and places of mounts beforehand: what is more is no error
+MOUNT = "mount"  # the systematic error that is its place
 MOVED_M = 1e-5  # of a mount, for its derivative
 LEAST_SCANS = 30  # in each part
 INNOVATIONS, MAP = AIMS = ("innovations", "map")
@@ -317,6 +319,7 @@ class _Task:
         """Return the calibrations that are off, and of those that the log cannot tell from another error, from which.
 
         All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
+        Those that it determines are estimated again without scales and places of mounts, which are not linear.
         """
         columns = causes.columns_of(linear, sensors_of(run), causes.rates_of(linear, given.robot, given.t_ns))
         columns += _mounts(linear, given)
@@ -331,15 +334,20 @@ class _Task:
             return [], {}
         s, sigma, alone = _together(linear, columns)
         level = float(norm.isf(ALPHA / 2 / max(sum(path is not None for path in {*paths}), 1)))
-        found, alike = [], {}
+        chosen, alike = [], {}
         for k, (key, column) in enumerate(zip(keys, columns, strict=True)):
-            if key not in paths or key is None:
+            if key not in paths:
                 continue
-            seen = abs(s[k]) > level * sigma[k] and (column.unit or abs(s[k]) < MOST_SCALE)
-            if key in sure or (seen and 0.5 * (s[k] / sigma[k]) ** 2 > LEAST_GAIN):
-                found.append(Finding(column.name, key, 0.0, 0.0, float(s[k]), float(sigma[k]), column.unit))
-            elif abs(alone[k][0]) > level * alone[k][1] and 0.5 * (alone[k][0] / alone[k][1]) ** 2 > LEAST_GAIN:
+            if key in sure or (_shows(s[k], sigma[k], level) and (column.unit or abs(s[k]) < MOST_SCALE)):
+                chosen.append(k)
+            elif _shows(*alone[k], level):
                 alike[key] = f"the log does not tell it from other systematic errors (alone {alone[k][0]:+.3g})"
+        beside = [k for k, c in enumerate(columns) if keys[k] not in paths and c.unit and c.name != MOUNT]
+        s, sigma, _ = _together(linear, [columns[k] for k in chosen + beside]) if chosen else (s, sigma, alone)
+        found = [
+            Finding(columns[k].name, keys[k], 0.0, 0.0, float(s[n]), float(sigma[n]), columns[k].unit)
+            for n, k in enumerate(chosen)
+        ]
         return found, alike
 
     # ------------------------------------------------------------------ the whole
@@ -525,7 +533,7 @@ def _mounts(linear: Linear, given: Given) -> Iterator[Column]:
             )
             parts = [np.zeros(other.R.shape[:2]) for other in linear.problem.factors]
             parts[f] += (z - moved) / MOVED_M
-            yield Column("mount", (robot, sensor, "xyz"[axis]), "m", linear.whitened(parts), none)
+            yield Column(MOUNT, (robot, sensor, "xyz"[axis]), "m", linear.whitened(parts), none)
 
 
 def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list[tuple[float, float]]]:
@@ -536,13 +544,20 @@ def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list
     Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
     have, left = linear.residuals, linear.left(Z, W)
     g, I = Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m
+    prior = [KNOWN_TO.get(column.unit, np.inf) if column.name != "range_offset" else np.inf for column in columns]
+    I = I + np.diag(np.array(prior) ** -2.0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(I), 1e-300))
-    C = scale[:, None] * np.linalg.pinv(I * np.outer(scale, scale), rcond=1e-9, hermitian=True) * scale
+    C = scale[:, None] * np.linalg.pinv(I * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
     s = C @ g
     P = causes.stretches(linear, left, s)
     sigma = np.sqrt(np.maximum(np.diag(C), np.diag(C @ P @ P.T @ C)))
     alone = {(f.name, *f.of): (f.value, f.sigma) for f in causes.systematic(linear, columns)}
     return s, sigma, [alone.get((c.name, *c.of), (0.0, math.inf)) for c in columns]
+
+
+def _shows(s: float, sigma: float, level: float) -> bool:
+    """Return whether a systematic error is other than zero."""
+    return abs(s) > level * sigma and 0.5 * (s / sigma) ** 2 > LEAST_GAIN
 
 
 def _calibrated(path: Path_, value: float, s: float) -> float:
