@@ -279,7 +279,9 @@ def tuning() -> Iterator[Figure]:
     command, shown = "python benchmarks/tuning.py", "{2} / {5} / {9}, {10} m, {11} m to {13}, {14} m, {15} m"
     for log, start in (("Lost in the Woods", "lost_in_the_woods"), ("MRCLAM 6, robot 3", "mrclam_3")):
         for aim, wanted in (("innovations", ".9 to 1.1 after"), ("map", "")):
-            name = f"{log}, aim {aim}: NIS of the second half before / after / pose NEES, path, landmarks before and after"
+            name = (
+                f"{log}, aim {aim}: NIS of the second half before / after / pose NEES, path, landmarks before and after"
+            )
             yield Figure("Tuning by the first half", name, wanted, command, row(f"{start} {aim}:", shown))
 
 
