@@ -87,7 +87,9 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     """
     log = log_of(run)
     log = log if isinstance(log, Log) else Log(run.log.name, run.log.robots, list(log))
-    summary = run.summary or run.evaluate()
+    if not run.summary:
+        run.evaluate()
+    summary = run.summary
     mistake = gross(run, log)
     if mistake is not None:
         cause = Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
