@@ -24,7 +24,16 @@ from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.models import landmarks, seen, sensors
 from kalmark.models.landmarks3d import chained
-from kalmark.models.protocols import Completing, FullSensor, Landmark, Motion, Parametrized, Sensor, finds_depth
+from kalmark.models.protocols import (
+    Completing,
+    FullSensor,
+    HasVelocity,
+    Landmark,
+    Motion,
+    Parametrized,
+    Sensor,
+    finds_depth,
+)
 from kalmark.models.seen import EXPECT, LOOK, residual
 
 View = tuple[int, int, int, int, Array, Array, Flags]
@@ -40,6 +49,10 @@ MOUNT = 4  # where a view has the mount
 # of the state r (size,), the control u (m,), parameters and seconds: the new r, R_r (dof, dof), R_u (dof, m)
 MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")
 call_move = by_address(MOVE)
+
+# of the state r (size,) and parameters: the velocity in the robot's frame b (3 or 6,) and B_r (3 or 6, dof)
+VELOCITY = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], f8[::1])")
+call_velocity = by_address(VELOCITY)
 
 NOTHING = np.zeros(0)
 
@@ -273,6 +286,16 @@ class Compiled:
         return type(self).moves(r, u, self.parameters, dt_s)
 
 
+class CompiledVelocity(Compiled):
+    """A compiled motion of which the state tells how fast the robot moves: a `HasVelocity`."""
+
+    velocity: ClassVar[Any]
+
+    def body_velocity(self, r: Array) -> tuple[Array, Array]:
+        """Return the velocity of a state r (size,) in the robot's frame (3 or 6,), and its Jacobian (3 or 6, dof)."""
+        return type(self).velocity(r, self.parameters)
+
+
 def step_of(motion: Motion) -> Any:
     """Return the argument of `step`: address and parameters of a built-in motion, else the motion."""
     if type(motion) in built_in("motion") and isinstance(motion, Compiled):
@@ -289,4 +312,23 @@ def step(model: Any, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Arr
 def _compiled_step(model: Any, r: Any, u: Any, dt_s: Any) -> Any:
     if isinstance(model, types.BaseTuple):
         return lambda model, r, u, dt_s: call_move(model[0], (r, u, model[1], dt_s))
+    return None
+
+
+def velocity_of(motion: HasVelocity) -> Any:
+    """Return the argument of `body_velocity`: address and parameters of a built-in motion, else the motion."""
+    if type(motion) in built_in("motion") and isinstance(motion, CompiledVelocity):
+        return address_of(type(motion).velocity, VELOCITY), motion.parameters
+    return motion
+
+
+def body_velocity(model: Any, r: Array) -> tuple[Array, Array]:
+    """Return the velocity of a state r (size,) in the robot's frame (3 or 6,), and its Jacobian (3 or 6, dof)."""
+    return call_velocity(model[0], (r, model[1])) if isinstance(model, tuple) else model.body_velocity(r)
+
+
+@overload(body_velocity, strict=False)  # type: ignore[untyped-decorator]  # strict: the annotations differ
+def _compiled_velocity(model: Any, r: Any) -> Any:
+    if isinstance(model, types.BaseTuple):
+        return lambda model, r: call_velocity(model[0], (r, model[1]))
     return None

@@ -161,6 +161,17 @@ class SelfCalibrating(Protocol):
 
 
 @runtime_checkable
+class HasVelocity(Protocol):
+    """A motion of which the state tells how fast the robot moves."""
+
+    def body_velocity(self, r: Array) -> tuple[Array, Array]:
+        """Return the velocity of a state r (size,) in the robot's frame, and its Jacobian (3 or 6, dof).
+
+        In the plane (vx, vy, w), in space (v (3), w (3)), m/s and rad/s; NaN where the state does not tell.
+        """
+
+
+@runtime_checkable
 class _InnovationSize(Protocol):
     cov_size: int
 
@@ -389,7 +400,7 @@ def place_of(landmark: Landmark, l: Array) -> tuple[Array, Array] | None:
 
 # ------------------------------------------------------------------ spelling
 _OF: dict[type, tuple[type, ...]] = {
-    Motion: (Motion, _OfWorld, _Coasts, SelfCalibrating),
+    Motion: (Motion, _OfWorld, _Coasts, SelfCalibrating, HasVelocity),
     Sensor: (
         FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
         _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,
