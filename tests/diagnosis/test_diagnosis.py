@@ -18,8 +18,10 @@ from kalmark.batch.solver import optimum
 from kalmark.cli.app import main
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.breakdown import breakdown, nees_parts
+from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.gross import elsewhere, fit
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.verdict import Verdict
+from kalmark.diagnosis.verdict import Verdict, causes_of
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log
 from kalmark.results.batch import given_by
@@ -127,6 +129,47 @@ def test_a_robot_that_was_carried_away_is_noticed_at_that_time() -> None:
     assert verdict.causes[0].name == "kidnapped"
     assert (verdict.sigma_factor or 0.0) > 2
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=5.0)
+
+
+def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidnapped() -> None:
+    log, config = simulate(world_of(), 3), world_of().config()
+    ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
+    a, b = sorted({*ids}, key=lambda i: (-ids.count(i), i))[:2]
+    begin = log.events[len(log.events) // 2].t_ns
+
+    def swapped(e: Event) -> Event:
+        if not isinstance(e, Scan) or e.ids is None or e.t_ns < begin:
+            return e
+        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=[{a: b, b: a}.get(i, i) for i in e.ids])
+
+    log = replace(log, events=[*map(swapped, log.events)])
+    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+    verdict = km.diagnose(run)
+    assert (verdict.map, verdict.causes[0].name) == ("wrong", "wrong_ids")
+    assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=2.0)
+    assert f"what is called {a} is where {b} was" in verdict.causes[0].evidence
+    # its score is half of the chi-square of what was filtered again, which is at most that of the whole run
+    assert 100 < verdict.causes[0].score < 0.5 * fit(run).chi2
+
+
+def test_places_that_are_exchanged_are_found_under_a_shift_and_a_turn() -> None:
+    rng = np.random.default_rng(0)
+    before = dict(enumerate(rng.uniform(0, 20, (12, 2))))
+    c, s = np.cos(2.0), np.sin(2.0)
+    after = {k: np.array([[c, -s], [s, c]]) @ p + [3.0, -7.0] + rng.normal(size=2) * 0.02 for k, p in before.items()}
+    assert elsewhere(before, after) == {}
+    assert elsewhere(before, after | {2: after[5], 5: after[2]}) == {2: 5, 5: 2}
+    assert elsewhere(before, after | {2: after[2] + 2.0}) == {}
+
+
+def test_a_landmark_that_moves_by_less_than_the_map_is_good_to_is_no_cause() -> None:
+    run = run_of()
+    search = km.diagnose(run).search
+    assert search is not None
+    search.found = [Finding("moving_landmark", ("7",), 50.0, 1e-9, 0.001, 0.0001, "m/s", moved_m=0.04)]
+    assert causes_of(run, search, accuracy_m=0.05) == []
+    (cause,) = causes_of(run, search, accuracy_m=0.03)
+    assert "0.04 m while it was seen" in cause.evidence
 
 
 def test_what_is_left_of_data_is_their_projection_in_textbook_form() -> None:

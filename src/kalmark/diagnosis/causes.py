@@ -47,7 +47,8 @@ class Finding:
     That is robot, sensor and column, or robot, column and kind of error of its controls, or a landmark, or a robot.
     `value` and `sigma` are its size in `unit`.  `cure` is what takes it out of the data: the systematic error itself as
     (Z, W), factors of the noise (N,) and of the motion's errors (r,).  `since_s` is when it begins, after the first
-    scan, None for all the time.  `alike` are causes that explain the same.
+    scan, None for all the time.  `alike` are causes that explain the same.  `moved_m` is by how much a place in the map
+    is wrong for it while it was seen.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Finding:
     rows: Flags | None = None
     since_s: float | None = None
     alike: tuple[Finding, ...] = ()
+    moved_m: float | None = None
 
 
 class Column(NamedTuple):
@@ -332,7 +334,9 @@ def landmarks(linear: Linear, t_s: Array) -> list[Finding]:
         noise = np.where(rows.landmark == l, OUT, 1.0)
         since_s = float(t_s[rows.node[mine]].min())
         name, gain = str(linear.problem.ids[l]), 0.5 * float(g @ v)
-        found.append(Finding("moving_landmark", (name,), gain, p, speed, sigma, "m/s", noise=noise, since_s=since_s))
+        moved_m = speed * float(np.ptp(t_s[rows.node[mine]]))
+        found.append(Finding("moving_landmark", (name,), gain, p, speed, sigma, "m/s", noise=noise, since_s=since_s,
+                             moved_m=moved_m))  # fmt: skip
     return found
 
 

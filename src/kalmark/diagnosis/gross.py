@@ -6,20 +6,23 @@ A mistake is named where the log fits the filter as it should once the mistake i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
+from kalmark.diagnosis.words import UNKNOWN_IDS
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log
+from kalmark.results.measures import rigid, rigid_robust
 from kalmark.results.record import record
 from kalmark.results.run import Run
 
@@ -31,6 +34,9 @@ MOST = 25.0  # that one observation counts, and what counts one that was left ou
 TURNS_DEG = (180, 90, -90)
 HEADINGS_DEG = tuple(range(30, 360, 30))
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
+IN_A_ROW = 8  # sightings of a landmark that do not fit: its id may mean another one from there on
+SAME = 0.25  # of the distance to the next landmark, within which two places are one
+COMMON = 4  # landmarks, of which most are where they were
 
 Change = Callable[[Event], Event]
 
@@ -38,7 +44,8 @@ Change = Callable[[Event], Event]
 class Mistake(NamedTuple):
     """What may have been done wrongly: its name, what it is, its cure, and the configuration and log without it.
 
-    `gain` is by how much the log fits better without it, and `since_s` since when it counts, in s of the log.
+    `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
+    `since_s` since when it counts, in s of the log.
     """
 
     name: str
@@ -50,54 +57,146 @@ class Mistake(NamedTuple):
     since_s: float = 0.0
 
 
-def misfits(run: Run) -> Array:
-    """Return d2 per degree of freedom of each observation (O,), at most `MOST`; `MOST` if it fits nothing."""
+class Fit(NamedTuple):
+    """How observations (O,) fit: d2 per degree of freedom, at most `MOST`, and the degrees of freedom of each."""
+
+    values: Array
+    dof: Array
+
+    @property
+    def mean(self) -> float:
+        """Its mean over the observations; that of a log that the filter refuses, or that has none, is infinite."""
+        return float(self.values.mean()) if len(self.values) else math.inf
+
+    @property
+    def chi2(self) -> float:
+        """The sum of the d2."""
+        return float(self.values @ self.dof)
+
+    def of(self, rows: slice) -> Fit:
+        """Return that of some observations."""
+        return Fit(self.values[rows], self.dof[rows])
+
+
+REFUSED = Fit(np.zeros(0), np.zeros(0))
+
+
+def fit(run: Run) -> Fit:
+    """Return how the observations of a run fit: what fits nothing counts `MOST`."""
     history = run.history
     dof = np.maximum(np.isfinite(history.z).sum(axis=1), 1)
     d2 = np.minimum(np.nan_to_num(history.d2, nan=0.0) / dof, MOST)
-    return np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2)
+    return Fit(np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2), dof)
 
 
-def misfit(run: Run) -> float:
-    """Return the mean of `misfits`; that of a log that the filter refuses, or that has none, is infinite."""
-    return math.inf if run.stopped or not len(run.history.d2) else float(misfits(run).mean())
+def explained(before: Fit, after: Fit) -> float:
+    """Return half of the chi-square that is less after than before; what a filter refused fitted nothing."""
+    refused = MOST * float(after.dof.sum())
+    return 0.5 * ((before.chi2 if len(before.values) else refused) - after.chi2)
 
 
 def gross(run: Run, log: Log) -> Mistake | None:
     """Return the mistake that explains why a run does not fit, None if it does fit or if none explains it."""
-    if misfit(run) < MISFIT or not run.config.get("robots"):
+    if not run.config.get("robots"):
         return None
+    now = fit(run)
+    if now.mean < MISFIT and not run.stopped:
+        return exchanged(run, log, now)
     events = beginning(log)
-    as_it_is = misfit_of(run.config, log, events)
+    as_it_is = fit_of(run.config, log, events)
     found = []
-    for mistake in mistakes(run.config, log) if as_it_is >= MISFIT else ():
-        after = misfit_of(mistake.config, log, [*map(mistake.change, events)] if mistake.change else events)
-        if after < FITS and MUCH * after < as_it_is:
-            gain = (min(as_it_is, MOST) - after) * sum(len(e.y) for e in events if isinstance(e, Scan))
-            found.append(mistake._replace(gain=gain, since_s=events[0].t_s))
-    return max(found, key=lambda f: f.gain, default=None) or kidnapped(run, log)
+    for mistake in mistakes(run.config, log) if as_it_is.mean >= MISFIT else ():
+        after = fit_of(mistake.config, log, [*map(mistake.change, events)] if mistake.change else events)
+        if after.mean < FITS and MUCH * after.mean < as_it_is.mean:
+            found.append(mistake._replace(gain=explained(as_it_is, after), since_s=events[0].t_s))
+    return max(found, key=lambda f: f.gain, default=None) or exchanged(run, log, now) or kidnapped(run, log, now)
 
 
-def kidnapped(run: Run, log: Log) -> Mistake | None:
+def kidnapped(run: Run, log: Log, now: Fit) -> Mistake | None:
     """Return that the robot was moved, if the run fits before some time, does not after it, and a new one would."""
-    values, history = misfits(run), run.history
+    values = now.values
     if len(values) < 4 * WINDOW:
         return None
     bad = np.convolve(values, np.full(WINDOW, 1.0 / WINDOW), mode="valid") > MUCH * FITS
     first = int(np.argmax(bad)) + WINDOW if bad.any() else 0
     if not WINDOW < first < len(values) - WINDOW or values[: first - WINDOW].mean() > FITS:
         return None
-    step = int(history.step[first])
-    t_ns, robot = int(history.t_ns[step]), str(history.robot[step])
-    rest = [e for e in log.events if e.t_ns >= t_ns]
-    after, before = misfit_of(run.config, log, beginning(rest)), float(values[first:].mean())
-    if after > FITS or MUCH * after > before:
+    t_ns, robot, rest = _from(run, log, first)
+    after, before = fit_of(run.config, log, rest), now.of(slice(first, None))
+    if after.mean > FITS or MUCH * after.mean > before.mean:
         return None
     evidence = (
         f"{robot} was elsewhere from t={t_ns * 1e-9:.1f} s on: the log before and after it fits, but not together"
     )
-    gain = (before - after) * (len(values) - first)
+    gain = explained(before.of(slice(len(after.values))), after)
     return Mistake("kidnapped", evidence, "", run.config, None, gain, t_ns * 1e-9)
+
+
+def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
+    """Return that ids mean other landmarks from some time on: those whose sightings do not fit any more.
+
+    The log is filtered anew from there.  Most landmarks are where they were, after a rigid alignment, but some where
+    another one was.
+    """
+    first = _misfit_in_a_row(run, now)
+    if first is None:
+        return None
+    t_ns, _, rest = _from(run, log, first)
+    after = _filtered(run.config, log, rest)
+    if after is None or fit(after).mean > FITS:
+        return None
+    old = run.history.map_at(int(run.history.step[first]) - 1)
+    new = after.landmarks
+    others = elsewhere(_places(old.ids, old.means[:, : run.history.d]), _places(new.ids, new.positions()[0]))
+    if not others:
+        return None
+    ids = "; ".join(f"what is called {a} is where {b} was" for a, b in others.items())
+    gain = explained(now.of(slice(first, first + len(after.history.d2))), fit(after))
+    evidence = f"ids mean other landmarks from t={t_ns * 1e-9:.1f} s on: {ids}"
+    return Mistake("wrong_ids", evidence, UNKNOWN_IDS, run.config, None, gain, t_ns * 1e-9)
+
+
+def _misfit_in_a_row(run: Run, now: Fit) -> int | None:
+    """Return the first observation of those of an id that misfit in a row, None if there are none."""
+    starts, landmark = [], np.where(run.history.id != "", run.history.landmark, "")
+    for name in np.unique(landmark[landmark != ""]):
+        mine = np.flatnonzero(landmark == name)
+        if len(mine) < 2 * IN_A_ROW:
+            continue
+        bad = np.convolve(now.values[mine] > MUCH * FITS, np.ones(IN_A_ROW), mode="valid") > IN_A_ROW - 0.5
+        if bad.any():
+            starts.append(mine[int(np.argmax(bad)) + 1])  # the first of them may be one that is off by chance
+    return int(min(starts)) if starts else None
+
+
+def elsewhere(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> dict[Any, Any]:
+    """Return the landmarks that are now where another one was, and which: after the alignment of most of all."""
+    common = [name for name in after if name in before]
+    if len(common) < COMMON:
+        return {}
+    old, new = (np.array([places[name] for name in common]) for places in (before, after))
+    every = np.array([*before.values()])
+    near = SAME * float(np.median(cKDTree(every).query(every, k=2)[0][:, 1]))
+    onto = rigid_robust(new, old, near)
+    still = np.linalg.norm(onto(new) - old, axis=1) < near
+    if 2 * still.sum() <= len(common):
+        return {}
+    onto, names = rigid(new[still], old[still]), list(before)
+    away, which = cKDTree(every).query(onto(new))
+    moved = ~still & (away < near)
+    return {name: names[k] for name, k, other in zip(common, which, moved, strict=True) if other and names[k] != name}
+
+
+def _places(ids: Sequence[Any], means: Array) -> dict[Any, Array]:
+    """Return the positions of landmarks by their ids."""
+    return {id_: mean for id_, mean in zip(ids, means, strict=True) if np.isfinite(mean).all()}
+
+
+def _from(run: Run, log: Log, row: int) -> tuple[int, str, list[Event]]:
+    """Return the time and robot of an observation, and the events of the log from there."""
+    step = int(run.history.step[row])
+    t_ns = int(run.history.t_ns[step])
+    return t_ns, str(run.history.robot[step]), beginning([e for e in log.events if e.t_ns >= t_ns])
 
 
 def beginning(events: Log | list[Event]) -> list[Event]:
@@ -111,14 +210,21 @@ def beginning(events: Log | list[Event]) -> list[Event]:
     return list(events)
 
 
-def misfit_of(config: Mapping[str, Any], log: Log, events: list[Event]) -> float:
-    """Return the misfit of events under a configuration, infinite if they are refused."""
+def fit_of(config: Mapping[str, Any], log: Log, events: list[Event]) -> Fit:
+    """Return how events fit under a configuration."""
+    run = _filtered(config, log, events)
+    return REFUSED if run is None else fit(run)
+
+
+def _filtered(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
+    """Return the run of events under a configuration, None if they are refused."""
     try:
         made = config_of(Tree(deepcopy(dict(config))), None)
         part = replace(log, events=events)
-        return misfit(record(build_slam(made, part), part, progress=False, on_error="skip"))
+        run = record(build_slam(made, part), part, progress=False, on_error="skip")
     except (KalmarkError, np.linalg.LinAlgError):
-        return math.inf
+        return None
+    return None if run.stopped else run
 
 
 # ------------------------------------------------------------------ what may have been done wrongly

@@ -16,7 +16,10 @@ from kalmark.diagnosis.linear import Linear
 from kalmark.results.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
-ROUNDS = 6
+ROUNDS, MORE = 6, 14  # in which all that is sure is taken out, and further ones for what explains this
+SHARE = (
+    0.01  # of all that was explained: a log with many causes comes back to some of them, and more rounds are used up
+)
 LEAST_GAIN = 8.0
 TAKEN_UP, ALIKE = 0.5, 0.85
 ORDER = ("steering_offset", "odometry_scale", "odometry_turn", "odometry_offset")
@@ -65,9 +68,11 @@ class Search:
 
     def run(self, progress: bool = False) -> list[Finding]:
         """Return all causes, the one that explains most first."""
-        for _ in track(range(ROUNDS), "causes, one after the other", ROUNDS, show=progress):
+        rounds = ROUNDS + MORE
+        for n in track(range(rounds), "causes, one after the other", rounds, show=progress):
             candidates = self.candidates()
-            sure = [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > LEAST_GAIN]
+            least = max(LEAST_GAIN, SHARE * sum(f.gain for f in self.found) if n >= ROUNDS else 0.0)
+            sure = [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > least]
             if not sure:
                 break
             first, *alike = best(sure)

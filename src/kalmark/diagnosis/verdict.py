@@ -112,7 +112,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         why = str(error).removeprefix("batch solution: ")
         checked = f"innovations alone, no batch solution: {why}"
         return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
-    effect, causes = effect_of(run, found), causes_of(run, found.search)
+    effect = effect_of(run, found)
+    causes = causes_of(run, found.search, effect.accuracy_m or 0.0)
     causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
     causes = sorted([*first, *causes], key=lambda c: c.harmless)
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
@@ -198,9 +199,9 @@ def thinned(run: Run, given: Given, most: int) -> Given:
 
 
 # ------------------------------------------------------------------ the causes
-def causes_of(run: Run, search: Search) -> list[Cause]:
-    """Return the causes that a search found."""
-    return [_cause(run, finding) for finding in search.found]
+def causes_of(run: Run, search: Search, accuracy_m: float = 0.0) -> list[Cause]:
+    """Return the causes that a search found; a landmark that moves by less than the map's accuracy does not matter."""
+    return [_cause(run, f) for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
 
 
 def _cause(run: Run, finding: Finding) -> Cause:

@@ -11,6 +11,7 @@ from kalmark.results.words import figure
 
 Words = tuple[str, str]  # evidence, cure
 MOST_SIGMAS = 1e4
+UNKNOWN_IDS = "--set log.ids=hidden --set association.type=auto"
 CALIBRATIONS = {  # the keys that put an error of a column of the controls into the map, by its kind
     ("v_mps", "offset"): "sigma_v_bias_mps",
     ("w_radps", "offset"): "sigma_w_bias_radps",
@@ -147,7 +148,9 @@ def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 
 def _moving(finding: Finding, config: Mapping[str, Any]) -> Words:
-    return f"landmark {finding.of[0]} moves at {_value(finding)} ({_sure(finding)})", f"leave out {finding.of[0]}"
+    far = f", {figure(finding.moved_m)} m while it was seen" if finding.moved_m is not None else ""
+    evidence = f"landmark {finding.of[0]} moves at {_value(finding)} ({_sure(finding)}){far}: its place is wrong"
+    return evidence, f"leave out {finding.of[0]}"
 
 
 def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -156,7 +159,7 @@ def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
     evidence = f"{finding.value:.1%} of the observations are far off where their landmark is, and fit another one"
-    return evidence, "--set log.ids=hidden --set association.type=auto"
+    return evidence, UNKNOWN_IDS
 
 
 def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
