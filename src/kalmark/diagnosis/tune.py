@@ -9,8 +9,7 @@ the rest likelier, is left as it was.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from copy import deepcopy
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,23 +18,22 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.data import Given, replayed
-from kalmark.batch.problem import sightings
+from kalmark.batch.data import replayed
 from kalmark.batch.solver import optimum
 from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.config import build_slam, config_dict, open_run
-from kalmark.config.opening import EACH
 from kalmark.config.reading import config_of, resolve_config
 from kalmark.config.tree import Tree, read_tree
 from kalmark.diagnosis import causes
-from kalmark.diagnosis.causes import MOST_SCALE, Column, Finding
+from kalmark.diagnosis.calibrations import ALPHA, calibrations
+from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.components import Components, Estimate, Noise
+from kalmark.diagnosis.keys import Keys, Path_, Values
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.search import LEAST_GAIN
 from kalmark.diagnosis.verdict import NEAR, calibrated, sensors_of
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
-from kalmark.models.observe import view_of
 from kalmark.results.batch import given_by
 from kalmark.results.measures import nis
 from kalmark.results.progress import track
@@ -44,18 +42,10 @@ from kalmark.results.run import Run
 from kalmark.results.warnings import Window, nis_windows
 
 ROUNDS, SAME = 6, 0.03  # of filter and estimates, until no value changes by more
-ALPHA = 0.01  # of right configurations of which anything is changed
 WIDER = (1e-4, 1e-5, 1e-7, 1e-9, 1e-12, 1e-15)  # shares of right observations that a gate may leave out
-KNOWN_TO = {"": MOST_SCALE, "m": 0.1}  # scales and places of mounts beforehand: what is more is no error
-MOUNT = "mount"  # the systematic error that is its place
-MOVED_M = 1e-5  # of a mount, for its derivative
 LEAST_SCANS = 30  # in each part
 INNOVATIONS, MAP = AIMS = ("innovations", "map")
-CALIBRATIONS = {"range_scale": ("scale",), "range_offset": ("bias_m",), "bearing_offset": ("mount", "theta_rad")}
 GATE = ("association", "gate")
-
-Path_ = tuple[str, ...]
-Values = dict[Path_, Any]
 
 
 class Change(NamedTuple):
@@ -164,7 +154,7 @@ class _Task:
     def __init__(
         self, config: dict[str, Any], log: Log, share: float, keep: set[str], written: Mapping[str, Any], progress: bool
     ) -> None:
-        self.config, self.log, self.keep, self.written, self.progress = config, log, keep, written, progress
+        self.keys, self.log, self.progress = Keys(config, written, keep), log, progress
         times = [event.t_ns for event in log.events] or [0]
         self.split_ns = times[0] + int(share * (times[-1] - times[0]))
         self.first = replace(log, events=[event for event in log.events if event.t_ns <= self.split_ns])
@@ -172,27 +162,8 @@ class _Task:
     # ------------------------------------------------------------------ runs
     def run(self, values: Values, log: Log) -> Run:
         """Return the run with other values of some keys."""
-        content = deepcopy(self.config)
-        for path, value in values.items():
-            node = content
-            for owner in self._owners(path):
-                node = content
-                for key in owner[:-1]:
-                    node = node.setdefault(key, {})
-                node[owner[-1]] = value
-        made = config_of(Tree(content), None)
+        made = config_of(Tree(self.keys.changed(values)), None)
         return record(build_slam(made, log), log, progress=False, config=config_dict(made))
-
-    def _owners(self, path: Path_) -> list[Path_]:
-        """Return the paths in the configuration in force of a key in the file."""
-        robots = self.config["robots"]
-        if path[0] != "robots" or path[1] in robots:
-            return [path]
-        return [("robots", name, *path[2:]) for name in robots if self.section(name) == path[1]]
-
-    def section(self, name: str) -> str:
-        """Return the name of the section of the file that a robot, or section, of the configuration in force is in."""
-        return EACH if name not in self.written and EACH in self.written else name
 
     def judged(self, values: Values) -> _Judged:
         """Return the whole log filtered with some values."""
@@ -232,65 +203,9 @@ class _Task:
     @property
     def gate(self) -> float | None:
         """The gate of the configuration, if it has one that may be opened: with known ids."""
-        association = self.config.get("association") or {}
+        association = self.keys.config.get("association") or {}
         value = association.get("gate")
         return value if association.get("type") == "identity" and isinstance(value, float) else None
-
-    # ------------------------------------------------------------------ keys
-    def noises(self, run: Run) -> list[Noise]:
-        """Return the noises of the configuration that may be estimated."""
-        found: dict[Path_, Noise] = {}
-        for path, names, value in self._keys(run):
-            if not path[-1].startswith("sigma_") or "_bias_" in path[-1] or path[-1] == "sigma_scale":
-                continue
-            scale = value or self._begin(run, path)
-            if scale > 0 and ".".join(path) not in self.keep:
-                robots = (*(found[path].robots if path in found else ()), *names)
-                found[path] = Noise(path, robots, float(value), scale)
-        return [*found.values()]
-
-    def _keys(self, run: Run) -> Iterator[tuple[Path_, tuple[str, ...], float]]:
-        """Yield the numbers of the models: path in the file, robots, value."""
-        robots: Mapping[str, Any] = self.config["robots"]
-        for name, robot in robots.items():
-            names = tuple(n for n in run.final_slam().robots if n == name or (name == EACH and n not in robots))
-            here = ("robots", self.section(name))
-            parts: list[tuple[Path_, Any]] = [((*here, "motion"), robot["motion"])]
-            parts += [((*here, "sensors", s), section) for s, section in robot["sensors"].items()]
-            for path, section in parts if names else ():
-                for key, value in section.items():
-                    if isinstance(value, float | int) and not isinstance(value, bool):
-                        yield (*path, key), names, value
-
-    def _begin(self, run: Run, path: Path_) -> float:
-        """Return the value that a noise which is not stated is looked for from: that of a range may grow with it."""
-        if path[-1] != "sigma_range_rel":
-            return 0.0
-        h = run.history
-        mine = (h.sensor == path[3]) & np.isfinite(h.y[:, 0])
-        sigma = run.section(str(h.robot[h.step[mine][0]]), path[3]).get("sigma_range_m", 0.0) if mine.any() else 0.0
-        return float(sigma / max(np.median(h.y[mine, 0]), 1e-3)) if mine.any() else 0.0
-
-    def calibration(self, run: Run, column: Column) -> Path_ | None:
-        """Return the path of the key of a systematic error, None if it has none, or is in the map."""
-        if column.name not in CALIBRATIONS:
-            return None
-        robot, sensor, _ = column.of
-        path: Path_ = ("robots", self.section(robot if robot in self.config["robots"] else EACH), "sensors", sensor)
-        section = run.section(robot, sensor)
-        mount = section.get("mount") or {}
-        in_map = any(section.get(key) for key in ("sigma_scale", "sigma_bias_m"))
-        in_map |= any(value for key, value in mount.items() if key.startswith("sigma_"))
-        path = (*path, *CALIBRATIONS[column.name])
-        known = CALIBRATIONS[column.name][0] in section
-        return path if known and not in_map and ".".join(path) not in self.keep else None
-
-    def stated(self, path: Path_) -> Any:
-        """Return the value of a key as it is in force."""
-        node: Any = self.config
-        for key in self._owners(path)[0]:
-            node = node.get(key) if isinstance(node, Mapping) else None
-        return node
 
     # ------------------------------------------------------------------ estimates
     def fit(self, run: Run, values: Values, sure: set[Path_]) -> _Fit:
@@ -300,55 +215,18 @@ class _Task:
         if not problem.factors:
             raise KalmarkError("tune: no observation of the first part was of a landmark in the map")
         linear = Linear.of(problem, optimum(problem, tolerance=NEAR).state)
-        found, alike = self._calibrations(run, linear, given, sure)
+        found, alike = calibrations(run, linear, given, self.keys, sure)
         for finding in found:
             path, value = finding.of, finding.value
-            values[path] = _calibrated(path, self.stated(path) if path not in values else values[path], value)
+            values[path] = _calibrated(path, self.keys.stated(path) if path not in values else values[path], value)
         again = self.run(values, self.first) if found else run
         if found:
             given = calibrated(again, given_by(again))
             problem = replayed(given, self.first)
             linear = Linear.of(problem, optimum(problem, tolerance=NEAR).state)
-        components = Components(given, self.first, linear.state, self.noises(run))
+        components = Components(given, self.first, linear.state, self.keys.noises(run))
         now = {n: values.get(n.path, n.stated) for n in components.noises}
         return _Fit(components.fit(now), found, components, again, alike)
-
-    def _calibrations(
-        self, run: Run, linear: Linear, given: Given, sure: set[Path_]
-    ) -> tuple[list[Finding], dict[Path_, str]]:
-        """Return the calibrations that are off, and of those that the log cannot tell from another error, from which.
-
-        All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
-        Those that it determines are estimated again without scales and places of mounts, which are not linear.
-        """
-        columns = causes.columns_of(linear, sensors_of(run), causes.rates_of(linear, given.robot, given.t_ns))
-        columns += _mounts(linear, given)
-        paths = [self.calibration(run, column) for column in columns]
-        joined: dict[Any, Column] = {}
-        for column, path in zip(columns, paths, strict=True):
-            key = path or (column.name, *column.of)
-            old = joined.get(key)
-            joined[key] = column if old is None else column._replace(Z=old.Z + column.Z, W=old.W + column.W)
-        keys, columns = [*joined], [*joined.values()]
-        if not columns:
-            return [], {}
-        s, sigma, alone = _together(linear, columns)
-        level = float(norm.isf(ALPHA / 2 / max(sum(path is not None for path in {*paths}), 1)))
-        chosen, alike = [], {}
-        for k, (key, column) in enumerate(zip(keys, columns, strict=True)):
-            if key not in paths:
-                continue
-            if key in sure or (_shows(s[k], sigma[k], level) and (column.unit or abs(s[k]) < MOST_SCALE)):
-                chosen.append(k)
-            elif _shows(*alone[k], level):
-                alike[key] = f"the log does not tell it from other systematic errors (alone {alone[k][0]:+.3g})"
-        beside = [k for k, c in enumerate(columns) if keys[k] not in paths and c.unit and c.name != MOUNT]
-        s, sigma, _ = _together(linear, [columns[k] for k in chosen + beside]) if chosen else (s, sigma, alone)
-        found = [
-            Finding(columns[k].name, keys[k], 0.0, 0.0, float(s[n]), float(sigma[n]), columns[k].unit)
-            for n, k in enumerate(chosen)
-        ]
-        return found, alike
 
     # ------------------------------------------------------------------ the whole
     def tuned(self, aim: str) -> Tuning:
@@ -385,9 +263,8 @@ class _Task:
             fit = self.fit(run, values, {*offsets})
             offsets |= {finding.of: finding.sigma for finding in fit.found}
             new = {noise.path: estimate.value for noise, estimate in fit.noises.items()}
-            moved = [
-                abs(math.log(max(v, 1e-12) / max(values.get(p, self.stated(p) or v), 1e-12))) for p, v in new.items()
-            ]
+            old = {path: values.get(path, self.keys.stated(path) or value) for path, value in new.items()}
+            moved = [abs(math.log(max(value, 1e-12) / max(old[path], 1e-12))) for path, value in new.items()]
             moved += [abs(f.value) / max(f.sigma, 1e-12) * SAME for f in fit.found]
             values |= new
             if max(moved, default=0.0) < SAME:
@@ -397,9 +274,9 @@ class _Task:
     def _opened(self, values: Values) -> Values:
         """Return the gate that is as wide as it was, in units of the measurements, if sigmas of sensors are smaller."""
         shrunk = [
-            v / self.stated(p)
+            v / self.keys.stated(p)
             for p, v in values.items()
-            if p[2] == "sensors" and p[-1].startswith("sigma_") and self.stated(p)
+            if p[2] == "sensors" and p[-1].startswith("sigma_") and self.keys.stated(p)
         ]
         if self.gate is None or min(shrunk, default=1.0) >= 1.0:
             return {}
@@ -440,10 +317,12 @@ class _Task:
                 why = "at most" if e.bound and e.value < noise.scale else "at least" if e.bound else ""
                 changes.append(Change(noise.path, noise.stated, _short(e.value), e.sigma, why))
         for path, sigma in offsets.items():
-            stated = self.stated(path)
+            stated = self.keys.stated(path)
             changes.append(Change(path, stated, _short(values[path]), sigma, ""))
         changes += [
-            Change(p, self.stated(p), self.stated(p), 0.0, why) for p, why in fit.alike.items() if p not in offsets
+            Change(p, self.keys.stated(p), self.keys.stated(p), 0.0, why)
+            for p, why in fit.alike.items()
+            if p not in offsets
         ]
         return changes
 
@@ -513,51 +392,6 @@ class _Task:
 def values_of(noises: Mapping[Noise, Estimate]) -> dict[Noise, float]:
     """Return the values of some estimates."""
     return {noise: estimate.value for noise, estimate in noises.items()}
-
-
-def _mounts(linear: Linear, given: Given) -> Iterator[Column]:
-    """Yield what a sensor that sits elsewhere adds to the data, by each coordinate of its place, in 1/m."""
-    none, d = np.zeros(len(linear.at.w)), linear.state.d
-    for f, factor in enumerate(linear.problem.factors):
-        robot, sensor = factor.sensor
-        mount = given.robots[robot].sensors[sensor] if sensor else None
-        if mount is None or (robot, sensor) in given.mounts or factor.term.blocks[-1].group != LANDMARKS:
-            continue
-        z, _ = factor.term.at(linear.state)
-        for axis in range(d):
-            at = np.array(mount.at, dtype=np.float64)
-            at[axis] += MOVED_M
-            view = view_of(mount.sensor, given.landmark, at)
-            moved, _ = sightings(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor).term.at(
-                linear.state
-            )
-            parts = [np.zeros(other.R.shape[:2]) for other in linear.problem.factors]
-            parts[f] += (z - moved) / MOVED_M
-            yield Column(MOUNT, (robot, sensor, "xyz"[axis]), "m", linear.whitened(parts), none)
-
-
-def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list[tuple[float, float]]]:
-    """Return the systematic errors s (K,), all estimated at once, and their sigmas (K,); and each as if alone.
-
-    The sigmas are by stretches of the run where these vary more than the noise says (`causes.systematic`).
-    """
-    Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
-    have, left = linear.residuals, linear.left(Z, W)
-    g, I = Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m
-    prior = [KNOWN_TO.get(column.unit, np.inf) if column.name != "range_offset" else np.inf for column in columns]
-    I = I + np.diag(np.array(prior) ** -2.0)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(I), 1e-300))
-    C = scale[:, None] * np.linalg.pinv(I * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
-    s = C @ g
-    P = causes.stretches(linear, left, s)
-    sigma = np.sqrt(np.maximum(np.diag(C), np.diag(C @ P @ P.T @ C)))
-    alone = {(f.name, *f.of): (f.value, f.sigma) for f in causes.systematic(linear, columns)}
-    return s, sigma, [alone.get((c.name, *c.of), (0.0, math.inf)) for c in columns]
-
-
-def _shows(s: float, sigma: float, level: float) -> bool:
-    """Return whether a systematic error is other than zero."""
-    return abs(s) > level * sigma and 0.5 * (s / sigma) ** 2 > LEAST_GAIN
 
 
 def _calibrated(path: Path_, value: float, s: float) -> float:

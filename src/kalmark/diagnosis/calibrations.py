@@ -1,0 +1,111 @@
+"""The calibrations of a configuration that a log shows to be off, each beside all that the log may have instead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from kalmark.arrays import Array
+from kalmark.batch.data import Given
+from kalmark.batch.problem import sightings
+from kalmark.batch.state import LANDMARKS
+from kalmark.diagnosis import causes
+from kalmark.diagnosis.causes import MOST_SCALE, Column, Finding
+from kalmark.diagnosis.keys import Keys, Path_
+from kalmark.diagnosis.linear import Linear
+from kalmark.diagnosis.search import LEAST_GAIN
+from kalmark.diagnosis.verdict import sensors_of
+from kalmark.models.observe import view_of
+from kalmark.results.run import Run
+
+ALPHA = 0.01  # of right configurations of which anything is changed
+KNOWN_TO = {"": MOST_SCALE, "m": 0.1}  # scales and places of mounts beforehand: what is more is no error
+MOUNT = "mount"  # the systematic error that is its place
+MOVED_M = 1e-5  # of a mount, for its derivative
+
+
+def calibrations(
+    run: Run, linear: Linear, given: Given, keys: Keys, sure: set[Path_]
+) -> tuple[list[Finding], dict[Path_, str]]:
+    """Return the calibrations that are off, and of those that the log cannot tell from another error, from which.
+
+    All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
+    Those that it determines are estimated again without scales and places of mounts, which are not linear.
+    """
+    columns = causes.columns_of(linear, sensors_of(run), causes.rates_of(linear, given.robot, given.t_ns))
+    columns += _mounts(linear, given)
+    paths = [keys.calibration(run, column) for column in columns]
+    joined: dict[Any, Column] = {}
+    for column, path in zip(columns, paths, strict=True):
+        key = path or (column.name, *column.of)
+        old = joined.get(key)
+        joined[key] = column if old is None else column._replace(Z=old.Z + column.Z, W=old.W + column.W)
+    names, columns = [*joined], [*joined.values()]
+    if not columns:
+        return [], {}
+    s, sigma, alone = _together(linear, columns)
+    level = float(norm.isf(ALPHA / 2 / max(sum(path is not None for path in {*paths}), 1)))
+    chosen, alike = [], {}
+    for k, (key, column) in enumerate(zip(names, columns, strict=True)):
+        if key not in paths:
+            continue
+        if key in sure or (_shows(s[k], sigma[k], level) and (column.unit or abs(s[k]) < MOST_SCALE)):
+            chosen.append(k)
+        elif _shows(*alone[k], level):
+            alike[key] = f"the log does not tell it from other systematic errors (alone {alone[k][0]:+.3g})"
+    beside = [k for k, c in enumerate(columns) if names[k] not in paths and c.unit and c.name != MOUNT]
+    s, sigma, _ = _together(linear, [columns[k] for k in chosen + beside]) if chosen else (s, sigma, alone)
+    found = [
+        Finding(columns[k].name, names[k], 0.0, 0.0, float(s[n]), float(sigma[n]), columns[k].unit)
+        for n, k in enumerate(chosen)
+    ]
+    return found, alike
+
+
+def _mounts(linear: Linear, given: Given) -> Iterator[Column]:
+    """Yield what a sensor that sits elsewhere adds to the data, by each coordinate of its place, in 1/m."""
+    none, d = np.zeros(len(linear.at.w)), linear.state.d
+    for f, factor in enumerate(linear.problem.factors):
+        robot, sensor = factor.sensor
+        mount = given.robots[robot].sensors[sensor] if sensor else None
+        if mount is None or (robot, sensor) in given.mounts or factor.term.blocks[-1].group != LANDMARKS:
+            continue
+        z, _ = factor.term.at(linear.state)
+        for axis in range(d):
+            at = np.array(mount.at, dtype=np.float64)
+            at[axis] += MOVED_M
+            view = view_of(mount.sensor, given.landmark, at)
+            moved, _ = sightings(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor).term.at(
+                linear.state
+            )
+            parts = [np.zeros(other.R.shape[:2]) for other in linear.problem.factors]
+            parts[f] += (z - moved) / MOVED_M
+            yield Column(MOUNT, (robot, sensor, "xyz"[axis]), "m", linear.whitened(parts), none)
+
+
+def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list[tuple[float, float]]]:
+    """Return the systematic errors s (K,), all estimated at once, and their sigmas (K,); and each as if alone.
+
+    The sigmas are by stretches of the run where these vary more than the noise says (`causes.systematic`).
+    """
+    Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
+    have, left = linear.residuals, linear.left(Z, W)
+    g, I = Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m
+    prior = [KNOWN_TO.get(column.unit, np.inf) if column.name != "range_offset" else np.inf for column in columns]
+    I = I + np.diag(np.array(prior) ** -2.0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(I), 1e-300))
+    C = scale[:, None] * np.linalg.pinv(I * np.outer(scale, scale), rcond=1e-12, hermitian=True) * scale
+    s = C @ g
+    P = causes.stretches(linear, left, s)
+    sigma = np.sqrt(np.maximum(np.diag(C), np.diag(C @ P @ P.T @ C)))
+    alone = {(f.name, *f.of): (f.value, f.sigma) for f in causes.systematic(linear, columns)}
+    return s, sigma, [alone.get((c.name, *c.of), (0.0, math.inf)) for c in columns]
+
+
+def _shows(s: float, sigma: float, level: float) -> bool:
+    """Return whether a systematic error is other than zero."""
+    return abs(s) > level * sigma and 0.5 * (s / sigma) ** 2 > LEAST_GAIN
