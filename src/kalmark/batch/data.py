@@ -6,9 +6,10 @@ docs/batch.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeGuard
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -30,21 +31,30 @@ if TYPE_CHECKING:
 
 Texts = npt.NDArray[np.str_]
 Known = Mapping[Id, tuple[Any, Any]]
-Seen = tuple[int, Id, Array, Array]  # node, landmark or node of a robot, y and R
 NONE = np.zeros(0, dtype=np.int64)
+
+
+class Seen(NamedTuple):
+    """An observation: its node, what it is of (a landmark, None, or the node of a robot), y, R, and its number."""
+
+    node: int
+    target: Id | None
+    y: Array
+    R: Array
+    row: int
 
 
 @dataclass(frozen=True, eq=False)
 class Associations:
     """The observations (O,) that count: number `index` of scan `scan` by `sensor`, of the landmark or robot `landmark`.
 
-    `e` (O, m) is what was expected of it, NaN for nothing.
+    One that is of None is read and not used.  `e` (O, m) is what was expected of it, NaN for nothing.
     """
 
     scan: Ints
     sensor: Texts
     index: Ints
-    landmark: list[Id]
+    landmark: Sequence[Id | None]
     e: Array
 
 
@@ -89,16 +99,10 @@ def replayed(given: Given, events: Iterable[Event]) -> Problem:
 
     Raises KalmarkError for what cannot be solved for, or if the events are not those of the associations.
     """
-    replay = _Replay(given)
-    for event in events:
-        replay.take(event)
-    if len(replay.nodes) < len(given.t_ns):
-        t_s = given.t_ns[len(replay.nodes)] * 1e-9
-        raise unsolved(f"the log has no scan at t={t_s:.9g} s, expected the log of the run")
-    return replay.problem()
+    return Replay.of(given, events).problem()
 
 
-class _Replay:
+class Replay:
     """Replays the events and gathers nodes, motions and sightings."""
 
     def __init__(self, given: Given) -> None:
@@ -113,6 +117,30 @@ class _Replay:
         self.rows: dict[int, list[int]] = {}
         for row, scan in enumerate(given.associations.scan.tolist()):
             self.rows.setdefault(scan, []).append(row)
+
+    @classmethod
+    def of(cls, given: Given, events: Iterable[Event]) -> Replay:
+        """Return the events replayed.  Raises KalmarkError if they are not those of the associations."""
+        replay = cls(given)
+        for event in events:
+            replay.take(event)
+        if len(replay.nodes) < len(given.t_ns):
+            t_s = given.t_ns[len(replay.nodes)] * 1e-9
+            raise unsolved(f"the log has no scan at t={t_s:.9g} s, expected the log of the run")
+        return replay
+
+    def reassociated(
+        self, landmark: Sequence[Id | None], poses: Array, landmarks: Mapping[Id, tuple[Array, Array]]
+    ) -> Replay:
+        """Return it with other landmarks of the observations, and other initial poses (S, .) and landmarks."""
+        other = copy(self)
+        associations = replace(self.given.associations, landmark=landmark)
+        other.given = replace(self.given, associations=associations, poses=poses, landmarks=landmarks)
+        other.sighted = {
+            key: [one._replace(target=landmark[one.row]) for one in seen] if key[2] == LANDMARKS else seen
+            for key, seen in self.sighted.items()
+        }
+        return other
 
     def take(self, event: Event) -> None:
         """Replay one event; scans that are none of the given ones change nothing."""
@@ -158,7 +186,7 @@ class _Replay:
             target, group = used.landmark[row], LANDMARKS
             if isinstance(target, str) and target in self.given.robots:
                 target, group = self._node(target, scan.t_ns), POSES
-            self.sighted.setdefault((scan.robot, scan.sensor, group), []).append((node, target, y, R_row))
+            self.sighted.setdefault((scan.robot, scan.sensor, group), []).append(Seen(node, target, y, R_row, row))
 
     def _noise(self, scan: Scan, sensor: Sensor, rows: list[int]) -> Array:
         """Return the noise R of a scan's rows as in the filter: where it varies, that of what was expected."""
@@ -209,8 +237,9 @@ class _Replay:
         """Return the landmarks.  One that was measured by fewer numbers than it has says nothing and is left out."""
         numbers: dict[Id, int] = {}
         for (_, _, group), seen in self.sighted.items():
-            for _, name, _, R in seen if group == LANDMARKS else ():
-                numbers[name] = numbers.get(name, 0) + len(R)
+            for one in seen if group == LANDMARKS else ():
+                if one.target is not None:
+                    numbers[one.target] = numbers.get(one.target, 0) + len(one.R)
         return [name for name, k in numbers.items() if k >= self.given.landmark.space.dof or name in self.known]
 
     def _sightings(self, at: Mapping[Id, int]) -> tuple[list[Factor], list[Array]]:
@@ -219,7 +248,7 @@ class _Replay:
         for (robot, sensor, group), seen in self.sighted.items():
             if given.robots[robot].sensors[sensor].cov is not None and (robot, sensor) not in given.mounts:
                 raise unsolved(f"mount '{robot}.{sensor}' is in the map, expected mounts that are known")
-            rows = [(node, at.get(target, -1) if group == LANDMARKS else target, y, R) for node, target, y, R in seen]
+            rows = [(*one[:1], at.get(one.target, -1) if group == LANDMARKS else one.target, *one[2:4]) for one in seen]
             columns = [np.array(column) for column in zip(*(row for row in rows if row[1] != -1), strict=True)]
             if columns:
                 kept[robot, sensor, group] = columns
@@ -256,7 +285,7 @@ class _Replay:
             return mean
         for (robot, sensor, _), seen in self.sighted.items():
             mount = self.given.robots[robot].sensors[sensor]
-            for node, landmark, y, _ in seen:
+            for node, landmark, y, *_ in seen:
                 if landmark == name and isinstance(mount.sensor, FullSensor):
                     at = np.array(mount.at)
                     return inverse_expectation(poses[node], at, mount.sensor, self.given.landmark, y[None])[0][0]

@@ -221,10 +221,16 @@ class Reduced:
 
     def covariances(self) -> Array:
         """Return the covariances (m, dof, dof) of the landmarks: blocks of the inverse of S, zero where held."""
-        m, dof, end = len(self.state.groups[LANDMARKS]), self.state.spaces[LANDMARKS].dof, self.state.ends[POSES]
+        m, dof = len(self.state.groups[LANDMARKS]), self.state.spaces[LANDMARKS].dof
+        return self.joint().reshape(m, dof, m, dof)[np.arange(m), :, np.arange(m)]
+
+    def joint(self) -> Array:
+        """Return the joint covariance (m dof, m dof) of the landmarks: the inverse of S, zero where held."""
+        end = self.state.ends[POSES]
         P, at = np.zeros((self.state.ends[-1] - end,) * 2), self.rest - end
         P[np.ix_(at, at)] = self._solved(np.eye(len(at)))
-        return P[: m * dof, : m * dof].reshape(m, dof, m, dof)[np.arange(m), :, np.arange(m)]
+        size = self.state.ends[LANDMARKS] - end
+        return P[:size, :size]
 
     @cached_property
     def factor(self) -> tuple[Array, bool]:

@@ -88,8 +88,14 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         print_table("calibrations, estimated", ESTIMATE_COLUMNS, estimates, align="<<>>")
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
-        table = [(label, number(value), unit) for _, label, value, unit in in_words(batch, BATCH)]
+        over_time = batch.get("pose_differences", ())
+        figures = {key: value for key, value in batch.items() if key != "pose_differences"}
+        table = [(label, number(value), unit) for _, label, value, unit in in_words(figures, BATCH)]
         print_table("against the batch solution", ("", "", ""), table, align="<><")
+        rows = [[row["robot"], *(number(row[key]) for key in ("start_s", "end_s", "sigmas"))] for row in over_time]
+        if rows:
+            columns = ("robot", "from s", "to s", "sigmas of the filter")
+            print_table("difference of the poses from the batch solution", columns, rows, align="<>>>")
     for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
         for line in summary.get(key, ()):
             typer.echo(f"{kind}: {line}")

@@ -6,28 +6,32 @@ to a fraction of its sigma, and with the same sigma; one that is not claims to k
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kalmark.arrays import Array
-from kalmark.batch.data import Associations, Given, Known, replayed
+from kalmark.arrays import Array, Flags, Index
+from kalmark.batch.data import Associations, Given, Known, Replay, replayed
 from kalmark.batch.problem import Problem
+from kalmark.batch.reassociation import Reassociated, reassociated
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, POSES, State
 from kalmark.errors import KalmarkError
-from kalmark.events import Event, Scan
+from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.models.landmarks import Point2D, Point3D, Tag
 from kalmark.models.protocols import Landmark
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
-from kalmark.results.history import as_id
+from kalmark.results.history import History, as_id
 from kalmark.results.landmarks import refuse_other_than_points
-from kalmark.results.measures import rigid, rmse
+from kalmark.results.measures import nees, pose_error, rigid, rmse
 from kalmark.results.progress import track
+
+STRETCHES = 10  # of a robot's path, each with its difference from the batch solution
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
@@ -38,12 +42,75 @@ if TYPE_CHECKING:
 def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
     """Return the entry `batch` of a run's summary: `compare`, or of a run that saw tags `compare_tags`.
 
-    The log is read again unless it is given or not needed.
+    Where the log does not tell which landmark an observation is of, that is decided again (`second_opinion`).  The log
+    is read again unless it is given or not needed.
     """
     if not np.isnan(run.history.left_px).all():
         problem = tag_problem(run)
         return compare_tags(run, problem, optimum(problem))
-    return compare(run, solve_batch(run, log_of(run) if log is None else log))
+    log = log_of(run) if log is None else log
+    if not unknown(run).any():
+        return compare(run, solve_batch(run, log))
+    opinion = second_opinion(run, log)
+    return compare(run, opinion.found.batch, opinion.found.merged) | opinion.as_dict()
+
+
+def unknown(run: Recording) -> Flags:
+    """Return which observations (O,) a filter had to associate: the log does not say what they are of."""
+    return (run.history.id == "") & (run.history.outcome != "ignored")
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """A batch solution with associations of its own, and in how many observations they differ from the filter's.
+
+    `changed` are of another landmark, `added` are of one where the filter had none, `left_out` the reverse; a landmark
+    that was `merged` with another counts as that.  `split`: landmarks made of observations that the filter gave to
+    others; `found`: of those that it gave to none.
+    """
+
+    found: Reassociated
+    observations: int
+    changed: int
+    added: int
+    left_out: int
+    split: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures as they are in ``summary.json``."""
+        return {
+            "observations": self.observations,
+            "observations_changed": self.changed,
+            "observations_added": self.added,
+            "observations_left_out": self.left_out,
+            "landmarks_merged": len(self.found.merged),
+            "landmarks_split": self.split,
+            "landmarks_found": len(self.found.new) - self.split,
+            "association_rounds": self.found.rounds,
+            "association_settled": self.found.settled,
+        }
+
+
+def second_opinion(run: Recording, log: Log | Iterable[Event], *, known: Known | None = None) -> Opinion:
+    """Find the batch solution of a run whose log does not tell all associations: they are decided again about it.
+
+    Begins at the associations of the filter; see `kalmark.batch.reassociation`.  Raises KalmarkError as `solve_batch`.
+    """
+    open_ = unknown(run)
+    rows = np.flatnonzero(run.history.fused | open_)
+    given = given_by(run, known, rows)
+    found = reassociated(Replay.of(given, log), open_[rows])
+    changed = added = left_out = 0
+    made_of: dict[Id, list[bool]] = {name: [] for name in found.new}
+    for before, after in zip(given.associations.landmark, found.landmark, strict=True):
+        old = None if before is None else found.merged.get(before, before)
+        changed += old is not None and after is not None and old != after
+        added += old is None and after is not None
+        left_out += old is not None and after is None
+        if after in made_of:
+            made_of[after].append(old is not None)
+    split = sum(2 * sum(had) > len(had) for had in made_of.values())
+    return Opinion(found, len(rows), changed, added, left_out, split)
 
 
 def solve_batch(
@@ -66,8 +133,11 @@ def solve_batch(
     return optimum(problem, initial, iterations=steps)
 
 
-def given_by(run: Recording, known: Known | None = None) -> Given:
-    """Return what the batch solution needs of a run: of the observations exactly those that the filter used."""
+def given_by(run: Recording, known: Known | None = None, rows: Index | None = None) -> Given:
+    """Return what the batch solution needs of a run: of the observations exactly those that the filter used.
+
+    With `rows` of the history these are read; those that the filter did not use are of no landmark.
+    """
     rejected = sum(not fix.used for fix in run.history.fixes)
     if rejected:
         raise KalmarkError(f"batch solution: the filter rejected {rejected} fixes, expected a run that used all")
@@ -78,11 +148,12 @@ def given_by(run: Recording, known: Known | None = None) -> Given:
         zip(run.landmarks.ids, zip(run.landmarks.means, run.landmarks.covariances, strict=True), strict=True)
     )
     ids = {str(id_): id_ for id_ in landmarks} | {name: name for name in robots}
-    rows = np.flatnonzero(history.fused)
-    names = [ids.get(name, as_id(name)) for name in history.landmark[rows].tolist()]
-    started = {name for name, outcome in zip(names, history.outcome[rows], strict=True) if outcome != "associated"}
+    fused = np.flatnonzero(history.fused)
+    rows = fused if rows is None else rows
+    names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
+    started = {name for row, name in names.items() if history.outcome[row] != "associated"}
     beforehand = {ids.get(str(name), name): prior for name, prior in (known or {}).items()}
-    for name in dict.fromkeys(names):
+    for name in dict.fromkeys(names.values()):
         if name not in started and name not in beforehand and name not in robots:
             mean, covariance = landmarks.get(name, (None, np.ones(1)))
             if covariance.any():
@@ -96,13 +167,27 @@ def given_by(run: Recording, known: Known | None = None) -> Given:
         robot=history.robot,
         poses=history.poses,
         associations=Associations(
-            history.step[rows], history.sensor[rows], history.index[rows], names, history.e[rows]
+            history.step[rows],
+            history.sensor[rows],
+            history.index[rows],
+            [names.get(row) for row in rows],
+            history.e[rows],
         ),
         landmarks=landmarks,
         known=beforehand,
         starts={start.robot: (start.mean, start.covariance) for start in history.starts},
         fixes=len(run.history.fixes),
     )
+
+
+def _in_the_end(history: History, rows: Index) -> list[str]:
+    """Return the landmarks of observations as they are called in the end, after merges."""
+    now: dict[str, str] = {}
+    for change in history.changes:
+        if change.what == "merged":
+            now = {one: change.into if other == change.landmark else other for one, other in now.items()}
+            now[change.landmark] = change.into
+    return [now.get(name, name) for name in history.landmark[rows].tolist()]
 
 
 def _point(slam: Slam) -> Landmark:
@@ -152,15 +237,21 @@ def tag_problem(run: Recording) -> Problem:
     return replayed(given, (Scan(t_ns=t, robot=name, sensor=camera, y=seen) for t, name, camera, seen in scans))
 
 
-def compare(run: Recording, batch: Batch) -> dict[str, Any]:
+def compare(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None) -> dict[str, Any]:
     """Return how far the filter's map and path are from the optimum of the same data.
+
+    `merged` says which landmark of the batch solution one of the filter has become.
 
     `sigma_ratio`: median over landmarks of the filter's sigma over the batch's (1: honest, below: overconfident).
     `map_difference_m`: RMS over landmarks of the distance between the two.  `map_difference_sigma`: the largest
-    such distance over the batch's sigma of that landmark.  `path_ratio`: with truth, the filter's raw position RMSE
-    over the batch's, which sees the future, else None.  `path_difference_m`: RMS over steps of the distance.
+    such distance over the batch's sigma of that landmark, `map_difference_filter_sigma`: over the filter's own.
+    `path_ratio`: with truth, the filter's raw position RMSE over the batch's, which sees the future, else None.
+    `path_difference_m`: RMS over steps of the distance.  `path_difference_sigma`: RMS over steps and coordinates of the
+    difference of the poses in the filter's own sigmas, at most 1 of an honest filter, whose difference from the batch
+    solution has the covariance P_filter - P_batch; `pose_differences` is that over time, a robot and stretch a row.
     """
-    rows = [(k, batch.ids.index(id_)) for k, id_ in enumerate(run.landmarks.ids) if id_ in batch.ids]
+    at, same = {id_: j for j, id_ in enumerate(batch.ids)}, merged or {}
+    rows = [(k, at[same.get(id_, id_)]) for k, id_ in enumerate(run.landmarks.ids) if same.get(id_, id_) in at]
     d, sigma = batch.state.d, batch.sigma()[np.array([j for _, j in rows], dtype=np.int64)]
     distance = np.array([np.linalg.norm(run.landmarks.means[k][:d] - batch.means[j][:d]) for k, j in rows])
     filtered = np.array([np.sqrt(np.trace(run.landmarks.covariances[k][:d, :d])) for k, _ in rows])
@@ -171,11 +262,32 @@ def compare(run: Recording, batch: Batch) -> dict[str, Any]:
         "sigma_ratio": _or_none(np.median, filtered[free] / sigma[free]),
         "map_difference_m": _or_none(rmse, distance[:, None]),
         "map_difference_sigma": _or_none(np.max, distance[free] / sigma[free]),
+        "map_difference_filter_sigma": _or_none(np.max, distance[filtered > 0] / filtered[filtered > 0]),
         "path_ratio": errors[0] / errors[1] if errors[0] is not None and errors[1] else None,
         "path_difference_m": _or_none(rmse, path - batch.poses[:, :d]),
+        **_over_time(run, batch),
         "landmarks": len(rows),
         "iterations": batch.iterations,
         "chi2_per_dof": batch.chi2 / batch.dof if batch.dof > 0 else None,
+    }
+
+
+def _over_time(run: Recording, batch: Batch) -> dict[str, Any]:
+    """Return the differences of the poses in sigmas of the filter: of all, and of each robot over time."""
+    history = run.history
+    e = pose_error(history.poses, batch.poses, run.coordinates)
+    per_dof = nees(e, history.pose_covariances) / e.shape[1]
+    rows = []
+    for robot in history.robots:
+        mine = np.flatnonzero((history.robot == robot) & np.isfinite(per_dof))
+        for part in np.array_split(mine, min(STRETCHES, len(mine))) if len(mine) else ():
+            first, last = (float(history.t_ns[k]) * 1e-9 for k in (part[0], part[-1]))
+            sigmas = float(np.sqrt(per_dof[part].mean()))
+            rows.append({"robot": robot, "start_s": first, "end_s": last, "sigmas": sigmas})
+    known = per_dof[np.isfinite(per_dof)]
+    return {
+        "path_difference_sigma": float(np.sqrt(known.mean())) if len(known) else None,
+        "pose_differences": rows,
     }
 
 
