@@ -242,7 +242,7 @@ class Replay:
                     numbers[one.target] = numbers.get(one.target, 0) + len(one.R)
         return [name for name, k in numbers.items() if k >= self.given.landmark.space.dof or name in self.known]
 
-    def _sightings(self, at: Mapping[Id, int]) -> tuple[list[Factor], list[Array]]:
+    def _sightings(self, at: Mapping[Id | None, int]) -> tuple[list[Factor], list[Array]]:
         """Return what each sensor saw and the means of the mounts to be solved for, in the order of their groups."""
         given, kept = self.given, {}
         for (robot, sensor, group), seen in self.sighted.items():

@@ -10,7 +10,16 @@ from typing import Annotated, Any
 import typer
 
 from kalmark.errors import KalmarkError
-from kalmark.results.words import BATCH, ROBOT, TOTALS, header, in_words
+from kalmark.results.words import (
+    BATCH,
+    DIFFERENCE_COLUMNS,
+    DIFFERENCE_TITLE,
+    ROBOT,
+    TOTALS,
+    difference_rows,
+    header,
+    in_words,
+)
 
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
@@ -88,14 +97,11 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         print_table("calibrations, estimated", ESTIMATE_COLUMNS, estimates, align="<<>>")
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
-        over_time = batch.get("pose_differences", ())
         figures = {key: value for key, value in batch.items() if key != "pose_differences"}
         table = [(label, number(value), unit) for _, label, value, unit in in_words(figures, BATCH)]
         print_table("against the batch solution", ("", "", ""), table, align="<><")
-        rows = [[row["robot"], *(number(row[key]) for key in ("start_s", "end_s", "sigmas"))] for row in over_time]
-        if rows:
-            columns = ("robot", "from s", "to s", "sigmas of the filter")
-            print_table("difference of the poses from the batch solution", columns, rows, align="<>>>")
+        if rows := difference_rows(summary):
+            print_table(DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, rows, align="<>>>")
     for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
         for line in summary.get(key, ()):
             typer.echo(f"{kind}: {line}")

@@ -39,7 +39,17 @@ from kalmark.results.scene import (
     stretches_of,
 )
 from kalmark.results.verdict import verdict_lines
-from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, header, in_words
+from kalmark.results.words import (
+    BATCH,
+    DIFFERENCE_COLUMNS,
+    DIFFERENCE_TITLE,
+    MORE,
+    ROBOT,
+    TOTALS,
+    difference_rows,
+    header,
+    in_words,
+)
 
 NOT_FIGURES = ("robots", "warnings", "advice", "notes", "gaps", "repeats", "verdict")
 BINS = 120
@@ -80,7 +90,8 @@ def report_html(run: Recording) -> str:
         summary=summary_table(summary),
         warnings="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("warnings", ())),
         advice="".join(f"<li>{html.escape(line)}</li>" for line in notes),
-        mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS),
+        mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS)
+        + _section(DIFFERENCE_TITLE, difference_rows(summary), DIFFERENCE_COLUMNS),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),
         changes=_section("Landmarks merged and removed", [*change_rows(run)], ("t (s)", "landmark", "", "why")),
         skipped=_skipped(run, summary),
@@ -132,7 +143,7 @@ def show(value: Any, unit: str = "") -> str:
 def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
-        if (key in NOT_FIGURES and not prefix) or key == "directions":
+        if (key in NOT_FIGURES and not prefix) or key in ("directions", "pose_differences"):
             continue
         out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
     return out

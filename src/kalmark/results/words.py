@@ -30,6 +30,16 @@ def in_words(figures: Mapping[str, Any], words: Words) -> Iterator[tuple[str, st
         yield key, label, figures[key], unit
 
 
+DIFFERENCE_TITLE = "Difference of the poses from the batch solution"
+DIFFERENCE_COLUMNS = ("robot", "from s", "to s", "sigmas of the filter")
+
+
+def difference_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return the differences of the poses over time that a comparison with the batch solution has, as a table."""
+    rows = summary.get("batch", {}).get("pose_differences", ())
+    return [(r["robot"], *(f"{r[key]:.1f}" for key in ("start_s", "end_s")), figure(r["sigmas"])) for r in rows]
+
+
 def header(label: str, unit: str) -> str:
     """Return the words at the top of a column of figures: position RMSE (m)."""
     return f"{label.strip()} ({unit})" if unit else label.strip()
