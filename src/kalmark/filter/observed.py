@@ -96,8 +96,8 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
 def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
     """Return d2 = z' Z^-1 z (K,) of innovations z (K, p) with their covariances Z (K, p, p).
 
-    d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a finite Z is not
-    positive definite.
+    d2 is NaN where nothing can be expected (a landmark at the sensor) and where Z is not positive definite; the last
+    answer is False if that is so of any.
     """
     k, p = z.shape
     d2, valid = np.zeros(k), True
@@ -119,8 +119,7 @@ def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
             w[a] /= L[a, a]
             d2[i] += w[a] * w[a]
         if not positive:
-            d2[i] = np.nan
-            valid = valid and not np.isfinite(Z[i]).all()
+            d2[i], valid = np.nan, False
     return d2, valid
 
 
