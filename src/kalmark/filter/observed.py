@@ -88,6 +88,7 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
                 for c in range(n):
                     s += H[a, c] * HP[b, c]
                 Z[i, a, b] = s + R[i, a, b]
+            Z[i, a, a] *= 1.0 + kernels.RAISED
     d2, valid = squared_distances(Z, z)
     return Z, d2, valid
 
@@ -164,12 +165,13 @@ def sparse_product(H: Array, S: Array, head: int, k: int) -> Array:
 
 @compiled
 def add_blocks(S: Array, R: Array) -> None:
-    """S += blockdiag(R), R (K, p, p)."""
+    """S += blockdiag(R), R (K, p, p), and raise its diagonal by what rounding may have taken off it."""
     k, p, _ = R.shape
     for i in range(k):
         for a in range(p):
             for b in range(p):
                 S[i * p + a, i * p + b] += R[i, a, b]
+            S[i * p + a, i * p + a] *= 1.0 + kernels.RAISED
 
 
 @compiled
