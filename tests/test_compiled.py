@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -82,3 +85,43 @@ def test_a_job_that_fails_is_not_taken_for_done(tmp_path: Path) -> None:
     with pytest.raises(KeyError):
         compiled.work_ahead('["kalmark.filter.corrections", "compile_correction", "no", "none", 1, false]', str(mark))
     assert not mark.exists()
+
+
+DAMAGED = """
+import sys
+from pathlib import Path
+import numpy as np
+from kalmark.compiled import compiled
+from kalmark.filter.kernels import product
+
+A = np.arange(12.0).reshape(3, 4)
+
+def anew():
+    function = compiled(product.py_func)
+    np.testing.assert_array_equal(function(A, A.T), A @ A.T)
+    return sum(function.stats.cache_hits.values())
+
+assert anew() == 0 and anew() == 1
+index, data = sorted(Path(sys.argv[1]).rglob("kernels.product-*.nb*"), key=lambda file: file.suffix, reverse=True)
+assert (index.suffix, data.suffix) == (".nbi", ".nbc")
+cases = 0
+for file in (index, data):
+    whole = file.read_bytes()
+    flips = [bytes([*whole[:at], whole[at] ^ 0x41, *whole[at + 1:]]) for at in (0, 40, len(whole) // 2, len(whole) - 1)]
+    for damage in (b"", whole[:10], whole[: len(whole) // 2], whole[:-1], whole + b"0", bytes(len(whole)), *flips):
+        file.write_bytes(damage)
+        assert anew() == 0, "what is damaged is not loaded"
+        assert anew() == 1, "it has been made anew"
+        cases += 1
+    file.unlink()
+    assert anew() == 0 and anew() == 1
+print(cases)
+"""
+
+
+def test_compiled_code_that_is_damaged_on_the_disk_is_noticed_and_made_anew(tmp_path: Path) -> None:
+    environment = os.environ | {"KALMARK_CACHE": str(tmp_path)}
+    command = [sys.executable, "-c", DAMAGED, str(tmp_path)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "20\n"

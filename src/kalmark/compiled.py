@@ -7,6 +7,9 @@ What one compiled function calls is compiled into it once more.  Where that woul
 ever needed, the call goes `by_address` instead: the callee is compiled once, alone, and only when it is used.  The
 filter calls the models so, hence its code does not depend on theirs: each has a folder of its own.
 
+Each file of compiled code ends with its SHA-256.  One that is damaged, or cut, counts as none and is made anew: what
+numba would take out of it might do anything.
+
 An address holds in the process that made it, as long as the function lives.  So it is always an argument of compiled
 code, never a constant in it that the disk would keep; who is copied to another process leaves it behind and asks again.
 """
@@ -14,17 +17,19 @@ code, never a constant in it that the disk would keep; who is copied to another 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
+import pickle
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import llvmlite.binding
 import numba
@@ -32,6 +37,7 @@ import platformdirs
 from llvmlite import ir
 from numba import types
 from numba.core import event
+from numba.core.caching import IndexDataCacheFile
 from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
@@ -60,15 +66,48 @@ def cache_folder(part: str) -> str:
     return str(Path(root) / "compiled" / digest.hexdigest()[:16])
 
 
+class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc, unused-ignore]
+    """The files of one function's compiled code, which end with their checksums."""
+
+    def _load_index(self) -> Any:
+        return super()._load_index() if _whole(self._index_path) is not None else {}
+
+    def _load_data(self, name: str) -> Any:
+        data = _whole(self._data_path(name))
+        if data is None:
+            raise FileNotFoundError(name)  # which numba takes for a file that was never there
+        return pickle.loads(data)
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[BinaryIO]:
+        with super()._open_for_write(filepath) as file:
+            content = io.BytesIO()
+            yield content
+            file.write(content.getvalue())
+            file.write(hashlib.sha256(content.getvalue()).digest())
+
+
+def _whole(path: str) -> bytes | None:
+    """Return what is in a file but for its checksum, None if that is not the checksum of it."""
+    try:
+        data = Path(path).read_bytes()
+    except OSError:
+        return None
+    content, checksum = data[:-32], data[-32:]
+    return content if hashlib.sha256(content).digest() == checksum else None
+
+
 def compiled(function: F) -> F:
     """Compile `function` with numba in nopython mode, cached on disk."""
     before = numba.config.CACHE_DIR
     part = function.__module__.split(".")[1]
     numba.config.CACHE_DIR = cache_folder(part if part in SOURCES else "models")
     try:
-        return numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+        dispatcher = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     finally:
         numba.config.CACHE_DIR = before
+    dispatcher._cache._cache_file.__class__ = _CheckedFiles  # numba has no door for it
+    return dispatcher
 
 
 @cache

@@ -42,4 +42,4 @@ class RunError(KalmarkError):
 
 
 class DivergedError(KalmarkError):
-    """The filter refuses to go on: an innovation covariance is no longer positive definite."""
+    """The filter is lost for good: the covariance of a robot is none.  All other errors leave the map as it was."""

@@ -16,6 +16,7 @@ from kalmark.filter.estimators import Correction
 
 Late = tuple[int, str, str, int]
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
+INDEFINITE = "the covariance of its innovation is not positive definite"
 NOTHING = np.zeros((0, 0))
 NOTHING.flags.writeable = False
 
@@ -78,12 +79,13 @@ def outcomes_of(judged: Judged) -> list[Observation]:
     outcomes = list(map(tuple.__new__, repeat(Observation), fates))  # several times as fast as by their constructor
     if all(fused):
         return outcomes
-    return [seen if used else _rejected(seen, gate) for seen, used in zip(outcomes, fused, strict=True)]
+    return [seen if used else _rejected(seen, gate, Z) for seen, used, Z in zip(outcomes, fused, done.Z, strict=True)]
 
 
-def _rejected(seen: Observation, gate: float) -> Observation:
+def _rejected(seen: Observation, gate: float, Z: Array) -> Observation:
     if seen.d2 is None or math.isnan(seen.d2):
-        return seen._replace(outcome="rejected", d2=None, reason="nothing can be expected of it from here")
+        why = INDEFINITE if np.isfinite(Z).all() else "nothing can be expected of it from here"
+        return seen._replace(outcome="rejected", d2=None, reason=why)
     far = "so far from what is expected that d2 is no number" if gate == math.inf else f"outside the gate of {gate:.2f}"
     return seen._replace(outcome="rejected", reason=far)
 

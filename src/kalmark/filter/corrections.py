@@ -213,8 +213,9 @@ def invariant(
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan: gate, iterate, fuse, retract, transport; inverse distances by their parallax.
 
-    docs/invariant.md, docs/bearing_only.md.  Returns e, z, Z, d2 at the prediction, which were fused, and whether the
-    covariances are valid.
+    docs/invariant.md, docs/bearing_only.md.  Returns e, z, Z, d2 at the prediction, which were fused, and whether all
+    covariances are valid: an observation whose Z is none is left out, and if that of all together is none, nothing is
+    fused.
     """
     x, P, n, blocks, atoms, axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
@@ -227,7 +228,7 @@ def invariant(
     Z = diagonal_blocks(linear[3], z.shape[1])
     d2, valid = squared_distances(Z, z)
     near, count = within(d2, gate)
-    if not valid or count == 0:
+    if count == 0:
         return e, z, Z, d2, near, valid
     if count < len(near):
         slots, y, R = chosen(near, count, slots, y, R)
@@ -237,7 +238,7 @@ def invariant(
         linear = linearized(z_near, E_r, E_l, P_ss, R)
     H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
-        return e, z, Z, d2, near, False
+        return e, z, Z, d2, within(d2, -1.0)[0], False
     origin, x_before = mean[:3].copy(), x.copy()
     before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     V, correction = gain(P, n, index, H, M, v, (h, count))
@@ -261,7 +262,7 @@ def invariant(
         s, S = sensor_at(model, observer, ways[_SENSOR_AT])
         parallax.call_retract(ways[_RETRACT_PARALLAX], (x, x_before, baselines, correction, d_head, s))
         parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, rows, x_before, x, baselines, s, S))
-    return e, z, Z, d2, near, True
+    return e, z, Z, d2, near, valid
 
 
 def compared(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
@@ -356,7 +357,7 @@ def textbook(
         valid = valid and positive
         near[i] = d2[i] < gate
         if near[i]:
-            M, _positive = cholesky_inverse(Z[i])
+            M, _positive = cholesky_inverse(Z[i])  # which gives d2, too
             V, correction = gain(P, n, index, stacked(E_r, E_l), M, z[i].copy(), (E_r.shape[2], 1))
             downdate(P, V)
             call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
@@ -376,17 +377,18 @@ def first_estimates(
     _, _, E_r, E_l = linearize(model, first[:head], first[head:].reshape(k, d), y)
     Z, d2, valid = innovation(P, index, E_r, E_l, R, z)
     near, count = within(d2, gate)
-    if not valid or count == 0:
+    if count == 0:
         return e, z, Z, d2, near, valid
     index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
     H = stacked(E_r[near], E_l[near])
     sizes = E_r.shape[2], count
     M, positive = cholesky_inverse(joint_innovation(H, submatrix(P, index), R[near], sizes[0])[1])
-    if positive:
-        V, correction = gain(P, n, index, H, M, z[near].ravel(), sizes)
-        downdate(P, V)
-        call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
-    return e, z, Z, d2, near, positive
+    if not positive:
+        return e, z, Z, d2, within(d2, -1.0)[0], False
+    V, correction = gain(P, n, index, H, M, z[near].ravel(), sizes)
+    downdate(P, V)
+    call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
+    return e, z, Z, d2, near, valid
 
 
 compiled_invariant = compiled(invariant)

@@ -9,6 +9,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
+
 from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import ahead
 from kalmark.declare import Count, Positive, register
@@ -55,7 +57,8 @@ class Movement(NamedTuple):
 class Correction(NamedTuple):
     """Of K observations: expectation, innovation and its covariance, squared distance, and which were fused.
 
-    Where the correction is not `valid`, a covariance is no longer positive definite: the filter has diverged.
+    Where the correction is not `valid`, some could not be fused, because nothing can be expected of them or because
+    their covariance is not positive definite: their d2 is NaN.
     """
 
     e: Array
@@ -82,7 +85,7 @@ class Estimator(Protocol):
         """Return the estimator that fuses absolute positions."""
 
     def pose_jacobian(self, map_: Map, robot: int, J: Array) -> Array:
-        """Return the Jacobian J (., 3 or more) in the robot's state, taken where this estimator linearises."""
+        """Return the Jacobian J (., 3 or more) in the robot's state, and a mount's behind it, where it linearises."""
 
 
 @runtime_checkable
@@ -127,14 +130,37 @@ class _Estimator:
         return bool(run(where, (model, robot, here, *control), self.from_first))
 
     def correct(self, map_: Map, update: Update) -> Correction:
-        """Fuse a scan, where d2 is within the gate."""
+        """Fuse a scan, where d2 is within the gate.
+
+        Observations whose covariance is not positive definite are left out; if only that of all together is not, they
+        are fused one after the other.
+        """
         model, robot, mount, slots, d, y, R, gate = update
-        run = type(self).compiled if isinstance(model, tuple) else type(self).source
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
         scan = robot_here, mount_here, here, d, y, R, gate
-        done = Correction(*run(model, m.whole, scan, self._option(m)))
+        done = self._fused(model, m, scan)
+        if not done.valid and not done.fused.any():
+            done = self._one_by_one(model, m, scan, done)
         map_.corrected(robot, self.transports)
         return done
+
+    def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan) -> Correction:
+        run = type(self).compiled if isinstance(model, tuple) else type(self).source
+        return Correction(*run(model, m.whole, scan, self._option(m)))
+
+    def _one_by_one(
+        self, model: Any, m: StochasticMap, scan: corrections.Scan, together: Correction
+    ) -> Correction:  # fmt: skip
+        """Fuse those of a scan one after the other that could not be fused together."""
+        robot, mount, slots, d, y, R, gate = scan
+        d2, fused = together.d2.copy(), together.fused.copy()
+        for k in np.flatnonzero(d2 <= gate).tolist():
+            one = slice(k, k + 1)
+            done = self._fused(model, m, (robot, mount, slots[one], d, y[one], R[one], gate))
+            fused[k] = done.fused[0]
+            if not done.valid:
+                d2[k] = np.nan
+        return together._replace(d2=d2, fused=fused)
 
     def average(self, map_: Map, update: Update, pairs: Index, weights: Array) -> tuple[Array, bool]:
         """Fuse the mean over matchings (H, K), numbers of slots or -1, of these weights (H,); nothing is gated.
@@ -227,8 +253,9 @@ class Fej(_Estimator):
         """Return J (I + (generator(x) - generator(x_first)) e_theta'): displacements counted from x_first."""
         space = map_.spaces[robot]
         assert space is not None
-        dof, axes = J.shape[1], space.axes
+        axes = space.axes
+        theta, dof = (2, 3) if axes == 1 else (3, 6)  # a mount, whose columns follow, does not turn with the world
         now, first = (space.generator(x)[:dof] for x in (map_.mean(robot), map_.first(robot)))
-        J, theta = J.copy(), 2 if axes == 1 else 3
-        J[:, theta : theta + axes] += J @ (now - first)
+        J = J.copy()
+        J[:, theta : theta + axes] += J[:, :dof] @ (now - first)
         return J

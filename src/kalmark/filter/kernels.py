@@ -6,6 +6,7 @@ Rank-k updates go through BLAS (dsyrk): in C order our lower triangle is Fortran
 
 from __future__ import annotations
 
+import math
 import sys
 from importlib.machinery import PathFinder
 from importlib.util import module_from_spec
@@ -47,6 +48,10 @@ _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 CACHED = 256  # rows of a covariance that stays in a cache between one pass over it and the next
 BAND = 128  # rows of a larger one that do
 TILE = 64  # rows of a tile of which two do
+
+# What rounding may take off a variance: with these a covariance stays one where 1e-5 rad are beside metres
+KEPT = 2.0**-50  # of what a variance loses to a correction, and of the terms that a prediction adds up
+RAISED = 2.0**-44  # of the variance of an innovation
 
 
 def one_thread() -> Any:
@@ -166,6 +171,10 @@ def predict(P: Array, n: int, index: Index, F: Array, Q: Array) -> None:
     for a in range(len(index)):
         for b in range(len(index)):
             B[a, index[b]] = 0.5 * (block[a, b] + block[b, a])
+        terms = 0.0
+        for b in range(len(index)):  # at most the sum of all |F P F'|, of which no change needs none
+            terms += abs(F[a, b]) * math.sqrt(max(P[index[b], index[b]], 0.0))
+        B[a, index[a]] += KEPT * max(terms * terms - P[index[a], index[a]], 0.0)
     set_rows(P, index, B)
 
 
@@ -194,9 +203,22 @@ def clear(P: Array, n: int, at: int, d: int) -> None:
 
 
 @compiled
-def downdate(P: Array, V: Array) -> None:
-    """P <- P - V' V, V (q, n), on the lower triangle.  [S] (30) with K Z K' = V' V, V = L^-1 H P.  O(n^2 q)."""
+def keep_some(P: Array, V: Array) -> None:
+    """Raise the diagonal of P (n, n) by `KEPT` of that of V' V, V (q, n): more than its subtraction rounds."""
     q, n = V.shape
+    for k in range(q):
+        for i in range(n):
+            P[i, i] += KEPT * V[k, i] * V[k, i]
+
+
+@compiled
+def downdate(P: Array, V: Array) -> None:
+    """P <- P - V' V, V (q, n), on the lower triangle.  [S] (30) with K Z K' = V' V, V = L^-1 H P.  O(n^2 q).
+
+    The variances keep `KEPT` of what they lose.
+    """
+    q, n = V.shape
+    keep_some(P, V)
     if n <= 40 or (q <= 2 and n <= CACHED):  # the call would cost more than the sum
         k = 0
         while k + 2 <= q:
@@ -287,6 +309,7 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: int) -> None:
         transport(P, a, theta)
         return
     q = len(V)
+    keep_some(P, V)
     w, a_T = np.empty((axes, n)), np.empty((axes, n))
     for c in range(axes):
         for j in range(n):

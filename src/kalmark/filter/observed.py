@@ -88,6 +88,7 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
                 for c in range(n):
                     s += H[a, c] * HP[b, c]
                 Z[i, a, b] = s + R[i, a, b]
+            Z[i, a, a] *= 1.0 + kernels.RAISED
     d2, valid = squared_distances(Z, z)
     return Z, d2, valid
 
@@ -96,8 +97,8 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
 def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
     """Return d2 = z' Z^-1 z (K,) of innovations z (K, p) with their covariances Z (K, p, p).
 
-    d2 is NaN where nothing can be expected (a landmark at the sensor).  The last answer is False if a finite Z is not
-    positive definite.
+    d2 is NaN where nothing can be expected (a landmark at the sensor) and where Z is not positive definite; the last
+    answer is False if that is so of any.
     """
     k, p = z.shape
     d2, valid = np.zeros(k), True
@@ -119,8 +120,7 @@ def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
             w[a] /= L[a, a]
             d2[i] += w[a] * w[a]
         if not positive:
-            d2[i] = np.nan
-            valid = valid and not np.isfinite(Z[i]).all()
+            d2[i], valid = np.nan, False
     return d2, valid
 
 
@@ -165,12 +165,13 @@ def sparse_product(H: Array, S: Array, head: int, k: int) -> Array:
 
 @compiled
 def add_blocks(S: Array, R: Array) -> None:
-    """S += blockdiag(R), R (K, p, p)."""
+    """S += blockdiag(R), R (K, p, p), and raise its diagonal by what rounding may have taken off it."""
     k, p, _ = R.shape
     for i in range(k):
         for a in range(p):
             for b in range(p):
                 S[i * p + a, i * p + b] += R[i, a, b]
+            S[i * p + a, i * p + a] *= 1.0 + kernels.RAISED
 
 
 @compiled

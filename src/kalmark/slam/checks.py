@@ -13,6 +13,9 @@ from kalmark.events import MOST, Control, Fix, Scan, finite, refuse_huge, shown,
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
 
+LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
+ROUNDING = 1e-3  # of a correlation
+
 
 def covariance(value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError) -> Array:
     """Return a copy of a (size, size) covariance; raise `error` if it is asymmetric or not positive (semi)definite."""
@@ -68,6 +71,19 @@ def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[Kalma
     if bad.any():
         kind = "positive definite" if definite else "positive semidefinite"
         raise error(f"{what} has the eigenvalue {lowest[np.argmax(bad)]:.3g}, expected a {kind} matrix")
+
+
+def fault_of(P: Array) -> str:
+    """Return what is wrong with a covariance (n, n) of the map, "" if nothing is but the rounding of its numbers."""
+    if not np.isfinite(P).all():
+        return "is not finite"
+    sigma = np.sqrt(np.maximum(P.diagonal(), LEAST_VARIANCE))
+    lowest = float(np.linalg.eigvalsh(P / sigma / sigma[:, None])[0])
+    return (
+        f"is not positive semidefinite: in its own sigmas it has the eigenvalue {lowest:.3g}"
+        if lowest < -ROUNDING
+        else ""
+    )
 
 
 def numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -> Array:

@@ -11,6 +11,7 @@ the scans correct them like all else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
@@ -175,11 +176,17 @@ class Moving:
             slots, columns = [*slots, self.bias], [*columns, self.motion.calibration_effect(part.u, part.dt_s)]
         return slots, np.hstack(columns)
 
-    def leads_somewhere(self, map_: Map, part: Part) -> bool:
-        """Return whether one part of its control leads to a finite place, with a finite covariance."""
-        slots, B = self.added(part)
-        u = part.u + (B @ np.concatenate([map_.mean(block) for block in slots]) if slots else 0.0)
-        return moved_noise(*step(self.model, map_.mean(self.slot), u, part.dt_s), part.N)[1]
+    def leads_somewhere(self, map_: Map, parts: Sequence[Part]) -> bool:
+        """Return whether parts of its controls, one after the other, lead to finite places, with finite covariances."""
+        r = map_.mean(self.slot)
+        for part in parts:
+            slots, B = self.added(part)
+            u = part.u + (B @ np.concatenate([map_.mean(block) for block in slots]) if slots else 0.0)
+            moved = step(self.model, r, u, part.dt_s)
+            if not moved_noise(*moved, part.N)[1]:
+                return False
+            r = moved[0]
+        return True
 
     def movement(self, part: Part) -> Movement:
         """Return what one part of its control does to the robot."""

@@ -12,7 +12,7 @@ return decisions and actions.  This page alone changes the map, the tracks and t
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -43,9 +43,10 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, place_of
-from kalmark.report import Gap, Judged, LandmarkTable, Observation, Repeat, Report, outcomes_of
+from kalmark.report import INDEFINITE, Gap, Judged, LandmarkTable, Observation, Repeat, Report, outcomes_of
 from kalmark.slam.checks import (
     covariance,
+    fault_of,
     instance,
     measurements,
     numbers,
@@ -63,6 +64,8 @@ from kalmark.tracks.track import ChannelKey, Late, Pending, Status, Track, Track
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 UNEXPLAINED = "no landmark explains this measurement"
+SINGULAR = "what it may be cannot be computed: a matrix is singular"
+CURE = "start anew from a pose that is less certain, or with larger sigmas of controls and sensors"
 HEADING_RAD = 0.3  # a sigma above which a correction is not linearised at the prediction
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
@@ -143,7 +146,7 @@ class Slam:
     def process(self, event: Event) -> Report:
         """Take one event into the map and report what became of it; a bad event changes nothing.
 
-        Raises EventError for an event that cannot be used, DivergedError when the filter cannot go on.
+        Raises EventError for an event that cannot be used, DivergedError when a robot is lost for good.
         """
         take = self._takes.get(type(event))
         if take is None:
@@ -159,13 +162,20 @@ class Slam:
         except EventError:
             self.t_ns = before
             raise
+        except np.linalg.LinAlgError as error:
+            self._refuse_lost(event)
+            why = " ".join(str(error).split())
+            raise DivergedError(f"{when(event)}: {why}; {CURE}") from error
 
     def _control(self, event: Control) -> Report:
         moving, report = self._moving[event.robot], Report(event)
         refuse_bad_control(event, moving.motion.columns)
         self.t_ns = event.t_ns
         with moving.held as held:
-            for part in held.accept(event):
+            parts = held.accept(event)
+            if len(parts) > 1:
+                self._refuse_nowhere(event.robot, parts)
+            for part in parts:
                 self._move(event.robot, part)
         if moving.error is not None:  # of a control that is no longer held
             self.map.remove(moving.error)
@@ -187,11 +197,9 @@ class Slam:
         if policy.averages:
             refuse_averaging(self.map, self.estimator, event)
         self.t_ns = event.t_ns
-        gaps = self._advance(event.robot)
         ids = event.ids or (None,) * len(event.y)
-        for i in ids if len(self.robots) > 1 else ():
-            if i in self.robots:
-                gaps += self._advance(i)
+        seen = [i for i in ids if i in self.robots and i != event.robot] if len(self.robots) > 1 else []
+        gaps = self._advance(event.robot, *seen)
         robot, report = self._moving[event.robot].slot, Report(event, event.y)
         report.gaps = gaps
         scan = ScanContext(
@@ -219,34 +227,46 @@ class Slam:
         return report
 
     # ------------------------------------------------------------------ motion
-    def _advance(self, name: str) -> tuple[Gap, ...]:
-        """Move a robot up to now by the control it holds; return a gap in its controls."""
+    def _advance(self, *names: str) -> tuple[Gap, ...]:
+        """Move robots up to now by the controls they hold, all or none of them; return gaps in their controls."""
         assert self.t_ns is not None
-        with self._moving[name].held as held:
-            part = held.advance(self.t_ns)
-            if part is not None:
-                self._move(name, part)
-            return held.noticed()
+        with ExitStack() as clocks:
+            helds = [clocks.enter_context(self._moving[name].held) for name in names]
+            moves = [(name, held.advance(self.t_ns)) for name, held in zip(names, helds, strict=True)]
+            for name, part in moves if len(moves) > 1 else ():
+                self._refuse_nowhere(name, [] if part is None else [part])
+            for name, part in moves:
+                if part is not None:
+                    self._move(name, part)
+            return tuple(gap for held in helds for gap in held.noticed())
+
+    def _refuse_nowhere(self, name: str, parts: Sequence[Part]) -> None:
+        """Refuse, before anything has moved, parts of a robot's controls that lead nowhere."""
+        if not self._moving[name].leads_somewhere(self.map, parts):
+            raise self._nowhere(name, parts[-1])
+
+    def _nowhere(self, name: str, part: Part) -> EventError:
+        what = f"{name!r} at t={seconds(self.t_ns or 0)} s"
+        return EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
 
     def _move(self, name: str, part: Part) -> None:
         """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
         moving = self._moving[name]
+        if not isinstance(moving.model, tuple):  # a user's: nothing is known of it
+            self._refuse_nowhere(name, [part])
         shared = moving.error is None and not (part.first and part.last) and part.N.any()
-        if shared and moving.leads_somewhere(self.map, part):
+        if shared and moving.leads_somewhere(self.map, [part]):
             with suppress(MapError):  # it is full: each part has an error of its own
                 moving.error = self.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
         if not self.estimator.predict(self.map, moving.movement(part)):
-            what = f"{name!r} at t={seconds(self.t_ns or 0)} s"
-            raise EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
+            raise self._nowhere(name, part)
         self.clones.moved(name)
 
     # ------------------------------------------------------------------ scans
     def _fuse(self, scan: ScanContext, policy: Policy) -> None:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
         query = self._relocalized(scan, Query(scan))
-        decisions = policy.association.associate(query)
-        if policy.holds_back:
-            decisions = accepted(query, decisions, policy.upkeep.odds)
+        decisions = self._decided(policy, query)
         self.tracks.learn(*query.learned)
         names = [name for name, _ in decisions]
         groups = self.tracks.by_model(scan.channel, names, scan.event.robot)
@@ -263,6 +283,14 @@ class Slam:
             found = list(seen.values())
         scan.report.observations = tuple(found)
 
+    def _decided(self, policy: Policy, query: Query) -> Sequence[Decision]:
+        """Ask the association; where its numbers are singular, only ids say what was observed."""
+        try:
+            decisions = policy.association.associate(query)
+            return accepted(query, decisions, policy.upkeep.odds) if policy.holds_back else decisions
+        except np.linalg.LinAlgError:
+            return [(None, SINGULAR) if i is None else (i, "") for i in query.ids]
+
     def _relocalized(self, scan: ScanContext, query: Query) -> Query:
         """Move a robot whose heading a gap has left unknown to where its scan fits; return what to ask then.
 
@@ -275,7 +303,9 @@ class Slam:
         if len(r) != 3 or self.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2:
             held.recovered()
             return query
-        T = relocalized(query)
+        T = None
+        with suppress(np.linalg.LinAlgError):
+            T = relocalized(query)
         if T is None:
             return query
         self.map.set_predicted(scan.robot, compose(T, compose(inverse(scan.pose())[0], r)[0])[0])
@@ -316,20 +346,26 @@ class Slam:
             return []
         assert isinstance(self.estimator, Averaging)
         d2, valid = self.estimator.average(self.map, found.update, found.pairs, found.weights)
-        self._refuse_diverged(valid, scan.event)
+        if not valid:
+            self._refuse_lost(scan.event)
+            rows = [k for k in found.rows.tolist() if isinstance(decisions[k][0], Mixture)]
+            return [Observation(k, None, "rejected", None, None, INDEFINITE) for k in rows]
         of_these = outcomes(found, decisions, d2)
         self.tracks.count([o.landmark for o in of_these], [o.outcome == "associated" for o in of_these])
         return of_these
 
     def _corrected(self, update: Update, event: Event, estimator: Estimator | None = None) -> Correction:
-        """Correct the map.  Raises DivergedError where the filter cannot go on."""
+        """Correct the map.  Raises DivergedError if the robot is lost for good."""
         done = (estimator or self.estimator).correct(self.map, update)
-        self._refuse_diverged(done.valid, event)
+        if not done.valid:
+            self._refuse_lost(event)
         return done
 
-    def _refuse_diverged(self, valid: bool, event: Event) -> None:
-        if not valid:
-            raise DivergedError(f"{when(event)}: the innovation's covariance is not positive definite")
+    def _refuse_lost(self, event: Event) -> None:
+        """Raise DivergedError if the covariance of an event's robot is none: no measurement can bring it back."""
+        fault = fault_of(self.map.covariance([self._moving[event.robot].slot]))
+        if fault:
+            raise DivergedError(f"{when(event)}: the covariance of {event.robot!r} {fault}; {CURE}")
 
     # ------------------------------------------------------------------ new landmarks
     def _start(
@@ -355,6 +391,13 @@ class Slam:
             seen[k] = self._initialize(scan, policy, k, name, reason)
 
     def _initialize(self, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
+        """Add a landmark, if its measurement determines it."""
+        try:
+            return self._initialized(scan, policy, k, name, reason)
+        except np.linalg.LinAlgError:
+            return Observation(k, scan.ids[k], "ignored", None, None, SINGULAR)
+
+    def _initialized(self, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
         """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
         channel, id_ = scan.channel, scan.ids[k]
         refusal = self._refusal(scan, policy, k, name, reason)
@@ -465,10 +508,18 @@ class Slam:
         except MapError as full:
             return [Observation(k, i, "ignored", None, None, str(full)) for k, i in ids.items()]
         made = {k: scan.measurement(k, clone) for k in ids}
-        candidates, best = delayed.joined(scan, way, self.tracks.candidates.get(key, []), made, ids)
+        try:
+            candidates, best = delayed.joined(scan, way, self.tracks.candidates.get(key, []), made, ids)
+        except np.linalg.LinAlgError:
+            self._release(key)
+            return [Observation(k, i, "ignored", None, None, SINGULAR) for k, i in ids.items()]
         found = []
         for k, i in ids.items():
-            outcome, name = delayed.started(scan, way, candidates, best[k]), None
+            try:
+                outcome, name = delayed.started(scan, way, candidates, best[k]), None
+            except np.linalg.LinAlgError:
+                found.append(Observation(k, i, "deferred", None, None, SINGULAR))
+                continue
             candidates, reason = outcome.candidates, outcome.reason
             if outcome.start is not None and outcome.used is not None:
                 try:
@@ -496,7 +547,11 @@ class Slam:
         self.tracks.rename_tentative(scan.event.ids or ())
         rows = [k for k in new if decisions[k][0] in policy.starts]
         lost = np.array([decisions[k][0] is REMAP for k in rows], dtype=np.bool_)
-        matches, others = confirm.matched(scan, policy.association, rows, lost)
+        try:
+            matches, others = confirm.matched(scan, policy.association, rows, lost)
+        except np.linalg.LinAlgError:
+            seen |= {k: Observation(k, None, "ignored", None, None, SINGULAR) for k in rows}
+            return {}
         seen |= {o.index: o for o in others}
         confirmed: dict[int, tuple[Id, str]] = {}
         waiting: dict[int, Track] = {}
@@ -524,9 +579,11 @@ class Slam:
         late: list[Late] = [] if track.first is None else [track.first]
         for m in track.measurements:
             channel, clone = self._channels[m.robot, m.sensor], self.clones[m.clone]
-            start, R = confirm.residual(self.map, self.estimator, channel, clone, track, m)
             try:
+                start, R = confirm.residual(self.map, self.estimator, channel, clone, track, m)
                 slot = self._add(start)
+            except np.linalg.LinAlgError:
+                continue
             except MapError:  # it is full
                 break
             p, gate = len(R), scan.channel.gate
@@ -622,7 +679,9 @@ class Slam:
         fused = [(o, self.tracks.confirmed[o.landmark]) for o in seen
                  if o.outcome == "associated" and o.landmark in self.tracks.confirmed]  # fmt: skip
         for _, track in fused if self.reparametrize is not None else ():
-            point = reparametrize.simplified(scan, track, self.reparametrize)  # type: ignore[arg-type]
+            point = None
+            with suppress(np.linalg.LinAlgError):
+                point = reparametrize.simplified(scan, track, self.reparametrize)  # type: ignore[arg-type]
             if point is not None:
                 try:
                     slot = self._add(point.start)
@@ -633,7 +692,8 @@ class Slam:
                 self.map.remove(old)
         for o, track in fused:
             if track.extent is not None and isinstance(track.model, Segmented) and track.model.extend:
-                track.extent = reparametrize.extent(scan, track, scan.y[o.index])
+                with suppress(np.linalg.LinAlgError):
+                    track.extent = reparametrize.extent(scan, track, scan.y[o.index])
         if policy.attention.delete:
             self._give_up(scan, policy, {o.landmark: o.outcome for o in seen})
 
@@ -686,7 +746,9 @@ class Slam:
             track = self.tracks.confirmed[name]
             if search.is_first_pass:
                 track.compared = track.observations, self.tracks.changes
-            found = merge.proposal(self.map, self.tracks, name, scan.robot, scan.pose(), policy.upkeep.odds)
+            found = None
+            with suppress(np.linalg.LinAlgError):
+                found = merge.proposal(self.map, self.tracks, name, scan.robot, scan.pose(), policy.upkeep.odds)
             for gone, kept, why in self._merge_pairs(scan, found) if found else ():
                 search.was_merged(kept)
                 scan.report.merged += ((gone, kept, why),)
@@ -694,7 +756,7 @@ class Slam:
     def _merge_pairs(self, scan: ScanContext, found: merge.Merge) -> list[tuple[Id, Id, str]]:
         """Constrain pairs of landmarks to be equal, through the estimator, and remove one of each.
 
-        In a full map nothing is merged.
+        In a full map nothing is merged, nor where their difference has no covariance.
         """
         try:
             slots = self._add_all([merge.difference(self.map, self.tracks, pair) for pair in found.pairs])
@@ -706,8 +768,10 @@ class Slam:
         done, merged = self.estimator.correct(self.map, update), []
         others = f", with {count - 1} others" if count > 1 else ""
         ordered = merge.order(self.tracks, found.pairs)
-        for slot, (kept, gone), d2 in zip(slots, ordered, done.d2.tolist(), strict=True):
+        for slot, (kept, gone), d2, fused in zip(slots, ordered, done.d2.tolist(), done.fused.tolist(), strict=True):
             self.map.remove(slot)
+            if not fused:
+                continue
             self.tracks.merge(self.tracks.confirmed[kept], self.tracks.confirmed[gone])
             self.remove(gone)
             why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
@@ -720,7 +784,9 @@ class Slam:
         One is merged at a time: it changes the map.
         """
         self.tracks.searched = self.tracks.changes
-        found = of_map.repeats(self.map, self.tracks)
+        found: list[Repeat] = []
+        with suppress(np.linalg.LinAlgError):
+            found = of_map.repeats(self.map, self.tracks)
         for repeat in found:
             if policy.upkeep.repeats == "merge" and repeat.sure and (repeat.agrees or self._displace(scan, repeat)):
                 merged = self._merge_pairs(scan, merge.Merge(repeat.pairs, repeat.score))
@@ -742,7 +808,10 @@ class Slam:
         if inside:
             slots += [scan.robot, *(track.slot for track in self.tracks.tentative.values())]
             slots += [clone.slot for clone in self.clones.clones.values()]
-        moved = of_map.displacement(self.map, slots, repeat)
+        try:
+            moved = of_map.displacement(self.map, slots, repeat)
+        except np.linalg.LinAlgError:
+            return False
         rows = self._rows(tuple((slot, len(self.map.rows(slot))) for slot in slots))
         self.map.predict(rows, moved.F, moved.Q)
         for slot, mean in zip(moved.slots, moved.means, strict=True):

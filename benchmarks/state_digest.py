@@ -1,0 +1,48 @@
+"""A digest of all that events have made of a Slam, to the last bit; what it may make anew at any time is left out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+import kalmark as km
+
+# caches, memory made ready, and what does not change
+MADE_ANEW = {"_rows", "_numbers", "_wanted", "_sort_at", "_next", "prefault", "_workspace", "workspace", "_search",
+             "_before", "motion", "model", "capacity"}  # fmt: skip
+
+
+def parts(value: Any) -> Iterator[bytes]:
+    """Return a value as bytes, piece by piece."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.shape}{value.dtype}".encode()
+        yield np.ascontiguousarray(value).tobytes()
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield repr(key).encode()
+            yield from parts(item)
+    elif isinstance(value, set | frozenset):
+        yield repr(sorted(value, key=repr)).encode()
+    elif isinstance(value, list | tuple):
+        yield str(len(value)).encode()
+        for item in value:
+            yield from parts(item)
+    elif type(value).__module__.startswith("kalmark.") and not isinstance(value, Enum) and hasattr(value, "__dict__"):
+        for key, item in vars(value).items():
+            if key not in MADE_ANEW:
+                yield key.encode()
+                yield from parts(item)
+    else:
+        yield repr(value).encode()
+
+
+def digest(slam: km.Slam) -> str:
+    """Return the digest of the map, the tracks, the clones, the controls held and the time."""
+    found = hashlib.sha256()
+    for part in parts((slam.t_ns, slam.map, slam.tracks, slam.clones, slam._moving)):
+        found.update(part)
+    return found.hexdigest()
