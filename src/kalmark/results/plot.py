@@ -57,12 +57,13 @@ class Stroke(NamedTuple):
 def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim: bool = True) -> None:
     """Write a figure as a PNG, with a narrow rim around all that is drawn, or as it is.
 
-    The box of what is drawn is known before it is drawn; matplotlib's own `bbox_inches="tight"` draws twice.
+    matplotlib draws twice to find that box, which only a figure with a layout of its own needs.
     """
     figure.set_dpi(dpi)
     FigureCanvasAgg(figure)
-    box = figure.get_tightbbox().padded(0.15) if rim else None
-    figure.savefig(path, dpi=dpi, format="png", bbox_inches=box, pil_kwargs={"compress_level": 3})
+    laid_out = figure.get_layout_engine() is not None
+    box = None if not rim else "tight" if laid_out else figure.get_tightbbox().padded(0.15)
+    figure.savefig(path, dpi=dpi, format="png", bbox_inches=box, pad_inches=0.15, pil_kwargs={"compress_level": 3})
 
 
 def save_map(run: Recording, path: str | PathLike[str]) -> None:
