@@ -319,6 +319,13 @@ def partial_measurements() -> Iterator[Figure]:
                      "python examples/05_table2.py 50", row(sensor, "{0}"))  # fmt: skip
 
 
+def commands() -> Iterator[Figure]:
+    """Yield what commands add to the filter's own time."""
+    for verb in ("demo", "evaluate", "explain"):
+        yield Figure("Speed", f"`kalmark {verb}`, warm, processor time added to the filter's own: here / 9ae1bee / ratio", "2 s",
+                     "python benchmarks/warm.py 9ae1bee", row(f"{verb}, added:", "{0} s / {3} s / {7}"))  # fmt: skip
+
+
 def speed() -> Iterator[Figure]:
     """Yield the ratios of times within one run, and microseconds for orientation."""
     section, command = "Speed", "python benchmarks/step.py"
@@ -450,6 +457,7 @@ def figures() -> list[Figure]:
         tuning,
         partial_measurements,
         space,
+        commands,
         speed,
         structure,
     )

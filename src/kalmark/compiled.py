@@ -37,7 +37,7 @@ import platformdirs
 from llvmlite import ir
 from numba import types
 from numba.core import event
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
@@ -63,7 +63,7 @@ def cache_folder(part: str) -> str:
         for source in sorted(package.glob(pattern)):
             digest.update(source.read_bytes())
     root = os.environ.get("KALMARK_CACHE") or platformdirs.user_cache_dir("kalmark")
-    return str(Path(root) / "compiled" / digest.hexdigest()[:16])
+    return str(Path(root).absolute() / "compiled" / digest.hexdigest()[:16])
 
 
 class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc, unused-ignore]
@@ -99,15 +99,26 @@ def _whole(path: str) -> bytes | None:
 
 def compiled(function: F) -> F:
     """Compile `function` with numba in nopython mode, cached on disk."""
-    before = numba.config.CACHE_DIR
     part = function.__module__.split(".")[1]
-    numba.config.CACHE_DIR = cache_folder(part if part in SOURCES else "models")
-    try:
-        dispatcher = numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
-    finally:
-        numba.config.CACHE_DIR = before
-    dispatcher._cache._cache_file.__class__ = _CheckedFiles  # numba has no door for it
-    return dispatcher
+    made = numba.njit(error_model="numpy", no_cfunc_wrapper=True)(function)
+    made._cache = _OpenedLater(function, cache_folder(part if part in SOURCES else "models"))
+    return made
+
+
+class _OpenedLater(FunctionCache):  # type: ignore[misc]
+    """The cache of a function in a folder, opened when the function is first used: in one process, most never are."""
+
+    def __init__(self, py_func: Callable[..., Any], folder: str) -> None:
+        self._py_func, self._folder = py_func, folder
+
+    def __getattr__(self, name: str) -> Any:  # of what is not there until it is opened
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, self._folder
+        try:
+            super().__init__(self._py_func)
+            self._cache_file.__class__ = _CheckedFiles  # numba has no door for it
+        finally:
+            numba.config.CACHE_DIR = before
+        return getattr(self, name)
 
 
 @cache

@@ -74,12 +74,12 @@ def test_the_map_of_a_run_in_space_has_a_view_and_a_plan(run: Run, tmp_path: Pat
     assert space.get_aspect() == plan.get_aspect() == 1.0
     assert (plan.get_xlabel(), plan.get_ylabel()) == ("x (m)", "y (m)")
     labels = [text.get_text() for text in draw_map(run).legends[0].get_texts()]
-    ends = ["start", "end", r"$3\sigma$ of the end"]
+    ends = ["start", "end", "3σ of the end"]
     assert labels == [
         "estimated path",
         "true path",
         "true landmarks",
-        r"Euclidean landmarks, $3\sigma$",
+        "Euclidean landmarks, 3σ",
         *ends,
         "dead reckoning",
     ]
@@ -139,7 +139,7 @@ def test_the_image_shows_what_was_used_and_what_was_rejected(run: Run) -> None:
     (axes,) = figure.axes
     assert axes.get_ylim() == (480.0, 0.0)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["measured", r"Euclidean, used, $3\sigma$", r"Euclidean, predicted only, $3\sigma$", "rejected"]
+    assert labels == ["measured", "Euclidean, used, 3σ", "Euclidean, predicted only, 3σ", "rejected"]
     names = {text.get_text(): text.get_position() for text in axes.texts}
     assert names[str(WRONG)][1] == pytest.approx(by_name[str(WRONG)].expected[0, 1] - 15)
 
@@ -309,4 +309,4 @@ def test_points_that_a_camera_starts_are_placed_by_their_depth() -> None:
     drawn = Scene.of(run).shapes
     assert (drawn.group == OTHERS).any(), "some points are not yet Euclidean"
     labels = [text.get_text() for text in draw_sensor(run, "rover", "eye").legends[0].get_texts()]
-    assert r"not Euclidean, used, $3\sigma$" in labels
+    assert "not Euclidean, used, 3σ" in labels

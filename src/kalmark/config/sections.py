@@ -52,7 +52,8 @@ class Section(BaseModel):
     `elsewhere` says of keys that another section of this kind has what they are here.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    # what a command does not read is not built: a third of the time to import the configuration
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
     elsewhere: ClassVar[dict[str, str]] = {}
 
     @model_validator(mode="before")

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
@@ -50,27 +51,26 @@ _SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
 _ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
 
 
-def place(
-    model: Landmark | None, mean: Array, covariance: Array, ends: Array | None = None
+def places(
+    model: Landmark | None, means: Array, covariances: Array, ends: Sequence[Array | None]
 ) -> tuple[Array, Array] | None:
-    """Return the place and covariance of one landmark's state; `ends` (2,) are the abscissas of a line's ends.
+    """Return the places and covariances of the states (K, n) of landmarks of one model.
 
-    The pose of a tag and a point with its signature are their own places.  None if a model does not say where it is.
+    `ends` (K of (2,)) are the abscissas of lines' ends.  The pose of a tag and a point with its signature are their
+    own places.  None if a model does not say where it is.
     """
-    mean, covariance = np.array(mean, dtype=np.float64), np.array(covariance, dtype=np.float64)
     if model is None or model.space.kinds == SE3.kinds or isinstance(model, PointSignature2D):
-        return mean, covariance
+        return means, covariances
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if isinstance(model, Segmented):
-            p, P_l = model.endpoints(mean[None], np.array(model.first_ends if ends is None else ends)[None])
-            p, P_l = p.reshape(1, LINE), P_l.reshape(1, LINE, -1)
-        elif (found := place_of(model, mean[None])) is not None:
+            p, P_l = model.endpoints(means, np.array([model.first_ends if t is None else t for t in ends]))
+            p, P_l = p.reshape(-1, LINE), P_l.reshape(len(means), LINE, -1)
+        elif (found := place_of(model, means)) is not None:
             p, P_l = found
         else:
             return None
-        covariance = P_l[0] @ covariance @ P_l[0].T
-    at_infinity = ~np.isfinite(p[0])
-    return np.where(at_infinity, np.inf, p[0]), np.where(np.isfinite(covariance), covariance, np.inf)
+        covariances = P_l @ covariances @ P_l.swapaxes(1, 2)
+    return np.where(np.isfinite(p), p, np.inf), np.where(np.isfinite(covariances), covariances, np.inf)
 
 
 class Shapes(NamedTuple):
@@ -131,9 +131,16 @@ class MapLandmarks:
         table = slam.landmarks()
         in_space = any(robot.motion.space.world == "space" for robot in slam.robots.values())
         d = 3 if in_space else 2
-        nowhere = np.full(d, np.nan), np.full((d, d), np.nan)
-        places = [place(slam.landmark_model(i), mean, P, slam.segment_ends(i)) or nowhere for i, _, mean, P, _ in table]
-        means, covariances = ([one[k] for one in places] for k in (0, 1))
+        means, covariances = [np.full(d, np.nan)] * len(table), [np.full((d, d), np.nan)] * len(table)
+        of_models: dict[int, list[int]] = defaultdict(list)
+        models = [slam.landmark_model(i) for i in table.ids]
+        for k, model in enumerate(models):
+            of_models[id(model)].append(k)
+        for rows in of_models.values():
+            states = np.array([table.means[k] for k in rows]), np.array([table.covariances[k] for k in rows])
+            found = places(models[rows[0]], *states, [slam.segment_ends(table.ids[k]) for k in rows])
+            for k, mean, covariance in zip(rows, *found, strict=True) if found is not None else ():
+                means[k], covariances[k] = mean, covariance
         observations = [int(count) for count in table.observations]
         return cls(list(table.ids), list(table.kinds), means, covariances, observations, in_space)
 

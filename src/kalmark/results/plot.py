@@ -27,11 +27,11 @@ VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "f
 LANDMARK_COLOUR = "#d2691e"
 EUCLIDEAN_COLOUR, OTHER_COLOUR, LINE_COLOUR = "#1f5fa8", "#c8412f", "#8c1c13"
 GROUPS = {  # of landmarks that are drawn alike, by the dimensions of the scene
-    2: ((LANDMARK_COLOUR, r"estimated landmarks, $3\sigma$"),) * 3,
+    2: ((LANDMARK_COLOUR, "estimated landmarks, 3σ"),) * 3,
     3: (
-        (EUCLIDEAN_COLOUR, r"Euclidean landmarks, $3\sigma$"),
-        (OTHER_COLOUR, r"other landmarks, $3\sigma$"),
-        (LINE_COLOUR, r"lines, $3\sigma$ of their ends"),
+        (EUCLIDEAN_COLOUR, "Euclidean landmarks, 3σ"),
+        (OTHER_COLOUR, "other landmarks, 3σ"),
+        (LINE_COLOUR, "lines, 3σ of their ends"),
     ),
 }
 LONG = 3000  # a path of more steps than this is drawn thinner
@@ -54,10 +54,16 @@ class Stroke(NamedTuple):
     sample: dict[str, Any] | None = None
 
 
-def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, **how: Any) -> None:
-    """Write a figure as a PNG, by default with a narrow rim."""
+def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim: bool = True) -> None:
+    """Write a figure as a PNG, with a narrow rim around all that is drawn, or as it is.
+
+    matplotlib draws twice to find that box, which only a figure with a layout of its own needs.
+    """
+    figure.set_dpi(dpi)
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=dpi, format="png", **(how or {"bbox_inches": "tight", "pad_inches": 0.15}))
+    laid_out = figure.get_layout_engine() is not None
+    box = None if not rim else "tight" if laid_out else figure.get_tightbbox().padded(0.15)
+    figure.savefig(path, dpi=dpi, format="png", bbox_inches=box, pad_inches=0.15, pil_kwargs={"compress_level": 3})
 
 
 def save_map(run: Recording, path: str | PathLike[str]) -> None:
@@ -207,7 +213,7 @@ def _robot_strokes(scene: Scene) -> list[Stroke]:
         ends.append(Stroke(path[-1:, :d], _marks(marker, colour, size, 8) | {"markeredgecolor": "white"}, "end", mark))
         ring = joined(contours(path[-1:, :d], scene.pose_covariances[robot][-1:, :d, :d])[0], d)
         style = {"color": colour if d == 2 else POSE_COLOUR, "linewidth": 0.9, "zorder": 7}
-        rings.append(Stroke(ring, style, r"$3\sigma$ of the end", style | {"color": INK if d == 2 else POSE_COLOUR}))
+        rings.append(Stroke(ring, style, "3σ of the end", style | {"color": INK if d == 2 else POSE_COLOUR}))
         if d == 3:
             thin = {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}
             rings.append(Stroke(joined(scene.frames(robot)), thin))

@@ -258,7 +258,7 @@ def legend(seen: list[Image]) -> list[Line2D]:
         out = [Line2D([], [], color="#3a68c8", linewidth=3, alpha=0.55, label="measured")]
     found = dict.fromkeys(colour_of(s) for s in sightings if np.isfinite(s.expected).all())
     lines = any(len(s.measured) > 1 for s in sightings)
-    out += [Line2D([], [], color=c, label=label if lines else rf"{label}, $3\sigma$") for c, label in sorted(found)]
+    out += [Line2D([], [], color=c, label=label if lines else f"{label}, 3σ") for c, label in sorted(found)]
     if any(s.outcome == "new" for s in sightings):
         square: dict[str, Any] = {"marker": "s", "markerfacecolor": "none", "linestyle": ""}
         out.append(Line2D([], [], color=NAME, label="new landmark", **square))

@@ -429,4 +429,4 @@ def rounded(values: Array, digits: int) -> list[float | None]:
 
 def significant(values: Array, digits: int = 4) -> list[float | None]:
     """Return values to so many significant digits, None for NaN and infinity."""
-    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values.tolist()]
+    return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in values.tolist()]

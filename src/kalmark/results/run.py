@@ -57,6 +57,6 @@ class Run(Recording):
         for robot, sensor, *_ in (camera for camera in self.history.cameras if len(steps_of(self.history, camera))):
             written.append(folder / f"sensor_{file_name(robot)}_{file_name(sensor)}.png")
             picture = draw_sensor(self, robot, sensor)
-            replace_file(written[-1], partial(save_figure, picture, dpi=110, bbox_inches=None))
+            replace_file(written[-1], partial(save_figure, picture, dpi=110, rim=False))
         write(folder / "report.html", report_html(self))
         return written

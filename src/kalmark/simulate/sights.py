@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -90,14 +91,17 @@ class Things:
     values: Array
     sizes: Array
     seen: Flags = field(init=False)
-    tree: Any = field(init=False)
     dimensions: int = 2
 
     def __post_init__(self) -> None:
+        self.seen = np.zeros(len(self.values), dtype=np.bool_)
+
+    @cached_property
+    def tree(self) -> Any:
+        """All of it in a tree of places.  Sensors without a limit of range do without."""
         from scipy.spatial import cKDTree
 
-        self.seen = np.zeros(len(self.values), dtype=np.bool_)
-        self.tree = cKDTree(self.centres()) if len(self.values) else None
+        return cKDTree(self.centres())
 
     def extent(self) -> float:
         """Return the length of the diagonal of all of it, in m, at least 1."""
@@ -109,7 +113,7 @@ class Things:
 
     def near(self, place: Array, reach_m: float) -> Indices:
         """Return the indices (K,) of those within `reach_m` of a place (D,), in order."""
-        if math.isinf(reach_m) or self.tree is None:
+        if math.isinf(reach_m) or not len(self.values):
             return np.arange(len(self.values))
         return np.array(sorted(self.tree.query_ball_point(place, reach_m)), dtype=np.int64)
 
