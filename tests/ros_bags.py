@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.events import Control, Event, Scan
+from kalmark.logs import Log
 from kalmark.logs.bag.geodesy import earth_centred
 from kalmark.logs.bag.write import Outgoing, Types, header
 from laser_worlds import LaserWorld
@@ -176,3 +178,30 @@ def fix(t_ns: int, lla: list[float], status: int = 0, kind: int = 2, sigma: floa
     fields |= dict(zip(("latitude", "longitude", "altitude"), lla, strict=True))
     fields |= {"position_covariance": np.diag([sigma**2, sigma**2, 1.0]).ravel(), "position_covariance_type": kind}
     return Outgoing("/fix", "sensor_msgs/msg/NavSatFix", t_ns, fields)
+
+
+def same(a: Event, b: Event) -> bool:
+    """Return whether two events are the same to the last bit."""
+    if type(a) is not type(b) or (a.t_ns, a.robot) != (b.t_ns, b.robot):
+        return False
+    if isinstance(a, Scan) and isinstance(b, Scan) and (a.sensor, a.ids or ()) != (b.sensor, b.ids or ()):
+        none = {None}
+        if a.sensor != b.sensor or set(a.ids or none) != none or set(b.ids or none) != none:
+            return False
+    numbers = [(e.u if isinstance(e, Control) else e.y, e.cov) for e in (a, b)]
+    return all(
+        (x is None) == (y is None) and (x is None or (x.shape == y.shape and x.tobytes() == y.tobytes()))
+        for x, y in zip(*numbers, strict=True)
+    )
+
+
+def same_logs(a: Log, b: Log) -> bool:
+    return (
+        len(a.events) == len(b.events)
+        and all(map(same, a.events, b.events))
+        and {r: (p.t_ns.tobytes(), p.poses.tobytes()) for r, p in a.truth.items()}
+        == {r: (p.t_ns.tobytes(), p.poses.tobytes()) for r, p in b.truth.items()}
+        and {k: v.tobytes() for k, v in a.landmarks.items()} == {k: v.tobytes() for k, v in b.landmarks.items()}
+        and (a.control_columns, a.sensor_columns) == (b.control_columns, b.sensor_columns)
+        and a.describes == b.describes
+    )

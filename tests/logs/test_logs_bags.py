@@ -12,8 +12,8 @@ import pytest
 
 from kalmark.config import build_slam, open_run
 from kalmark.errors import KalmarkError, LogError
-from kalmark.events import Control, Event, Fix, Scan
-from kalmark.logs import Log, open_log, write_native
+from kalmark.events import Control, Fix, Scan
+from kalmark.logs import open_log, write_native
 from kalmark.logs.bag.geodesy import A_M, E2, FLATTENING, earth_centred, local
 from kalmark.results.record import record
 
@@ -32,6 +32,7 @@ from ros_bags import (
     odometry,
     pose,
     robot_among_posts,
+    same_logs,
     tf,
     transform,
     write_bag,
@@ -67,33 +68,6 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def bag_of(tmp_path: Path, messages: Iterable[Outgoing], kind: str = "mcap") -> Path:
     return write_bag(tmp_path, kind, messages)
-
-
-def same(a: Event, b: Event) -> bool:
-    """Return whether two events are the same to the last bit."""
-    if type(a) is not type(b) or (a.t_ns, a.robot) != (b.t_ns, b.robot):
-        return False
-    if isinstance(a, Scan) and isinstance(b, Scan) and (a.sensor, a.ids or ()) != (b.sensor, b.ids or ()):
-        none = {None}
-        if a.sensor != b.sensor or set(a.ids or none) != none or set(b.ids or none) != none:
-            return False
-    numbers = [(e.u if isinstance(e, Control) else e.y, e.cov) for e in (a, b)]
-    return all(
-        (x is None) == (y is None) and (x is None or (x.shape == y.shape and x.tobytes() == y.tobytes()))
-        for x, y in zip(*numbers, strict=True)
-    )
-
-
-def same_logs(a: Log, b: Log) -> bool:
-    return (
-        len(a.events) == len(b.events)
-        and all(map(same, a.events, b.events))
-        and {r: (p.t_ns.tobytes(), p.poses.tobytes()) for r, p in a.truth.items()}
-        == {r: (p.t_ns.tobytes(), p.poses.tobytes()) for r, p in b.truth.items()}
-        and {k: v.tobytes() for k, v in a.landmarks.items()} == {k: v.tobytes() for k, v in b.landmarks.items()}
-        and (a.control_columns, a.sensor_columns) == (b.control_columns, b.sensor_columns)
-        and a.describes == b.describes
-    )
 
 
 # ------------------------------------------------------------------ the same from every file

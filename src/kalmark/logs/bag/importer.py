@@ -117,7 +117,7 @@ class _Importer:
             if received.topic in tf:
                 self.frames.take(MESSAGES[received.type].transforms(received.message))  # type: ignore[misc]
             elif received.topic in scans and received.topic not in self.of_sensor:
-                self.of_sensor[received.topic] = _frame_id(received.message)
+                self.of_sensor[received.topic] = frame_id(received.message)
             elif received.topic in moves:
                 robot = self.topics[received.topic].robot
                 self.base.setdefault(robot, getattr(received.message, "child_frame_id", ""))
@@ -368,7 +368,7 @@ def sensor_name(name: str, scan: Scans) -> str:
     return scan.sensor or name.strip("/").replace("/", "_")
 
 
-def _frame_id(message: Any) -> str:
+def frame_id(message: Any) -> str:
     """Return the frame of a message; of markers that of the first."""
     if has_header(message):
         return str(message.header.frame_id)

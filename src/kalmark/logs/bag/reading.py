@@ -109,19 +109,14 @@ class Bag:
         known = ", ".join(sorted(self.topics)) or "one of a bag that is not empty"
         raise LogError(f"{self.path}: no topic {shown(name)}, expected {known}{nearest(name, self.topics)}")
 
+    def times(self) -> Iterator[tuple[str, int]]:
+        """Yield topic and time (ns) of all messages as recorded, without reading them.  Raises LogError."""
+        for connection, recorded_ns, _ in self._raw(self._reader.connections):
+            yield connection.topic, int(recorded_ns)
+
     def messages(self, topics: Collection[str]) -> Iterator[Received]:
         """Yield the messages of these topics in the order in which they were recorded.  Raises LogError."""
-        wanted = [each for each in self._reader.connections if each.topic in topics]
-        if not wanted:
-            return
-        incoming = self._reader.messages(connections=wanted)
-        while True:
-            try:
-                connection, recorded_ns, raw = next(incoming)
-            except StopIteration:
-                return
-            except Exception as error:  # a file that ends too early, or is damaged in the middle
-                raise self._damaged(error) from None
+        for connection, recorded_ns, raw in self._raw([c for c in self._reader.connections if c.topic in topics]):
             try:
                 message = self._reader.deserialize(raw, connection.msgtype)
             except Exception as error:
@@ -132,6 +127,18 @@ class Bag:
                 at = f"the message of {connection.topic} recorded at {recorded_ns} ns"
                 raise LogError(f"{self.path}: {at} is no {connection.msgtype} ({reason})") from None
             yield Received(connection.topic, connection.msgtype, int(recorded_ns), message)
+
+    def _raw(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        """Yield connection, time (ns) and bytes of the messages of some connections."""
+        incoming = self._reader.messages(connections=connections) if connections else iter(())
+        while True:
+            try:
+                received = next(incoming)
+            except StopIteration:
+                return
+            except Exception as error:  # a file that ends too early, or is damaged in the middle
+                raise self._damaged(error) from None
+            yield received
 
 
 def stamp(message: Any) -> int:
