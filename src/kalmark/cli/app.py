@@ -9,11 +9,13 @@ from typing import Annotated
 
 import typer
 
+from kalmark.cli.bag import bag
 from kalmark.cli.campaign import campaign
 from kalmark.cli.check import check
+from kalmark.cli.convert import convert
 from kalmark.cli.diagnose import diagnose
 from kalmark.cli.folders import evaluate, explain, report
-from kalmark.cli.logs import config, convert, data, simulate
+from kalmark.cli.logs import config, data, simulate
 from kalmark.cli.run import demo, run, warm_up
 from kalmark.cli.tune import tune
 from kalmark.errors import KalmarkError
@@ -43,7 +45,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verb in (demo, run, simulate, evaluate, diagnose, tune, report, explain, campaign, config, convert, check, warm_up):
+for verb in (
+    demo,
+    run,
+    simulate,
+    evaluate,
+    diagnose,
+    tune,
+    report,
+    explain,
+    campaign,
+    config,
+    bag,
+    convert,
+    check,
+    warm_up,
+):
     app.command()(verb)
 app.add_typer(data, name="data")
 for name, what in COMING.items():

@@ -1,4 +1,4 @@
-"""What makes logs, `kalmark simulate`, `convert` and `data`, and configurations to start from, `kalmark config`."""
+"""What makes logs, `kalmark simulate` and `data`, and configurations to start from, `kalmark config`."""
 
 from __future__ import annotations
 
@@ -45,20 +45,6 @@ def fitting_config(world: World, seed: int) -> str:
     values = config_dict(config.model_copy(update={"log": log, "seed": seed}))
     chosen = config.estimator.model_dump(exclude_defaults=True)  # so that --set estimator.type=ekf is enough
     return config_yaml(values | {"estimator": {"type": config.estimator.type, **chosen}})
-
-
-def convert(
-    source: Annotated[Path, typer.Argument(metavar="IN", help="A log in any format kalmark reads.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder of the native log to write.")],
-    log_format: Annotated[str | None, typer.Option("--format", help="Format of IN, if not recognised.")] = None,
-) -> None:
-    """Write a log as a native one: a folder of CSV files."""
-    from kalmark.logs import open_log, write_native
-
-    writable(out)
-    log = open_log(source, log_format)
-    write_native(log, out)
-    typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}, read as {log.format}")
 
 
 @data.command("list")

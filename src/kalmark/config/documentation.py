@@ -68,7 +68,8 @@ def page() -> str:
         [HEAD.format(names=", ".join(f"`{n}`" for n in shipped_configs()))],
     )
     parts += [_section("The file", schema.Config)]
-    parts += [_section("`log`", schema.LogConfig), _section("`robots.NAME`", schema.RobotConfig)]
+    parts += [_section("`log`", schema.LogConfig), _choice("`log.topics.TOPIC`, of a bag", "topic")]
+    parts += [_section("`robots.NAME`", schema.RobotConfig)]
     parts += [_section("`robots.NAME.start`, in the plane", schema.StartConfig)]
     parts += [_section("`robots.NAME.start`, in space", schema.SpaceStartConfig)]
     parts += [_choice("`robots.NAME.motion`", "motion"), _section(f"{of_sensor}`", schema.Mounted)]

@@ -37,6 +37,7 @@ Initialization = Annotated[Any, Choice("initialization", default="immediate")]
 Detector = Annotated[Any, Choice("detector")]
 Attention = Annotated[Any, Choice("attention", typed=False)]
 Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
+Topic = Annotated[Any, Choice("topic")]
 
 Plugins = Annotated[tuple[str, ...], Field(strict=False)]
 
@@ -252,6 +253,8 @@ class LogConfig(Section):
     """tagslam: use the odometry of the bag (auto if absent)."""
     sigma_px: Positive | None = None
     """tagslam: noise of a corner's coordinate (the pixel_noise of tagslam.yaml if absent)."""
+    topics: dict[str, Topic] | None = None
+    """bag: topics by name, and what each of them is in the log, see below."""
 
     def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""

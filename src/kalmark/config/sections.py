@@ -16,6 +16,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 import kalmark.association
 import kalmark.detect
 import kalmark.filter.estimators
+import kalmark.logs.bag.topics
 import kalmark.management.attention
 import kalmark.management.initialization
 import kalmark.management.upkeep

@@ -12,6 +12,7 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.events import Event, Scan
+from kalmark.logs.bag.importer import BAG
 from kalmark.logs.download import find_data
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
@@ -27,6 +28,7 @@ from kalmark.logs.victoria_park import VICTORIA_PARK
 
 FORMATS: dict[str, Format] = {entry.name: entry for entry in (
     NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB, TAGSLAM, KITTI_STEREO, PLAZA,
+    BAG,
 )}  # fmt: skip
 
 

@@ -6,9 +6,6 @@ from scan to scan.  The reference bag gives the path of the rig and the tags, to
 
 from __future__ import annotations
 
-import bz2
-import shutil
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,6 +19,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.geometry.frames3d import compose, inverse
+from kalmark.logs.bag.reading import Bag, stamp
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     Format,
@@ -47,7 +45,6 @@ LENSES = {"equidistant": "equidistant", "radtan": "radtan", "plumb_bob": "radtan
 COEFFICIENTS = {"equidistant": 4, "radtan": 5}
 MAX_HAMMING = 2
 HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
-SECOND_NS = 1_000_000_000
 SIGMA = 0.005
 """Of odometry, m and rad per square root of a second, where none is given: that of test 21 is 0.003."""
 LATE_NS = 1_000_000_000
@@ -181,28 +178,8 @@ def find_bag(folder: Path, name: str) -> Path | None:
 
 def messages(path: Path) -> list[tuple[str, Any]]:
     """Return (topic, message) of everything in a bag, as recorded.  Raises LogError if it cannot be read."""
-    try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-    except ImportError:
-        raise LogError(f"{path}: a bag needs the library rosbags, `pip install 'kalmark[rosbags]'`") from None
-    with tempfile.TemporaryDirectory(prefix="kalmark-") as aside:
-        bag = Path(aside) / path.stem if path.suffix == ".bz2" else path
-        try:
-            if bag is not path:
-                with bz2.open(path) as packed, bag.open("wb") as plain:
-                    shutil.copyfileobj(packed, plain)
-        except (OSError, EOFError) as error:
-            raise LogError(f"{path}: cannot be unpacked ({error}), expected a whole bag") from None
-        try:
-            with AnyReader([bag]) as reader:
-                return [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
-        except AnyReaderError as error:
-            raise LogError(f"{path}: {error}, expected a whole bag") from None
-
-
-def stamp(message: Any) -> int:
-    """Return the time (ns) in a message's header."""
-    return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
+    with Bag(path) as bag:
+        return [(received.topic, received.message) for received in bag.messages(bag.topics)]
 
 
 def pose_of(position: Any, rotation: Any) -> Array:

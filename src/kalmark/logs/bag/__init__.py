@@ -1,0 +1,1 @@
+"""ROS bags by topic, without ROS: docs/bags.md."""

@@ -1,0 +1,42 @@
+"""Latitude and longitude as metres east, north and up of an origin: the local tangent plane of WGS 84.
+
+The closed form through earth-centred coordinates is exact (Hofmann-Wellenhof, Lichtenegger, Wasle, GNSS, 2008, 8.2):
+
+    N = a / sqrt(1 - e^2 sin^2 lat)
+    X = ((N + h) cos lat cos lon, (N + h) cos lat sin lon, ((1 - e^2) N + h) sin lat)
+    (east, north, up) = R(origin) (X - X(origin))
+
+A library for map projections would compute these three lines, too; it is needed for other datums and geoids, and
+receivers give neither.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+
+A_M = 6378137.0
+FLATTENING = 1 / 298.257223563
+E2 = FLATTENING * (2 - FLATTENING)
+
+
+def earth_centred(lla: Any) -> Array:
+    """Return positions (..., 3) = latitude and longitude (deg), height (m) as X, Y, Z (m), earth-centred."""
+    lla = np.asarray(lla, dtype=np.float64)
+    lat, lon, h = np.radians(lla[..., 0]), np.radians(lla[..., 1]), lla[..., 2]
+    n = A_M / np.sqrt(1 - E2 * np.sin(lat) ** 2)
+    across = (n + h) * np.cos(lat)
+    return np.stack([across * np.cos(lon), across * np.sin(lon), ((1 - E2) * n + h) * np.sin(lat)], axis=-1)
+
+
+def local(lla: Any, origin: Any) -> Array:
+    """Return positions (..., 3) = latitude, longitude (deg), height (m) as east, north, up (m) of an origin (3,)."""
+    origin = np.asarray(origin, dtype=np.float64)
+    lat, lon = np.radians(origin[:2])
+    s, c, sl, cl = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    R = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
+    enu: Array = (earth_centred(lla) - earth_centred(origin)) @ R.T
+    return enu

@@ -1,0 +1,407 @@
+"""Read a bag by topic: a configuration says of each topic what it is in the log (`topics.py`, docs/bags.md)."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import EventError, LogError
+from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.geometry import rotations
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.frames3d import compose, inverse
+from kalmark.logs.bag import tables
+from kalmark.logs.bag.frames import Frames
+from kalmark.logs.bag.geodesy import local
+from kalmark.logs.bag.messages import BEAM, MESSAGES, POINT, POSE, Message, Place, Pose, Seen
+from kalmark.logs.bag.reading import Bag, Received, find_bag, has_header, stamp
+from kalmark.logs.bag.topics import Fixes, Noisy, Placed, Posed, Scans, Topic, Truths, topic_of
+from kalmark.logs.log import Log, PositionTrack, Trajectory
+from kalmark.logs.source import Format, Request, placed, seconds
+from kalmark.logs.table import Refused
+
+BASES = ("base_link", "base_footprint")
+LEVEL = math.cos(math.radians(5))  # a sensor tilted by less is taken as level
+DAY_NS = 86_400_000_000_000
+_AXES2, _AXES3 = [0, 1], [0, 1, 2]
+
+
+def read(path: Path, request: Request, topics: Mapping[str, Any] | None = None) -> Log:
+    """Return the log that these topics of a bag are; of a bag that kalmark wrote, the log itself.
+
+    Raises LogError: a topic that is not there, messages that do not offer what the topic is to be.
+    """
+    with Bag(path) as bag:
+        if topics is None and tables.holds_log(bag):
+            return tables.read(bag, request)
+        if not topics:
+            there = ", ".join(bag.topics) or "none"
+            hint = f"topics {there}; `kalmark bag {path} --out config.yaml` writes a configuration to start from"
+            raise LogError(f"{path}: log.topics is missing, expected what they are: {hint}")
+        return _Importer(bag, {name: topic_of(name, section) for name, section in topics.items()}, request).log()
+
+
+def offered(bag: Bag, name: str, topic: Topic) -> Message:
+    """Return what the messages of a topic offer.  Raises LogError if that is not what the topic is to be."""
+    kind, known = bag.topics[name].type, MESSAGES.get(bag.topics[name].type)
+    if known is None or not any(getattr(known, want) for want in topic.wants):
+        types = ", ".join(sorted({short(k) for k, m in MESSAGES.items() if any(getattr(m, w) for w in topic.wants)}))
+        what = short(kind) if known is None else f"{short(kind)} ({known.what})"
+        raise LogError(f"{bag.path}: topic {name} has messages of the type {what}, expected one of {types}")
+    if known.transforms is not None and not (isinstance(topic, Posed) and topic.frame and topic.child_frame):
+        raise LogError(f"{bag.path}: topic {name} has many frames, expected `frame` and `child_frame`: two of them")
+    return known
+
+
+def short(kind: str) -> str:
+    """Return a type's name as users write it."""
+    return kind.replace("/msg/", "/")
+
+
+class _Importer:
+    """Takes messages one by one and gathers what becomes of them."""
+
+    def __init__(self, bag: Bag, topics: Mapping[str, Topic], request: Request) -> None:
+        self.bag, self.request = bag, request
+        self.topics = {bag.find(name): topic for name, topic in topics.items()}
+        self.offers = {name: offered(bag, name, topic) for name, topic in self.topics.items()}
+        self.columns = self._controls()
+        self.events: list[Event] = []
+        self.sensor_columns: dict[tuple[str, str], tuple[str, ...]] = {}
+        self.paths: dict[str, dict[int, Array]] = {}
+        self.positions: dict[str, dict[int, Array]] = {}
+        self.last: dict[str, tuple[int, Array]] = {}
+        self.origins: dict[str, Array] = {}
+        self.left_out: Counter[tuple[str, str]] = Counter()
+        self.clocks: dict[bool, tuple[str, int]] = {}
+        self.frames, self.of_sensor, self.base = Frames(), dict[str, str](), dict[str, str]()
+        self.mounts: dict[tuple[str, str], dict[str, float]] = {}
+        self.level: dict[str, tuple[Array, bool]] = {}
+
+    def _controls(self) -> dict[str, tuple[str, ...]]:
+        """Return the columns of each robot's controls.  Raises LogError if two topics are those of one robot."""
+        columns: dict[str, tuple[str, ...]] = {}
+        named: dict[str, str] = {}
+        for name, topic in self.topics.items():
+            if topic.columns and topic.robot in columns:
+                both = f"{named[topic.robot]} and {name} are both controls of {topic.robot!r}"
+                raise LogError(f"{self.bag.path}: topics {both}, expected one topic of controls for each robot")
+            if topic.columns:
+                columns[topic.robot], named[topic.robot] = topic.columns, name
+        return columns
+
+    def in_space(self, robot: str) -> bool:
+        """Return whether a robot moves in space: by its controls; one without any does."""
+        own = [topic.space for topic in self.topics.values() if topic.robot == robot and topic.columns]
+        return own[0] if own else True
+
+    # -------------------------------------------------------------- mounts
+    def look_ahead(self) -> None:
+        """Note the frames of sensors and robots, and those of tf that stand still: for the mounts of sensors."""
+        scans = {name for name, topic in self.topics.items() if isinstance(topic, Scans)}
+        if not scans:
+            return
+        tf = {
+            name
+            for name, topic in self.bag.topics.items()
+            if topic.type in MESSAGES and MESSAGES[topic.type].transforms
+        }
+        moves = {name for name, topic in self.topics.items() if isinstance(topic, Posed) and topic.columns}
+        for received in self.bag.messages(tf | scans | moves):
+            if received.topic in tf:
+                self.frames.take(MESSAGES[received.type].transforms(received.message))  # type: ignore[misc]
+            elif received.topic in scans and received.topic not in self.of_sensor:
+                self.of_sensor[received.topic] = frame_id(received.message)
+            elif received.topic in moves:
+                robot = self.topics[received.topic].robot
+                self.base.setdefault(robot, getattr(received.message, "child_frame_id", ""))
+        for name in sorted(scans):
+            self._mount(name, self.topics[name])
+
+    def _mount(self, name: str, scan: Topic) -> None:
+        """Note where a sensor is mounted, if tf says so; in the plane also how its points are made level."""
+        assert isinstance(scan, Scans)
+        bases = (scan.base_frame, self.base.get(scan.robot), *BASES)
+        base = next((each for each in bases if each and each.lstrip("/") in self.frames.names()), None)
+        mount = None if base is None else self.frames.fixed(base, self.of_sensor.get(name, ""))
+        if mount is None:
+            return
+        key = (scan.robot, sensor_name(name, scan))
+        if self.in_space(scan.robot):
+            self.mounts[key] = placed(mount)
+            return
+        R = rotations.matrix(mount[3:])
+        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
+        raw = MESSAGES[self.bag.topics[name].type].seen is beams_of
+        if raw and abs(R[2, 2]) < LEVEL:
+            tilt = math.degrees(math.acos(min(1.0, abs(R[2, 2]))))
+            self.request.skipped.append(f"{self.bag.path}: {name} is tilted by {tilt:.0f} deg in tf, taken as level")
+        self.level[name] = (np.eye(3) if raw else R, bool(raw and R[2, 2] < 0))
+        self.mounts[key] = {"x_m": float(mount[0]), "y_m": float(mount[1]), "theta_rad": yaw if raw else 0.0}
+
+    # -------------------------------------------------------------- messages
+    def log(self) -> Log:
+        """Return the log."""
+        self.look_ahead()
+        for received in self.bag.messages(self.topics):
+            self.take(received)
+        for (name, reason), count in sorted(self.left_out.items()):
+            self.request.leave_out(count, f"{self.bag.path}: {name}: {count} {reason}")
+        for name in self.topics:
+            if not self.bag.topics[name].number:
+                raise LogError(f"{self.bag.path}: topic {name} has no messages, expected at least one")
+        robots = tuple(dict.fromkeys(topic.robot for topic in self.topics.values()))
+        return Log(
+            name=self.bag.path.name.partition(".")[0], format="bag", path=self.bag.path,
+            robots=tuple(robot for robot in robots if any(event.robot == robot for event in self.events)),
+            events=sorted(self.events, key=order), truth=_trajectories(self.paths), skipped=self.request.skipped,
+            gps={robot: _track(positions) for robot, positions in self.positions.items()},
+            control_columns=self.columns, sensor_columns=self.sensor_columns, describes=self.describes(),
+        )  # fmt: skip
+
+    def describes(self) -> dict[str, Any]:
+        """Return the motions by the topics' types, and the mounts of tf, in the shape of a configuration."""
+        robots: dict[str, dict[str, Any]] = {}
+        for topic in self.topics.values():
+            if topic.columns:
+                robots.setdefault(topic.robot, {})["motion"] = {"type": type_of(topic)}
+        for (robot, sensor), mount in self.mounts.items():
+            robots.setdefault(robot, {}).setdefault("sensors", {})[sensor] = {"mount": mount}
+        return {"robots": robots} if robots else {}
+
+    def take(self, received: Received) -> None:
+        """Take one message; what is bad in it is refused, with its topic and time."""
+        topic, offer = self.topics[received.topic], self.offers[received.topic]
+        t_ns = self.time(received, topic)
+        try:
+            if isinstance(topic, Scans):
+                self.scan(received, topic, offer, t_ns)
+            elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
+                self.globe(received, topic, offer.globe(received.message), t_ns)
+            elif isinstance(topic, Posed):
+                self.poses(received, topic, offer, t_ns)
+            elif offer.drive is not None and "drive" in topic.wants:
+                self.control(topic, t_ns, offer.drive(received.message), None)
+            elif offer.twist is not None:
+                self.velocity(topic, t_ns, offer, received.message)
+        except (Refused, EventError) as refused:
+            at = f"{received.topic} at t={seconds(t_ns)} s"
+            self.request.refuse(f"{self.bag.path}: {at}: {refused}")
+
+    def time(self, received: Received, topic: Topic) -> int:
+        """Return the time (ns) of a message.  Raises LogError if headers and the recorder have different clocks."""
+        own = has_header(received.message) and topic.time != "recorded"
+        if topic.time == "header" and not own:
+            what = f"topic {received.topic}: messages of the type {short(received.type)} have no header"
+            raise LogError(f"{self.bag.path}: {what}, expected `time: recorded`")
+        t_ns = stamp(received.message) if own else received.recorded_ns
+        first = self.clocks.setdefault(own, (received.topic, t_ns))
+        other = self.clocks.get(not own)
+        if other is not None and abs(first[1] - other[1]) > DAY_NS:
+            (a, t_a), (b, t_b) = self.clocks[True], self.clocks[False]
+            what = f"{a} begins at {t_a * 1e-9:.0f} s by its headers, {b} at {t_b * 1e-9:.0f} s as recorded"
+            raise LogError(f"{self.bag.path}: {what}, expected one clock: `time: recorded` for both")
+        return t_ns + round(topic.shift_s * 1e9)
+
+    def poses(self, received: Received, topic: Posed, offer: Message, t_ns: int) -> None:
+        """Take the pose in a message, or those of its frames that the topic asks for, each at its own time."""
+        if offer.transforms is not None:
+            wanted = ((topic.frame or "").lstrip("/"), (topic.child_frame or "").lstrip("/"))
+            shift = round(topic.shift_s * 1e9)
+            for each in offer.transforms(received.message):
+                if (each.parent, each.child) == wanted:
+                    at = t_ns if topic.time == "recorded" else each.t_ns + shift
+                    self.pose(received, topic, offer, Pose(each.frame, None, *wanted), at)
+        elif offer.pose is not None:
+            self.pose(received, topic, offer, offer.pose(received.message), t_ns)
+
+    def pose(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
+        """Take one pose: of odometry, as a fix or as truth."""
+        if not np.isfinite(pose.frame).all():
+            raise Refused(f"pose {pose.frame.tolist()}, expected finite numbers")
+        if isinstance(topic, Fixes):
+            self.fix(topic, t_ns, pose.frame[:3], None if pose.cov is None else pose.cov[:3, :3])
+        elif isinstance(topic, Truths):
+            own = pose.frame if self.in_space(topic.robot) else in_plane(pose.frame)
+            self.kept(self.paths, received.topic, topic.robot, t_ns, own)
+        else:
+            self.moved(received, topic, offer, pose, t_ns)
+
+    def moved(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
+        """Take a pose of odometry: the increment from the one before it."""
+        before = self.last.get(received.topic)
+        if before is not None and t_ns <= before[0]:
+            if t_ns == before[0]:
+                self.left_out[received.topic, "poses at the time of the one before"] += 1
+                return
+            raise Refused(f"time after {seconds(before[0])} s, expected times that never run backwards")
+        self.last[received.topic] = (t_ns, pose.frame)
+        if before is None:
+            return
+        cov, dt_s = None, (t_ns - before[0]) * 1e-9
+        if isinstance(topic, Noisy) and topic.own_noise:
+            twist = None if offer.twist is None else offer.twist(received.message).cov
+            if twist is None:
+                raise Refused("the message has no covariance, expected one for `own_noise`")
+            cov = twist * dt_s**2
+        step = compose(inverse(before[1])[0], pose.frame)[0]
+        if self.in_space(topic.robot):
+            u = np.append(step[:3], rotations.log(step[3:]))
+        else:
+            u, cov = increment(in_plane(before[1]), in_plane(pose.frame)), None if cov is None else flat(cov)
+        self.control(topic, t_ns, u, cov)
+
+    def velocity(self, topic: Topic, t_ns: int, offer: Message, message: Any) -> None:
+        """Take a velocity, held from now on."""
+        v, cov = offer.twist(message)  # type: ignore[misc]
+        own = [0, 1, 2, 3, 4, 5] if topic.space else [0, 5]
+        if isinstance(topic, Noisy) and topic.own_noise and cov is None:
+            raise Refused("the message has no covariance, expected one for `own_noise`")
+        noise = cov[np.ix_(own, own)] if isinstance(topic, Noisy) and topic.own_noise and cov is not None else None
+        self.control(topic, t_ns, v[own], noise)
+
+    def control(self, topic: Topic, t_ns: int, u: Array, cov: Array | None) -> None:
+        """Take a control."""
+        if cov is not None and np.linalg.eigvalsh(cov)[0] < -1e-12 * np.abs(cov).max(initial=0.0):
+            raise Refused(f"noise {cov.tolist()}, expected it positive semidefinite")
+        self.events.append(Control(t_ns=t_ns, robot=topic.robot, u=u, cov=cov))
+
+    def globe(self, received: Received, topic: Placed, place: Place | None, t_ns: int) -> None:
+        """Take a position on the globe: as a fix, or to score only."""
+        if place is None:
+            self.left_out[received.topic, "messages without a fix"] += 1
+            return
+        if not (np.isfinite(place.lla[:2]).all() and abs(place.lla[0]) <= 90 and abs(place.lla[1]) <= 360):
+            raise Refused(f"latitude and longitude are {place.lla[:2].tolist()}, expected degrees")
+        lla = np.where(np.isfinite(place.lla), place.lla, 0.0)  # a fix in two dimensions has no height
+        origin = self.origins.setdefault("", lla if topic.origin is None else np.array(topic.origin, dtype=np.float64))
+        enu = local(lla, origin)
+        if isinstance(topic, Fixes):
+            self.fix(topic, t_ns, enu, place.cov)
+        else:
+            self.kept(self.positions, received.topic, topic.robot, t_ns, enu[:2])
+
+    def fix(self, topic: Fixes, t_ns: int, p: Array, cov: Array | None) -> None:
+        """Take a position as a fix, with the noise of the topic or else its own."""
+        own = _AXES3 if self.in_space(topic.robot) else _AXES2
+        N = None if cov is None else cov[np.ix_(own, own)]
+        if topic.sigma_m is not None:
+            N = np.eye(len(own)) * topic.sigma_m**2
+        if N is None or not np.isfinite(N).all() or np.linalg.eigvalsh(N)[0] <= 0:
+            told = "no covariance" if N is None else f"the covariance {N.tolist()}"
+            raise Refused(f"the position has {told}, expected a positive definite one, or sigma_m of the topic")
+        self.events.append(Fix(t_ns=t_ns, robot=topic.robot, y=p[own], cov=N))
+
+    def kept(self, table: dict[str, dict[int, Array]], name: str, robot: str, t_ns: int, value: Array) -> None:
+        """Keep a true pose or position; times must increase."""
+        mine = table.setdefault(robot, {})
+        last = next(reversed(mine), None)
+        if last is not None and t_ns <= last:
+            if t_ns == last:
+                self.left_out[name, "poses at the time of the one before"] += 1
+                return
+            raise Refused(f"time after {seconds(last)} s, expected times that never run backwards")
+        mine[t_ns] = value
+
+    def scan(self, received: Received, topic: Scans, offer: Message, t_ns: int) -> None:
+        """Take what a sensor saw."""
+        seen = offer.seen(received.message, topic)  # type: ignore[misc]
+        for reason, count in seen.left_out.items():
+            self.left_out[received.topic, reason] += count
+        columns, y = self.chosen(received.topic, topic, seen)
+        sensor = sensor_name(received.topic, topic)
+        known = self.sensor_columns.setdefault((topic.robot, sensor), columns)
+        if known != columns and len(y):
+            raise Refused(f"columns {', '.join(columns)}, expected {', '.join(known)} as in its first message")
+        ids = seen.ids if seen.ids else None
+        self.events.append(Scan(t_ns=t_ns, robot=topic.robot, sensor=sensor, y=y, ids=ids))
+
+    def chosen(self, name: str, topic: Scans, seen: Seen) -> tuple[tuple[str, ...], Any]:
+        """Return the columns to take, and the observations (K, m), for a robot of the plane made level."""
+        y = np.asarray(seen.y, dtype=np.float64).reshape(-1, len(seen.columns))
+        R, turned = self.level.get(name, (np.eye(3), False))
+        space, points = self.in_space(topic.robot), seen.columns[:3] == POINT
+        if points and not space:
+            y = np.column_stack([y[:, :3] @ R.T, y[:, 3:]])
+        if turned:
+            y = (y * np.where(np.array(seen.columns) == BEAM[1], -1.0, 1.0))[::-1]
+        default = seen.columns if space or not points else POINT[:2]
+        wanted = tuple(topic.take) if topic.take is not None else default
+        if wanted == seen.columns:
+            return wanted, y
+        given = dict(zip(seen.columns, y.T, strict=True))
+        if points:
+            given |= polar(y, space)
+        for column in wanted:
+            if column not in given or (column in POSE[3:] and not space):
+                raise Refused(f"take has {column}, expected some of {', '.join(given)}")
+        return wanted, np.column_stack([given[column] for column in wanted])
+
+
+beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].seen
+
+
+def polar(p: Array, space: bool) -> dict[str, Array]:
+    """Return ranges and angles of points (K, 3 or more), in the plane or in space."""
+    x, y, z = p[:, 0], p[:, 1], p[:, 2]
+    across, angle = np.hypot(x, y), np.arctan2(y, x)
+    if not space:
+        return {"range_m": across, "bearing_rad": angle}
+    return {"range_m": np.hypot(across, z), "azimuth_rad": angle, "elevation_rad": np.arctan2(z, across)}
+
+
+def type_of(topic: Topic) -> str:
+    """Return the type of a topic as configurations write it."""
+    from kalmark.declare import registered_name
+
+    return registered_name(type(topic)) or type(topic).__name__
+
+
+def sensor_name(name: str, scan: Scans) -> str:
+    """Return the name of a topic's sensor."""
+    return scan.sensor or name.strip("/").replace("/", "_")
+
+
+def frame_id(message: Any) -> str:
+    """Return the frame of a message; of markers that of the first."""
+    if has_header(message):
+        return str(message.header.frame_id)
+    markers = getattr(message, "markers", ())
+    return str(markers[0].header.frame_id) if markers else ""
+
+
+def in_plane(frame: Array) -> Array:
+    """Return x, y and yaw (3,) of a frame (7,)."""
+    x, y, z, w = frame[3:]
+    return np.array([frame[0], frame[1], np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])
+
+
+def increment(a: Array, b: Array) -> Array:
+    """Return the pose b (3,) in the frame of a: the way between them."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    x, y = b[:2] - a[:2]
+    return np.array([c * x + s * y, c * y - s * x, wrap(b[2] - a[2])])
+
+
+def flat(cov: Array) -> Array:
+    """Return the covariance (3, 3) of x, y and yaw of one of (x, y, z, rotation)."""
+    own = [0, 1, 5]
+    return cov[np.ix_(own, own)]
+
+
+def _trajectories(paths: Mapping[str, Mapping[int, Array]]) -> dict[str, Trajectory]:
+    return {robot: Trajectory(np.array([*path]), np.array([*path.values()])) for robot, path in paths.items()}
+
+
+def _track(positions: Mapping[int, Array]) -> PositionTrack:
+    return PositionTrack(np.array([*positions]), np.array([*positions.values()]), np.zeros(2))
+
+
+BAG = Format("bag", "a ROS bag (.bag, .mcap, .db3, the folder of a ROS 2 bag), with log.topics", find_bag, read,
+             options=("topics",))  # fmt: skip

@@ -1,0 +1,151 @@
+"""Open a ROS bag without ROS: ROS 1 (`.bag`, also packed as `.bag.bz2`), ROS 2 (a folder, `.mcap` or `.db3`).
+
+The library rosbags reads the files; here its many errors become one line each.
+"""
+
+from __future__ import annotations
+
+import bz2
+import shutil
+import tempfile
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+from kalmark.errors import LogError
+from kalmark.events import shown
+from kalmark.logs.source import nearest
+
+ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
+METADATA = "metadata.yaml"  # of a ROS 2 bag, which is a folder
+EXPECTED = "expected a whole bag: .bag, .bag.bz2, .mcap, .db3 or the folder of a ROS 2 bag"
+SECOND_NS = 1_000_000_000
+
+
+class Messages(NamedTuple):
+    """What a bag says of one topic: the type of its messages, as ROS 2 writes it, and how many there are."""
+
+    type: str
+    number: int
+
+
+class Received(NamedTuple):
+    """One message: where it came from, the time (ns) at which it was recorded, and what is in it."""
+
+    topic: str
+    type: str
+    recorded_ns: int
+    message: Any
+
+
+def find_bag(path: Path) -> Path | None:
+    """Return the bag at a path: the file, the folder of a ROS 2 bag, or the only bag in a folder."""
+    if path.is_file():
+        return path if path.name.endswith(ENDINGS) else None
+    if not path.is_dir() or (path / METADATA).is_file():
+        return path if path.is_dir() else None
+    inside = [child for child in sorted(path.iterdir()) if child.is_file() and child.name.endswith(ENDINGS)]
+    return inside[0] if len(inside) == 1 else None
+
+
+class Bag:
+    """An open bag: `topics` by name, and their messages.  To be used in a `with` statement; raises LogError."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics: dict[str, Messages] = {}
+        self._open = ExitStack()
+        self._reader: Any = None
+
+    def __enter__(self) -> Self:
+        """Open the bag.  Raises LogError if it cannot be read."""
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError:
+            hint = "`pip install 'kalmark[rosbags]'`"
+            raise LogError(f"{self.path}: a bag needs the library rosbags, {hint}") from None
+        with ExitStack() as stack:
+            path = self._unpacked(stack)
+            try:
+                # older ROS 2 bags do not define their types: then those of ROS itself are taken
+                reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+                self._reader = stack.enter_context(reader)
+                connections = list(self._reader.connections)
+            except Exception as error:  # rosbags has no common error for damaged files
+                raise self._damaged(error) from None
+            for each in connections:
+                count = self.topics[each.topic].number if each.topic in self.topics else 0
+                self.topics[each.topic] = Messages(each.msgtype, count + each.msgcount)
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the bag."""
+        self._open.close()
+
+    def _unpacked(self, stack: ExitStack) -> Path:
+        """Return the path of the bag, unpacked into a folder for the time being if it is packed."""
+        if self.path.suffix != ".bz2":
+            return self.path
+        bag = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kalmark-"))) / self.path.stem
+        try:
+            with bz2.open(self.path) as packed, bag.open("wb") as plain:
+                shutil.copyfileobj(packed, plain)
+        except (OSError, EOFError) as error:
+            raise LogError(f"{self.path}: cannot be unpacked ({error}), expected a whole bag") from None
+        return bag
+
+    def _damaged(self, error: Exception) -> LogError:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return LogError(f"{self.path}: not a bag that can be read ({reason[:160].rstrip('.')}), {EXPECTED}")
+
+    def find(self, name: str) -> str:
+        """Return a topic's name as the bag has it, with or without its first slash.  Raises LogError."""
+        same = [topic for topic in self.topics if topic.lstrip("/") == name.lstrip("/")]
+        if name in self.topics or same:
+            return name if name in self.topics else same[0]
+        known = ", ".join(sorted(self.topics)) or "one of a bag that is not empty"
+        raise LogError(f"{self.path}: no topic {shown(name)}, expected {known}{nearest(name, self.topics)}")
+
+    def times(self) -> Iterator[tuple[str, int]]:
+        """Yield topic and time (ns) of all messages as recorded, without reading them.  Raises LogError."""
+        for connection, recorded_ns, _ in self._raw(self._reader.connections):
+            yield connection.topic, int(recorded_ns)
+
+    def messages(self, topics: Collection[str]) -> Iterator[Received]:
+        """Yield the messages of these topics in the order in which they were recorded.  Raises LogError."""
+        for connection, recorded_ns, raw in self._raw([c for c in self._reader.connections if c.topic in topics]):
+            try:
+                message = self._reader.deserialize(raw, connection.msgtype)
+            except Exception as error:
+                if connection.msgtype not in self._reader.typestore.fielddefs:
+                    what = f"messages of the type {connection.msgtype}, which the bag does not define"
+                    raise LogError(f"{self.path}: topic {connection.topic} has {what}") from None
+                reason = " ".join(str(error).split())[:120] or type(error).__name__
+                at = f"the message of {connection.topic} recorded at {recorded_ns} ns"
+                raise LogError(f"{self.path}: {at} is no {connection.msgtype} ({reason})") from None
+            yield Received(connection.topic, connection.msgtype, int(recorded_ns), message)
+
+    def _raw(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        """Yield connection, time (ns) and bytes of the messages of some connections."""
+        incoming = self._reader.messages(connections=connections) if connections else iter(())
+        while True:
+            try:
+                received = next(incoming)
+            except StopIteration:
+                return
+            except Exception as error:  # a file that ends too early, or is damaged in the middle
+                raise self._damaged(error) from None
+            yield received
+
+
+def stamp(message: Any) -> int:
+    """Return the time (ns) in a message's header."""
+    return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
+
+
+def has_header(message: Any) -> bool:
+    """Return whether a message carries a time of its own."""
+    return "header" in vars(type(message)).get("__dataclass_fields__", {})

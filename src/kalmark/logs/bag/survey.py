@@ -1,0 +1,188 @@
+"""What is in a bag: topics, types, rates, gaps and frames; and what a first configuration is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.geometry import rotations
+from kalmark.logs.bag.frames import Frames
+from kalmark.logs.bag.importer import frame_id
+from kalmark.logs.bag.messages import MESSAGES, Message, Pose
+from kalmark.logs.bag.reading import Bag, has_header, stamp
+from kalmark.logs.bag.tables import holds_log
+from kalmark.logs.bag.topics import Scans
+from kalmark.logs.table import Refused
+
+GAP = 5.0  # an interval longer than so many usual ones is a gap
+FLAT_M, FLAT_RAD = 0.05, 0.05  # height and tilt of a path of the plane vary by less
+
+
+@dataclass
+class Poses:
+    """The poses that a topic or a pair of frames has, with the covariance of the first."""
+
+    t_ns: list[int] = field(default_factory=list)
+    frames: list[Array] = field(default_factory=list)
+    cov: Array | None = None
+
+    def take(self, t_ns: int, pose: Pose) -> None:
+        """Take one more pose, unless it is not later than the last."""
+        if not self.t_ns:
+            self.cov = pose.cov
+        if not self.t_ns or t_ns > self.t_ns[-1]:
+            self.t_ns.append(t_ns)
+            self.frames.append(pose.frame)
+
+    @property
+    def flat(self) -> bool:
+        """Whether the path is one of the plane: of one height, and never tilted."""
+        frames = np.array(self.frames)
+        x, y = frames[:, 3], frames[:, 4]
+        tilt = 2 * np.arcsin(np.minimum(np.hypot(x, y), 1.0))
+        return bool(np.ptp(frames[:, 2]) < FLAT_M and tilt.max() < FLAT_RAD)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the poses differ."""
+        frames = np.array(self.frames)
+        return bool(np.ptp(frames, axis=0).max() > 1e-3)
+
+
+@dataclass
+class TopicSummary:
+    """One topic: its messages, their median rate (Hz), the longest gap (s) and when it began (s), their frames.
+
+    `gaps` counts the intervals of more than five usual ones.  `header` says whether its messages have a time of their
+    own, which is `offset_s` behind that of the recorder in the first of them.
+    """
+
+    name: str
+    type: str
+    count: int
+    what: str = ""
+    rate_hz: float = float("nan")
+    gaps: int = 0
+    longest_s: float = float("nan")
+    longest_at_s: float = float("nan")
+    frame: str = ""
+    child: str = ""
+    header: bool = False
+    offset_s: float = 0.0
+    error: str = ""
+    poses: Poses = field(default_factory=Poses)
+    columns: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
+    named: bool = False
+    origin: Array | None = None
+    camera: dict[str, Any] | None = None
+
+    @property
+    def offers(self) -> Message:
+        """What can be read from its messages, nothing of a type that is not known."""
+        return MESSAGES.get(self.type, Message(""))
+
+    @property
+    def frames(self) -> str:
+        """Its frames in words."""
+        return f"{self.child} in {self.frame}" if self.child else self.frame
+
+
+@dataclass
+class Survey:
+    """What is in a bag; `start_s` is the time of its first message as recorded, `pairs` the poses of moving frames."""
+
+    path: Path
+    start_s: float
+    length_s: float
+    topics: list[TopicSummary]
+    frames: Frames
+    pairs: dict[tuple[str, str], Poses]
+    holds_log: bool
+
+    def named(self, name: str) -> TopicSummary:
+        """Return the topic of a name."""
+        return next(topic for topic in self.topics if topic.name == name)
+
+
+def survey(path: Path) -> Survey:
+    """Return what is in a bag.  Raises LogError if it cannot be read."""
+    with Bag(path) as bag:
+        summaries = {name: _summary(name, told.type, told.number) for name, told in sorted(bag.topics.items())}
+        begin, end = _rates(bag, summaries)
+        frames, pairs = Frames(), dict[tuple[str, str], Poses]()
+        known = {name for name, summary in summaries.items() if summary.type in MESSAGES}
+        for received in bag.messages(known):
+            summary, m = summaries[received.topic], received.message
+            own = has_header(m)
+            t_ns = stamp(m) if own else received.recorded_ns
+            if not summary.frame and own:
+                summary.frame, summary.child = m.header.frame_id, getattr(m, "child_frame_id", "")
+                summary.header, summary.offset_s = True, (received.recorded_ns - t_ns) * 1e-9
+            try:
+                _look(summary, m, t_ns)
+                if summary.offers.transforms is not None:
+                    transforms = summary.offers.transforms(m)
+                    frames.take(transforms)
+                    for at, parent, child, frame in transforms:
+                        pairs.setdefault((parent, child), Poses()).take(at, Pose(frame, None, parent, child))
+            except Refused as refused:
+                summary.error = summary.error or str(refused)
+        moving = {pair: poses for pair, poses in pairs.items() if pair in frames.moving}
+        return Survey(path, begin, end - begin, [*summaries.values()], frames, moving, holds_log(bag))
+
+
+def _summary(name: str, kind: str, count: int) -> TopicSummary:
+    known = MESSAGES.get(kind)
+    return TopicSummary(name, kind, count, known.what if known else "")
+
+
+def _rates(bag: Bag, summaries: dict[str, TopicSummary]) -> tuple[float, float]:
+    """Note the rates and gaps of all topics, by the recorder's clock; return when the bag begins and ends (s)."""
+    times: dict[str, list[int]] = {}
+    for name, recorded_ns in bag.times():
+        times.setdefault(name, []).append(recorded_ns)
+    if not times:
+        return 0.0, 0.0
+    begin = min(min(each) for each in times.values())
+    for name, each in times.items():
+        summary, steps = summaries[name], np.diff(np.sort(each)) * 1e-9
+        summary.count = len(each)
+        if len(steps):
+            usual, worst = float(np.median(steps)), int(np.argmax(steps))
+            summary.rate_hz = 1 / usual if usual > 0 else float("nan")
+            summary.gaps = int((steps > GAP * usual).sum()) if usual > 0 else 0
+            summary.longest_s, summary.longest_at_s = float(steps[worst]), (sorted(each)[worst] - begin) * 1e-9
+    return begin * 1e-9, max(max(each) for each in times.values()) * 1e-9
+
+
+def _look(summary: TopicSummary, m: Any, t_ns: int) -> None:
+    """Note of a message what a first configuration needs."""
+    offers = summary.offers
+    if offers.pose is not None:
+        summary.poses.take(t_ns, offers.pose(m))
+    if offers.globe is not None:
+        place = offers.globe(m)
+        if place is not None and np.isfinite(place.lla[:2]).all():
+            lla = np.where(np.isfinite(place.lla), place.lla, 0.0)
+            summary.origin = lla if summary.origin is None else summary.origin
+            cov = None if place.cov is None else np.pad(place.cov, (0, 3))
+            summary.poses.take(t_ns, Pose(np.append(lla, [0.0, 0, 0, 1]), cov, summary.frame, ""))
+    if offers.camera is not None and summary.camera is None:
+        summary.camera = offers.camera(m)
+    if hasattr(m, "fields"):
+        summary.fields = tuple(each.name for each in m.fields)
+    elif offers.seen is not None and not (summary.columns and summary.named):
+        seen = offers.seen(m, Scans(size_m=1.0))
+        summary.columns = summary.columns or seen.columns
+        summary.named = summary.named or any(id_ is not None for id_ in seen.ids)
+    summary.frame = summary.frame or frame_id(m)
+
+
+def yaw(frame: Array) -> float:
+    """Return the heading (rad) of a frame (7,)."""
+    return float(rotations.to_euler(np.array(frame[3:]))[0][2])

@@ -1,0 +1,189 @@
+"""What a topic of a bag is in a log: the types of `log.topics.TOPIC` in a configuration, each declared once.
+
+`wants` names what the topic's messages must offer, an attribute of `kalmark.logs.bag.messages.Message`; `columns` are
+those of the control that comes of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
+
+from kalmark.declare import Number, Within, class_of, classes, declared, parameters, refuse, register
+from kalmark.errors import LogError, ModelError
+from kalmark.events import Id, shown
+from kalmark.logs.source import landmark_id, nearest
+
+
+@declared
+class Topic:
+    """What all topics have: whose it is, and when it was."""
+
+    wants: ClassVar[tuple[str, ...]] = ()
+    columns: ClassVar[tuple[str, ...]] = ()
+    space: ClassVar[bool] = False
+
+    robot: Annotated[str, "Robot that it belongs to."] = "robot"
+    time: Annotated[
+        Literal["auto", "header", "recorded"],
+        "Time of a message: in its header, or when it was recorded; auto: the header's, if it has one.",
+    ] = "auto"
+    shift_s: Annotated[Number, "Added to the time of every message."] = 0.0
+
+
+@declared
+class Posed(Topic):
+    """Poses of the robot: Odometry, PoseStamped, PoseWithCovarianceStamped, or a frame of tf."""
+
+    wants: ClassVar[tuple[str, ...]] = ("pose", "transforms")
+
+    frame: Annotated[str | None, "tf: the frame in which the pose is, such as odom."] = None
+    child_frame: Annotated[str | None, "tf: the frame whose pose it is, such as base_link."] = None
+
+
+@declared
+class Noisy:
+    """Controls may bring their own noise."""
+
+    own_noise: Annotated[bool, "Take the covariance of the message's twist instead of the motion's noise."] = False
+
+
+@register("topic", "odometry_2d")
+class Odometry2DTopic(Posed, Noisy):
+    """Increments of odometry in the plane: differences of successive poses."""
+
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
+
+
+@register("topic", "odometry_3d")
+class Odometry3DTopic(Posed, Noisy):
+    """Increments of odometry in space: differences of successive poses."""
+
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    space: ClassVar[bool] = True
+
+
+@register("topic", "unicycle")
+class UnicycleTopic(Topic, Noisy):
+    """Speed and turn rate, held until the next message: Odometry, Twist, TwistStamped, TwistWithCovarianceStamped."""
+
+    wants: ClassVar[tuple[str, ...]] = ("twist",)
+    columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
+
+
+@register("topic", "velocity_3d")
+class Velocity3DTopic(Topic, Noisy):
+    """Velocities in space, held until the next message: Odometry, Twist, TwistStamped, TwistWithCovarianceStamped."""
+
+    wants: ClassVar[tuple[str, ...]] = ("twist",)
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    space: ClassVar[bool] = True
+
+
+@register("topic", "ackermann")
+class AckermannTopic(Topic):
+    """Speed and steering angle, held until the next message: AckermannDrive, AckermannDriveStamped."""
+
+    wants: ClassVar[tuple[str, ...]] = ("drive",)
+    columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
+
+
+def _a_size(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e3
+
+
+@register("topic", "scan")
+class Scans(Topic):
+    """What a sensor saw: laser beams, points, ranges, detections, corners or poses of tags, markers."""
+
+    wants: ClassVar[tuple[str, ...]] = ("seen",)
+
+    sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
+    take: Annotated[
+        Any, "The columns to take of those that the message has, such as [x_m, y_m]; if absent what fits the robot."
+    ] = None
+    ids: Annotated[
+        str | None,
+        "Where ids come from: of a point cloud the name of a field, of detections `class`; `none`: there are none.",
+    ] = None
+    clusters: Annotated[str | None, "Point cloud: the field that numbers clusters; their means are taken."] = None
+    landmark: Annotated[Any, "Range: id of the landmark that is measured."] = None
+    size_m: Annotated[float | None, Within(gt=0), "Corners of tags: side of the black square."] = None
+    sizes: Annotated[Any, "Corners of tags: sides by id, of tags with another one; all others have `size_m`."] = None
+    max_hamming: Annotated[int, Within(ge=0), "Tags: the most corrected bits."] = 2
+    base_frame: Annotated[
+        str | None, "The robot's frame in tf, for the sensor's mount; if absent that of its odometry, or base_link."
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.take is not None:
+            names = self.take if isinstance(self.take, list | tuple) else ()
+            if not names or not all(isinstance(each, str) for each in names):
+                raise refuse(self, "take", "a list of columns")
+        if self.landmark is not None and (isinstance(self.landmark, bool) or not isinstance(self.landmark, int | str)):
+            raise refuse(self, "landmark", "an id")
+        if self.sizes is not None and not (isinstance(self.sizes, Mapping) and all(map(_a_size, self.sizes.values()))):
+            raise refuse(self, "sizes", "a mapping of ids to lengths in m")
+
+    def size(self, tag: Id) -> float | None:
+        """Return the size (m) of a tag, None if it has none."""
+        named = {landmark_id(str(name)): size for name, size in (self.sizes or {}).items()}
+        return named.get(tag, self.size_m)
+
+
+@declared
+class Placed(Posed):
+    """Poses, or positions on the globe, whose origin is that of metres."""
+
+    wants: ClassVar[tuple[str, ...]] = ("pose", "globe", "transforms")
+
+    origin: Annotated[
+        Any, "NavSatFix: [latitude_deg, longitude_deg, height_m] of the map's origin; the first fix if absent."
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.origin is None:
+            return
+        given = self.origin if isinstance(self.origin, list | tuple) else ()
+        numbers = [float(v) for v in given if isinstance(v, int | float) and not isinstance(v, bool)]
+        limits = (90.0, 360.0, 1e5)
+        if len(numbers) != 3 or len(given) != 3 or not all(abs(v) <= m for v, m in zip(numbers, limits, strict=True)):
+            raise refuse(self, "origin", "[latitude_deg, longitude_deg, height_m]")
+
+
+@register("topic", "fix")
+class Fixes(Placed):
+    """Absolute positions: NavSatFix (metres east, north, up of the origin), poses with covariance, poses."""
+
+    sigma_m: Annotated[
+        float | None, Within(gt=0), "Noise of each coordinate; the message's own covariance if absent."
+    ] = None
+
+
+@register("topic", "truth")
+class Truths(Placed):
+    """True poses, to score against; of a NavSatFix positions that only score."""
+
+
+def topic_of(name: str, section: Any) -> Topic:
+    """Return a topic of a configuration's mapping, which has its `type`.  Raises LogError."""
+    if isinstance(section, Topic):
+        return section
+    where, kinds = f"log option topics: {name}", classes("topic")
+    if not isinstance(section, Mapping) or not isinstance(section.get("type"), str):
+        raise LogError(f"{where} is {shown(section)}, expected a mapping with a type: {', '.join(kinds)}")
+    if section["type"] not in kinds:
+        hint = nearest(section["type"], kinds)
+        raise LogError(f"{where}: type is {section['type']!r}, expected one of {', '.join(kinds)}{hint}")
+    model = class_of("topic", section["type"])
+    given, known = {key: value for key, value in section.items() if key != "type"}, [p.name for p in parameters(model)]
+    for key in given:
+        if key not in known:
+            raise LogError(
+                f"{where}: unknown key {key!r}, expected one of {', '.join(known)}{nearest(str(key), known)}"
+            )
+    try:
+        topic: Topic = model(**given)
+    except ModelError as error:
+        raise LogError(f"{where}: {error}") from None
+    return topic

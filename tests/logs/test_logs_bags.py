@@ -1,0 +1,427 @@
+"""Bags by topic: the same log from ROS 1, sqlite3 and MCAP, each type of message, and one line for what is wrong."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kalmark.config import build_slam, open_run
+from kalmark.errors import KalmarkError, LogError
+from kalmark.events import Control, Fix, Scan
+from kalmark.logs import open_log, write_native
+from kalmark.logs.bag.geodesy import A_M, E2, FLATTENING, earth_centred, local
+from kalmark.results.record import record
+
+pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")
+
+from ros_bags import (
+    KINDS,
+    MOUNT,
+    ORIGIN,
+    POSTS,
+    Outgoing,
+    drive,
+    fix,
+    geodetic,
+    header,
+    odometry,
+    pose,
+    robot_among_posts,
+    same_logs,
+    tf,
+    transform,
+    write_bag,
+)
+
+TOPICS: dict[str, dict[str, Any]] = {
+    "/odom": {"type": "odometry_2d"},
+    "/scan": {"type": "scan", "sensor": "lidar"},
+    "/fix": {"type": "fix", "origin": [*ORIGIN]},
+    "/truth": {"type": "truth"},
+}
+CONFIG = """
+log: {{path: {path}{topics}}}
+robots:
+  robot:
+    motion: {{type: odometry_2d, sigma_x_m: 0.01, sigma_y_m: 0.002, sigma_theta_rad: 0.004}}
+    sensors:
+      lidar: {{type: range_bearing, detector: {{type: trunks, sigma_range_m: 0.01}}}}
+association: {{type: auto}}
+"""
+IN_YAML = f""", topics: {{
+  /odom: {{type: odometry_2d}}, /scan: {{type: scan, sensor: lidar}},
+  /fix: {{type: fix, origin: {[*ORIGIN]}}}, /truth: {{type: truth}}}}"""
+T0 = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return the bags of the robot among posts, by kind."""
+    folder, messages = tmp_path_factory.mktemp("bags"), robot_among_posts()
+    return {kind: write_bag(folder, kind, messages) for kind in KINDS}
+
+
+def bag_of(tmp_path: Path, messages: Iterable[Outgoing], kind: str = "mcap") -> Path:
+    return write_bag(tmp_path, kind, messages)
+
+
+# ------------------------------------------------------------------ the same from every file
+def test_ros_1_sqlite_and_mcap_are_the_same_log_as_csv(bags: dict[str, Path], tmp_path: Path) -> None:
+    logs = [open_log(path, topics=TOPICS) for path in bags.values()]
+    native = open_log(write_native(logs[0], tmp_path / "csv"))
+    assert len(logs[0].events) == 639 and len(logs[0].truth["robot"]) == 400
+    assert all(same_logs(logs[0], log) for log in (*logs[1:], native))
+
+
+def test_ros_1_sqlite_mcap_and_csv_make_the_same_map(bags: dict[str, Path], tmp_path: Path) -> None:
+    write_native(open_log(bags["ros1.bag"], topics=TOPICS), tmp_path / "csv")
+    found = []
+    for path in (*bags.values(), tmp_path / "csv"):
+        file = tmp_path / "config.yaml"
+        file.write_text(CONFIG.format(path=path, topics="" if path.name == "csv" else IN_YAML))
+        config, log = open_run(file)
+        slam = build_slam(config, log)
+        run = record(slam, log, progress=False)
+        ids = [landmark.id for landmark in slam.landmarks()]
+        means = tuple(slam.mean(name).tobytes() for name in ("robot", *ids))
+        found.append((*ids, *means, slam.covariance("robot", *ids).tobytes()))
+    assert len(set(found)) == 1 and len(ids) == len(POSTS)
+    assert run.evaluate()["robots"]["robot"]["ate_raw_m"] < 0.05
+
+
+def test_the_controls_are_the_differences_of_the_poses(bags: dict[str, Path]) -> None:
+    log = open_log(bags["mcap"], topics={"/truth": {"type": "odometry_2d"}})
+    t_ns, poses = drive()
+    assert [c.t_ns for c in log.events] == t_ns[1:].tolist()
+    here = poses[0].copy()
+    for control in log.events:
+        c, s = np.cos(here[2]), np.sin(here[2])
+        here += np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ control.u
+    np.testing.assert_allclose(here, poses[-1], atol=1e-9)
+
+
+def test_fixes_are_metres_east_and_north_of_the_origin(bags: dict[str, Path]) -> None:
+    log = open_log(bags["sqlite3"], topics={"/odom": TOPICS["/odom"], "/fix": TOPICS["/fix"]})
+    t_ns, poses = drive()
+    fixes = [event for event in log.events if isinstance(event, Fix)]
+    true = poses[np.searchsorted(t_ns, [event.t_ns for event in fixes]), :2]
+    assert np.abs(np.array([event.y for event in fixes]) - true).max() < 2.0
+    assert all(event.cov.tolist() == [[0.25, 0], [0, 0.25]] for event in fixes)
+
+
+def test_the_origin_is_the_first_fix_if_none_is_given(bags: dict[str, Path]) -> None:
+    log = open_log(bags["mcap"], topics={"/odom": TOPICS["/odom"], "/fix": {"type": "fix"}})
+    first = next(event for event in log.events if isinstance(event, Fix))
+    assert first.y.tolist() == [0, 0]
+
+
+def test_frames_of_tf_are_odometry_truth_and_mounts(bags: dict[str, Path]) -> None:
+    of_tf = {"/tf": {"type": "odometry_2d", "frame": "odom", "child_frame": "base_link"}}
+    a, b = (open_log(bags["mcap"], topics=topics) for topics in (of_tf, {"/odom": TOPICS["/odom"]}))
+    assert same_logs(a, b)
+    mount = open_log(bags["ros1.bag"], topics=TOPICS).describes["robots"]["robot"]["sensors"]["lidar"]["mount"]
+    np.testing.assert_allclose([mount["x_m"], mount["y_m"], mount["theta_rad"]], MOUNT, atol=1e-12)
+
+
+def test_a_laser_that_hangs_upside_down_sees_the_same(tmp_path: Path) -> None:
+    flipped = {"position": {"x": 0.2}, "orientation": {"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}}
+    scan = {"header": header(T0, "laser"), "angle_min": -0.5, "angle_increment": 0.25, "range_max": 9.0}
+    scan |= {"ranges": [1.0, 2.0, np.inf, 4.0, 5.0]}
+    messages = [
+        tf("/tf_static", T0, transform("base_link", "laser", T0, flipped)),
+        odometry(T0, pose(0, 0, 0)),
+        Outgoing("/scan", "sensor_msgs/msg/LaserScan", T0, scan),
+        odometry(T0 + 10**8, pose(0.1, 0, 0)),
+    ]
+    log = open_log(bag_of(tmp_path, messages), topics={"/odom": TOPICS["/odom"], "/scan": {"type": "scan"}})
+    seen = next(event for event in log.events if isinstance(event, Scan))
+    np.testing.assert_allclose(seen.y, [[5, -0.5], [4, -0.25], [2, 0.25], [1, 0.5]])
+    assert log.describes["robots"]["robot"]["sensors"]["scan"]["mount"] == {"x_m": 0.2, "y_m": 0.0, "theta_rad": 0.0}
+
+
+# ------------------------------------------------------------------ positions on the globe
+def test_a_degree_of_latitude_and_longitude_has_its_length() -> None:
+    """The radii of curvature of the ellipsoid: M = a (1 - e^2) / w^3 along a meridian, N cos lat along a parallel."""
+    for lat in (-60.0, 0.0, 48.1, 89.0):
+        w = np.sqrt(1 - E2 * np.sin(np.radians(lat)) ** 2)
+        step = 1e-5
+        north = local([lat + step, 11.0, 0.0], [lat, 11.0, 0.0])
+        east = local([lat, 11.0 + step, 0.0], [lat, 11.0, 0.0])
+        np.testing.assert_allclose(north[1] / np.radians(step), A_M * (1 - E2) / w**3, rtol=1e-6)
+        np.testing.assert_allclose(east[0] / np.radians(step), A_M / w * np.cos(np.radians(lat)), rtol=1e-6)
+        np.testing.assert_allclose(local([lat, 11.0, 7.0], [lat, 11.0, 2.0]), [0, 0, 5], atol=1e-8)
+
+
+def test_the_poles_and_the_equator_are_where_the_ellipsoid_has_them() -> None:
+    np.testing.assert_allclose(earth_centred([0, 0, 0]), [A_M, 0, 0], atol=1e-8)
+    np.testing.assert_allclose(earth_centred([90, 0, 0]), [0, 0, A_M * (1 - FLATTENING)], atol=1e-8)
+    np.testing.assert_allclose(local(geodetic([120.0, -35.0, 4.0]), ORIGIN), [120, -35, 4], atol=1e-6)
+
+
+def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
+    messages = [odometry(T0 + k, pose(0, 0, 0)) for k in (0, 10)]
+    messages += [
+        fix(T0 + 20, [48.0, 11.0, 0.0]),
+        fix(T0 + 30, [48.0, 11.0, np.nan]),
+        fix(T0 + 40, [0, 0, 0], status=-1),
+    ]
+    log = open_log(bag_of(tmp_path, messages), topics={"/odom": TOPICS["/odom"], "/fix": {"type": "fix"}})
+    assert sum(isinstance(event, Fix) for event in log.events) == 2
+    assert [line.split(": ", 1)[1] for line in log.skipped] == ["/fix: 1 messages without a fix"]
+
+
+def test_a_satellite_truth_only_scores(tmp_path: Path) -> None:
+    messages = [odometry(T0 + k * 10**9, pose(k, 0, 0)) for k in range(3)]
+    messages += [fix(T0 + 10**9, geodetic([3.0, 4.0, 0.0]))]
+    topics = {"/odom": TOPICS["/odom"], "/fix": {"type": "truth", "origin": list(ORIGIN)}}
+    log = open_log(bag_of(tmp_path, messages), topics=topics)
+    np.testing.assert_allclose(log.gps["robot"].xy, [[3, 4]], atol=1e-6)
+
+
+# ------------------------------------------------------------------ each type of message
+def twist(v: float, w: float) -> dict[str, Any]:
+    return {"linear": {"x": v, "y": 0.1, "z": 0.2}, "angular": {"x": 0.3, "y": 0.4, "z": w}}
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "topic", "u"),
+    [
+        ("geometry_msgs/msg/Twist", twist(1.0, 0.5), {"type": "unicycle"}, [1.0, 0.5]),
+        ("geometry_msgs/msg/TwistStamped", {"twist": twist(1.0, 0.5)}, {"type": "unicycle"}, [1.0, 0.5]),
+        ("geometry_msgs/msg/TwistStamped", {"twist": twist(1.0, 0.5)}, {"type": "velocity_3d"},
+         [1.0, 0.1, 0.2, 0.3, 0.4, 0.5]),
+        ("geometry_msgs/msg/TwistWithCovarianceStamped", {"twist": {"twist": twist(2.0, 0.25)}}, {"type": "unicycle"},
+         [2.0, 0.25]),
+        ("ackermann_msgs/msg/AckermannDriveStamped", {"drive": {"speed": 2.0, "steering_angle": 0.25}},
+         {"type": "ackermann"}, [2.0, 0.25]),
+        ("ackermann_msgs/msg/AckermannDrive", {"speed": 2.0, "steering_angle": 0.25}, {"type": "ackermann"},
+         [2.0, 0.25]),
+    ],
+)  # fmt: skip
+def test_velocities_are_controls(
+    kind: str, fields: dict[str, Any], topic: dict[str, Any], u: list[float], tmp_path: Path
+) -> None:
+    stamped = {"header": header(T0 + 5, "base_link")} if "Stamped" in kind else {}
+    path = bag_of(tmp_path, [Outgoing("/drive", kind, T0, stamped | fields)])
+    (control,) = open_log(path, topics={"/drive": topic}).events
+    assert isinstance(control, Control) and control.u.tolist() == u
+    assert control.t_ns == (T0 + 5 if stamped else T0)
+    assert (
+        open_log(path, topics={"/drive": topic | {"time": "recorded", "shift_s": -0.5}}).events[0].t_ns
+        == T0 - 5 * 10**8
+    )
+
+
+def test_own_noise_is_that_of_the_twist_over_the_interval(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, [odometry(T0 + k * 10**8, pose(0.1 * k, 0, 0), 1.0) for k in range(2)])
+    (moved,) = open_log(path, topics={"/odom": {"type": "odometry_2d", "own_noise": True}}).events
+    np.testing.assert_allclose(moved.cov, np.diag([0.01, 1, 0.02]) * 0.01)
+    held = open_log(path, topics={"/odom": {"type": "unicycle", "own_noise": True}}).events
+    np.testing.assert_allclose(held[0].cov, np.diag([0.01, 0.02]))
+
+
+def corners(*points: tuple[float, float]) -> list[dict[str, float]]:
+    return [{"x": x, "y": y} for x, y in points]
+
+
+SQUARE = ((10.0, 20.0), (30.0, 20.0), (30.0, 40.0), (10.0, 40.0))
+AT = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+AWAY = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def hypotheses(*named: tuple[str, float]) -> list[dict[str, Any]]:
+    return [{"hypothesis": {"class_id": name, "score": score}} for name, score in named]
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields", "topic", "y", "ids"),
+    [
+        ("sensor_msgs/msg/Range", {"range": 2.5, "max_range": 9.0}, {"landmark": "b1"}, [[2.5]], ("b1",)),
+        ("sensor_msgs/msg/Range", {"range": 9.5, "max_range": 9.0}, {"landmark": "b1"}, [], None),
+        ("vision_msgs/msg/Detection2DArray",
+         {"detections": [{"id": "7", "bbox": {"center": {"position": {"x": 4.0, "y": 5.0}}}},
+                         {"id": "", "results": hypotheses(("a", 0.2), ("b", 0.8))}]}, {}, [[4, 5], [0, 0]], (7, "b")),
+        ("vision_msgs/msg/Detection3DArray",
+         {"detections": [{"id": "x", "bbox": {"center": AT}, "results": hypotheses(("post", 1.0))}]},
+         {"take": ["x_m", "y_m", "z_m"]}, [[1, 2, 3]], ("x",)),
+        ("vision_msgs/msg/Detection3DArray",
+         {"detections": [{"id": "x", "bbox": {"center": AT}, "results": hypotheses(("post", 1.0))}]},
+         {"ids": "class"}, [AWAY], ("post",)),
+        ("vision_msgs/msg/Detection3DArray", {"detections": [{"id": "x", "bbox": {"center": AT}}]},
+         {"ids": "none", "take": ["elevation_rad"]}, [[np.arctan2(3, np.hypot(1, 2))]], (None,)),
+        ("visualization_msgs/msg/MarkerArray",
+         {"markers": [{"id": 4, "pose": AT}, {"id": 5, "action": 3, "pose": AT}, {"id": 4, "pose": AT}]}, {}, [AWAY],
+         (4,)),
+        ("visualization_msgs/msg/MarkerArray", {"markers": [{"ns": "a", "id": 4, "pose": AT}, {"ns": "b", "pose": AT}]},
+         {}, [AWAY, AWAY], ("a/4", "b/0")),
+        ("apriltag_msgs/msg/AprilTagDetectionArray",
+         {"detections": [{"id": 3, "corners": corners(*SQUARE)}, {"id": 4, "corners": corners(*SQUARE), "hamming": 3}]},
+         {"size_m": 0.2}, [[*np.ravel(SQUARE), 0.2]], (3,)),
+        ("apriltag_msgs/msg/AprilTagDetectionArray", {"detections": [{"id": 3, "corners": corners(*SQUARE)}]},
+         {"size_m": 0.2, "sizes": {"3": 0.4}}, [[*np.ravel(SQUARE), 0.4]], (3,)),
+        ("aruco_msgs/msg/MarkerArray", {"markers": [{"id": 6, "pose": {"pose": AT}}]}, {}, [AWAY], (6,)),
+    ],
+)  # fmt: skip
+def test_observations_are_scans(
+    kind: str, fields: dict[str, Any], topic: dict[str, Any], y: list[Any], ids: Any, tmp_path: Path
+) -> None:
+    stamped = {} if "visualization" in kind else {"header": header(T0, "camera")}
+    path = bag_of(tmp_path, [Outgoing("/seen", kind, T0, stamped | fields)])
+    (scan,) = open_log(path, topics={"/seen": {"type": "scan"} | topic}).events
+    assert isinstance(scan, Scan) and scan.sensor == "seen" and scan.ids == ids
+    np.testing.assert_array_equal(scan.y, np.array(y).reshape(len(y), -1) if y else np.empty((0, 0)))
+
+
+def cloud(points: np.ndarray, names: str = "x y z id") -> dict[str, Any]:
+    """Return the fields of a PointCloud2 of float32 coordinates and 16 bit numbers."""
+    kind = np.dtype({"names": names.split(), "formats": ["<f4"] * 3 + ["<u2"] * (len(names.split()) - 3)}, align=True)
+    rows = np.zeros(len(points), kind)
+    for k, name in enumerate(kind.names or ()):
+        rows[name] = points[:, k]
+    sorts = {"<f4": 7, "<u2": 4}
+    fields = [
+        {"name": name, "offset": kind.fields[name][1], "datatype": sorts[kind.fields[name][0].str], "count": 1}
+        for name in kind.names
+    ]
+    return {
+        "header": header(T0, "lidar"), "height": 1, "width": len(rows), "fields": fields, "point_step": kind.itemsize,
+        "row_step": rows.nbytes, "data": rows.view(np.uint8),
+    }  # fmt: skip
+
+
+def test_points_of_a_cloud_are_taken_by_their_ids_or_clusters(tmp_path: Path) -> None:
+    points = np.array([[1, 0, 0, 7], [2, 0, 0, 9], [4, 2, 0, 9], [np.nan, 0, 0, 9]])
+    path = bag_of(tmp_path, [Outgoing("/points", "sensor_msgs/msg/PointCloud2", T0, cloud(points))])
+    log = open_log(path, topics={"/points": {"type": "scan", "ids": "id"}})
+    assert log.events[0].ids == (7, 9) and log.events[0].y.tolist() == [[1, 0, 0], [3, 1, 0]]
+    assert [line.split(": ", 1)[1] for line in log.skipped] == ["/points: 1 points without coordinates"]
+    (scan,) = open_log(path, topics={"/points": {"type": "scan", "clusters": "id"}}).events
+    assert scan.ids == (None, None) and scan.y.tolist() == [[1, 0, 0], [3, 1, 0]]
+
+
+def test_what_a_camera_sees_is_made_level_for_a_robot_of_the_plane(tmp_path: Path) -> None:
+    """A camera that looks ahead has z forward: a marker 3 m ahead and 1 m to the right is at (3, -1)."""
+    optical = {"position": {"x": 0.1, "y": 0.0, "z": 0.5}, "orientation": {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}}
+    ahead = {"position": {"x": 1.0, "y": 0.0, "z": 3.0}, "orientation": AT["orientation"]}
+    messages = [
+        tf("/tf_static", T0, transform("base_link", "camera", T0, optical)),
+        odometry(T0, pose(0, 0, 0)),
+        odometry(T0 + 1, pose(0, 0, 0)),
+        Outgoing("/seen", "visualization_msgs/msg/MarkerArray", T0,
+                 {"markers": [{"id": 4, "header": header(T0, "camera"), "pose": ahead}]}),
+    ]  # fmt: skip
+    log = open_log(bag_of(tmp_path, messages), topics={"/odom": TOPICS["/odom"], "/seen": {"type": "scan"}})
+    scan = next(event for event in log.events if isinstance(event, Scan))
+    np.testing.assert_allclose(scan.y, [[3, -1]], atol=1e-12)
+    assert log.sensor_columns["robot", "seen"] == ("x_m", "y_m")
+
+
+# ------------------------------------------------------------------ what is wrong
+@pytest.mark.parametrize(
+    ("topics", "said"),
+    [
+        (None, "log.topics is missing"),
+        ({"/odm": {"type": "odometry_2d"}}, "no topic '/odm', expected .*; did you mean '/odom'"),
+        ({"/odom": {"type": "odometry2d"}}, "type is 'odometry2d', expected one of .*; did you mean 'odometry_2d'"),
+        ({"/odom": {"type": "odometry_2d", "robt": "a"}}, "unknown key 'robt'.*; did you mean 'robot'"),
+        ({"/odom": "odometry_2d"}, "is 'odometry_2d', expected a mapping with a type"),
+        ({"/odom": {"type": "scan"}}, "type nav_msgs/Odometry .odometry., expected one of .*LaserScan"),
+        ({"/tf": {"type": "truth"}}, "expected `frame` and `child_frame`"),
+        ({"/odom": {"type": "odometry_2d"}, "/truth": {"type": "odometry_2d"}}, "both controls of 'robot'"),
+        ({"/fix": {"type": "fix", "origin": [1, 2]}}, "origin is .1, 2., expected .latitude_deg"),
+        ({"/fix": {"type": "fix", "sigma_m": -1.0}}, "sigma_m is -1.0, expected a positive number"),
+        ({"/truth": {"type": "fix"}}, "the position has no covariance, expected .* sigma_m"),
+        ({"/scan": {"type": "scan", "take": ["depth"]}}, "take has depth, expected some of range_m"),
+    ],
+)
+def test_a_topic_that_cannot_be_gets_one_line(topics: Any, said: str, bags: dict[str, Path]) -> None:
+    with pytest.raises(LogError, match=said) as error:
+        open_log(bags["mcap"], topics=topics)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_type_of_message_gets_one_line(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, [Outgoing("/other", "some_msgs/msg/Other", T0, {"value": 1.0})])
+    with pytest.raises(LogError, match="/other has messages of the type some_msgs/Other, expected one of"):
+        open_log(path, topics={"/other": {"type": "fix"}})
+
+
+def test_a_topic_without_messages_gets_one_line(tmp_path: Path) -> None:
+    path = bag_of(tmp_path, [odometry(T0 + k, pose(0, 0, 0)) for k in range(2)], "sqlite3")
+    with sqlite3.connect(next(path.glob("*.db3"))) as database:
+        database.execute("delete from messages")
+    metadata = path / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("message_count: 2", "message_count: 0"))
+    with pytest.raises(LogError, match="topic /odom has no messages"):
+        open_log(path, topics={"/odom": TOPICS["/odom"]})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
+def test_a_cut_bag_gets_one_line(kind: str, share: float, bags: dict[str, Path], tmp_path: Path) -> None:
+    source = bags[kind] if bags[kind].is_file() else next(bags[kind].glob("*.[dm][bc]*"))
+    cut = tmp_path / source.name
+    content = source.read_bytes()
+    cut.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(LogError, match=r"not a bag that can be read|no message|no topic") as error:
+        open_log(cut, topics=TOPICS)
+    assert "\n" not in str(error.value) and str(cut) in str(error.value)
+
+
+def test_damaged_bags_get_one_line(bags: dict[str, Path], tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    for kind in KINDS:
+        source = bags[kind] if bags[kind].is_file() else next(bags[kind].glob("*.[dm][bc]*"))
+        content = np.frombuffer(source.read_bytes(), np.uint8)
+        for n in range(12):
+            odd = content.copy()
+            odd[random.integers(0, len(odd), 1 + 40 * n)] = random.integers(0, 256, 1 + 40 * n)
+            (tmp_path / source.name).write_bytes(odd.tobytes())
+            try:
+                open_log(tmp_path / source.name, topics=TOPICS, on_error="skip")
+            except KalmarkError as error:
+                assert "\n" not in str(error)
+
+
+def test_two_clocks_get_one_line(tmp_path: Path) -> None:
+    messages = [odometry(10**9 * (1 + k), pose(0, 0, 0))._replace(t_ns=T0 + k) for k in range(2)]
+    messages.append(Outgoing("/cmd_vel", "geometry_msgs/msg/Twist", T0, twist(1.0, 0.0)))
+    path = bag_of(tmp_path, messages)
+    topics = {"/odom": {"type": "truth", "robot": "b"}, "/cmd_vel": {"type": "unicycle"}}
+    with pytest.raises(LogError, match="by its headers, /cmd_vel at 1700000000 s as recorded"):
+        open_log(path, topics=topics)
+    topics["/odom"]["time"] = "recorded"
+    assert open_log(path, topics=topics).events[0].t_ns == T0
+
+
+def test_bad_messages_are_refused_or_left_out(tmp_path: Path) -> None:
+    messages = [odometry(T0 + k, pose(0, 0, 0)) for k in (0, 10, 20)]
+    messages += [
+        odometry(T0 + 15, pose(0, 0, 0)),
+        odometry(T0 + 30, pose(np.nan, 0, 0)),
+        odometry(T0 + 40, pose(1, 0, 0)),
+    ]
+    messages += [odometry(T0 + 50, {"position": {}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 0}})]
+    messages = [message._replace(t_ns=T0 + 100 + n) for n, message in enumerate(messages)]
+    path, topics = bag_of(tmp_path, messages), {"/odom": TOPICS["/odom"]}
+    with pytest.raises(LogError, match=r"/odom at t=1700000000.000000015 s: time after 1700000000.000000020 s"):
+        open_log(path, topics=topics)
+    log = open_log(path, topics=topics, on_error="skip")
+    assert len(log.events) == 3 and len(log.skipped) == 3
+    assert "quaternion has length 0" in log.skipped[2] and "finite" in log.skipped[1]
+
+
+def test_a_type_that_the_bag_does_not_define_gets_one_line(tmp_path: Path) -> None:
+    """As older ROS 2 bags in sqlite3 are: without definitions, of which ROS's own are known."""
+    path = bag_of(tmp_path, [Outgoing("/tags", "aruco_msgs/msg/MarkerArray", T0, {"header": header(T0, "camera")}),
+                             odometry(T0, pose(0, 0, 0)), odometry(T0 + 9, pose(1, 0, 0))], "sqlite3")  # fmt: skip
+    with sqlite3.connect(next(path.glob("*.db3"))) as database:
+        database.execute("delete from message_definitions")
+    assert open_log(path, topics={"/odom": TOPICS["/odom"]}).events[0].u.tolist() == [1, 0, 0]
+    with pytest.raises(LogError, match="/tags has messages of the type aruco_msgs/msg/MarkerArray, which the"):
+        open_log(path, topics={"/tags": {"type": "scan"}})
