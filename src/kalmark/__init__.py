@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from kalmark.management.upkeep import Upkeep
     from kalmark.models import landmarks, motion, sensors
     from kalmark.models.pointwise import pointwise
-    from kalmark.report import Observation, Report
+    from kalmark.report import Expectations, Observation, Report
     from kalmark.results.record import record
     from kalmark.results.run import Run
     from kalmark.slam.robot import Mount, Robot
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Attention", "Control", "Delayed", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report", "Robot", "Run",
-    "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators", "geometry",
+    "Attention", "Control", "Delayed", "Expectations", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report",
+    "Robot", "Run", "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators", "geometry",
     "initialization", "landmarks", "motion", "open_log", "pointwise", "presets", "record", "register", "sensors",
 ]  # fmt: skip
 
@@ -62,7 +62,7 @@ _NAMES = {
     "kalmark.management.delayed": ("Delayed",),
     "kalmark.management.upkeep": ("Upkeep",),
     "kalmark.models.pointwise": ("pointwise",),
-    "kalmark.report": ("Observation", "Report"),
+    "kalmark.report": ("Expectations", "Observation", "Report"),
     "kalmark.results.record": ("record",),
     "kalmark.results.run": ("Run",),
     "kalmark.slam.robot": ("Mount", "Robot"),

@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array, Index
+from kalmark.arrays import Array, Flags, Index
+from kalmark.errors import MapError
 from kalmark.events import Event, Id, Scan, seconds
 from kalmark.filter.estimators import Correction
+from kalmark.geometry.gaussian import ellipses
 
 Late = tuple[int, str, str, int]
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
@@ -127,6 +129,52 @@ class Repeat(NamedTuple):
     agrees: bool
     sure: bool
     newer: list[Id]
+
+
+@dataclass(frozen=True, eq=False)
+class Expectations:
+    """What a sensor of a robot should measure of landmarks (L of them), measured or not.  [S] 2.4, [TB] Obs.
+
+    `in_view` (L,) says which it should observe from where the filter has it, `why` what keeps it from the others ("" of
+    those in view).  e (L, m) is the expectation h(x), Z (L, p, p) the covariance that an innovation would have, with
+    the noise of the sensor.  E_r (L, p, 3 or 6), E_s and E_p are the Jacobians in the robot's pose, in the mount,
+    whether it is in the map or not, and in the parameters of the sensor that are in the map (none: 0 columns).  E_l
+    (L, p, n) is the Jacobian in the landmark.  All are padded with NaN where landmarks differ in size, and NaN of what
+    cannot be expected.
+    """
+
+    robot: str
+    sensor: str
+    columns: tuple[str, ...]
+    names: tuple[Id, ...]
+    kinds: tuple[str, ...]
+    in_view: Flags
+    why: tuple[str, ...]
+    e: Array
+    Z: Array
+    E_r: Array
+    E_s: Array
+    E_p: Array
+    E_l: Array
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def row(self, name: Id) -> int:
+        """Return the row of a landmark in all arrays.  Raises MapError if it was not asked about."""
+        if name not in self.names:
+            raise MapError(f"{name!r} is not among the {len(self)} landmarks asked about, expected one of them")
+        return self.names.index(name)
+
+    def ellipses(self, sigmas: float = 3.0, points: int = 40, axes: tuple[int, int] = (0, 1)) -> Array:
+        """Return the n-sigma ellipses (L, points + 1, 2) of Z around e in two columns, closed.  [S] (85)-(87).
+
+        NaN of what cannot be expected.  Of a sensor that measures one number they are intervals: use e and Z.
+        """
+        a, b = axes
+        if not (0 <= a < self.e.shape[1] and 0 <= b < self.e.shape[1] and max(axes) < self.Z.shape[1]):
+            raise MapError(f"axes are {axes}, expected two columns among the first {self.Z.shape[1]} of {self.columns}")
+        return ellipses(self.e[:, [a, b]], self.Z[:, [a, b]][:, :, [a, b]], sigmas, points)
 
 
 class Report:

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from state_digest import digest
 
 import kalmark as km
 from kalmark.errors import DivergedError, EventError, MapError
 from kalmark.report import INDEFINITE
 from kalmark.slam.slam import SINGULAR
-from state_digest import digest
 
 ESTIMATORS = [km.estimators.Ekf(), km.estimators.Invariant(), km.estimators.Fej()]
 MAPS = ["dense", "postponed"]

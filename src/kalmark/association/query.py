@@ -11,6 +11,7 @@ from kalmark.association.matchings import Places
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import P_AT
+from kalmark.filter.local import beside
 from kalmark.filter.map import Marginal, Pairs
 from kalmark.filter.observed import add_blocks, observed_block
 from kalmark.models.observe import linearize
@@ -18,6 +19,7 @@ from kalmark.report import Compared
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 
+AROUND = 64  # landmarks known exactly to be compared with what determines no place
 LIMITS = 30, 1e-2  # linearisations of a matching, and the sigmas by which the last one moves anything
 
 
@@ -37,6 +39,7 @@ class Query:
         self.learned = 0.0, 0.0
         self._pairs: Pairs | None = None  # near each other when candidates were asked for,
         self._names: list[Id] = []  # and the landmarks of these
+        self._known = scan.tracks.known  # exactly, and outside the map
 
     def dof(self) -> int:
         """Return the size p of one innovation."""
@@ -65,12 +68,31 @@ class Query:
         scan, channel, tracks = self.scan, self.scan.channel, self.scan.tracks
         places = channel.places(scan.map, scan.robot, scan.y)
         if places is None:
-            return tracks.observable(channel)
+            around = scan.pose()[None, : scan.dimensions]
+            return tracks.observable(channel) + self._known.near(channel.models, around, AROUND)
         sorts = tracks.sorts_of(channel.kinds, len(scan.map.blocks))
         self._pairs = scan.map.pairs(sorts, scan.robot, channel.mount, places, nearest, farther)
         self._names = [tracks.names[slot] for slot in self._pairs.slots.tolist()]
+        if len(self._known):
+            names = self._names + self._known.near(channel.models, places, nearest)
+            read = self.read(names)
+            at = read.map.means(read.slots, scan.dimensions)
+            self._pairs = Pairs.of(np.arange(len(names)), at, read, places, nearest, farther)
+            self._names = [names[i] for i in self._pairs.slots.tolist()]
         scan.report.seen_at = places
         return self._names.copy()
+
+    def read(self, names: list[Id]) -> Marginal:
+        """Return the joint marginal of robot, mount and landmarks, those known exactly among them."""
+        scan = self.scan
+        mapped = [name for name in names if name not in self._known]
+        read = scan.map.marginal(scan.robot, scan.channel.mount, scan.tracks.slots_of(mapped))
+        if len(mapped) == len(names):
+            return read
+        known = [name for name in names if name in self._known]
+        read = beside(read, [self._known.model(name).space for name in known], [*map(self._known.mean, known)])
+        at = {name: i for i, name in enumerate(mapped + known)}
+        return read._replace(slots=read.slots[[at[name] for name in names]])
 
     def distances(self, candidates: list[Id]) -> Array:
         """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83).
@@ -79,9 +101,13 @@ class Query:
         """
         d2 = np.full((len(self.y), len(candidates)), np.inf)
         if self._pairs is None:
-            slots = self.scan.tracks.slots_of(candidates)
             rows, numbers = (a.ravel() for a in np.indices(d2.shape))
-            d2[rows, numbers] = self._squared(Pairs(rows, numbers, slots, np.zeros((len(slots), 0)), None), candidates)
+            nowhere, read = np.zeros((len(candidates), 0)), None
+            if any(name in self._known for name in candidates):
+                slots, read = np.arange(len(candidates)), self.read(candidates)
+            else:
+                slots = self.scan.tracks.slots_of(candidates)
+            d2[rows, numbers] = self._squared(Pairs(rows, numbers, slots, nowhere, read), candidates)
             return d2
         pairs, columns = self._pairs, self._pairs.numbers
         if candidates != self._names:
@@ -96,14 +122,14 @@ class Query:
     def _squared(self, pairs: Pairs, names: list[Id]) -> Array:
         """Return the squared distances (M,) of pairs of an observation and a landmark."""
         out = np.empty(len(pairs.rows))
-        for model, which in self.scan.tracks.by_model(self.scan.channel, names):
+        for model, which in self.scan.tracks.any_by_model(self.scan.channel, names):
             some = slice(None) if len(which) == len(names) else np.isin(pairs.numbers, which)
             k, l = pairs.rows[some], pairs.numbers[some]
             if pairs.marginal is None:
                 out[some] = self.scan.predict(model, pairs.slots[l], k)[1]
             else:
                 m, robot, mount, here = pairs.marginal
-                R = self.scan.noise(model, pairs.slots[l], k)
+                R = self.scan.noise_of(model, m.means(here[l], model.d), k)
                 out[some] = model.predict(m, robot, mount, here[l], self.y[k], R)[1]
         return out
 
@@ -114,15 +140,14 @@ class Query:
         The noise of an observation is in the blocks of its pairs, not between them: only one of them can be right.
         """
         scan, p = self.scan, self.scan.channel.dof
-        slots = scan.tracks.slots_of(names)
-        m, robot, mount, here = scan.map.marginal(scan.robot, scan.channel.mount, slots)
+        m, robot, mount, here = self.read(names)
         z, R, H, at = np.empty((len(rows), p)), np.empty((len(rows), p, p)), [], []
-        for model, which in scan.tracks.by_model(scan.channel, names):
+        for model, which in scan.tracks.any_by_model(scan.channel, names):
             index, _, mean = observed_block(m.x, m.blocks, m.atoms, robot, mount, here[which], model.d)
             head = len(mean) - model.d * len(which)
             l = mean[head:].reshape(len(which), model.d)
             _, z[which], E_h, E_l = linearize(model.model, mean[:head], l, scan.y[rows[which]])
-            R[which] = scan.noise(model, slots[which], rows[which])
+            R[which] = scan.noise_of(model, l, rows[which])
             H += [(i, E_h[k], E_l[k]) for k, i in enumerate(which)]
             h, d = E_h.shape[2], E_l.shape[2]
             at += [np.concatenate([index[:h], index[h + k * d : h + (k + 1) * d]]) for k in range(len(which))]
@@ -138,23 +163,21 @@ class Query:
     def together(self, names: list[Id]) -> Candidates | None:
         """Return landmarks to be asked about jointly; None if of several kinds, or if this sensor gives no places."""
         scan = self.scan
-        if not scan.channel.gives_places or len({scan.tracks.sorts[name] for name in names}) > 1:
+        if not scan.channel.gives_places or len(sorts := {scan.tracks.sort(name) for name in names}) > 1:
             return None
         read = None if self._pairs is None else self._pairs.marginal
         if read is not None and names != self._names:
             at = {name: i for i, name in enumerate(self._names)}
             read = read._replace(slots=read.slots[[at[n] for n in names]]) if at.keys() >= set(names) else None
-        slots, model = scan.tracks.slots_of(names), scan.channel.models[scan.tracks.sorts[names[0]]]
-        if read is None:
-            read = scan.map.marginal(scan.robot, scan.channel.mount, slots)
-        return Candidates(scan, model, slots, read)
+        model = scan.channel.models[str(sorts.pop())]
+        return Candidates(scan, model, self.read(names) if read is None else read)
 
 
 class Candidates:
     """Landmarks of one kind that a scan may show, asked about jointly; `read` is a joint marginal that has them."""
 
-    def __init__(self, scan: ScanContext, model: ObservationModel, slots: Index, read: Marginal) -> None:
-        self._scan, self._model, self._slots, self._read = scan, model, slots, read
+    def __init__(self, scan: ScanContext, model: ObservationModel, read: Marginal) -> None:
+        self._scan, self._model, self._read = scan, model, read
 
     def places(self) -> Places:
         """Return where all observations seem to be from the sensor (K, n), where the landmarks are, and covariances."""
@@ -169,7 +192,7 @@ class Candidates:
         """Return the joint d2 and log |Z| of pairs of an observation `rows` (M,) and a landmark `columns` (M,)."""
         m, robot, mount, here = self._read
         model, y = self._model, self._scan.y[rows]
-        R = self._scan.noise(model, self._slots[columns], rows)
+        R = self._scan.noise_of(model, m.means(here[columns], model.d), rows)
         run = corrections.compiled_fit if isinstance(model.model, tuple) else corrections.fit
         scan = robot, mount, here[columns], model.d, y, np.ascontiguousarray(R), np.inf
         d2, log_det = run(model.model, m.whole, scan, LIMITS)
@@ -180,6 +203,6 @@ class Candidates:
         if not len(rows):
             return np.zeros(0)
         m, robot, mount, here = self._read
-        R = self._scan.noise(self._model, self._slots[columns], rows)
+        R = self._scan.noise_of(self._model, m.means(here[columns], self._model.d), rows)
         Z, _ = self._model.predict(m, robot, mount, here[columns], self._scan.y[rows], R)
         return log_volume_ratio(Z, R)

@@ -37,6 +37,12 @@ def density(map_: Map, tracks: Tracks, names: Sequence[Id], sensor: Array) -> fl
     """
     d, found = 2 if len(sensor) == 3 else 3, []
     for name in names:
+        if name in tracks.known:
+            of = tracks.known.of_kind[str(tracks.known.kind(name))]
+            gaps = of.gaps(tracks.known.mean(name)[:d], NEIGHBOURS)
+            reach = gaps[-1] if len(gaps) else np.linalg.norm(tracks.known.mean(name)[:d] - sensor[:d])
+            found.append(max(len(gaps), 1) / max(float(reach), LEAST_M) ** d)
+            continue
         others = [n for n in tracks.confirmed[name].covisible if n != name and n in tracks.confirmed]
         p = map_.means(tracks.slots_of([name, *others]), d)
         gaps = np.sort(np.linalg.norm(p[1:] - p[0], axis=1))[:NEIGHBOURS]
@@ -101,13 +107,14 @@ def accepted(query: Query, decisions: list[Decision], odds: float) -> list[Decis
     Observations with ids are trusted.
     """
     scan, tracks, ids = query.scan, query.scan.tracks, query.ids
-    mine = [k for k, (name, _) in enumerate(decisions) if ids[k] is None and name in tracks.confirmed]
+    mapped = [name in tracks.confirmed or name in tracks.known for name, _ in decisions]
+    mine = [k for k, there in enumerate(mapped) if ids[k] is None and there]
     if not mine or not scan.channel.gives_places:
         return decisions
     V_y = scan.channel.sensor.invert(scan.y)[1]
     if V_y.shape[1] != V_y.shape[2]:
         return decisions
-    sure = [k for k, (name, _) in enumerate(decisions) if ids[k] is not None and name in tracks.confirmed]
+    sure = [k for k, there in enumerate(mapped) if ids[k] is not None and there]
     rows = np.array([*sure, *mine])
     names: list[Any] = [decisions[k][0] for k in rows]
     z, Z = query.jointly(rows, names)

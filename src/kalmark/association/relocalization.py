@@ -51,7 +51,7 @@ def relocalized(query: Query) -> Array | None:
     if not fits:
         return None
     best = min(fits, key=lambda fit: fit[0])[1]
-    return best if all(_same(best, T) for _, T in fits) else None
+    return best if all(same(best, T) for _, T in fits) else None
 
 
 def _by_constellation(query: Query) -> tuple[list[Id], Index]:
@@ -73,8 +73,8 @@ def _by_constellation(query: Query) -> tuple[list[Id], Index]:
 
 def _by_id(query: Query) -> tuple[list[Id], Index]:
     """Return the landmarks of a scan, and the one matching (1, K) that their ids are."""
-    slots = query.scan.tracks.confirmed
-    names = [i for i in query.ids if i is not None and i in slots]
+    tracks = query.scan.tracks
+    names = [i for i in query.ids if i is not None and (i in tracks.confirmed or i in tracks.known)]
     if len(names) < FEWEST:
         return names, np.zeros((0, len(query.ids)), dtype=np.int64)
     return names, np.array([[names.index(i) if i in names else -1 for i in query.ids]])
@@ -90,5 +90,6 @@ def aligned(v: Array, l: Array, weights: Array) -> Array:
     return np.array([x, y, theta])
 
 
-def _same(one: Array, other: Array) -> bool:
+def same(one: Array, other: Array) -> bool:
+    """Return whether two poses (3,) are so near to each other that they are one."""
     return math.dist(one[:2], other[:2]) <= SAME_M and abs(wrap(one[2] - other[2])) <= SAME_RAD

@@ -70,7 +70,7 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
     kernels.copy_submatrix(P, index[:head], S)
     for i in range(k):
         H[:, :head], H[:, head:] = E_r[i], E_l[i]
-        own = index[head + i * d]
+        own = index[head + i * d] if d > 0 else 0
         for a in range(head, n):
             row = own + a - head
             for b in range(a + 1):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Flags
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, inverse
 
@@ -22,6 +22,16 @@ def ellipse(mean: Any, cov: Any, sigmas: float = 1.0, points: int = 16) -> Array
     alpha = 2 * np.pi / points * np.arange(points + 1)
     circle = np.stack([np.cos(alpha), np.sin(alpha)])
     return np.asarray(mean, dtype=np.float64) + (sigmas * axes @ (np.sqrt(d2)[:, None] * circle)).T
+
+
+def ellipses(means: Array, covs: Array, sigmas: float = 1.0, points: int = 16) -> Array:
+    """Return the n-sigma contours (K, points + 1, 2) of 2-D Gaussians, closed; NaN of what is not finite."""
+    known: Flags = np.logical_and(np.isfinite(covs).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    values, axes = np.linalg.eigh(np.where(known[:, None, None], covs, 0.0))
+    alpha = 2 * np.pi / points * np.arange(points + 1)
+    half = axes * (sigmas * np.sqrt(np.maximum(values, 0.0)))[:, None, :]
+    out = means[:, None] + np.stack([np.cos(alpha), np.sin(alpha)], axis=1) @ half.swapaxes(1, 2)
+    return np.where(known[:, None, None], out, np.nan)
 
 
 def mahalanobis(x: Any, mean: Any, cov: Any) -> float:

@@ -70,21 +70,27 @@ def is_clear(scan: ScanContext, k: int) -> bool:
     return not np.isfinite(chi2[0, 0]) or bool(chi2[0, 1] - chi2[0, 0] >= TELLING)
 
 
-def approach(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Update | None:
+def approach(
+    scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int], known: Array | None = None
+) -> Update | None:  # fmt: skip
     """Return the correction by the poses of those tags of the observations `rows` that are far; None if none is.
 
-    `slots` (K,) are the tags' blocks.  A tag of ambiguous pose is left out, and so is what is no tag.
+    `slots` (K,) are the tags' blocks; of tags `known` (K, 7) exactly they are the robot's, and `model` is theirs.  A
+    tag of ambiguous pose is left out, and so is what is no tag.
     """
     channel, map_, robot = scan.channel, scan.map, scan.robot
     if channel.far is None or not isinstance(channel.sensor, FarCorrected):
         return None
     y, R = scan.y[rows], scan.R[rows]
-    far = np.flatnonzero(channel.sensor.is_far(y, channel.innovations(map_, robot, model, slots, y)))
+    exactly = np.zeros((len(rows), 0)) if known is None else known
+    z = channel.innovations(map_, robot, model, slots, np.concatenate([y, exactly], axis=1))
+    far = np.flatnonzero(channel.sensor.is_far(y, z))
     if not len(far):
         return None
     v, cov = channel.sensor.poses(y[far], R[far])
-    clear = channel.predict(map_, robot, channel.far, slots[far], v, cov)[1] <= channel.gate  # not of a NaN
+    v, by_pose = np.concatenate([v, exactly[far]], axis=1), channel.far if known is None else channel.far.exactly
+    clear = channel.predict(map_, robot, by_pose, slots[far], v, cov)[1] <= channel.gate  # not of a NaN
     if not clear.any():
         return None
     some, R_far = slots[far][clear], SHARE * cov[clear]
-    return Update(channel.far.model, robot, channel.mount, some, model.d, v[clear], R_far, channel.gate)
+    return Update(by_pose.model, robot, channel.mount, some, model.d, v[clear], R_far, channel.gate)

@@ -100,6 +100,14 @@ class Camera(NamedTuple):
     corners: Matrix
 
 
+class Measuring(NamedTuple):
+    """A sensor of a robot that is no camera, and what its rows of y are."""
+
+    robot: str
+    sensor: str
+    columns: Names
+
+
 class Mounted(NamedTuple):
     """A sensor that calibrates itself: its name in the map, and its mount (3,) or (7,) at the end.
 
@@ -145,6 +153,7 @@ ROWS: dict[
     "fixes": ("used_fix", UsedFix, False),
     "starts": ("start", Start, False),
     "cameras": ("camera", Camera, True),
+    "sensors": ("measuring", Measuring, True),
     "mounts": ("mount", Mounted, True),
     "biases": ("bias", Biased, True),
     "gaps": ("gap", Gap, False),
@@ -169,9 +178,15 @@ class History:
 
     Observations `candidate_row` (C,) were compared with landmarks, `candidate_landmark` (C,), of distance
     `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks
-    `share_landmark` with weights `share_weight`.  `changes` is what became of landmarks, `fixes` are those used, in the
-    order they came, `controls` those of each robot that had any, `gaps` the times without, `repeats` pairs of
-    landmarks that seem to be one.
+    `share_landmark` with weights `share_weight`.
+
+    Of some 2,000 scans spread over the run, `unmeasured_step` (U,) are the steps of landmarks that should be in view
+    of the sensor `unmeasured_sensor` and were not measured, at most 32 in a scan, the most certain ones:
+    `unmeasured_landmark`, their kinds, expectations `unmeasured_e` (U, m) before the scan and the covariances
+    `unmeasured_Z` (U, p, p) that their innovations would have had.
+
+    `changes` is what became of landmarks, `fixes` are those used, in the order they came, `controls` those of each
+    robot that had any, `gaps` the times without, `repeats` pairs of landmarks that seem to be one.
     """
 
     t_ns: Ints
@@ -205,12 +220,19 @@ class History:
     share_row: Ints
     share_landmark: Texts
     share_weight: Array
+    unmeasured_step: Ints
+    unmeasured_sensor: Texts
+    unmeasured_landmark: Texts
+    unmeasured_kind: Texts
+    unmeasured_e: Array
+    unmeasured_Z: Array
     maps: tuple[MapSnapshot, ...] = ()
     controls: dict[str, Controlled] = field(default_factory=dict)
     changes: tuple[Change, ...] = ()
     fixes: tuple[UsedFix, ...] = ()
     starts: tuple[Start, ...] = ()
     cameras: tuple[Camera, ...] = ()
+    sensors: tuple[Measuring, ...] = ()
     mounts: tuple[Mounted, ...] = ()
     biases: tuple[Biased, ...] = ()
     gaps: tuple[Gap, ...] = ()

@@ -17,6 +17,8 @@ from matplotlib.lines import Line2D
 from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.results.explain import Explanation, Fate
+from kalmark.results.history import Camera, Measuring
+from kalmark.results.plot_measured import draw_measured, measuring
 from kalmark.results.recording import Recording
 from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
 from kalmark.results.words import figure as figure_of
@@ -166,24 +168,29 @@ def _legend(told: Explanation) -> list[Line2D]:
 
 
 def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None, t_s: float | None = None) -> Figure:
-    """Return the figure of a camera's last scan, or of that at a step, or of the last up to a time.
+    """Return the figure of a sensor's last scan, or of that at a step, or of the last up to a time.
 
-    Pixels, v downwards; measurements are grey crosses or thick lines, expectations 3-sigma ellipses of Z around e or
-    thin lines.  `t_s`, and the time in the title, are seconds since the first scan, as in the report.  Raises RunError
-    if there is no such camera or scan.
+    Of a camera in pixels, v downwards; measurements are grey crosses or thick lines, expectations 3-sigma ellipses of Z
+    around e or thin lines.  Of another sensor in its measurement space (`kalmark.results.plot_measured`).  `t_s`, and
+    the time in the title, are seconds since the first scan, as in the report.  Raises RunError if there is no such
+    sensor or scan.
     """
-    history, cameras = run.history, {(camera.robot, camera.sensor): camera for camera in run.history.cameras}
-    if (robot, sensor) not in cameras:
-        names = ", ".join(map(".".join, cameras)) or "none"
-        raise RunError(f"camera {robot}.{sensor} is not in this run, expected one of: {names}")
-    camera = cameras[robot, sensor]
+    history = run.history
+    drawable: list[Camera | Measuring] = [*history.cameras, *measuring(history)]
+    sensors = {(s.robot, s.sensor): s for s in drawable}
+    if (robot, sensor) not in sensors:
+        names = ", ".join(map(".".join, sensors)) or "none"
+        raise RunError(f"sensor {robot}.{sensor} has no picture in this run, expected one of: {names}")
+    camera = sensors[robot, sensor]
     steps = steps_of(history, camera)
     if t_s is not None:
         steps = steps[history.t_ns[steps] - history.t_ns[0] <= round(t_s * 1e9)]
     if step is not None:
         steps = steps[steps <= step]
     if len(steps) == 0:
-        raise RunError(f"camera {robot}.{sensor} saw nothing until then, expected a scan with an observation")
+        raise RunError(f"sensor {robot}.{sensor} saw nothing until then, expected a scan with an observation")
+    if isinstance(camera, Measuring):
+        return draw_measured(history, camera, int(steps[-1]))
     seen = images(history, camera, int(steps[-1]))
     shape = camera.size[1] / camera.size[0]
     width = 9.0 if len(seen) == 1 else 14.0
@@ -215,10 +222,12 @@ def draw_image(axes: Axes, image: Image, size: tuple[float, float]) -> None:
 
 def _draw(axes: Axes, s: Sighting, size: tuple[float, float]) -> None:
     colour, _ = colour_of(s)
-    expected, single = np.isfinite(s.expected).all(), len(s.measured) == 1
+    expected, single = np.isfinite(s.expected).all(), len(s.expected) == 1
     closed = np.vstack([s.measured, s.measured[:1]]) if len(s.measured) > 2 else s.measured
     rejected, new = s.outcome == "rejected", s.outcome == "new"
-    if single:
+    if not len(s.measured):
+        pass
+    elif single:
         axes.plot(*s.measured.T, "+", color=MEASURED, markersize=8, markeredgewidth=1.1, zorder=3)
     else:
         axes.plot(*closed.T, "-", color="#3a68c8" if not new else MEASURED, linewidth=3.0, alpha=0.55, zorder=2)
@@ -229,7 +238,7 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float]) -> None:
     if expected:
         _draw_expected(axes, s, size, colour, rejected)
     if s.outcome != "ignored" and s.name:
-        at = s.expected.mean(axis=0) if expected and single else s.measured.mean(axis=0)
+        at = s.expected.mean(axis=0) if expected and (single or not len(s.measured)) else s.measured.mean(axis=0)
         text: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 7, "color": NAME, "clip_on": True}
         axes.text(at[0], at[1] - 15.0, s.name, zorder=7, **text)
 

@@ -18,7 +18,7 @@ from kalmark.logs.log import Log
 from kalmark.models.protocols import calibrating
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
-from kalmark.results.history import Biased, Camera, Mounted
+from kalmark.results.history import Biased, Camera, Measuring, Mounted
 from kalmark.slam.motion import bias_name
 
 if TYPE_CHECKING:
@@ -152,6 +152,17 @@ def cameras(slam: Slam) -> tuple[Camera, ...]:
                 )
                 found.append(Camera(robot.name, name, at, size, columns, _corners(sensor)))
     return tuple(found)
+
+
+def sensors(slam: Slam) -> tuple[Measuring, ...]:
+    """Return the sensors of a filter that are no cameras."""
+    seen = {(camera.robot, camera.sensor) for camera in cameras(slam)}
+    return tuple(
+        Measuring(robot.name, name, tuple(mount.sensor.columns))
+        for robot in slam.robots.values()
+        for name, mount in robot.sensors.items()
+        if (robot.name, name) not in seen
+    )
 
 
 def mounts(slam: Slam) -> tuple[Mounted, ...]:

@@ -16,11 +16,12 @@ from kalmark.errors import DivergedError, EventError, LogError
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.source import nearest
+from kalmark.results.foresight import Foresight
 from kalmark.results.gaps import joined
 from kalmark.results.history import Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
-from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, stated_noise
+from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
 from kalmark.results.recording import LogReference
 from kalmark.results.repeats import repeated
 from kalmark.results.run import Run
@@ -59,7 +60,7 @@ def record(
     slam.reserve(name for event in log.events if type(event) is Scan for name in event.ids or ())
     recorder = _Recorder(slam, log)
     begin = time.perf_counter()
-    with numba_event.install_listener("numba:compiler_lock", recorder.compiler):
+    with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.foresight:
         for event in track(log.events, log.name or "log", len(log.events), show=progress):
             try:
                 recorder.process(event)
@@ -111,7 +112,9 @@ class _Recorder:
 
     def __init__(self, slam: Slam, log: Log) -> None:
         self.slam, self.log = slam, log
-        self.snapshot_at = np.linspace(0, sum(type(e) is Scan for e in log.events) - 1, SNAPSHOTS)
+        scans = sum(type(e) is Scan for e in log.events)
+        self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS)
+        self.foresight = Foresight(slam, scans)
         self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
         begins = {name: begins_at(log.events, name, robot.motion.held) for name, robot in slam.robots.items()}
         self.starts = tuple(
@@ -143,7 +146,7 @@ class _Recorder:
         try:
             report = self.slam.process(event)
         finally:
-            self.spent_ns += time.perf_counter_ns() - start
+            self.spent_ns += time.perf_counter_ns() - start - self.foresight.spent_ns()
         self.gaps += report.gaps
         if type(event) is Control:
             number, first_ns, _ = self.controls.get(event.robot, (0, event.t_ns, 0))
@@ -158,6 +161,7 @@ class _Recorder:
         self.spent_ns, self.compiler.was_busy = 0, False
         self.dead.append(self.reckoned[event.robot].at(event.t_ns))
         self.scans.append(event)
+        self.foresight.keep(len(self.reports), report)
         self.reports.append(report)
         self.states.append((self.slam.mean(event.robot), self.slam.covariance(event.robot)))
         models = [
@@ -239,11 +243,13 @@ class _Recorder:
             fixes=tuple(self.fixes),
             starts=self.starts,
             cameras=cameras(self.slam),
+            sensors=sensors(self.slam),
             mounts=mounts(self.slam),
             biases=biases(self.slam),
             gaps=joined(self.gaps),
             repeats=repeated(self.slam),
             **decisions(reports, 3 if n > 3 else 2),
+            **self.foresight.columns(m, p),
         )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.results.evaluate import evaluate
+from kalmark.results.history import Camera, Measuring
 from kalmark.results.recording import Recording, file_name, replace_file, write
 from kalmark.results.scene import steps_of
 
@@ -46,17 +47,19 @@ class Run(Recording):
         return folder
 
     def report(self, folder: str | Path) -> list[Path]:
-        """Write ``map.png``, ``report.html`` and each camera's last scan into a folder; return their paths."""
+        """Write ``map.png``, ``report.html`` and each sensor's last scan into a folder; return their paths."""
         from kalmark.results.plot import save_figure, save_map  # matplotlib is slow to import
+        from kalmark.results.plot_measured import measuring
         from kalmark.results.plot_scan import draw_sensor
         from kalmark.results.report import report_html
 
         folder = Path(folder)
         replace_file(folder / "map.png", lambda path: save_map(self, path))
         written = [folder / "map.png", folder / "report.html"]
-        for robot, sensor, *_ in (camera for camera in self.history.cameras if len(steps_of(self.history, camera))):
-            written.append(folder / f"sensor_{file_name(robot)}_{file_name(sensor)}.png")
-            picture = draw_sensor(self, robot, sensor)
+        drawable: list[Camera | Measuring] = [*self.history.cameras, *measuring(self.history)]
+        for seen in (sensor for sensor in drawable if len(steps_of(self.history, sensor))):
+            written.append(folder / f"sensor_{file_name(seen.robot)}_{file_name(seen.sensor)}.png")
+            picture = draw_sensor(self, seen.robot, seen.sensor)
             replace_file(written[-1], partial(save_figure, picture, dpi=110, rim=False))
         write(folder / "report.html", report_html(self))
         return written

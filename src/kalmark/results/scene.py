@@ -22,7 +22,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
-from kalmark.results.history import Camera, History, Ints
+from kalmark.results.history import Camera, History, Ints, Measuring
 from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, LINE, Shapes, shapes
 from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording
@@ -35,6 +35,7 @@ EXPECTED = {  # colours and their meaning, by whether the landmark is Euclidean,
     (False, True): ("#d81b1b", "not Euclidean, used"),
     (False, False): ("#c218c2", "not Euclidean, predicted only"),
 }
+IN_VIEW = "in view, not measured"
 SIDES = {"": "", "l": "left", "r": "right"}
 COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b0457a", "#6b6f2a")
 SPACE_COLOURS = ("#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#6b6f2a", "#b0457a")  # landmarks are blue or red
@@ -271,7 +272,8 @@ class Sighting(NamedTuple):
     """One observation in one image: its name, what became of it, what was measured and what was expected.
 
     `measured` and `expected` (V, 2) are pixels, one row a point; without an expectation the latter is NaN.  `Z` (2, 2)
-    is the covariance of the innovation of a single point, NaN of what has several.
+    is the covariance of the innovation of a single point, NaN of what has several.  A landmark in view that was not
+    measured has the outcome `IN_VIEW` and `measured` (0, 2).
     """
 
     name: str
@@ -301,6 +303,12 @@ def images(history: History, camera: Camera, step: int) -> list[Image]:
             Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
             euclidean = str(history.kind[row]) in EUCLIDEAN
             image.sightings.append(Sighting(name, outcome, euclidean, y[at], e[at], Z_at))
+    for row in np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == camera.sensor)):
+        e, Z, name = history.unmeasured_e[row], history.unmeasured_Z[row], str(history.unmeasured_landmark[row])
+        for image, at in zip(found, points.values(), strict=True):
+            Z_at = Z[np.ix_(at[0], at[0])] if len(at) == 1 else np.full((2, 2), np.nan)
+            euclidean = str(history.unmeasured_kind[row]) in EUCLIDEAN
+            image.sightings.append(Sighting(name, IN_VIEW, euclidean, np.empty((0, 2)), e[at], Z_at))
     return found
 
 
@@ -309,8 +317,8 @@ def colour_of(sighting: Sighting) -> tuple[str, str]:
     return EXPECTED[sighting.euclidean, sighting.outcome == "associated"]
 
 
-def steps_of(history: History, camera: Camera) -> Ints:
-    """Return the steps at which a camera saw something."""
+def steps_of(history: History, camera: Camera | Measuring) -> Ints:
+    """Return the steps at which a sensor observed something."""
     mine = (history.sensor == camera.sensor) & (history.robot[history.step] == camera.robot)
     return np.unique(history.step[mine])
 

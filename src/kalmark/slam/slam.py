@@ -11,7 +11,7 @@ return decisions and actions.  This page alone changes the map, the tracks and t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from importlib import import_module
@@ -23,6 +23,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.association import Association, ByIdentity
 from kalmark.association.averaging import average, outcomes, refuse_averaging
+from kalmark.association.global_start import Located, is_lost, located
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
 from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
@@ -43,7 +44,17 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, place_of
-from kalmark.report import INDEFINITE, Gap, Judged, LandmarkTable, Observation, Repeat, Report, outcomes_of
+from kalmark.report import (
+    INDEFINITE,
+    Expectations,
+    Gap,
+    Judged,
+    LandmarkTable,
+    Observation,
+    Repeat,
+    Report,
+    outcomes_of,
+)
 from kalmark.slam.checks import (
     covariance,
     fault_of,
@@ -59,6 +70,7 @@ from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_worl
 from kalmark.slam.robot import Robot, mount_name, robots_given
 from kalmark.tracks.channel import Channel, ObservationModel, Parts
 from kalmark.tracks.clones import Clones
+from kalmark.tracks.expecting import expectations
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import ChannelKey, Late, Pending, Status, Track, Tracks
 
@@ -106,6 +118,7 @@ class Slam:
                 raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
             self.robots[robot.name] = robot
         self.tracks, self.clones = Tracks(self.robots), Clones()
+        self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may ask `expect`
         self._moving: dict[str, Moving] = {}
         self._channels: dict[ChannelKey, Channel] = {}
         self._policies: dict[ChannelKey, Policy] = {}
@@ -205,6 +218,8 @@ class Slam:
         scan = ScanContext(
             self.map, self.tracks, self.clones, self.estimator, channel, robot, event, ids, R, report
         )  # fmt: skip
+        if self.before_scan is not None:
+            self.before_scan(event.robot, event.sensor)
         if len(event.y):
             self._fuse(scan, policy)
             if gaps and any(o.outcome == "associated" for o in report.observations):
@@ -265,12 +280,21 @@ class Slam:
     # ------------------------------------------------------------------ scans
     def _fuse(self, scan: ScanContext, policy: Policy) -> None:
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
-        query = self._relocalized(scan, Query(scan))
-        decisions = self._decided(policy, query)
+        query = Query(scan)
+        located = self._started(scan, query)
+        if located is not None and located.T is None:
+            scan.report.blank(scan.channel.dof)
+            fate = [Observation(k, i, "deferred", None, None, located.why) for k, i in enumerate(scan.ids)]
+            scan.report.observations = fate
+            return
+        query = self._relocalized(scan, query) if located is None else Query(scan)
+        decisions = self._decided(policy, query, located.decisions if located is not None else None)
         self.tracks.learn(*query.learned)
         names = [name for name, _ in decisions]
         groups = self.tracks.by_model(scan.channel, names, scan.event.robot)
+        exact = self._correct_by_known(scan, policy, decisions) if self.tracks.known else []
         judged, found = self._correct(scan, policy, groups, decisions)
+        judged = exact + judged
         if not found and not policy.reviews and sum(len(group.rows) for group in judged) == len(decisions):
             scan.report.judged = tuple(judged)
             return
@@ -279,17 +303,33 @@ class Slam:
             self._review(scan, policy, found)
         if len(found) < len(decisions):
             seen = {o.index: o for o in found}
-            self._start(scan, policy, [k for _, rows in groups for k in rows], decisions, seen)
+            used = [k for group in exact for k in group.rows] + [k for _, rows in groups for k in rows]
+            self._start(scan, policy, used, decisions, seen)
             found = list(seen.values())
         scan.report.observations = tuple(found)
 
-    def _decided(self, policy: Policy, query: Query) -> Sequence[Decision]:
-        """Ask the association; where its numbers are singular, only ids say what was observed."""
+    def _decided(self, policy: Policy, query: Query, told: list[Decision] | None) -> Sequence[Decision]:
+        """Ask the association, unless it has `told`; where its numbers are singular, only ids say what was observed."""
         try:
-            decisions = policy.association.associate(query)
+            decisions = policy.association.associate(query) if told is None else told
             return accepted(query, decisions, policy.upkeep.odds) if policy.holds_back else decisions
         except np.linalg.LinAlgError:
             return [(None, SINGULAR) if i is None else (i, "") for i in query.ids]
+
+    def _started(self, scan: ScanContext, query: Query) -> Located | None:
+        """Move a robot that may be anywhere in a known map to where its scan fits; None of a robot that may not.
+
+        Its mean alone: the covariance says that it may be there.
+        """
+        if not self.tracks.known:
+            return None
+        r = self.map.mean(scan.robot)
+        if not is_lost(r, self.map.covariance([scan.robot]), self.tracks):
+            return None
+        found = located(query)
+        if found.T is not None:
+            self.map.set_predicted(scan.robot, compose(found.T, compose(inverse(scan.pose())[0], r)[0])[0])
+        return found
 
     def _relocalized(self, scan: ScanContext, query: Query) -> Query:
         """Move a robot whose heading a gap has left unknown to where its scan fits; return what to ask then.
@@ -338,6 +378,31 @@ class Slam:
             self.tracks.count(names, done.fused.tolist())
             judged.append(Judged(rows, scan.ids, names, done, scan.channel.gate))
         return judged, found + self._average(scan, decisions) if policy.averages else found
+
+    def _correct_by_known(
+        self, scan: ScanContext, policy: Policy, decisions: Sequence[Decision]
+    ) -> list[Judged]:  # fmt: skip
+        """Correct by observations of landmarks known exactly, as by fixes.  docs/localization.md."""
+        report, known, m = scan.report, self.tracks.known, scan.y.shape[1]
+        groups = self.tracks.known_by_model(scan.channel, [name for name, _ in decisions])
+        if policy.attention.sequential:
+            groups = [(model, [k]) for model, rows in groups for k in rows]
+        if groups and len(groups[0][1]) < len(scan.y):
+            report.blank(scan.channel.dof)
+        judged = []
+        for model, rows in groups:
+            names: list[Any] = [decisions[k][0] for k in rows]
+            l, estimator = known.means(names), self.estimator.for_fixes()
+            if scan.channel.far is not None:
+                slots = np.full(len(rows), scan.robot)
+                if (near := tags.approach(scan, model.exactly, slots, rows, l)) is not None:
+                    estimator.correct(self.map, near)
+            done = self._corrected(scan.known_update(model, l, rows), scan.event, estimator)
+            done = done._replace(e=done.e[:, :m])
+            report.fill(rows, done)
+            known.count(names, done.fused.tolist())
+            judged.append(Judged(rows, scan.ids, names, done, scan.channel.gate))
+        return judged
 
     def _average(self, scan: ScanContext, decisions: Sequence[Decision]) -> list[Observation]:
         """Correct by the mean over the matchings among the decisions.  [F]."""
@@ -415,7 +480,7 @@ class Slam:
         tentative = held or (name in (NEW, REMAP) and policy.upkeep.confirm > 1)
         name = self.tracks.new_name() if isinstance(name, Answer) else name
         try:
-            track = Track(name, channel.landmark, self._add(start))
+            track = Track(name, channel.landmark, self._add(start), size_m=scan.size_of(k))
         except MapError as full:
             return Observation(k, id_, "ignored", None, None, str(full))
         if not tentative:
@@ -439,7 +504,7 @@ class Slam:
         if name == scan.event.robot:
             return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
         self.tracks.reserve([id_])
-        if name in self.tracks.slots:
+        if name in self.tracks.slots or name in self.tracks.known:
             return Observation(k, id_, "rejected", name, None, f"it is no {scan.channel.landmark.kind}")
         if policy.deferred is None and not scan.channel.starts_landmarks:
             return Observation(k, id_, "ignored", None, None, f"a {sensor} measurement alone cannot start a landmark")
@@ -480,7 +545,7 @@ class Slam:
         if step.keep:
             pending = replace(pending, measurements=(*pending.measurements, scan.measurement(k, self._clone(scan))))
         if step.start is not None:
-            track.slot = self._add(step.start)
+            track.slot, track.size_m = self._add(step.start), scan.size_of(k)
             track.pending = None
             self.tracks.pending.pop(track.id, None)
             self.tracks.confirm(track, step.measurements)
@@ -496,7 +561,7 @@ class Slam:
         """Keep measurements of no landmark as pending; start the landmarks that enough of them determine.  [T] 2."""
         names = {k: decisions[k][0] for k in new}
         ids: dict[int, Id | None] = {k: None for k, n in names.items() if n is NEW}
-        ids |= {k: n for k, n in names.items() if isinstance(n, int | str) and n not in self.tracks.slots}
+        ids |= {k: n for k, n in names.items() if isinstance(n, int | str) and not self._is_there(n)}
         ids, way, key = {k: ids[k] for k in new if k in ids}, policy.delayed, scan.key
         if way is None or not ids:
             return []
@@ -824,22 +889,72 @@ class Slam:
             self.map = grown(self.map, (track.model.space for track in self.tracks.confirmed.values()), self.numbers)
 
     # ------------------------------------------------------------------ reading and editing the map
+    def _is_there(self, name: Id) -> bool:
+        """Return whether a name is that of a block, or of a landmark known exactly."""
+        return name in self.tracks.slots or name in self.tracks.known
+
+    def is_known(self, name: Id) -> bool:
+        """Return whether a landmark is known exactly: it is outside the map, and no scan moves it."""
+        return name in self.tracks.known
+
     def mean(self, name: Id) -> Array:
         """Return the mean (size,) of a landmark or robot: x, y, heading in m and rad, or x, y, z, qx, qy, qz, qw."""
-        return self.map.mean(self.slot(name))
+        known = self.tracks.known
+        return known.mean(name) if name in known else self.map.mean(self.slot(name))
 
     def covariance(self, *names: Id) -> Array:
         """Return the joint covariance (n, n) of robots and landmarks, in the given order, in standard coordinates."""
         if not names:
             raise MapError("covariance of nothing was asked for, expected names of robots or landmarks")
-        return self.map.covariance([self.slot(name) for name in names])
+        known = self.tracks.known
+        slots = [self.slot(name) for name in names if name not in known]
+        P = self.map.covariance(slots) if slots else np.zeros((0, 0))
+        if len(slots) == len(names):
+            return P
+        dofs = [known.model(name).space.dof if name in known else -1 for name in names]
+        sizes = [len(self.map.rows(self.slot(name))) if d < 0 else d for name, d in zip(names, dofs, strict=True)]
+        rows = np.flatnonzero(np.repeat(np.array(dofs) < 0, sizes))
+        out = np.zeros((sum(sizes), sum(sizes)))
+        out[np.ix_(rows, rows)] = P
+        return out
 
-    def landmarks(self) -> LandmarkTable:
-        """Return ids, kinds, means, covariances and numbers of observations of all landmarks."""
+    def landmarks(self, *, exactly_known: bool = True) -> LandmarkTable:
+        """Return ids, kinds, means, covariances and numbers of observations of all landmarks.
+
+        Those known exactly, outside the map, come last and have the covariance 0; or without them.
+        """
         tracks = self.tracks.confirmed.values()
         kinds, counts = [track.model.kind for track in tracks], [track.observations for track in tracks]
         means, covs = [self.mean(track.id) for track in tracks], [self.covariance(track.id) for track in tracks]
-        return LandmarkTable([track.id for track in tracks], kinds, means, covs, counts)
+        names, known = [track.id for track in tracks], self.tracks.known
+        for name in known if exactly_known else ():
+            space = known.model(name).space
+            names.append(name)
+            kinds.append(known.model(name).kind)
+            means.append(known.mean(name))
+            covs.append(np.zeros((space.dof, space.dof)))
+            counts.append(known.observations(name))
+        return LandmarkTable(names, kinds, means, covs, counts)
+
+    def expect(
+        self, robot: str, sensor: str, names: Iterable[Id] | None = None, *, in_view: bool = False
+    ) -> Expectations:  # fmt: skip
+        """Return what a sensor should measure of landmarks, by default of all, from where its robot is.
+
+        In view or not and why, expectations, their covariances and Jacobians, as a correction would have them; with
+        `in_view` of those in view alone.  Robots may be among the `names`.  A robot that lags is where it was (`lags`).
+        Nothing changes.  Raises MapError.
+        """
+        if (robot, sensor) not in self._channels:
+            known = ", ".join(f"{r!r} {s!r}" for r, s in self._channels) or "none"
+            raise MapError(f"robot {robot!r} has no sensor {sensor!r}, expected one of: {known}")
+        chosen = None if names is None else [*names]
+        for name in chosen or ():
+            if not self.is_known(name):
+                self.slot(name)
+            if self.tracks.sort(name) is None:
+                raise MapError(f"{name!r} is a sensor's mount or a control's bias, expected a landmark or a robot")
+        return expectations(self.map, self.tracks, self._channels[robot, sensor], robot, sensor, chosen, in_view)
 
     def slot(self, name: Id) -> int:
         """Return the slot of a robot or landmark in `map`."""
@@ -873,6 +988,8 @@ class Slam:
     def landmark_model(self, name: Id) -> Landmark | None:
         """Return the model of a landmark, None of what is no landmark of the map."""
         track = self.tracks.confirmed.get(name)
+        if track is None and name in self.tracks.known:
+            return self.tracks.known.model(name)
         return None if track is None else track.model
 
     def segment(self, name: Id) -> tuple[Array, Array]:
@@ -886,28 +1003,40 @@ class Slam:
     def segment_ends(self, name: Id) -> Array | None:
         """Return the extent of the segment observed so far as abscissas (2,) on its line; None of what is no line."""
         track = self.tracks.confirmed.get(name)
+        if track is None and name in self.tracks.known:
+            return self.tracks.known.extent(name)
         return None if track is None else track.extent
 
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
-        """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance."""
+        """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance.
+
+        What is known exactly stays outside the map: no step depends on how many there are (docs/localization.md).
+        """
         name = checked_id(name, "landmark")
         if landmark is not None:
             instance(landmark, Landmark, f"landmark {name!r}", "a landmark model")
         default = next((channel.landmark for channel in self._channels.values()), Point2D())
         model = landmark or reparametrize.surveyed(default, mean)
         refuse_other_world(self.robots, model.kind, model.space.world)
-        if name in self.tracks.slots or name in self._inner:
+        if self._is_there(name) or name in self._inner:
             what = "names a robot's bias or mount" if name in self._inner else "is in the map already"
             raise MapError(f"landmark {name!r} {what}, expected a new id")
         mean = numbers(mean, model.space.size, f"landmark {name!r}: mean", MapError)
         if cov is not None:
             cov = covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
-        self.tracks.enter(Track(name, model, self.map.add(model.space, mean, cov)))
         self.tracks.reserve([name])
+        if cov is None and not any(policy.averages for policy in self._policies.values()):
+            self.tracks.rename_tentative([name])
+            self.tracks.known.add(name, model, mean)
+            return
+        self.tracks.enter(Track(name, model, self.map.add(model.space, mean, cov)))
         self._let_grow()
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
+        if name in self.tracks.known:
+            self.tracks.known.remove(name)
+            return
         slot = self.slot(name)
         if name not in self.tracks.confirmed:
             what = "robot" if name in self.robots else "sensor's mount or a control's bias"

@@ -49,7 +49,7 @@ from kalmark.tracks.track import Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 9
+VERSION = 10
 DESCRIPTION, SUMS = "slam.json", "sha256"
 OF_TRACKS = (
     "recent",
@@ -121,6 +121,10 @@ def _state(state: State) -> Description:
         "blocks": [[_id(name), slot] for name, slot in blocks.items()],
         "tracks": [_record(track) | {"id": _id(track.id)} for track in all_],
         "candidates": [[*key, [_record(c) for c in candidates]] for key, candidates in tracks.candidates.items()],
+        "known": [
+            {"model": of.model, "names": [*map(_id, of.names)], "counts": of.counts.tolist()}
+            for of in tracks.known.of_kind.values()
+        ],
         "reserved": sorted(map(_id, tracks.reserved)),
         **{name: getattr(tracks, name) for name in OF_TRACKS},
         "clones": [[number, _record(clone)] for number, clone in state.clones.clones.items()],
@@ -164,6 +168,8 @@ def _id(name: Any) -> Any:
 
 def _arrays(state: State) -> Iterator[tuple[str, Array]]:
     yield from state.map.arrays()
+    for i, of in enumerate(state.tracks.known.of_kind.values()):
+        yield f"known{i}", of.values
     for i, moving in enumerate(state.moving.values()):
         if moving.held.u is not None and moving.held.N is not None:
             yield f"u{i}", moving.held.u
@@ -218,6 +224,7 @@ class Saved:
             _enter(tracks, _track(record, given), len(map_.spaces))
         for robot, sensor, candidates in s["candidates"]:
             tracks.candidates[robot, sensor] = [_pending(c) for c in candidates]
+        self._enter_known(tracks, given)
         tracks.reserve(s["reserved"])
         for name in OF_TRACKS:
             setattr(tracks, name, s[name])
@@ -242,6 +249,17 @@ class Saved:
         _check_measurements(robots, state)
         return state
 
+    def _enter_known(self, tracks: Tracks, own: Sequence[Landmark]) -> None:
+        """Enter the landmarks known exactly.  Raises MapError where one is there twice."""
+        for i, of in enumerate(self._state["known"]):
+            model = _model(of["model"], own)
+            values = _array(self._members, f"known{i}", (len(of["names"]), model.space.size))
+            for name, value, count in zip(of["names"], values, of["counts"], strict=True):
+                if name in tracks.slots or name in tracks.known:
+                    raise MapError(f"landmark {name!r} is there twice, expected each name once")
+                tracks.known.add(name, model, value)
+                tracks.known.recount(name, _count(count, f"observations of {name!r}"))
+
 
 def load(
     path: Path, robots: Iterable[Robot] | None, association: Association | None, estimator: Estimator | None,
@@ -259,7 +277,9 @@ def load(
             "robots": robots_restored(s["robots"], None if robots is None else list(robots)),
             "association": association or restored("association", s["association"], "association", "association"),
             "estimator": estimator or restored("estimator", s["estimator"], "estimator", "estimator"),
-            "landmarks": landmark_type(s["landmarks"], [t["model"] for t in state["tracks"]], landmarks),
+            "landmarks": landmark_type(
+                s["landmarks"], [t["model"] for t in (*state["tracks"], *state["known"])], landmarks
+            ),
             "map": s["map"],
             "numbers": s["numbers"],
             "reparametrize": _optional(s["reparametrize"], "reparametrize", "a number", int, float),
@@ -305,8 +325,7 @@ def _enter(tracks: Tracks, track: Track, slots: int) -> None:
 
 def _track(record: Description, own: Sequence[Landmark]) -> Track:
     name = record["id"]
-    model = next((landmark for landmark in own if same(landmark, record["model"])), None)
-    model = model or restored("landmark", record["model"], f"landmark {name!r}", "landmarks")
+    model = _model(record["model"], own, f"landmark {name!r}")
     pending = record["pending"]
     changed = {
         "model": model,
@@ -315,6 +334,7 @@ def _track(record: Description, own: Sequence[Landmark]) -> Track:
         "covisible": set(record["covisible"]),
         "compared": tuple(record["compared"]),
         "extent": None if record["extent"] is None else np.array(record["extent"], dtype=np.float64).reshape(2),
+        "size_m": _optional(record["size_m"], f"size_m of {name!r}", "a number", float),
         "first": None if record["first"] is None else tuple(record["first"]),
         "pending": None if pending is None else _pending(pending),
         "measurements": [_measurement(m) for m in record["measurements"]],
@@ -323,6 +343,13 @@ def _track(record: Description, own: Sequence[Landmark]) -> Track:
     for what in ("searched", "found", "hits", "chances", "missed"):
         _count(getattr(track, what), f"{what} of {name!r}")
     return track
+
+
+def _model(record: Description, own: Sequence[Landmark], what: str = "landmarks known exactly") -> Landmark:
+    """Return the model of a landmark: one of the user's `own`, or the registered one that a file describes."""
+    model = next((landmark for landmark in own if same(landmark, record)), None)
+    found: Landmark = model or restored("landmark", record, what, "landmarks")
+    return found
 
 
 def _pending(record: Description) -> Pending:

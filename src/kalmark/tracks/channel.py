@@ -17,6 +17,7 @@ from kalmark.filter.map import AT_ONCE, Map, StochasticMap
 from kalmark.filter.neighbours import has_place
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
+from kalmark.models.known import known_view
 from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
@@ -45,6 +46,11 @@ class ObservationModel:
         return view_of(self.sensor, self.landmark, self.at)
 
     @cached_property
+    def exactly(self) -> KnownModel:
+        """The same for landmarks known exactly, which are not in the map."""
+        return KnownModel(self.landmark, self.sensor, self.at)
+
+    @cached_property
     def built_in(self) -> bool:
         """Whether sensor and landmark are kalmark's own."""
         return is_built_in(self.sensor, self.landmark)
@@ -64,7 +70,21 @@ class ObservationModel:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled model, whose addresses mean nothing to another process."""
-        return {name: value for name, value in self.__dict__.items() if name != "model"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("model", "exactly")}
+
+
+class KnownModel(ObservationModel):
+    """How landmarks known exactly are observed: y (K, m + n) ends with their numbers, and the slots are the robot's."""
+
+    @cached_property
+    def model(self) -> Any:
+        """What `linearize` takes."""
+        return known_view(view_of(self.sensor, self.landmark, self.at))
+
+    @cached_property
+    def d(self) -> int:
+        """None of the landmark's numbers are in the map."""
+        return 0
 
 
 class Channel:
@@ -178,10 +198,7 @@ class Channel:
         """Return the indices (K,) of the `slots` in view; `extents` are the segments (2, 3) of lines, or None."""
         T, l = self.pose(map_, robot), map_.means(np.array(slots), model.d)
         if not isinstance(model.landmark, protocols.Segmented):
-            v = model.landmark.seen_from(T, l)[0]
-            if isinstance(model.landmark, InverseDepth2D):  # a ray, as long as rho times the distance
-                v = v / np.maximum(l[:, -1:], TINY_RHO)
-            return np.flatnonzero(self.sensor.sees(v))
+            return np.flatnonzero(self.sensor.sees(in_frame(model.landmark, T, l)))
         p, _ = model.landmark.endpoints(l, np.array(extents))
         return np.flatnonzero(self.sensor.sees_segments(T, p[:, 0], p[:, 1])[0])
 
@@ -189,7 +206,13 @@ class Channel:
         """Return the noise (K, p, p) of observations of blocks: R, unless it varies with their places  [F]."""
         if self.noise_at is None or own_noise:
             return R
-        return self.noise_at(model.landmark.seen_from(self.pose(map_, robot), map_.means(slots, model.d))[0])
+        return self.noise_of(map_, robot, model, map_.means(slots, model.d), R, own_noise)
+
+    def noise_of(self, map_: Map, robot: int, model: ObservationModel, l: Array, R: Array, own_noise: bool) -> Array:
+        """Return the noise (K, p, p) of observations of landmarks l (K, n): R, unless it varies with their places."""
+        if self.noise_at is None or own_noise:
+            return R
+        return self.noise_at(model.landmark.seen_from(self.pose(map_, robot), l)[0])
 
     def innovations(self, map_: Map, robot: int, model: ObservationModel, slots: Index, y: Array) -> Array:
         """Return the innovations z (K, p) of y (K, m) from the blocks `slots`."""
@@ -226,6 +249,14 @@ class Channel:
         if len(own):  # y = h(v, p) stays what it is: V_p = -V_y E_p
             L_h = np.concatenate([L_h, -L_y[0] @ sensor.parameters_jacobian(v)[0]], axis=1)
         return l[0], L_h, kernels.quadratic(L_y[0], np.array(R, dtype=np.float64)) + prior[0]
+
+
+def in_frame(landmark: Landmark, T: Array, l: Array) -> Array:
+    """Return landmarks l (K, n) in the frame T, v (K, d) as `sees` takes them."""
+    v = landmark.seen_from(T, l)[0]
+    if isinstance(landmark, InverseDepth2D):  # a ray, as long as rho times the distance
+        v = v / np.maximum(l[:, -1:], TINY_RHO)
+    return v
 
 
 def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool) -> Landmark:

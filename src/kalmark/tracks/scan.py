@@ -78,9 +78,17 @@ class ScanContext:
         """Return the pose of the sensor as it is estimated now, (3,) or (7,)."""
         return self.channel.pose(self.map, self.robot)
 
+    def size_of(self, k: int) -> float | None:
+        """Return the size of the tag of the k-th observation, m, if its sensor measures one."""
+        return float(self.y[k, -1]) if "size_m" in self.channel.sensor.columns else None
+
     def noise(self, model: ObservationModel, slots: Index, rows: Index | list[int]) -> Array:
         """Return the noise (M, p, p) of the observations `rows` if they are of the blocks `slots` (M,)."""
         return self.channel.noise(self.map, self.robot, model, slots, self.R[rows], self.own_noise)
+
+    def noise_of(self, model: ObservationModel, l: Array, rows: Index | list[int]) -> Array:
+        """Return the noise (M, p, p) of the observations `rows` if they are of the landmarks l (M, n)."""
+        return self.channel.noise_of(self.map, self.robot, model, l, self.R[rows], self.own_noise)
 
     def predict(self, model: ObservationModel, slots: Index, rows: Index | list[int]) -> tuple[Array, Array, Array]:
         """Return Z (M, p, p), d2 (M,) and the noise (M, p, p) of the observations `rows` of the blocks `slots` (M,)."""
@@ -92,6 +100,13 @@ class ScanContext:
         y, R = (self.y, self.R) if len(rows) == len(self.y) else (self.y[rows], self.R[rows])
         R = self.channel.noise(self.map, self.robot, model, slots, R, self.own_noise)
         return Update(model.model, self.robot, self.channel.mount, slots, model.d, y, R, self.channel.gate)
+
+    def known_update(self, model: ObservationModel, l: Array, rows: list[int]) -> Update:
+        """Return the correction by the observations `rows` of the landmarks l (K, n), which are known exactly."""
+        y, slots = np.concatenate([self.y[rows], l], axis=1), np.full(len(rows), self.robot)
+        R = np.ascontiguousarray(self.noise_of(model, l, rows))
+        exactly, mount = model.exactly, self.channel.mount
+        return Update(exactly.model, self.robot, mount, slots, exactly.d, y, R, self.channel.gate)
 
     def start_of(self, k: int, which: int = 0) -> Start:
         """Return the landmark that explains the k-th observation; of two that do, `which`."""

@@ -15,6 +15,7 @@ from kalmark.events import Id
 from kalmark.models.protocols import Landmark, Segmented
 from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
 from kalmark.tracks.clones import Measurement
+from kalmark.tracks.known import KnownLandmarks
 
 Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan
 ChannelKey = tuple[str, str]  # robot, sensor
@@ -65,7 +66,8 @@ class Track:
     the scans since it was last observed.  `log_odds` of its existence (None: never judged), `missed` scans in a row
     without it where it should be in view.  `covisible` landmarks were observed in one scan with it.  `compared` says
     after how many observations, and after how many changes of the map, it was last compared with others.  `extent`
-    (2,) are the abscissas of the segment observed of a line.  `first` is the observation that started it, and
+    (2,) are the abscissas of the segment observed of a line, `size_m` is the measured size of a tag.  `first` is the
+    observation that started it, and
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
     """
 
@@ -84,6 +86,7 @@ class Track:
     covisible: set[Id] = field(default_factory=set)
     compared: tuple[int, int] = (0, -1)
     extent: Array | None = None
+    size_m: float | None = None
     first: Late | None = None
     pending: Pending | None = None
     measurements: list[Measurement] = field(default_factory=list)
@@ -102,6 +105,7 @@ class Tracks:
     `searched` those until the map was last searched for repeats.  `candidates` are pending
     measurements without a landmark, by channel.  `reserved` are ids of the log or of a survey that look like invented
     names: u1, u2, ...  `experience` counts observations without ids that were of landmarks of the map, and were not.
+    `known` are the landmarks that are known exactly, outside the map.
     """
 
     def __init__(self, robots: Iterable[str]) -> None:
@@ -119,6 +123,7 @@ class Tracks:
         self.unnamed = 0
         self.reserved: set[Id] = set()
         self.experience = (0.0, 0.0)
+        self.known = KnownLandmarks()
         self._sort_at: Index = np.full(64, -1)  # by slot: the number of a landmark's kind in `_numbers`, -1 for none
         self._numbers: dict[str, int] = {}
         self._wanted: dict[frozenset[str], Flags] = {}
@@ -218,7 +223,8 @@ class Tracks:
         while True:
             self.unnamed += 1
             name = f"u{self.unnamed}"
-            if name not in self.slots and name not in self.tentative and name not in self.reserved:
+            taken = name in self.slots or name in self.tentative or name in self.reserved or name in self.known
+            if not taken:
                 return name
 
     def reserve(self, ids: Iterable[Id | None]) -> None:
@@ -263,11 +269,29 @@ class Tracks:
 
         Left out are names that a sensor of this robot does not observe in the map, itself among them.
         """
-        sorts, at = list(map(self.sorts.get, names)), list(range(len(names)))
+        return self._by_model(channel, names, list(map(self.sorts.get, names)), robot)
+
+    def known_by_model(self, channel: Channel, names: Sequence[Any]) -> list[tuple[ObservationModel, list[int]]]:
+        """Return the same of names known exactly; all others are left out."""
+        return self._by_model(channel, names, list(map(self.known.kind, names)), "")
+
+    def any_by_model(self, channel: Channel, names: Sequence[Any]) -> list[tuple[ObservationModel, list[int]]]:
+        """Return the same of names in the map or known exactly."""
+        return self._by_model(channel, names, list(map(self.sort, names)), "")
+
+    def sort(self, name: Any) -> str | None:
+        """Return the kind of a landmark, in the map or known exactly, ROBOT of a robot, None of none."""
+        return self.sorts.get(name) or self.known.kind(name)
+
+    def _by_model(
+        self, channel: Channel, names: Sequence[Any], sorts: list[str | None], robot: str
+    ) -> list[tuple[ObservationModel, list[int]]]:
+        at = list(range(len(names)))
         if robot in names:
             at = [i for i in at if names[i] != robot]
         elif len(set(sorts)) == 1:
-            return [(channel.models[sorts[0]], at)] if sorts[0] in channel.models else []
+            sort = sorts[0]
+            return [(channel.models[sort], at)] if sort in channel.models else []
         groups: dict[int, tuple[ObservationModel, list[int]]] = {}
         for i in at:
             if (sort := sorts[i]) in channel.models:

@@ -199,8 +199,8 @@ function drawImage(id, camera, scan, image) {
     lines.get(key).y.push(null);
   };
   for (const s of image.seen) {
-    const single = s.y.length === 1, close = p => p.length > 2 ? [...p, p[0]] : p, dash = s.outcome === "rejected" ? "dot" : "solid";
-    if (single) marks.measured.push([...s.y[0], s.name]); else add(SEGMENT, "measured", "solid", 4, close(s.y));
+    const single = (s.e || s.y).length === 1, close = p => p.length > 2 ? [...p, p[0]] : p, dash = s.outcome === "rejected" ? "dot" : "solid";
+    if (s.y.length && single) marks.measured.push([...s.y[0], s.name]); else if (s.y.length) add(SEGMENT, "measured", "solid", 4, close(s.y));
     if (s.outcome in marks) marks[s.outcome].push(...s.y.map(p => [...p, s.name]));
     if (s.e && single && s.Z) {
       const e = contours({x: [s.e[0][0]], y: [s.e[0][1]], pxx: [s.Z[0]], pxy: [s.Z[1]], pyy: [s.Z[2]]}, [0], 32, "xy");

@@ -1,0 +1,79 @@
+"""What a run's history keeps of landmarks that a scan should have shown: in view, not measured.  [TB] Obs.vis.
+
+It is asked before a scan is used, of some scans, and so many landmarks of each: what is kept is bounded.
+"""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.report import Expectations, Report
+from kalmark.results.history import padded_all, texts
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
+
+SCANS, LANDMARKS = 2_000, 32  # at most so many scans of a run, and of each so many landmarks
+KNOWN = ("associated", "new", "rejected")
+
+
+class Foresight:
+    """Asks a filter before its scans what is in view; a context, within which it is asked."""
+
+    def __init__(self, slam: Slam, scans: int) -> None:
+        self._slam, self._at = slam, set(np.linspace(0, max(scans - 1, 0), min(scans, SCANS)).round().astype(int))
+        self._scans = self._spent = 0
+        self._asked: Expectations | None = None
+        self._kept: list[tuple[int, Expectations, list[int]]] = []
+
+    def __enter__(self) -> None:
+        self._slam.before_scan = self._ask
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:  # fmt: skip
+        self._slam.before_scan = None
+
+    def _ask(self, robot: str, sensor: str) -> None:
+        self._asked = None
+        if self._scans in self._at:
+            start = time.perf_counter_ns()
+            self._asked = self._slam.expect(robot, sensor, in_view=True)
+            self._spent = time.perf_counter_ns() - start
+        self._scans += 1
+
+    def spent_ns(self) -> int:
+        """Return how long the last event was held up by it."""
+        spent, self._spent = self._spent, 0
+        return spent
+
+    def keep(self, step: int, report: Report) -> None:
+        """Keep of a scan the landmarks in view that it has not measured."""
+        asked, self._asked = self._asked, None
+        if asked is None or not len(asked):
+            return
+        seen = {o.landmark for o in report.observations if o.outcome in KNOWN}
+        rows = [i for i, name in enumerate(asked.names) if name not in seen]
+        if len(rows) > LANDMARKS:
+            size = np.linalg.slogdet(asked.Z[rows])[1]
+            rows = [rows[i] for i in sorted(np.argsort(size, kind="stable")[:LANDMARKS].tolist())]
+        if rows:
+            self._kept.append((step, asked, rows))
+
+    def columns(self, m: int, p: int) -> dict[str, Any]:
+        """Return fields of a history whose measurements have up to m numbers, their innovations p."""
+        each = [(step, asked, i) for step, asked, rows in self._kept for i in rows]
+        e = padded_all([np.full(m, np.nan), *(asked.e[i] for _, asked, i in each)])[1:]
+        Z = padded_all([np.full((p, p), np.nan), *(asked.Z[i] for _, asked, i in each)], 2)[1:]
+        return {
+            "unmeasured_step": np.array([step for step, _, _ in each], dtype=np.int64),
+            "unmeasured_sensor": texts([asked.sensor for _, asked, _ in each]),
+            "unmeasured_landmark": texts([asked.names[i] for _, asked, i in each]),
+            "unmeasured_kind": texts([asked.kinds[i] for _, asked, i in each]),
+            "unmeasured_e": e,
+            "unmeasured_Z": Z,
+        }

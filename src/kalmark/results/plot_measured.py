@@ -1,0 +1,108 @@
+"""The picture of one scan by a sensor that is no camera, in its measurement space: ``sensor_<robot>_<sensor>.png``.
+
+Two of its numbers are drawn: bearing and range, or two coordinates.  Crosses are the measurements, ellipses of Z around
+e are what the filter expected, of landmarks in view that were not measured, too.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from kalmark.arrays import Array, Flags
+from kalmark.geometry.gaussian import ellipses
+from kalmark.results.history import History, Measuring
+from kalmark.results.scene import IN_VIEW, INK
+
+ACROSS = ("bearing_rad", "azimuth_rad", "y_m")  # columns to be drawn from right to left, the first that there is,
+AHEAD = ("range_m", "x_m")  # and upwards
+USED, UNUSED, UNMEASURED, MARK = "#0aa5b5", "#c8553d", "#1f3fd0", "#2b2f36"
+DEGREES = 180.0 / np.pi
+
+
+class Axis(NamedTuple):
+    """A column of a measurement as an axis: its number, the factor to what is drawn, and the label."""
+
+    column: int
+    scale: float
+    label: str
+
+
+def axes_of(sensor: Measuring) -> tuple[Axis, Axis] | None:
+    """Return the axes of a sensor's picture, None if its measurements have no two that can be drawn."""
+    found = [next((name for name in names if name in sensor.columns), None) for names in (ACROSS, AHEAD)]
+    if None in found:
+        return None
+    across, ahead = (_axis(str(name), sensor.columns.index(str(name))) for name in found)
+    return across, ahead
+
+
+def measuring(history: History) -> list[Measuring]:
+    """Return the sensors of a run that have such a picture."""
+    return [sensor for sensor in history.sensors if axes_of(sensor) is not None]
+
+
+def _axis(name: str, column: int) -> Axis:
+    quantity, _, unit = name.rpartition("_")
+    return Axis(column, DEGREES, f"{quantity} (deg)") if unit == "rad" else Axis(column, 1.0, f"{quantity} ({unit})")
+
+
+def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
+    """Return the figure of a scan by a sensor that has `axes_of`."""
+    found = axes_of(sensor)
+    assert found is not None
+    rows, columns = np.flatnonzero(history.step == step), [axis.column for axis in found]
+    scale = np.array([axis.scale for axis in found])
+    figure = Figure(figsize=(9.5, 7.0), layout="constrained", facecolor="white")
+    axes = figure.subplots()
+    y, e, Z = history.y[rows][:, columns] * scale, *_expected(history.e[rows], history.Z[rows], columns, scale)
+    used = np.isin(history.outcome[rows], ("associated", "new"))
+    axes.plot(*y.T, "+", color=MARK, ms=9, mew=1.4, zorder=4)
+    _draw(axes, e[used], Z[used], USED, "-")
+    _draw(axes, e[~used], Z[~used], UNUSED, "--")
+    missed = np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == sensor.sensor))
+    e_m, Z_m = _expected(history.unmeasured_e[missed], history.unmeasured_Z[missed], columns, scale)
+    _draw(axes, e_m, Z_m, UNMEASURED, ":")
+    names = [*history.landmark[rows].tolist(), *history.unmeasured_landmark[missed].tolist()]
+    for at, name in zip([*y, *e_m], names, strict=True):
+        axes.annotate(name, at, (5, 5), textcoords="offset points", fontsize=8, color=INK)
+    axes.set_xlabel(found[0].label)
+    axes.set_ylabel(found[1].label)
+    axes.invert_xaxis()  # what is on the left has positive bearings
+    axes.grid(color="#eceef1")
+    axes.margins(0.08)
+    outcomes = Counter(history.outcome[rows].tolist()) | (Counter({IN_VIEW: len(missed)}) if len(missed) else Counter())
+    said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
+    title = f"{sensor.robot} · {sensor.sensor} · t = {history.t_s[step]:.3f} s · {said}"
+    figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
+    figure.legend(handles=_legend(used, e, len(missed)), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+def _expected(e: Array, Z: Array, columns: list[int], scale: Array) -> tuple[Array, Array]:
+    """Return e (K, 2) and Z (K, 2, 2) of two columns in the units of the axes."""
+    return e[:, columns] * scale, Z[:, columns][:, :, columns] * np.outer(scale, scale)
+
+
+def _draw(axes: Axes, e: Array, Z: Array, colour: str, style: str) -> None:
+    axes.plot(*e.T, ".", color=colour, ms=3, zorder=5)
+    for contour in ellipses(e, Z, 3.0, 60):
+        axes.plot(*contour.T, style, color=colour, lw=1.2, zorder=5)
+
+
+def _legend(used: Flags, e: Array, missed: int) -> list[Line2D]:
+    expected, line = np.isfinite(e).all(axis=1), "expected, $3\\sigma$"
+    cross: dict[str, Any] = {"ls": "", "marker": "+", "mew": 1.4}
+    out = [Line2D([], [], color=MARK, **cross, label="measured")]
+    if (expected & used).any():
+        out.append(Line2D([], [], color=USED, label=f"{line}, used"))
+    if (expected & ~used).any():
+        out.append(Line2D([], [], color=UNUSED, ls="--", label=f"{line}, not used"))
+    if missed:
+        out.append(Line2D([], [], color=UNMEASURED, ls=":", label=f"{line}, {IN_VIEW}"))
+    return out
