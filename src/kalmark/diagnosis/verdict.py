@@ -191,7 +191,7 @@ def thinned(run: Run, given: Given, most: int) -> Given:
     within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
     kept = (within >= 0) & (t_ns <= segments[within, 1])
     renumbered, rows = np.cumsum(kept) - 1, np.flatnonzero(kept[used.scan])
-    names = [used.landmark[k] for k in rows]
+    names = [used.landmark[k] for k in rows.tolist()]
     some = Associations(renumbered[used.scan[rows]], used.sensor[rows], used.index[rows], names, used.e[rows])
     return replace(
         given, t_ns=t_ns[kept], robot=given.robot[kept], poses=given.poses[kept], associations=some, segments=segments
