@@ -245,6 +245,12 @@ def cell(start: str, index: int) -> Read:
     return read
 
 
+def storms() -> Iterator[Figure]:
+    """Yield what becomes of a map in a storm of bad events."""
+    yield Figure("Bad events", "1,000,000 events, 5 % bad, all estimators, maps and worlds: refused / not as they should be / storms that end as without them / growth of memory",
+                 "all / 0 / all / flat", "python benchmarks/storm.py --events 1000000", row("total", "{1} / {2} / {3} of {4} / {5} MB"))  # fmt: skip
+
+
 def gaps() -> Iterator[Figure]:
     """Yield what becomes of a map when controls and scans stop for a while."""
     section, command = "Gaps", "python benchmarks/hall.py"
@@ -453,6 +459,7 @@ def figures() -> list[Figure]:
         real_logs,
         unknown_ids,
         gaps,
+        storms,
         diagnosis,
         tuning,
         partial_measurements,

@@ -13,7 +13,8 @@ import kalmark as km
 
 # caches, memory made ready, and what does not change
 MADE_ANEW = {"_rows", "_numbers", "_wanted", "_sort_at", "_next", "prefault", "_workspace", "workspace", "_search",
-             "_before", "motion", "model", "capacity"}  # fmt: skip
+             "_before", "motion", "model", "capacity", "map",
+             "addresses"}  # fmt: skip
 
 
 def parts(value: Any) -> Iterator[bytes]:
@@ -42,7 +43,19 @@ def parts(value: Any) -> Iterator[bytes]:
 
 def digest(slam: km.Slam) -> str:
     """Return the digest of the map, the tracks, the clones, the controls held and the time."""
+    return _digest(slam, slam.map)
+
+
+def digest_of_saved(slam: km.Slam) -> str:
+    """Return the digest of what `save` writes: a full update that is under way is finished first.
+
+    Not of memory that holds anything: above the diagonal of a covariance.
+    """
+    return _digest(slam, (slam.map.state(), list(slam.map.arrays())))
+
+
+def _digest(slam: km.Slam, map_: Any) -> str:
     found = hashlib.sha256()
-    for part in parts((slam.t_ns, slam.map, slam.tracks, slam.clones, slam._moving)):
+    for part in parts((slam.t_ns, map_, slam.tracks, slam.clones, slam._moving)):
         found.update(part)
     return found.hexdigest()

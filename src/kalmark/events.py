@@ -21,6 +21,7 @@ Id = int | str
 
 FLOAT = np.dtype(np.float64)
 LATEST_NS = 2**63  # times are int64: about 292 years either side of 0
+LONGEST_PAUSE_NS = 366 * 86_400_000_000_000  # between two events: what comes later has a wrong stamp
 LONGEST = 80  # characters of a value in a message
 LONGEST_ID = 200  # characters or digits of a landmark's id
 _SHORT = 2**63  # ids that need no second look

@@ -29,7 +29,7 @@ from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
 from kalmark.association.relocalization import relocalized
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
-from kalmark.events import Control, Event, Fix, Id, Scan, checked_id, seconds, when
+from kalmark.events import LONGEST_PAUSE_NS, Control, Event, Fix, Id, Scan, checked_id, seconds, when
 from kalmark.filter.compressed.map import CompressedMap
 from kalmark.filter.estimators import Averaging, Compiling, Correction, Estimator, Invariant, Update
 from kalmark.filter.map import Map
@@ -167,6 +167,10 @@ class Slam:
         before = self.t_ns
         if before is not None and event.t_ns < before:
             raise EventError(f"{when(event)} comes after one at t={seconds(before)} s")
+        if before is not None and event.t_ns - before > LONGEST_PAUSE_NS:
+            raise EventError(
+                f"{when(event)} comes more than a year after one at t={seconds(before)} s, expected it sooner"
+            )
         if event.robot not in self.robots:
             names = sorted(self.robots)
             raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
