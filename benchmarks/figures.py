@@ -157,6 +157,17 @@ def space() -> Iterator[Figure]:
                  "python benchmarks/filter_vs_batch.py starry_night", row("starry_night invariant", "{0} m / {2} / {1}"))  # fmt: skip
 
 
+def motions() -> Iterator[Figure]:
+    """Yield the consistency of the motions of the plane, each in its own world."""
+    for world in ("differential_drive", "tricycle", "omnidirectional", "mecanum"):
+        yield Figure("Motions", f"`{world}`: pose ANEES (3) / in band / NEES of its constants (1) / runs inside 99.7 %",
+                     "90 % in the band / 97 of 100", f"python benchmarks/motions.py {world}",
+                     row(world, "{1} / {5} / {7} / {9} of {11}"))  # fmt: skip
+    for world in ("slipping_unicycle", "constant_velocity", "constant_turn_rate"):
+        yield Figure("Motions", f"`{world}`: pose ANEES (3) / in band / ANEES of the whole state (1)", "90 % in the band",
+                     f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip
+
+
 TOOLBOX = {
     "a_idpPnt_odo": ".0365 / 6.5", "a_idpPnt_odo_small": ".0405 / 7.8", "a3_hmgPnt_odo": ".0217 / 25.7",
     "b2_idpPnt_constVel_small": ".095 / 5.3", "c_idpLin_small": ".0113 / 7.6", "c_plkLin_small": ".0117 / 7.6",
@@ -456,6 +467,7 @@ def figures() -> list[Figure]:
     parts = (
         exactness,
         campaigns,
+        motions,
         real_logs,
         unknown_ids,
         gaps,

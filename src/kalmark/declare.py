@@ -37,6 +37,8 @@ UNITS = {
     "_radps_per_sqrt_s": "rad/s/sqrt(s)",
     "_m_per_sqrt_s": "m/sqrt(s)",
     "_rad_per_sqrt_s": "rad/sqrt(s)",
+    "_per_sqrt_s": "1/sqrt(s)",
+    "_m_per_sqrt_m": "m/sqrt(m)",
     "_per_m": "1/m",
     "_mps": "m/s",
     "_radps": "rad/s",

@@ -15,7 +15,7 @@ from kalmark.batch.state import ORIGIN, Ints, unsolved
 from kalmark.events import Control
 from kalmark.geometry import frames, frames3d
 from kalmark.models.observe import composed
-from kalmark.models.protocols import Motion, SelfCalibrating, calibrating
+from kalmark.models.protocols import Motion, SelfCalibrating, calibrating, true_control
 from kalmark.slam.motion import HeldInput, Part
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class Course:
         """Return the control of a part, as it is with the constants that are known."""
         if self.bias is None or not isinstance(self.motion, SelfCalibrating):
             return part.u
-        return part.u + self.motion.calibration_effect(part.u, part.dt_s) @ self.bias
+        return true_control(self.motion, part.u, self.bias, part.dt_s)[0]
 
     def _stay(self, part: Part, F: Array, R_u: Array) -> None:
         """Carry the systematic errors on, in the order of `systematic_errors`."""

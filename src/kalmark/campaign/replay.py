@@ -27,15 +27,16 @@ from kalmark.config.tree import name_on
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.geometry.angles import wrap
+from kalmark.geometry.spaces import SE2
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
-from kalmark.models.protocols import SelfCalibrating, calibrating
+from kalmark.models.protocols import calibrating
 from kalmark.report import Report
 from kalmark.results.landmarks import MapLandmarks, refuse_other_than_points
 from kalmark.results.progress import track
 from kalmark.results.recording import config_yaml
 from kalmark.results.warnings import NO_ID
-from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start
+from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start, told
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
 from kalmark.slam.motion import HeldInput, Part
 from kalmark.slam.robot import Robot
@@ -222,10 +223,15 @@ def replay_of(config: Config, log: Log, progress: bool = True) -> Replay:
 
 
 def refuse_other(config: Config, name: str, robot: Robot) -> None:
-    """Refuse robots of space, and sensors whose scans a detector searches for landmarks."""
+    """Refuse robots of space, states of more than a pose, and sensors whose scans a detector searches for landmarks."""
     path = ("robots", name if name in config.robots else "each")
     if robot.motion.space.world != "plane":
         what = f"got {config.robots[path[1]].motion.type}, a motion of space, expected one of the plane to replay a log"
+        raise config.error((*path, "motion"), what)
+    if robot.motion.space.size > SE2.size:
+        what = (
+            f"got {config.robots[path[1]].motion.type}, expected a motion of which the state is a pose to replay a log"
+        )
         raise config.error((*path, "motion"), what)
     for key, mount in robot.sensors.items():
         if mount.detector is not None:
@@ -301,8 +307,7 @@ class _Replaying:
         robot.advance(event.t_ns, rng, last=True)
         N = robot.motion.control_noise(event.u) if event.cov is None else event.cov
         u = steered(robot.motion, robot.state, steer, N)
-        off = calibrated(robot.motion, u, steer.dt_s) @ robot.constants
-        robot.told = u - off + gaussian(N, rng)
+        robot.told = told(robot.motion, u, robot.constants, steer.dt_s) + gaussian(N, rng)
         self.events.append(Control(t_ns=event.t_ns, robot=event.robot, u=robot.told, cov=event.cov))
         for part in robot.drive.accept(Control(t_ns=event.t_ns, robot=event.robot, u=u)):
             robot.move(part, rng)
@@ -322,12 +327,6 @@ class _Replaying:
         told = None if event.ids is None else [event.ids[look.rows[i]] for i in rows]
         self.events.append(look.scan(y[seen], told, rows))
         self.origins[event.t_ns, event.robot, event.sensor] = tuple(look.real[i] for i in rows)
-
-
-def calibrated(motion: Any, u: Array, dt_s: float) -> Array:
-    """Return the effect (m, c) of the constants of a motion's controls, (m, 0) if it has none."""
-    has = isinstance(motion, SelfCalibrating) and motion.calibration
-    return motion.calibration_effect(u, dt_s) if has else np.zeros((len(u), 0))
 
 
 def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:

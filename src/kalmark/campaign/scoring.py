@@ -55,9 +55,13 @@ class Judged(NamedTuple):
 
 
 def state_error(mean: Array, truth: Array, turn: Any, coordinates: str) -> Array:
-    """Return the error of a robot's state: pose (3,) or (7,), or pose, velocity and body rate (13,)."""
-    if len(mean) == 3:
-        return np.append(point_error(mean[:2], truth[:2], turn, coordinates), wrap(truth[2] - mean[2]))
+    """Return the error of a robot's state: pose (3,) or (7,), or pose, velocity and body rate (13,).
+
+    In the plane numbers behind the pose, up to (6,), are in the robot's frame.
+    """
+    if len(mean) < 7:
+        place, angle = point_error(mean[:2], truth[:2], turn, coordinates), wrap(truth[2] - mean[2])
+        return np.concatenate([place, [angle], truth[3:] - mean[3:]])
     parts = [point_error(mean[:3], truth[:3], turn, coordinates), orientation_error(mean, truth, turn, coordinates)]
     if len(mean) == 13:
         parts += [point_error(mean[7:10], truth[7:10], turn, coordinates), truth[10:] - mean[10:]]
@@ -75,7 +79,7 @@ def orientation_error(mean: Array, truth: Array, turn: Array, coordinates: str) 
 
 def robot_turn(mean: Array, truth: Array) -> Any:
     """Return the error of a robot's orientation: of its heading, or a rotation vector (3,)."""
-    return wrap(truth[2] - mean[2]) if len(mean) == 3 else rotation_error(mean[3:7], truth[3:7])
+    return wrap(truth[2] - mean[2]) if len(mean) < 7 else rotation_error(mean[3:7], truth[3:7])
 
 
 def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array) -> Judged | None:
@@ -141,9 +145,9 @@ class Scores:
     """How one estimator did on one log.
 
     `series` has an array (robots, steps) for each of `SERIES`: NEES of the pose (3, in space 6), the heading or
-    orientation (1, 3), the whole state if it has velocities (12), landmarks (the mean over the map), joint state, and
-    the robot's uncertain mounts (the mean), each with its degrees of freedom `..._dof`; then   NaN where there
-    is nothing to say.
+    orientation (1, 3), the whole state if it has more than a pose, landmarks (the mean over the map), joint state,
+    and the robot's uncertain mounts (the mean), each with its degrees of freedom `..._dof`; NaN where there is
+    nothing to say.
     """
 
     series: dict[str, Array]

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from kalmark.config.opening import described, open_run
 from kalmark.config.reading import did_you_mean, load_config
-from kalmark.config.schema import VELOCITY, Config, covariance_of, pose_of
+from kalmark.config.schema import Config, covariance_of, pose_of, state_of
 from kalmark.config.sections import model_of
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW, Laser
@@ -19,6 +19,7 @@ from kalmark.errors import LogError, ModelError
 from kalmark.events import Scan
 from kalmark.logs.log import Log, true_start
 from kalmark.models.protocols import Motion as MotionModel
+from kalmark.models.protocols import coasts, state_columns
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 
@@ -98,11 +99,10 @@ def _start(section: Any, name: str, log: Log | None, moves: MotionModel) -> tupl
     """Return the start and its covariance: as configured, else the truth before the first motion, else the origin."""
     space = moves.space
     if section is not None:
-        pose = pose_of(section)
-        start = pose if space.size == len(pose) else [*pose, *(getattr(section, key) for key in VELOCITY[:6])]
-        return start, covariance_of(section, space.dof)
-    true = None if log is None else true_start(log, name, moves.held)
-    return (true if true is not None and (len(true) == 3) == (space.size == 3) else None), None
+        behind = state_columns(moves)
+        return [*pose_of(section), *state_of(section, behind)], covariance_of(section, space.dof, behind)
+    true = None if log is None else true_start(log, name, moves.held or coasts(moves))
+    return (true if true is not None and (len(true) == 3) == (space.world == "plane") else None), None
 
 
 def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mount:

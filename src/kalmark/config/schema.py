@@ -28,6 +28,7 @@ from kalmark.config.tree import OVERRIDE, name_of
 from kalmark.declare import classes, register
 from kalmark.errors import ConfigError
 from kalmark.geometry.rotations import from_euler
+from kalmark.models.protocols import state_columns
 
 Motion = Annotated[Any, Choice("motion")]
 Estimator = Annotated[Any, Choice("estimator", default="invariant")]
@@ -44,7 +45,12 @@ Plugins = Annotated[tuple[str, ...], Field(strict=False)]
 _UNITS = {"range": "m", "bearing": "rad"}
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
 _PLANE_FOR_SPACE = "a key of the plane for a robot of space"
-VELOCITY = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps", "sigma_v_mps", "sigma_w_radps")
+STATES = {
+    "plane": ("vx_mps", "vy_mps", "w_radps", "slip"),
+    "space": ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"),
+}
+"""What a state may have behind its pose, as keys of a start."""
+SIGMAS = {"v": "sigma_v_mps", "w": "sigma_w_radps", "s": "sigma_slip"}  # by how these begin
 POSE_OF_PLANE = ("theta_rad", "sigma_xy_m", "sigma_theta_rad")
 POSE_OF_SPACE = ("z_m", "roll_deg", "pitch_deg", "yaw_deg", "sigma_position_m", "sigma_rotation_deg")
 
@@ -103,7 +109,22 @@ class SpaceMountConfig(SpacePose):
 class StartConfig(PlanePose):
     """Where a robot of the plane starts, and how surely."""
 
-    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys((*POSE_OF_SPACE, *VELOCITY), _SPACE_FOR_PLANE)
+    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys((*POSE_OF_SPACE, *STATES["space"][2:]), _SPACE_FOR_PLANE)
+
+    vx_mps: Number = 0.0
+    """constant_velocity, constant_turn_rate: velocity forward."""
+    vy_mps: Number = 0.0
+    """constant_velocity: velocity to the left."""
+    w_radps: Number = 0.0
+    """constant_velocity, constant_turn_rate: turn rate."""
+    slip: Number = 0.0
+    """slipping_unicycle: velocity to the left, as a share of the speed."""
+    sigma_v_mps: NotNegative = 0.0
+    """constant_velocity, constant_turn_rate: standard deviation of each velocity."""
+    sigma_w_radps: NotNegative = 0.0
+    """constant_velocity, constant_turn_rate: standard deviation of the turn rate."""
+    sigma_slip: NotNegative = 0.0
+    """slipping_unicycle: standard deviation of the slip."""
 
 
 class SpaceStartConfig(SpacePose):
@@ -195,15 +216,40 @@ def pose_of(section: PlanePose | SpacePose) -> Array:
     return np.array([section.x_m, section.y_m, section.z_m, *q])
 
 
-def covariance_of(section: PlanePose | SpacePose, dof: int) -> Array | None:
-    """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly."""
+def covariance_of(section: PlanePose | SpacePose, dof: int, behind: tuple[str, ...] = ()) -> Array | None:
+    """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly.
+
+    `behind` are the names of what the state has behind its pose.
+    """
     if isinstance(section, PlanePose):
         sigmas = [section.sigma_xy_m, section.sigma_xy_m, section.sigma_theta_rad]
     else:
         sigmas = [*_three(section.sigma_position_m), *np.radians(_three(section.sigma_rotation_deg))]
-    if isinstance(section, SpaceStartConfig):
-        sigmas += [*_three(section.sigma_v_mps), *_three(section.sigma_w_radps)]
+    for name in _known(section, behind):
+        sigma = getattr(section, SIGMAS[name[0]])
+        sigmas.append(_three(sigma)["xyz".index(name[1])] if isinstance(section, SpaceStartConfig) else sigma)
+    sigmas += [0.0] * (dof - len(sigmas))
     return np.diag(np.square(sigmas[:dof])) if any(sigmas[:dof]) else None
+
+
+def state_of(section: PlanePose | SpacePose, behind: tuple[str, ...]) -> list[float]:
+    """Return what a start says of a state behind its pose, by its names; empty if these are no keys of a start."""
+    return [getattr(section, name) for name in _known(section, behind)]
+
+
+def _known(section: PlanePose | SpacePose, behind: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of a state behind its pose, if a start has keys for all of them."""
+    return behind if {*behind} <= {*STATES["plane" if isinstance(section, PlanePose) else "space"]} else ()
+
+
+def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None:
+    """Refuse what a start says of a state that its motion does not have.  Raises ValueError."""
+    has = _known(start, state_columns(model_of(motion)))
+    allowed = {*has, *(SIGMAS[name[0]] for name in has)}
+    for key in dict.fromkeys((*STATES["plane"], *STATES["space"], *SIGMAS.values())):
+        if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
+            what = "slip" if "slip" in key else "such velocity"
+            raise expected(f"0: {motion.type} has no {what} in its state", "start", key)
 
 
 def _three(sigma: float | tuple[float, ...]) -> Array:
@@ -281,6 +327,12 @@ class RobotConfig(_AnyRobot):
     sensors: dict[str, PlaneSensor] = Field(default_factory=dict)
     """Sensors by the log's name of each."""
 
+    @model_validator(mode="after")
+    def _start_fits(self) -> RobotConfig:
+        if self.start is not None:
+            refuse_odd_start(self.motion, self.start)
+        return self
+
 
 class SpaceRobotConfig(_AnyRobot):
     """One robot of space."""
@@ -292,10 +344,8 @@ class SpaceRobotConfig(_AnyRobot):
 
     @model_validator(mode="after")
     def _start_fits(self) -> SpaceRobotConfig:
-        if self.start is not None and model_of(self.motion).space.size == 7:
-            for key in VELOCITY:
-                if self.start.model_dump()[key] not in (0, (0, 0, 0)):
-                    raise expected(f"0: {self.motion.type} has no velocity in its state", "start", key)
+        if self.start is not None:
+            refuse_odd_start(self.motion, self.start)
         return self
 
 

@@ -24,7 +24,7 @@ Motion = tuple[Any, int, Index, bool, Array, Array, Array, Array, float]  # as `
 
 @compiled
 def in_world(state: Array, D: Array) -> Array:
-    """Return a noise D (k, k) of the robot's frame in the world's: in the plane (3, 3), in space (6 or more)."""
+    """Return a noise D (k, k) of the robot's frame in the world's: in the plane (3 or more), in space (6 or more)."""
     k = len(D)
     G = np.eye(k)
     if len(state) < 7:
@@ -91,7 +91,7 @@ def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
     r = x[at : at + size].copy()
     moved, F, R_u = step(model, r, total, dt_s)  # [S] (14)
     if from_first:
-        axes, origin = 1 if size == 3 else 3, np.zeros(3)
+        axes, origin = 1 if size < 7 else 3, np.zeros(3)
         now = call_generator(turns, (atoms, x, n, axes, origin))
         then = call_generator(turns, (atoms, x_first, n, axes, origin))
         F = transported(F, now, then, p_at)

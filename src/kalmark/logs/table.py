@@ -20,9 +20,10 @@ from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, numb
 
 NAMES = ("t_s", "robot", "sensor", "id")
 CONTROL = (
-    "v_mps", "w_radps", "vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps", "steering_rad",
-    "dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps",
-    "dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad", "dtheta_rad",
+    "v_mps", "vx_mps", "vy_mps", "vz_mps", "w_radps", "wx_radps", "wy_radps", "wz_radps", "steering_rad",
+    "dv_mps", "dvx_mps", "dvy_mps", "dvz_mps", "dw_radps", "dwx_radps", "dwy_radps", "dwz_radps",
+    "dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad", "dtheta_rad", "left_rad", "right_rad",
+    "front_left_radps", "front_right_radps", "rear_left_radps", "rear_right_radps",
 )  # fmt: skip
 OBSERVATION = (
     "range_m", "bearing_rad", "azimuth_rad", "elevation_rad", "signature",

@@ -92,13 +92,23 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
     found.jacobian("R_r", R_r, lambda x: move(x, u)[0], r, space, space, at)
     found.jacobian("R_u", R_u, lambda x: move(r, x)[0], u, Rn(k), space, at)
     found.covariance("control_noise", [*map(model.control_noise, u)], k, at)
-    diffusion = [D for D in map(model.diffusion, u, dt_s) if D is not None]
+    of_state = isinstance(model, protocols.StateDiffusion)
+    gathered = map(model.diffusion_at, r, u, dt_s) if of_state else map(model.diffusion, u, dt_s)
+    diffusion = [D for D in gathered if D is not None]
     if diffusion:
-        found.covariance("diffusion", diffusion, space.dof if space.world == "space" else SE2.dof, at)
+        pose_alone = space.world == "plane" and np.shape(diffusion[0]) == (SE2.dof, SE2.dof)
+        found.covariance("diffusion", diffusion, SE2.dof if pose_alone else space.dof, at)
     if (calibrating := protocols.calibrating(model)) is not None:
         c = len(calibrating.calibration)
         found.covariance("calibration_cov", [calibrating.calibration_cov], c, {})
         _shape("calibration_effect", np.array(calibrating.calibration_effect(u[0], dt_s[0])), (k, c))
+        if isinstance(calibrating, protocols.NonlinearCalibration):
+            of, a = calibrating, rng.normal(0, 1, (DRAWS, c)) * np.sqrt(np.diag(calibrating.calibration_cov))
+
+            def true(a: Array) -> list[Array]:
+                return [np.array(each) for each in zip(*map(of.calibrated, u, a, dt_s), strict=True)]
+
+            found.jacobian("U_a", true(a)[1], lambda x: true(x)[0], a, Rn(c), Rn(k), at | {"a": a})
     if isinstance(model, protocols.HasVelocity):
         size = 6 if space.world == "space" else 3
         b, B_r = (np.array(each) for each in zip(*map(model.body_velocity, r), strict=True))

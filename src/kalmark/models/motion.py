@@ -1,5 +1,8 @@
 """Motion models: odometry increments ([S] A.3), held velocities on exact arcs ([F]), Ackermann, constant velocity.
 
+Wheels of other kinds are in `wheels`, velocities in the state of a robot of the plane in `coasting`, what all share in
+`kinematics`; all have their names here.
+
 Three kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
 displacement is sigma times the duration.  What *all controls lack*, a constant or a share of them (`sigma_v_bias_mps`,
 `sigma_scale`, ...), is in the map and estimated.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with
@@ -10,7 +13,6 @@ wander).
 from __future__ import annotations
 
 import math
-from dataclasses import KW_ONLY
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
@@ -18,15 +20,20 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
-from kalmark.declare import NotNegative, Number, Positive, declared, register
+from kalmark.declare import NotNegative, Number, Positive, register
 from kalmark.geometry import frames3d
-from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
-from kalmark.geometry.spaces import ROTATION, SCALAR, SE2, SE3, VECTOR3, Space
-from kalmark.models.observe import Compiled, CompiledVelocity
+from kalmark.geometry.spaces import ROTATION, SCALAR, SE3, VECTOR3, Space
+from kalmark.models.coasting import ConstantTurnRate, ConstantVelocity
+from kalmark.models.kinematics import MotionModel, PlanarMotion, Scale, TurnPerMetre, TurnScale, arc
+from kalmark.models.observe import CompiledVelocity
+from kalmark.models.wheels import DifferentialDrive, Mecanum, Omnidirectional, SlippingUnicycle, Tricycle
 
-__all__ = ["Ackermann", "ConstantVelocity3D", "Odometry2D", "Odometry3D", "Unicycle", "Velocity3D"]
+__all__ = [
+    "Ackermann", "ConstantTurnRate", "ConstantVelocity", "ConstantVelocity3D", "DifferentialDrive", "Mecanum",
+    "Odometry2D", "Odometry3D", "Omnidirectional", "SlippingUnicycle", "Tricycle", "Unicycle", "Velocity3D",
+]  # fmt: skip
 
 
 @compiled
@@ -39,25 +46,6 @@ def increment_in_plane(r: Array, u: Array, par: Array, dt: float) -> tuple[Array
 def unicycle(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
     """Move r (3,) by the speed and turn rate u (2,) for dt s: the new r, R_r (3, 3), R_u (3, 2)."""
     return arc(r, u[0], u[1], dt)
-
-
-@compiled
-def arc(r: Array, v: float, w: float, dt: float) -> tuple[Array, Array, Array]:
-    """Move r along the exact arc of speed v and turn rate w; R_u (3, 2) with respect to (v, w).
-
-    Both limits of [F] are regular: a straight line for w -> 0 and a turn on the spot for v -> 0.
-    """
-    a = w * dt
-    p, q = exponential_v(a)
-    p_a, q_a = exponential_v_rate(a)
-    s = v * dt
-    step, R_u = np.empty(3), np.empty((3, 2))
-    step[0], step[1], step[2] = s * p, s * q, a
-    r2, R_r, R_d = compose(r, step)
-    for i in range(3):
-        R_u[i, 0] = R_d[i, 0] * (dt * p) + R_d[i, 1] * (dt * q)
-        R_u[i, 1] = R_d[i, 0] * (s * dt * p_a) + R_d[i, 1] * (s * dt * q_a) + R_d[i, 2] * dt
-    return r2, R_r, R_u
 
 
 @compiled
@@ -130,62 +118,6 @@ def velocity_of_coasting(r: Array, par: Array) -> tuple[Array, Array]:
     return b, B_r
 
 
-Scale = Annotated[
-    NotNegative, "Share of the way that is missing in all controls; above 0 it is in the map and is estimated."
-]
-TurnScale = Annotated[
-    NotNegative, "Share of the turn that is missing in all controls; above 0 it is in the map and is estimated."
-]
-TurnPerMetre = Annotated[
-    NotNegative, "Turn that is missing for each metre (unequal wheels); above 0 it is in the map and is estimated."
-]
-
-
-class _Motion(Compiled):
-    """What the motions share: white noise of a control, by the names of its parameters, and its calibration.
-
-    `calibrations` are the name and the parameter, a sigma, of each constant by which a control may be wrong.  Those
-    with a sigma above 0 are in the map and are estimated.
-    """
-
-    sigmas: ClassVar[tuple[str, ...]]
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = ()
-
-    @cached_property
-    def _N(self) -> Array:
-        return np.diag(np.square([vars(self)[name] for name in self.sigmas]))
-
-    def control_noise(self, u: Array) -> Array:
-        """Return N (m, m) of a control (m,): of an increment, of an impulse or of what is held."""
-        return self._N
-
-    @cached_property
-    def _unknown(self) -> list[int]:
-        return [k for k, (_, sigma) in enumerate(self.calibrations) if vars(self)[sigma] > 0]
-
-    @property
-    def calibration(self) -> tuple[str, ...]:
-        """The names of the c constants that are in the map."""
-        return tuple(self.calibrations[k][0] for k in self._unknown)
-
-    @property
-    def calibration_cov(self) -> Array:
-        """Their covariance (c, c)."""
-        return np.diag([vars(self)[self.calibrations[k][1]] ** 2 for k in self._unknown])
-
-    def calibration_effect(self, u: Array, dt_s: float) -> Array:
-        """Return B (m, c): with the constants a, a control u (m,) of `dt_s` is u + B a in truth."""
-        return np.ascontiguousarray(self._effects(u, dt_s)[:, self._unknown])
-
-    def _effects(self, u: Array, dt_s: float) -> Array:
-        """Return B by all `calibrations`: by default an offset of each component, then its share."""
-        return np.hstack([np.eye(len(u)), np.diag(u)])
-
-    def diffusion(self, u: Array, dt_s: float) -> Array | None:
-        """Return the covariance (dof, dof) of the white noise gathered in `dt_s`, None: all noise is in u (m,)."""
-        return None
-
-
 def _halves(u: Array) -> Array:
     """Return the first and the last three numbers of a control (6,) in a column each."""
     out = np.zeros((6, 2))
@@ -193,29 +125,8 @@ def _halves(u: Array) -> Array:
     return out
 
 
-@declared
-class _Planar(_Motion):
-    """What the planar motions share: the space and the diffusion."""
-
-    _: KW_ONLY
-    sigma_along_m_per_sqrt_s: Annotated[NotNegative, "Random walk along the heading, while it moves."] = 0.0
-    sigma_across_m_per_sqrt_s: Annotated[NotNegative, "Random walk across the heading, while it moves."] = 0.0
-    sigma_theta_rad_per_sqrt_s: Annotated[NotNegative, "Random walk of the heading, while it moves."] = 0.0
-
-    space: ClassVar[Space] = SE2
-
-    @cached_property
-    def _density(self) -> Array | None:
-        sigmas = (self.sigma_along_m_per_sqrt_s, self.sigma_across_m_per_sqrt_s, self.sigma_theta_rad_per_sqrt_s)
-        return np.diag(np.square(sigmas)) if any(sigmas) else None
-
-    def diffusion(self, u: Array, dt_s: float) -> Array | None:
-        """Return the covariance (3, 3) of the white noise gathered in `dt_s`, in the robot's frame."""
-        return None if self._density is None or not u.any() else self._density * dt_s
-
-
 @register("motion", "unicycle")
-class Unicycle(_Planar):
+class Unicycle(PlanarMotion):
     """Speed and turn rate, each held until the next control.
 
     A control is u = (v m/s, w rad/s); the exact arc of [F] with both its limits.
@@ -250,7 +161,7 @@ class Unicycle(_Planar):
 
 
 @register("motion", "odometry_2d")
-class Odometry2D(_Planar):
+class Odometry2D(PlanarMotion):
     """Increments dx, dy, dtheta in the robot's frame.
 
     A control u (3,) is the motion that ended at its time.  [S] (57)-(60).  The sigmas are those of one increment.  A
@@ -283,7 +194,7 @@ class Odometry2D(_Planar):
 
 
 @register("motion", "ackermann")
-class Ackermann(_Planar):
+class Ackermann(PlanarMotion):
     """A car: wheel speed and steering angle, each held until the next control.
 
     A control is u = (speed of the left rear wheel m/s, steering rad); the state is the rear axle's centre.
@@ -324,7 +235,7 @@ class Ackermann(_Planar):
 
 
 @register("motion", "odometry_3d")
-class Odometry3D(_Motion):
+class Odometry3D(MotionModel):
     """Increments dx, dy, dz and a rotation vector rx, ry, rz, in the robot's frame.
 
     A control is u (6,), m and rad.  The sigmas are those of one increment.
@@ -356,7 +267,7 @@ class Odometry3D(_Motion):
 
 
 @register("motion", "velocity_3d")
-class Velocity3D(_Motion):
+class Velocity3D(MotionModel):
     """Velocity and turn rate in the robot's frame, each held until the next control.
 
     A control is u = (vx, vy, vz, wx, wy, wz), m/s and rad/s.
@@ -395,7 +306,7 @@ class Velocity3D(_Motion):
 
 
 @register("motion", "constant_velocity_3d")
-class ConstantVelocity3D(_Motion, CompiledVelocity):
+class ConstantVelocity3D(MotionModel, CompiledVelocity):
     """Velocity and turn rate are in the state: it goes on as it goes, controls are changes of both, and needs none.
 
     The state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.  The robot coasts to the
@@ -414,6 +325,7 @@ class ConstantVelocity3D(_Motion, CompiledVelocity):
     moves: ClassVar[Any] = coast
     velocity: ClassVar[Any] = velocity_of_coasting
     coasts: ClassVar[bool] = True
+    state_columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
     sigmas: ClassVar[tuple[str, ...]] = (*3 * ("sigma_v_mps",), *3 * ("sigma_w_radps",))
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:

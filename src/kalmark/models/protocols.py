@@ -43,7 +43,10 @@ class Motion(Protocol):
         """Return the covariance N (k, k) of the control's error, which is held as long as the control is."""
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
-        """Return the covariance (3, 3) gathered in `dt_s`, in the robot's frame, or None for none at all."""
+        """Return the covariance gathered in `dt_s`, in the frame where the robot ends, or None for none at all.
+
+        It is (3, 3) in the plane, or that of the whole state; in space always the latter.
+        """
 
 
 @runtime_checkable
@@ -161,6 +164,27 @@ class SelfCalibrating(Protocol):
 
 
 @runtime_checkable
+class NonlinearCalibration(SelfCalibrating, Protocol):
+    """A motion of which the constants in the map do not change a control by B a."""
+
+    def calibrated(self, u: Array, a: Array, dt_s: float) -> tuple[Array, Array]:
+        """Return the control (m,) that u (m,) is in truth with the constants a (c,), and U_a (m, c)."""
+
+
+@runtime_checkable
+class StateDiffusion(Protocol):
+    """A motion of which the diffusion depends on its state, such as a velocity in it."""
+
+    def diffusion_at(self, r: Array, u: Array, dt_s: float) -> Array | None:
+        """Return what `diffusion` does, from the state r (size,) on."""
+
+
+@runtime_checkable
+class _StateColumns(Protocol):
+    state_columns: tuple[str, ...]
+
+
+@runtime_checkable
 class HasVelocity(Protocol):
     """A motion of which the state tells how fast the robot moves."""
 
@@ -214,6 +238,24 @@ def coasts(motion: object) -> bool:
 def calibrating(motion: object) -> SelfCalibrating | None:
     """Return a motion of which constants are in the map; by default None: it has none."""
     return motion if isinstance(motion, SelfCalibrating) and motion.calibration else None
+
+
+def true_control(motion: SelfCalibrating, u: Array, a: Array, dt_s: float) -> tuple[Array, Array]:
+    """Return the control (m,) that u (m,) is in truth with the constants a (c,), and U_a (m, c); by default u + B a."""
+    if isinstance(motion, NonlinearCalibration):
+        return motion.calibrated(u, a, dt_s)
+    B = motion.calibration_effect(u, dt_s)
+    return u + B @ a, B
+
+
+def diffusion_of(motion: Motion, r: Array, u: Array, dt_s: float) -> Array | None:
+    """Return the diffusion of a motion in `dt_s` from a state r (size,) on; by default it does not depend on that."""
+    return motion.diffusion_at(r, u, dt_s) if isinstance(motion, StateDiffusion) else motion.diffusion(u, dt_s)
+
+
+def state_columns(motion: object) -> tuple[str, ...]:
+    """Return the names, with units, of a state's components behind the pose; by default it has none."""
+    return motion.state_columns if isinstance(motion, _StateColumns) else ()
 
 
 def parameter_covariance(sensor: object) -> Array | None:
@@ -400,7 +442,9 @@ def place_of(landmark: Landmark, l: Array) -> tuple[Array, Array] | None:
 
 # ------------------------------------------------------------------ spelling
 _OF: dict[type, tuple[type, ...]] = {
-    Motion: (Motion, _OfWorld, _Coasts, SelfCalibrating, HasVelocity),
+    Motion: (
+        Motion, _OfWorld, _Coasts, NonlinearCalibration, StateDiffusion, _StateColumns, HasVelocity,
+    ),
     Sensor: (
         FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
         _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,

@@ -246,7 +246,7 @@ class History:
     @property
     def in_space(self) -> bool:
         """Whether the robots move in space."""
-        return self.mean.shape[1] > 3
+        return self.mean.shape[1] > 6  # in the plane a state may have a velocity or a slip behind its pose
 
     @property
     def d(self) -> int:

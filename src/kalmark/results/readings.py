@@ -15,7 +15,7 @@ from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import to_euler
 from kalmark.logs import FORMATS
 from kalmark.logs.log import Log
-from kalmark.models.protocols import calibrating
+from kalmark.models.protocols import calibrating, state_columns
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import Biased, Camera, Measuring, Mounted
@@ -78,11 +78,11 @@ def _keys(value: Any) -> dict[str, Any]:
 
 
 def _robot(robot: Any) -> dict[str, Any]:
-    start = describe_pose(robot.start)
-    rates = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
-    start |= dict(zip(rates, plain(robot.start)[7:], strict=False))
+    pose, behind = 3 if robot.motion.space.world == "plane" else 7, state_columns(robot.motion)
+    start = describe_pose(robot.start[:pose])
+    start |= dict(zip(behind, plain(robot.start)[pose:], strict=False))
     if robot.cov is not None:
-        start |= _sigmas(robot.cov)
+        start |= _sigmas(robot.cov, behind)
     sensors = {name: _sensor(mount) for name, mount in robot.sensors.items()}
     return {"motion": model(robot.motion), "start": start, "sensors": sensors}
 
@@ -112,13 +112,21 @@ def describe_pose(pose: Any) -> dict[str, float]:
     return dict(zip(("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg"), (*pose[:3], *angles), strict=True))
 
 
-def _sigmas(cov: Any) -> dict[str, float]:
-    """Return the sigmas of a covariance as configuration files have them, one for all axes."""
+def _sigmas(cov: Any, behind: tuple[str, ...] = ()) -> dict[str, float]:
+    """Return the sigmas of a covariance as configuration files have them, one for all axes.
+
+    `behind` are the names of what a state has behind its pose.
+    """
     sigma = np.sqrt(np.diagonal(np.asarray(cov, dtype=np.float64))).tolist()
-    if len(sigma) == 3:
-        return {"sigma_xy_m": sigma[0], "sigma_theta_rad": sigma[2]}
-    out = {"sigma_position_m": sigma[0], "sigma_rotation_deg": math.degrees(sigma[3])}
-    return out if len(sigma) == 6 else out | {"sigma_v_mps": sigma[6], "sigma_w_radps": sigma[9]}
+    names = {"v": "sigma_v_mps", "w": "sigma_w_radps", "s": "sigma_slip"}
+    more = {
+        names[name[0]]: sigma[i]
+        for i, name in reversed([*enumerate(behind, len(sigma) - len(behind))])
+        if name[0] in names
+    }
+    if len(sigma) - len(behind) == 3:
+        return {"sigma_xy_m": sigma[0], "sigma_theta_rad": sigma[2]} | more
+    return {"sigma_position_m": sigma[0], "sigma_rotation_deg": math.degrees(sigma[3])} | more
 
 
 @runtime_checkable

@@ -264,7 +264,7 @@ def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     for name in history.robots:
         mine = history.robot == name
         scans, controls = history.t_ns[mine], history.controls.get(name)
-        coasts = np.isfinite(history.mean[mine]).sum(axis=1).max(initial=0) > 7  # its velocity is estimated
+        coasts = np.isfinite(history.mean[mine]).sum(axis=1).max(initial=0) not in (3, 7)  # its velocity is estimated
         if len(scans) and controls is None and not coasts:
             yield f"robot {name} has {count(len(scans), 'scan')} but no controls: it is taken to stand still"
         elif len(scans) > 1 and controls is not None and controls.number > 1:

@@ -3,7 +3,8 @@
 The guide and the toolbox disturb the *estimator's* control and let the robot move exactly (`noise_on: control`); with
 `noise_on: robot` the robot is disturbed and the log holds what it was told.  Either way the log holds the control
 the estimator is given.  A diffusion always disturbs the robot.  A mount with sigmas truly sits elsewhere: the log's
-rig is the one configured, and where the sensor sits is drawn around it.
+rig is the one configured, and where the sensor sits is drawn around it.  So are the constants of a motion with sigmas:
+biases, scales, radii.
 """
 
 from __future__ import annotations
@@ -23,7 +24,14 @@ from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
-from kalmark.models.protocols import coasts, parameter_covariance, range_limit
+from kalmark.models.protocols import (
+    calibrating,
+    coasts,
+    diffusion_of,
+    parameter_covariance,
+    range_limit,
+    true_control,
+)
 from kalmark.simulate import sights
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
@@ -31,6 +39,7 @@ from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
 
 Key = tuple[int, str, str]
+ROUNDS = 10  # of a fixed point: a constant changes a control by some percent
 
 
 @dataclass
@@ -52,6 +61,7 @@ class SimRobot:
     driver: Driver
     sensors: dict[str, SimSensor]
     states: list[Array] = field(default_factory=list)
+    constants: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def pose(self) -> Array:
@@ -64,13 +74,15 @@ class Simulation:
     """A simulated log, and what only the simulator knows.
 
     `states` are the true states (steps + 1, n) of each robot, `mounts` where its sensors truly sit, `origins` (by time,
-    robot and sensor) what each observation of a scan is really of: an id, or None for a false one.
+    robot and sensor) what each observation of a scan is really of: an id, or None for a false one; `constants` (c,)
+    those by which each robot's controls are wrong.
     """
 
     log: Log
     states: dict[str, Array]
     mounts: dict[tuple[str, str], Array]
     origins: dict[Key, tuple[Id | None, ...]]
+    constants: dict[str, Array] = field(default_factory=dict)
 
 
 class Chance:
@@ -118,7 +130,8 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
         control_columns={r.name: r.motion.columns for r in robots},
         sensor_columns={(r.name, name): s.sensor.columns for r in robots for name, s in r.sensors.items()},
     )  # fmt: skip
-    return Simulation(log, states, {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}, origins)
+    mounts = {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}
+    return Simulation(log, states, mounts, origins, {r.name: r.constants for r in robots})
 
 
 def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
@@ -151,7 +164,9 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
         sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
         sensors[key] = SimSensor(*drawn_mount(mount, chance.mounts), sensing)
     driver = simulated.route.driver(robot.motion, world.dt_s, area, chance.route)
-    return SimRobot(name, robot.motion, state, driver, sensors)
+    model = calibrating(robot.motion)
+    constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
+    return SimRobot(name, robot.motion, state, driver, sensors, constants=constants)
 
 
 def drawn_start(robot: Robot, rng: Generator) -> Array:
@@ -175,18 +190,30 @@ def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
 
 def step(robot: SimRobot, world: World, rng: Generator) -> Array:
     """Move a robot by one step and return the control (m,) that its estimator is given."""
-    u = robot.driver(robot.state)
-    disturbed = u + gaussian(robot.motion.control_noise(u), rng)
-    told, done = (disturbed, u) if world.noise_on == "control" else (u, disturbed)
+    motion, dt_s, u = robot.motion, world.dt_s, robot.driver(robot.state)
+    error = gaussian(motion.control_noise(u), rng)
+    noisy, done = (u + error, u) if world.noise_on == "control" else (u, u + error)
     robot.states.append(robot.state)
-    robot.state, *_ = robot.motion.move(robot.state, done, world.dt_s)
-    robot.state = diffused(robot.motion, robot.state, done, world.dt_s, rng)
-    return told
+    D = diffusion_of(motion, robot.state, done, dt_s)
+    robot.state = disturbed(motion, motion.move(robot.state, done, dt_s)[0], D, rng)
+    return told(motion, noisy, robot.constants, dt_s)
+
+
+def told(motion: Any, u: Array, constants: Array, dt_s: float) -> Array:
+    """Return the control (m,) that is u (m,) in truth, with the constants (c,) by which all of a robot's are wrong."""
+    out = u
+    for _ in range(ROUNDS if len(constants) else 0):
+        out = out + u - true_control(motion, out, constants, dt_s)[0]
+    return out
 
 
 def diffused(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -> Array:
     """Return a state (size,) disturbed by the diffusion of the motion, if any, in `dt_s` of the control u (m,)."""
-    D = motion.diffusion(u, dt_s)
+    return disturbed(motion, state, motion.diffusion(u, dt_s), rng)
+
+
+def disturbed(motion: Any, state: Array, D: Array | None, rng: Generator) -> Array:
+    """Return a state (size,) disturbed by a diffusion D (k, k) in the robot's frame."""
     if D is None:
         return state
     d = np.zeros(motion.space.dof)
@@ -197,7 +224,7 @@ def diffused(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -
 def body_axes(state: Array, size: int) -> Array:
     """Return the matrix (size, size) from errors in the robot's frame to the world's; rates stay in the body's."""
     G = np.eye(size)
-    if len(state) < 7:
+    if len(state) < 7:  # a velocity behind a pose of the plane is in the robot's frame anyway
         G[:2, :2] = rotation(state[2])
         return G
     Q = matrix(state[3:7].copy())

@@ -15,8 +15,21 @@ from kalmark.arrays import Array
 from kalmark.config.sections import Number, OneOf, Positive, Section
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian, matrix
-from kalmark.models.motion import Ackermann, Odometry2D, Odometry3D, Unicycle
+from kalmark.models.motion import (
+    Ackermann,
+    DifferentialDrive,
+    Mecanum,
+    Odometry2D,
+    Odometry3D,
+    Omnidirectional,
+    SlippingUnicycle,
+    Tricycle,
+    Unicycle,
+)
+from kalmark.models.protocols import HasVelocity
 from kalmark.simulate.layouts import Points
+
+SLOW_S = 1.0  # in which a robot steered by impulses turns to its target
 
 Driver = Callable[[Array], Array]  # true state -> control of the next step
 
@@ -105,17 +118,30 @@ class Lanes(Drive):
 Route = Annotated[Any, OneOf(Constant, Waypoints, Wander, Lanes)]
 
 
-def steer_in_plane(motion: Any, pose: Array, target: Array, drive: Drive, dt_s: float) -> Array:
+def steer_in_plane(motion: Any, state: Array, target: Array, drive: Drive, dt_s: float) -> Array:
     """Return the control that turns the robot towards a target (2,) as fast as it may."""
-    error = wrap(math.atan2(target[1] - pose[1], target[0] - pose[0]) - pose[2])
-    limit = drive.speed_mps / drive.turn_radius_m
+    error = wrap(math.atan2(target[1] - state[1], target[0] - state[0]) - state[2])
+    limit, columns = drive.speed_mps / drive.turn_radius_m, motion.columns
+    if isinstance(motion, HasVelocity):  # by impulses
+        w = min(limit, max(-limit, error / max(dt_s, SLOW_S)))
+        change = np.array([drive.speed_mps, 0.0, w]) - motion.body_velocity(state)[0]
+        return change if len(columns) == 3 else change[[0, 2]]
     return control(motion, drive.speed_mps, min(limit, max(-limit, error / dt_s)), dt_s)
 
 
 def control(motion: Any, v: float, w: float, dt_s: float) -> Array:
     """Return the control (m,) of `motion` that drives at v (m/s) and turns at w (rad/s) for `dt_s`."""
-    if isinstance(motion, Unicycle):
+    if isinstance(motion, Unicycle | SlippingUnicycle):
         return np.array([v, w])
+    if isinstance(motion, Omnidirectional):
+        return np.array([v, 0.0, w])
+    if isinstance(motion, Mecanum):
+        return motion.wheels @ np.array([v, 0.0, w])
+    if isinstance(motion, Tricycle):
+        return np.array([math.hypot(v, w * motion.wheelbase_m), math.atan2(w * motion.wheelbase_m, v)])
+    if isinstance(motion, DifferentialDrive):
+        half = 0.5 * w * motion.track_m
+        return np.array([(v - half) * dt_s / motion.left_radius_m, (v + half) * dt_s / motion.right_radius_m])
     if isinstance(motion, Odometry2D):
         a = 0.5 * w * dt_s
         chord = v * dt_s * (math.sin(a) / a if a else 1.0)

@@ -26,11 +26,20 @@ from kalmark.filter.kernels import moved_noise
 from kalmark.filter.map import Map
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.observe import step, step_of
-from kalmark.models.protocols import Motion, SelfCalibrating, calibrating, coasts
+from kalmark.models.protocols import (
+    Motion,
+    NonlinearCalibration,
+    SelfCalibrating,
+    StateDiffusion,
+    calibrating,
+    coasts,
+    diffusion_of,
+    true_control,
+)
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
 
-NO_NOISE = np.zeros((0, 0))
+NO_NOISE, NOWHERE = np.zeros((0, 0)), np.zeros(0)
 
 
 class Part(NamedTuple):
@@ -161,42 +170,52 @@ class Moving:
     error: int | None = None
 
     @cached_property
+    def moves_itself(self) -> bool:
+        """Whether its diffusion depends on its state."""
+        return isinstance(self.motion, StateDiffusion)
+
+    @cached_property
     def model(self) -> Any:
         """The motion as the filter takes it."""
         return step_of(self.motion)
 
-    def added(self, part: Part) -> tuple[list[int], Array]:
-        """Return the slots of the blocks that change a control, and how, B (m, c) by their numbers together."""
+    def added(self, map_: Map, part: Part) -> tuple[list[int], Array, Array]:
+        """Return the slots of the blocks that change a control, how, B (m, c) by their numbers b, and u with u + B b.
+
+        Where the constants of a control do not enter linearly, that holds at their means.
+        """
         if self.error is None and self.bias is None:
-            return [], nothing(len(part.u))
-        slots, columns = [], []
+            return [], nothing(len(part.u)), part.u
+        slots, columns, u = [], [], part.u
         if self.error is not None:
-            slots, columns = [self.error], [np.eye(len(part.u))]
-        if self.bias is not None and isinstance(self.motion, SelfCalibrating):
-            slots, columns = [*slots, self.bias], [*columns, self.motion.calibration_effect(part.u, part.dt_s)]
-        return slots, np.hstack(columns)
+            slots, columns = [self.error], [np.eye(len(u))]
+        if self.bias is not None and isinstance(self.motion, NonlinearCalibration):
+            a = map_.mean(self.bias)
+            true, U_a = true_control(self.motion, u, a, part.dt_s)
+            slots, columns, u = [*slots, self.bias], [*columns, U_a], true - U_a @ a
+        elif self.bias is not None and isinstance(self.motion, SelfCalibrating):
+            slots, columns = [*slots, self.bias], [*columns, self.motion.calibration_effect(u, part.dt_s)]
+        return slots, np.hstack(columns), u
 
     def leads_somewhere(self, map_: Map, parts: Sequence[Part]) -> bool:
         """Return whether parts of its controls, one after the other, lead to finite places, with finite covariances."""
         r = map_.mean(self.slot)
         for part in parts:
-            slots, B = self.added(part)
-            u = part.u + (B @ np.concatenate([map_.mean(block) for block in slots]) if slots else 0.0)
+            slots, B, u = self.added(map_, part)
+            u = u + (B @ np.concatenate([map_.mean(block) for block in slots]) if slots else 0.0)
             moved = step(self.model, r, u, part.dt_s)
             if not moved_noise(*moved, part.N)[1]:
                 return False
             r = moved[0]
         return True
 
-    def movement(self, part: Part) -> Movement:
-        """Return what one part of its control does to the robot."""
-        D = self.motion.diffusion(part.u, part.dt_s)
+    def movement(self, map_: Map, part: Part) -> Movement:
+        """Return what one part of its control does to the robot in a map."""
+        D = diffusion_of(self.motion, map_.mean(self.slot) if self.moves_itself else NOWHERE, part.u, part.dt_s)
         if part.unknown is not None:
             D = part.unknown if D is None else part.unknown + D
-        shared, (slots, B) = self.error is not None, self.added(part)
-        return Movement(
-            self.model, self.slot, slots, shared, B, part.u, part.N, NO_NOISE if D is None else D, part.dt_s
-        )
+        shared, (slots, B, u) = self.error is not None, self.added(map_, part)
+        return Movement(self.model, self.slot, slots, shared, B, u, part.N, NO_NOISE if D is None else D, part.dt_s)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled model, whose address means nothing to another process."""

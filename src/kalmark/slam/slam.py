@@ -277,7 +277,7 @@ class Slam:
         if shared and moving.leads_somewhere(self.map, [part]):
             with suppress(MapError):  # it is full: each part has an error of its own
                 moving.error = self.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
-        if not self.estimator.predict(self.map, moving.movement(part)):
+        if not self.estimator.predict(self.map, moving.movement(self.map, part)):
             raise self._nowhere(name, part)
         self.clones.moved(name)
 
