@@ -45,7 +45,7 @@ def test_the_jacobians_of_walls_pass_the_check(model: Any) -> None:
 
 
 def test_the_jacobians_of_walls_are_those_of_differences() -> None:
-    v, V_T, V_l = (a[0] for a in WALL.seen_from(T, L[None]))
+    _, V_T, V_l = (a[0] for a in WALL.seen_from(T, L[None]))
     np.testing.assert_allclose(V_T, derivative(lambda x: WALL.seen_from(x, L[None])[0][0], T), atol=1e-8)
     np.testing.assert_allclose(V_l, derivative(lambda x: WALL.seen_from(T, x[None])[0][0], L), atol=1e-8)
     l, L_T, L_v = (a[0] for a in WALL.from_view(T, V[None]))
@@ -96,6 +96,7 @@ def test_what_is_seen_of_a_wall_ends_with_range_and_field_of_view() -> None:
     wall = [2.0, -5.0, 2.0, 5.0]
     np.testing.assert_allclose(seen((0, 0, 0), wall), [[2.0, 0.0, -5.0, 5.0]], atol=1e-12)
     np.testing.assert_allclose(seen((0, 0, 0), wall[2:] + wall[:2]), [[2.0, 0.0, -5.0, 5.0]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(seen((0, 0, np.pi), wall)), [[2.0, np.pi, 5.0, 5.0]], atol=1e-12)
     near = km.sensors.Wall(range_max_m=4.0)
     np.testing.assert_allclose(seen((0, 0, 0), wall, near), [[2.0, 0.0, -np.sqrt(12), np.sqrt(12)]], atol=1e-12)
     narrow = km.sensors.Wall(fov_rad=0.5 * np.pi)

@@ -13,7 +13,6 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.geometry.gaussian import gate
-from kalmark.models.protocols import Joining, Landmark
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track
 
@@ -27,14 +26,14 @@ def gap(one: Array, other: Array) -> Array:
     return np.asarray(np.maximum(one[:, 0] - other[:, 1], other[:, 0] - one[:, 1]))
 
 
-def apart(scan: ScanContext, landmark: Landmark, tracks: Sequence[Track], rows: Index, d2: Array) -> Flags:
-    """Return which observations `rows` (M,) do not join what is known of the walls `tracks`, at d2 (M,).
+def apart(scan: ScanContext, landmark: Any, tracks: Sequence[Track], rows: Index, d2: Array) -> Flags:
+    """Return which observations `rows` (M,) do not join what is known of `tracks` of a `Joining` landmark, at d2 (M,).
 
     They do if the gap is at most `join_m` and three sigmas of where the robot is along the wall.
     """
     out = np.zeros(len(rows), dtype=np.bool_)
     some = [i for i in np.flatnonzero(d2 <= FARTHEST).tolist() if tracks[i].extent is not None]
-    if not isinstance(landmark, Joining) or not some:
+    if not some:
         return out
     l = scan.map.means(np.array([tracks[i].slot for i in some]), landmark.space.size)
     v, T = scan.channel.sensor.invert(scan.y[rows[some]])[0], scan.pose()

@@ -8,11 +8,10 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry.frames3d import to_frame_many
-from kalmark.management import walls
 from kalmark.models.cameras import project_pinhole
 from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.lines import crossing_angles, extended
-from kalmark.models.protocols import Joining, Landmark, Reparametrizable, Segmented, UnknownDepth
+from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, UnknownDepth
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Track
 
@@ -57,8 +56,6 @@ def simplified(scan: ScanContext, track: Track, threshold: float) -> Simplified 
 
 def extent(scan: ScanContext, track: Track, y: Array) -> Array:
     """Return the abscissas (2,) of the segment known of a line after the observation y (4,) of it.  [TB] extPolicy."""
-    if isinstance(track.model, Joining):
-        return walls.grown(scan, track, y)
     sensor, line, t = scan.channel.sensor, track.model, track.extent
     assert isinstance(line, Segmented) and t is not None
     T, l, P = scan.pose(), scan.map.mean(track.slot)[None], scan.map.covariance([track.slot])

@@ -20,7 +20,6 @@ from kalmark.filter.map import Map
 from kalmark.geometry.gaussian import gate
 from kalmark.geometry.spaces import SCALAR, Space
 from kalmark.management.merge import EQUAL_M, EVERY, GATE, Merge, Pair
-from kalmark.models.protocols import Joining
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Track, Tracks
@@ -30,14 +29,26 @@ TINY_M = 1e-9
 TURNED_RAD = 0.3  # walls at a larger angle are not compared: they meet in a corner
 
 
-def grown(scan: ScanContext, track: Track, y: Array) -> Array:
-    """Return the abscissas (2,) of all that was observed of a wall, the observation y (m,) included."""
-    assert isinstance(track.model, Joining)
-    l, v = scan.map.means(np.array([track.slot]), track.model.space.size), scan.channel.sensor.invert(y[None])[0]
-    more, known = track.model.abscissas(scan.pose(), l, v)[0], track.extent
-    if known is None:
-        return more
-    return _hull(known, more) if track.model.extend else known
+def grown(scan: ScanContext, tracks: Sequence[Track], rows: Sequence[int]) -> list[Array | None]:
+    """Return the abscissas (2,) of what is known of some walls after the observations `rows` of them.
+
+    None, of a surveyed wall, stands for its whole line.
+    """
+    if not len(tracks):
+        return []
+    model: Any = tracks[0].model
+    l = scan.map.means(np.array([track.slot for track in tracks]), model.space.size)
+    more = model.abscissas(scan.pose(), l, scan.channel.sensor.invert(scan.y[[*rows]])[0])
+    told = zip(tracks, more, strict=True)
+    return [_hull(t.extent, m) if t.extent is not None and model.extend else t.extent for t, m in told]
+
+
+def first_extent(scan: ScanContext, track: Track, k: int) -> Array:
+    """Return the abscissas (2,) of the segment by which an observation started a wall."""
+    model: Any = track.model
+    l, v = scan.map.mean(track.slot)[None], scan.channel.sensor.invert(scan.y[k : k + 1])[0]
+    t: Array = model.abscissas(scan.pose(), l, v)[0]
+    return t
 
 
 def _hull(one: Array, other: Array) -> Array:
@@ -96,8 +107,8 @@ def _log_ratio(map_: Map, one: Track, other: Track, at: float, chance: float) ->
 
 def _difference(map_: Map, one: Track, other: Track, at: float) -> tuple[Array, Array, Array]:
     """Return the difference z (2,) of two walls at an abscissa of the first, its covariance and its Jacobian."""
-    assert isinstance(one.model, Joining)
-    z, *G = one.model.difference(map_.mean(one.slot), map_.mean(other.slot), at)
+    model: Any = one.model
+    z, *G = model.difference(map_.mean(one.slot), map_.mean(other.slot), at)
     J = np.hstack(G)
     return z, J @ map_.covariance([one.slot, other.slot]) @ J.T + EQUAL_M**2 * np.eye(len(z)), J
 
@@ -112,12 +123,12 @@ def difference(map_: Map, tracks: Tracks, pair: Pair) -> Start:
 
 def _extent_on(map_: Map, wall: Track, other: Track) -> Array:
     """Return the abscissas (2,), in order, on a wall of the ends of another."""
-    assert isinstance(wall.model, Joining) and isinstance(other.model, Joining) and other.extent is not None
+    assert other.extent is not None
     if wall is other:
         return other.extent
-    l = map_.mean(wall.slot)
-    base = wall.model.endpoints(l[None], np.array([[0.0, 1.0]]))[0][0]
-    ends = other.model.endpoints(map_.mean(other.slot)[None], other.extent[None])[0][0]
+    model: Any = wall.model
+    base = model.endpoints(map_.mean(wall.slot)[None], np.array([[0.0, 1.0]]))[0][0]
+    ends = model.endpoints(map_.mean(other.slot)[None], other.extent[None])[0][0]
     return np.sort((ends - base[0]) @ (base[1] - base[0]))
 
 

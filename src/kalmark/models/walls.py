@@ -141,7 +141,8 @@ def visible_wall(
     normal = np.arctan2(n[:, 1], n[:, 0])
     best, width = np.zeros_like(t), np.full(len(t), -np.inf)
     for turn in (0.0, 2 * math.pi, -2 * math.pi):  # the bearing of the abscissa t is normal + atan(t / rho)
-        edges = np.clip(np.array([-half, half])[:, None] + turn - normal, -math.pi / 2, math.pi / 2)
+        bounds = np.array([-half, half])[:, None] if half < math.pi else np.array([[-np.inf], [np.inf]])
+        edges = np.clip(bounds + turn - normal, -math.pi / 2, math.pi / 2)
         with np.errstate(over="ignore", invalid="ignore"):
             right, left = (np.nan_to_num(rho * np.tan(edge), nan=0.0) for edge in edges)
         first, last = np.maximum.reduce([t[:, 0], right, -reach]), np.minimum.reduce([t[:, 1], left, reach])

@@ -376,7 +376,7 @@ class Slam:
         except MapError as full:
             return Observation(k, id_, "ignored", None, None, str(full))
         if channel.joins:
-            track.extent = walls.grown(scan, track, scan.y[k])
+            track.extent = walls.first_extent(scan, track, k)
         if not tentative:
             self.tracks.confirm(track)
             return Observation(k, id_, "new", name, None, reason)
@@ -506,7 +506,7 @@ class Slam:
             track, u = self.tracks.tentative[match.name], policy.upkeep
             track.hits, track.chances, track.unseen = track.hits + 1, track.chances + 1, -1
             if scan.channel.joins:
-                track.extent = walls.grown(scan, track, scan.y[match.k])
+                track.extent = walls.grown(scan, [track], [match.k])[0]
             if u.confirms(track.hits):
                 confirmed[match.k] = match.name, f"confirmed: seen in {track.hits} of {track.chances} scans"
                 self._confirm(scan, track)
@@ -625,7 +625,8 @@ class Slam:
         """Simplify and extend the landmarks of a scan, and give up those that are expected and not found.  [TB] 4.4."""
         fused = [(o, self.tracks.confirmed[o.landmark]) for o in seen
                  if o.outcome == "associated" and o.landmark in self.tracks.confirmed]  # fmt: skip
-        for _, track in fused if self.reparametrize is not None else ():
+        simplifies = self.reparametrize is not None and not scan.channel.joins
+        for _, track in fused if simplifies else ():
             point = reparametrize.simplified(scan, track, self.reparametrize)  # type: ignore[arg-type]
             if point is not None:
                 try:
@@ -635,7 +636,11 @@ class Slam:
                 old = track.slot
                 self.tracks.replace(track, slot, point.model)
                 self.map.remove(old)
-        for o, track in fused:
+        if scan.channel.joins:
+            mine = [track for _, track in fused]
+            for track, extent in zip(mine, walls.grown(scan, mine, [o.index for o, _ in fused]), strict=True):
+                track.extent = extent
+        for o, track in fused if not scan.channel.joins else ():
             if track.extent is not None and isinstance(track.model, Segmented) and track.model.extend:
                 track.extent = reparametrize.extent(scan, track, scan.y[o.index])
         if policy.attention.delete:
