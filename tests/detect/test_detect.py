@@ -110,7 +110,8 @@ def test_walls_meet_their_covariances() -> None:
         found = Walls(range_max_m=80).detect(r, ANGLES)
         assert len(found) == 1
         assert found.attributes["length_m"][0] > 4
-        errors.append(found.y[0] - [p, n])
+        errors.append(found.y[0, :2] - [p, n])
+        assert found.y[0, 3] - found.y[0, 2] == pytest.approx(found.attributes["length_m"][0])
         covs.append(found.cov[0])
     e, P = np.array(errors), np.array(covs)
     nees = np.einsum("ki,ki->k", e, np.linalg.solve(P, e[:, :, None])[:, :, 0]) / 2

@@ -7,6 +7,7 @@ from zlib import crc32
 import numpy as np
 
 from kalmark.arrays import Array, Index
+from kalmark.association.extents import apart
 from kalmark.association.matchings import Places
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
@@ -131,6 +132,9 @@ class Query:
                 m, robot, mount, here = pairs.marginal
                 R = self.scan.noise_of(model, m.means(here[l], model.d), k)
                 out[some] = model.predict(m, robot, mount, here[l], self.y[k], R)[1]
+            if self.scan.channel.joins:
+                tracks = [self.scan.tracks.confirmed[names[i]] for i in l.tolist()]
+                out[some] = np.where(apart(self.scan, model.landmark, tracks, k, out[some]), np.inf, out[some])
         return out
 
     # ------------------------------------------------------------------ jointly

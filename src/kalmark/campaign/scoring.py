@@ -84,7 +84,7 @@ def robot_turn(mean: Array, truth: Array) -> Any:
 
 def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array) -> Judged | None:
     """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
-    if len(truth) == 6:
+    if len(truth) in (4, 6):
         return _line(model, mean, P, truth, turn, coordinates, eye) if isinstance(model, Segmented) else None
     if len(truth) == 7:
         if len(mean) != 7:
@@ -122,21 +122,21 @@ def _position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
 
 
 def _line(model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array) -> Judged | None:
-    """Judge a line by how far it passes, in two directions across it, from the two true ends (6,): four numbers."""
-    l = mean[None]
+    """Judge a line by how far it passes from the two true ends (4|6,): in the plane two numbers, in space four."""
+    l, d = mean[None], len(truth) // 2
     base, _ = model.endpoints(l, np.array([[0.0, 1.0]]))
     a, along = base[0, 0], base[0, 1] - base[0, 0]
-    ends = truth.reshape(2, 3)
+    ends = truth.reshape(2, d)
     t = (ends - a) @ along / (along @ along)
     q, Q_l = model.endpoints(l, t[None])
-    across = np.linalg.svd(along[None])[2][1:]  # (2, 3): at right angles to the line
-    to_eye = np.eye(3) - np.outer(along, along) / (along @ along)
-    if not all(
+    across = np.linalg.svd(along[None])[2][1:]  # (d - 1, d): at right angles to the line
+    to_eye = np.eye(d) - np.outer(along, along) / (along @ along)
+    if d == 3 and not all(
         _is_known(to_eye @ q[0, i], to_eye @ Q_l[0, i] @ P @ Q_l[0, i].T @ to_eye, to_eye @ eye) for i in (0, 1)
     ):
         return None
     own, world = (point_error(q[0], ends, turn, c) @ across.T for c in (coordinates, "world"))
-    F = (across @ Q_l[0]).reshape(4, -1)
+    F = (across @ Q_l[0]).reshape(own.size, -1)
     return Judged(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)
 
 

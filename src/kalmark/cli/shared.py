@@ -98,7 +98,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
         figures = {key: value for key, value in batch.items() if key != "pose_differences"}
-        compared: list[tuple[str, ...]] = [(label, number(v), unit) for _, label, v, unit in in_words(figures, BATCH)]
+        compared = [(label, number(v), unit) for _, label, v, unit in in_words(figures, BATCH)]
         print_table("against the batch solution", ("", "", ""), compared, align="<><")
         if rows := difference_rows(summary):
             print_table(DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, rows, align="<>>>")

@@ -29,13 +29,14 @@ PROBABILITY = 0.9999  # with which a straight wall passes for one
 class Walls(Laser):
     """Straight walls, by the distance of their line from the laser, m, and the direction of its normal, rad.
 
-    They are for a sensor and a landmark of your own: kalmark has none of walls of the plane yet.  A piece of surface is
-    cut where it bends by more than `split_m`.  A wall has at least `beams` beams and `length_m`, and fits a line by the
-    chi-square of its ranges.  Its ends (K, 2, 2), m in the laser's frame, are an attribute: where the beams on it end,
-    so it may be longer.
+    Then their right and left end, m along the line from the foot of the perpendicular on: where the beams on it end, so
+    it may be longer.  Covariances (K, 2, 2) are of the first two numbers.  A piece of surface is cut where it bends by
+    more than `split_m`.  A wall has at least `beams` beams and `length_m`, and fits a line by the chi-square of its
+    ranges.  Its ends (K, 2, 2), m in the laser's frame, are an attribute, too.
     """
 
-    columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad")
+    columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad", "right_m", "left_m")
+    given: ClassVar[int] = 4
 
     split_m: Annotated[Positive, "A wall is straight to this."] = 0.2
     beams: Annotated[Count, "Beams on a wall, at least."] = 8
@@ -51,9 +52,11 @@ class Walls(Laser):
         with np.errstate(divide="ignore", invalid="ignore"):
             far = u[:, :1] / np.cos(at)
         ends = np.stack([far * np.cos(a[beams]), far * np.sin(a[beams])], axis=2)
-        length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        abscissas = far * np.sin(at)
+        length = abscissas[:, 1] - abscissas[:, 0]
         most = np.array([gate(PROBABILITY, int(n)) for n in np.maximum(beams[:, 1] - beams[:, 0] - 1 - 2 * TRIM, 1)])
-        found = Detections(Walls.columns, u, P, beams, {"ends_m": ends, "length_m": length})
+        y = np.column_stack([u, abscissas])
+        found = Detections(Walls.columns, y, P, beams, {"ends_m": ends, "length_m": length})
         return found.take((chi2 <= most) & (length >= self.length_m))
 
     def _widened(self, found: Detections) -> Detections:
@@ -70,6 +73,7 @@ class Corners(Walls):
     """
 
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "opening_rad")
+    given: ClassVar[int] = 2
 
     gap_m: Annotated[NotNegative, "How far from the corner the ends of its walls may be."] = 0.3
     bend_deg: Annotated[Acute, "Angle between the walls, at least."] = 30.0
@@ -78,7 +82,7 @@ class Corners(Walls):
         walls = super()._find(r, a, intensities)
         first = np.arange(len(walls) - 1) if len(walls) > 1 else np.zeros(0, dtype=np.int64)
         second, ends = first + 1, walls.attributes["ends_m"]
-        (p1, n1), (p2, n2) = walls.y[first].T, walls.y[second].T
+        (p1, n1), (p2, n2) = walls.y[first, :2].T, walls.y[second, :2].T
         turn = np.sin(n2 - n1)
         bent = np.abs(turn) >= math.sin(math.radians(self.bend_deg))
         first, second, p1, n1, p2, n2, turn = (v[bent] for v in (first, second, p1, n1, p2, n2, turn))

@@ -21,9 +21,10 @@ RAW = ("range_m", "bearing_rad", "intensity")
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What was found in one scan: K measurements `y` (K, m) named by `columns`, with covariances `cov` (K, m, m).
+    """What was found in one scan: K measurements `y` (K, m) named by `columns`, with covariances `cov` (K, p, p).
 
-    `beams` (K, 2) are the first and the last beam of each, `attributes` what else is known of them, K of each.
+    p is m, but 2 for walls, whose ends have no error that counts.  `beams` (K, 2) are the first and the last beam of
+    each, `attributes` what else is known of them, K of each.
     """
 
     columns: tuple[str, ...]
@@ -53,6 +54,7 @@ class Laser:
     """
 
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")  # of what is found
+    given: ClassVar[int] = 2  # numbers of it that the filter gets; with a signature one more
 
     sigma_range_m: Annotated[float, Within(ge=1e-6), "Noise of the range of one beam."] = 0.03
     sigma_position_m: Annotated[
@@ -94,7 +96,7 @@ class Laser:
             found = self.detect(*scan.y.T)
         except EventError as error:
             raise EventError(f"{when(scan)}: {error}") from None
-        size = 3 if self.signature else 2
+        size = max(self.given, 3 if self.signature else 0)
         y, cov = found.y[:, :size], found.cov[:, :size, :size]
         return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=y, cov=cov if len(y) else None)
 

@@ -4,7 +4,8 @@
 `scans.csv`     t_s, robot, sensor, id, the sensors' columns[, own noise]; a sensor leaves the others' columns empty
 `fixes.csv`     t_s, robot, x_m, y_m[, z_m], own noise
 `truth.csv`     t_s, robot, x_m, y_m, theta_rad | x_m, y_m, z_m, qx, qy, qz, qw
-`landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags
+`landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags;
+                in the plane id, x_m, y_m[, x2_m, y2_m]: points, both ends of walls
 `gps.csv`       t_s, robot, x_m, y_m, antenna_x_m, antenna_y_m: fixes that only score a run
 `rig.yaml`      what the log describes of its robots and sensors, in the shape of a configuration
 
@@ -36,8 +37,9 @@ RIG = "rig.yaml"
 FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv")
 LANDMARK3 = ("x_m", "y_m", "z_m", "x2_m", "y2_m", "z2_m", "qx", "qy", "qz", "qw")
 POSE2, POSE3 = ("x_m", "y_m", "theta_rad"), ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-LANDMARKS = (LANDMARK3[:2], LANDMARK3[:3], LANDMARK3[:6], POSE3)
-"""The columns of a point of the plane, of one of space, of a line and of a tag, as `Log.landmarks` has them."""
+WALL = ("x_m", "y_m", "x2_m", "y2_m")
+LANDMARKS = (LANDMARK3[:2], WALL, LANDMARK3[:3], LANDMARK3[:6], POSE3)
+"""The columns of a point and a wall of the plane, and of a point, a line and a tag, as `Log.landmarks` has them."""
 
 Places = dict[tuple[Path, str, str], int]
 """The line where a robot's controls and fixes (sensor "") and its scans by each sensor begin in a file."""

@@ -107,8 +107,8 @@ def landmarks(log: Log) -> Table:
     """Return header and rows of landmarks.csv."""
     of_size = {len(names): names for names in LANDMARKS}
     sizes = {len(values) for values in log.landmarks.values()}
-    if not sizes <= of_size.keys() or (2 in sizes and len(sizes) > 1):
-        raise LogError(f"landmarks have {', '.join(map(str, sorted(sizes)))} numbers, expected all 2, or 3, 6 and 7")
+    if not (sizes <= {2, 4} or sizes <= {3, 6, 7}):
+        raise LogError(f"landmarks have {', '.join(map(str, sorted(sizes)))} numbers, expected 2 and 4, or 3, 6 and 7")
     columns = union(of_size[size] for size in sorted(sizes)) or LANDMARKS[0]
     rows = [{"id": id_text(id_)} | cells(columns, of_size[len(l)], l) for id_, l in log.landmarks.items()]
     return ["id", *columns], rows

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Flags
+from kalmark.association.extents import apart
 from kalmark.association.gated import assigned
 from kalmark.association.posterior import WELL_KNOWN
 from kalmark.association.protocol import Association, new_gate
@@ -115,8 +116,11 @@ def _distances(scan: ScanContext, rows: Sequence[int], names: Sequence[Id], lost
     for kind in dict.fromkeys(t.model.kind for t in tracks):
         i, j = np.nonzero(near & np.array([t.model.kind == kind for t in tracks]))
         if len(i):
-            slots = np.array([tracks[n].slot for n in j.tolist()])
-            Z, d2[i, j], R = scan.predict(scan.channel.models[kind], slots, np.asarray(rows)[i])
+            slots, model = np.array([tracks[n].slot for n in j.tolist()]), scan.channel.models[kind]
+            Z, d2[i, j], R = scan.predict(model, slots, np.asarray(rows)[i])
+            if scan.channel.joins:
+                others = apart(scan, model.landmark, [tracks[n] for n in j.tolist()], np.asarray(rows)[i], d2[i, j])
+                d2[i, j] = np.where(others, np.inf, d2[i, j])
             d2[i, j] = np.where(lost[i] & (log_volume_ratio(Z, R) > WELL_KNOWN), np.inf, d2[i, j])
     d2[np.isnan(d2)] = np.inf
     return d2

@@ -131,7 +131,9 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
     y = np.tile([0.3 * (name == "size_m") for name in model.columns], (len(v), 1))
     e, E_v = _expect(model, v, y)
     _shape("e of expect", e, (len(v), m))
-    lines = isinstance(model, protocols.SegmentVisible)  # what is measured of a line lies anywhere on it
+    lines = (
+        isinstance(model, protocols.SegmentVisible) and protocols.image_size(model) is not None
+    )  # anywhere on a line
     y = rng.uniform(0, [*model.image, *model.image], (len(v), m)) if lines else e
     E_v = _expect(model, v, y)[1] if spatial else E_v
     kept = _finite("e of expect", y, v)
@@ -165,10 +167,12 @@ def _changing(model: Any, v: Array, y: Array) -> Any:
 
 def _inverse(model: Any, y: Array, view: Space, measured: Space, found: _Findings) -> None:
     """Check what a sensor starts landmarks from: a view, a ray or the two rays of a line."""
-    sized = model.columns[-1] == "size_m"  # a tag, found by iterations; its size has no error
+    sized = model.columns[-1] == "size_m"  # a tag, found by iterations; its size has no error,
+    exact = sized + sum(name in ("right_m", "left_m") for name in model.columns)  # nor have the ends of a wall
     back, V_y = model.invert(y)
-    d, k, n = view.size, np.shape(back)[1], y.shape[1] - sized
-    if k not in ((d,) if protocols.finds_depth(model) else (d, d - 1, 2 * d)):
+    d, k, n = view.size, np.shape(back)[1], y.shape[1] - exact
+    segment = exact and not sized
+    if k not in ((d,) if protocols.finds_depth(model) and not segment else (d, d - 1, 2 * d)):
         raise ModelError(f"v of invert has shape {np.shape(back)}, expected {(len(y), d)}")
     kept = np.flatnonzero(_finite("v of invert", back, y))[: BATCH if sized else None]
     y, back, V_y = y[kept], back[kept], V_y[kept]
@@ -180,7 +184,7 @@ def _inverse(model: Any, y: Array, view: Space, measured: Space, found: _Finding
                 row[:] = model.invert(np.append(one, whole[n:])[None])[0][0]
         return rows
 
-    of, to = Rn(n) if sized else measured, view if k == d else Rn(k)
+    of, to = Rn(n) if exact else measured, view if k == d else Rn(k)
     found.jacobian("V_y", V_y, inverted, y[:, :n], of, to, {"y": y})
     if k != 2 * d:
         whole = np.column_stack([back, np.ones(len(back))]) if k == d - 1 else back  # a ray, at any distance
@@ -245,7 +249,9 @@ def _from_pose(model: Any, rng: Rng, found: _Findings) -> None:
         found.jacobian("P_l of place", model.place(l)[1], lambda x: model.place(x)[0], l, space, where, at)
     if "from_view" not in dir(model):
         return
-    if isinstance(model, protocols.UnknownDepth | protocols.Segmented):  # rays of length 1, completed by a prior
+    if isinstance(model, protocols.Joining):  # a distance, a direction and two ends
+        v = rng.normal(0, 1.5, (BATCH, 4))
+    elif isinstance(model, protocols.UnknownDepth | protocols.Segmented):  # rays of length 1, completed by a prior
         rays, d = 1 + isinstance(model, protocols.Segmented), 2 if space.world == "plane" else 3
         v = rng.normal(0, 1, (BATCH, rays, d))
         v = (v / np.linalg.norm(v, axis=2, keepdims=True)).reshape(BATCH, -1)
@@ -258,7 +264,7 @@ def _from_pose(model: Any, rng: Rng, found: _Findings) -> None:
     found.jacobian("L_T", L_T, lambda x: model.from_view(x[0], v)[0], Ts, pose, space, at)
     found.jacobian("L_v", L_v, lambda x: model.from_view(T, x)[0], v, given, space, at)
     again, looked = model.seen_from(T, l)[0], v[:, : view.size]
-    if isinstance(model, protocols.Segmented):  # the plane through both rays
+    if isinstance(model, protocols.Segmented) and space.world == "space":  # the plane through both rays
         again, looked = (n / np.linalg.norm(n, axis=1)[:, None] for n in (again, np.cross(v[:, :3], v[:, 3:6])))
     found.same("seen_from(from_view(v)) = v", again, looked, view, at)
 

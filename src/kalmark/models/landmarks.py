@@ -15,7 +15,7 @@ from kalmark.declare import NotNegative, Number, built_in, declared, register
 from kalmark.geometry import spaces
 from kalmark.geometry.directions import unit_many
 from kalmark.geometry.spaces import SE3, Space
-from kalmark.models import landmarks2d, landmarks3d, lines, seen, tags
+from kalmark.models import landmarks2d, landmarks3d, lines, seen, tags, walls
 
 TINY_M = 1e-12
 
@@ -84,6 +84,37 @@ class Polar2D(_Landmark):
     def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
         """Return how far the arc of a sigma leaves its tangent, in sigmas of the distance (K,); `sigmas` (K, 4)."""
         return np.asarray(0.5 * l[:, 3] * sigmas[:, 2] ** 2 / np.maximum(sigmas[:, 3], TINY_M))
+
+
+@register("landmark", "wall")
+class Wall2D(_Landmark):
+    """A wall of the plane: a line with the segment that has been observed of it (3 numbers).
+
+    A point on the line and the direction of its normal.  docs/walls.md.
+    """
+
+    join_m: Annotated[
+        NotNegative, "Segments of one line with a gap of at most this are of one wall; a door is wider."
+    ] = 0.3
+    extend: Annotated[bool, "The segment kept of the wall grows with what is seen of it."] = True
+
+    kind: ClassVar[str] = "wall"
+    space: ClassVar[Space] = Space("wall", (spaces.VECTOR, spaces.HEADING))
+    first_ends: ClassVar[tuple[float, float]] = (0.0, 0.0)
+    look: ClassVar[Any] = staticmethod(walls.wall_seen_from)
+    of: ClassVar[Any] = staticmethod(walls.wall_from_view)
+
+    def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2, 2) at abscissas t (K, 2), and P_l (K, 2, 2, 3)."""
+        return walls.wall_endpoints(l, t)
+
+    def abscissas(self, T: Array, l: Array, v: Array) -> Array:
+        """Return the abscissas (K, 2), in order, of the ends of segments v (K, 4) seen from T."""
+        return walls.wall_abscissas(T, l, v)
+
+    def difference(self, a: Array, b: Array, t: float) -> tuple[Array, Array, Array]:
+        """Return the angle and the distance (2,) of the wall b from a, both (3,), at the abscissa t, Z_a, Z_b."""
+        return walls.wall_difference(a, b, t)
 
 
 @register("landmark", "point")

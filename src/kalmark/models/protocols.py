@@ -282,7 +282,7 @@ class SegmentVisible(Protocol):
     """A sensor that sees parts of line segments."""
 
     def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
-        """Return which segments from p1 to p2 (K, 3) of the world are seen from T, and what is measured of them."""
+        """Return which segments from p1 to p2 (K, 2 or 3) of the world are seen from T, and what is measured."""
 
 
 @runtime_checkable
@@ -411,10 +411,23 @@ class Segmented(Protocol):
     extend: bool
 
     def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
-        """Return the points (K, 2, 3) of lines l (K, n) at abscissas t (K, 2), and P_l (K, 2, 3, n)."""
+        """Return the points (K, 2, 2 or 3) of lines l (K, n) at abscissas t (K, 2), and P_l (K, 2, 2 or 3, n)."""
 
-    def abscissas(self, T: Array, l: Array, rays: Array) -> Array:
-        """Return the abscissas (K, 2) where two viewing rays (K, 6) from T pass lines l (K, n) nearest."""
+    def abscissas(self, T: Array, l: Array, v: Array) -> Array:
+        """Return the abscissas (K, 2) on lines l (K, n) of the ends that v (K, m) of a sensor's `invert` has from T.
+
+        In space v are two viewing rays (K, 6), which pass the lines nearest there.
+        """
+
+
+@runtime_checkable
+class Joining(Segmented, Protocol):
+    """A line of the plane of which segments that join are one landmark, and others are others."""
+
+    join_m: float
+
+    def difference(self, a: Array, b: Array, t: float) -> tuple[Array, Array, Array]:
+        """Return angle and distance (2,) of b from a, both (n,), at the abscissa t of a, Z_a and Z_b (2, n)."""
 
 
 @runtime_checkable
@@ -450,7 +463,7 @@ _OF: dict[type, tuple[type, ...]] = {
         _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,
         StartNoise, Checked,
     ),
-    Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Placed),
+    Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Joining, Placed),
 }  # fmt: skip
 _NEAR = 0.85  # of difflib: "see" is near "sees", "extent" is not near "extend"
 

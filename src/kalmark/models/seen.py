@@ -4,6 +4,7 @@
 landmark                                view v (K, d)                                sensors
 ======================================  ===========================================  ==================
 point of the plane                      the point in the sensor's frame, 2 or more   those of the plane
+wall of the plane                       distance and direction of its normal, 2      walls
 Euclidean point                         the point in the sensor's frame, 3           points, cameras
 inverse depth, anchored, homogeneous    the ray rho (p - t) and rho, 4               cameras
 tag                                     its pose in the sensor's frame, 7            tags

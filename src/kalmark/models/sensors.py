@@ -20,11 +20,11 @@ from kalmark.errors import EventError
 from kalmark.geometry.directions import inv_spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
-from kalmark.models import cameras, lines, seen, tags
+from kalmark.models import cameras, lines, seen, tags, walls
 
 __all__ = [
     "Bearing", "Omnidirectional", "PinHole", "Position2D", "Position3D", "Range", "RangeBearing", "RangeBearing3D",
-    "RangeBearingSignature", "Segments", "Stereo", "TagCorners", "TagPose",
+    "RangeBearingSignature", "Segments", "Stereo", "TagCorners", "TagPose", "Wall",
 ]  # fmt: skip
 
 TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed
@@ -326,7 +326,7 @@ class RangeBearingSignature(_Ranging):
 
 # ---------------------------------------------------------------------- of space
 class Spatial(_Sensor):
-    """What the sensors of space share: the compiled expectation `expected`, of the form `seen.EXPECT`."""
+    """What sensors of space, and of walls, share: the compiled expectation `expected`, of the form `seen.EXPECT`."""
 
     world: ClassVar[str] = "space"
     expected: ClassVar[Any]
@@ -353,6 +353,51 @@ class Spatial(_Sensor):
         v, y = np.ascontiguousarray(v, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
         e, _, E_v = type(self).expected(self.code, np.array(self.parameters), angular, v, y)
         return e, E_v
+
+
+@register("sensor", "wall")
+class Wall(Spatial):
+    """Walls seen by a laser: distance of the line, direction of its normal, and what is seen of it.
+
+    The ends of the segment, right and left, are abscissas from the foot of the perpendicular on.  Innovations and noise
+    have two numbers: the ends are where the laser's view ends, not where the wall does.  docs/walls.md.
+    """
+
+    sigma_distance_m: Annotated[Positive, "Noise of the distance of the line."] = 0.02
+    sigma_normal_rad: Annotated[Positive, "Noise of the direction of its normal."] = 0.01
+    _: KW_ONLY
+    range_min_m: Annotated[NotNegative, "Nearest part of a wall the sensor sees."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest part of a wall the sensor sees."] = math.inf
+    fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
+    min_length_m: Annotated[NotNegative, "Shortest segment that counts as seen."] = 0.5
+
+    world: ClassVar[str] = "plane"
+    expected: ClassVar[Any] = walls.wall
+    cov_size: ClassVar[int] = 2
+    columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad", "right_m", "left_m")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_distance_m", "sigma_normal_rad")
+    sees_kinds: ClassVar[tuple[str, ...]] = ("wall",)
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the segments themselves (K, 4), and V_y (K, 4, 2)."""
+        return y.copy(), np.tile(np.eye(4, 2), (len(y), 1, 1))
+
+    def sees(self, v: Array) -> Flags:
+        """Return (K,) that all lines are in view: a line has no end."""
+        return np.ones(len(v), dtype=np.bool_)
+
+    def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
+        """Return which segments from p1 to p2 (K, 2) are seen from T, and their measurements (K, 4)."""
+        limits = self.range_min_m, self.range_max_m, self.fov_rad / 2
+        return walls.visible_wall(T, p1, p2, limits, self.min_length_m)
+
+    def check(self, y: Array) -> None:
+        """Refuse negative distances, and segments y (K, 4) whose right end is not to the right of the left one."""
+        for i, row in enumerate(y):
+            if row[0] < 0:
+                raise EventError(f"observation {i}: distance_m is {row[0]}, expected at least 0")
+            if not row[2] < row[3]:
+                raise EventError(f"observation {i}: right_m is {row[2]}, expected less than left_m, {row[3]}")
 
 
 @declared

@@ -14,7 +14,7 @@ from kalmark.report import OUTCOMES
 from kalmark.results.calibration import bias_figures, mount_figures
 from kalmark.results.gaps import gap_figures, gap_notes
 from kalmark.results.history import History, Ints
-from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
+from kalmark.results.landmarks import EUCLIDEAN, MapLandmarks
 from kalmark.results.matching import association_figures, best_known, by_position, no_ids
 from kalmark.results.measures import Rigid, diverged, identity, nees, nis, path_m, pose_error, rigid, rigid_robust, rmse
 from kalmark.results.recording import Recording
@@ -181,7 +181,7 @@ def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
         k
         for k, (i, kind, place) in enumerate(zip(landmarks.ids, landmarks.kinds, landmarks.means, strict=True))
         if str(i) in true
-        and LINE not in (len(place), len(true[str(i)]))
+        and 2 * d not in (len(place), len(true[str(i)]))
         and (kind in EUCLIDEAN or _sigma(covariances[k]) < SETTLED * extent)
     ]
     estimate = means[rows]
@@ -199,19 +199,20 @@ def line_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
 
     Across the lines: along them nothing is known.  Nothing is aligned.
     """
-    true = {str(i): l.reshape(2, 3) for i, l in truth.landmarks_in_map().items() if len(l) == LINE}
+    d = 3 if landmarks.in_space else 2
+    true = {str(i): l.reshape(2, d) for i, l in truth.landmarks_in_map().items() if len(l) == 2 * d}
     if not true:
         return {}
     extent = float(np.linalg.norm(np.ptp(np.concatenate(list(true.values())), axis=0)))
     errors = []
     for i, place, P in zip(landmarks.ids, landmarks.means, landmarks.covariances, strict=True):
-        if str(i) not in true or len(place) != LINE or not np.isfinite(P).all():
+        if str(i) not in true or len(place) != 2 * d or not np.isfinite(P).all():
             continue
-        along = place[3:] - place[:3]
-        across = np.eye(3) - np.outer(along, along) / np.maximum(along @ along, 1e-300)
-        if max(_sigma(across @ P[k : k + 3, k : k + 3] @ across) for k in (0, 3)) < SETTLED * extent:
-            errors.append((true[str(i)] - place[:3]) @ across)
-    return {"line_rmse_raw_m": rmse(np.reshape(errors, (-1, 3))), "lines_compared": len(errors)}
+        along = place[d:] - place[:d]
+        across = np.eye(d) - np.outer(along, along) / np.maximum(along @ along, 1e-300)
+        if max(_sigma(across @ P[k : k + d, k : k + d] @ across) for k in (0, d)) < SETTLED * extent:
+            errors.append((true[str(i)] - place[:d]) @ across)
+    return {"line_rmse_raw_m": rmse(np.reshape(errors, (-1, d))), "lines_compared": len(errors)}
 
 
 def _sigma(P: Array) -> float:

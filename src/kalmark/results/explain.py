@@ -13,7 +13,7 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import seconds as short
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.models.protocols import FullSensor, finds_depth
+from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth
 from kalmark.report import Candidate
 from kalmark.results.history import Change, History, Ints
 from kalmark.results.landmarks import LINE
@@ -150,7 +150,7 @@ def _seen(slam: Slam, told: Explanation, y: Array) -> Array:
     if not len(known) or not isinstance(sensor, FullSensor) or not finds_depth(sensor):
         return out
     v = sensor.invert(np.ascontiguousarray(y[known, : len(sensor.columns)]))[0]
-    if v.shape[1] == LINE:  # both ends of a line: rays
+    if v.shape[1] == LINE or isinstance(sensor, SegmentVisible):  # a line is nowhere in particular
         return out
     at = mount_now(slam, told.robot, told.sensor, mount.at)
     out[known] = as_rigid(told.pose[: len(at)])(as_rigid(at)(v[:, :d]))

@@ -7,6 +7,7 @@ kind        place                           error                       sizes
 ==========  ==============================  ==========================  =====
 point       x y z                           x y z                       3, 3
 line        both endpoints, x y z x2 y2 z2  the same                    6, 6
+wall        both endpoints, x y x2 y2       the same                    4, 4
 tag         x y z qx qy qz qw               x y z, rotation vector      7, 6
 ==========  ==============================  ==========================  =====
 
@@ -32,18 +33,18 @@ from kalmark.declare import is_own
 from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
 from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
-from kalmark.models.landmarks import PointSignature2D
+from kalmark.models.landmarks import PointSignature2D, Wall2D
 from kalmark.models.protocols import Landmark, Segmented, place_of
 from kalmark.results.history import Ints, as_id, padded_all
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
-POINT, LINE, TAG = 3, 6, 7
+POINT, WALL, LINE, TAG = 3, 4, 6, 7
 EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
 # kinds whose state is their place; what is not (inverse depth, say) is not well known yet
 EUCLIDEAN = ("", "point", "point3", "point_signature", "tag")
-_PLANE = {"point_signature": ("x_m", "y_m", "signature")}
+_PLANE = {"point_signature": ("x_m", "y_m", "signature"), "wall": ("x_m", "y_m", "x2_m", "y2_m")}
 _POINT = ("x_m", "y_m", "z_m")
 _LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
 _TAG = (*_POINT, "qx", "qy", "qz", "qw")
@@ -64,7 +65,7 @@ def places(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if isinstance(model, Segmented):
             p, P_l = model.endpoints(means, np.array([model.first_ends if t is None else t for t in ends]))
-            p, P_l = p.reshape(-1, LINE), P_l.reshape(len(means), LINE, -1)
+            p, P_l = p.reshape(len(means), -1), P_l.reshape(len(means), p[0].size, -1)
         elif (found := place_of(model, means)) is not None:
             p, P_l = found
         else:
@@ -74,7 +75,7 @@ def places(
 
 
 class Shapes(NamedTuple):
-    """What is to be drawn of a map: Gaussian points (of lines both endpoints), `lines` (L, 2, 3) and `tags` (T, 7).
+    """What is to be drawn of a map: Gaussian points (of lines both endpoints), `lines` (L, 2, d) and `tags` (T, 7).
 
     Of the points: which landmark each belongs to (K,), `means` (K, d), `covariances` (K, d, d), and as its `group`
     whether it is of a Euclidean landmark (0), another (1) or a line (2).
@@ -89,14 +90,14 @@ class Shapes(NamedTuple):
 
 
 def shapes(means: Array, covariances: Array, kinds: Sequence[str], d: int = 3) -> Shapes:
-    """Sort the places (K, n) of landmarks, in space padded with NaN, and covariances (K, q, q), by what they are.
+    """Sort the places (K, n) of landmarks, padded with NaN, and covariances (K, q, q), by what they are.
 
-    In the plane (d = 2) all are points.
+    In the plane (d = 2) all are points or walls.
     """
     size = (~np.isnan(means)).sum(axis=1)
-    lines, tags = np.flatnonzero(size == LINE), np.flatnonzero(size == TAG)
+    lines, tags = np.flatnonzero(size == 2 * d), np.flatnonzero(size == TAG)
     row = np.concatenate([np.arange(len(means)), lines])
-    ends, P = means[lines, :LINE].reshape(-1, 2, 3), covariances[lines, 3:LINE, 3:LINE].reshape(-1, d, d)
+    ends, P = means[lines, : 2 * d].reshape(-1, 2, d), covariances[lines, d : 2 * d, d : 2 * d].reshape(-1, d, d)
     return Shapes(
         row,
         np.concatenate([means[:, :d].reshape(-1, d), ends[:, 1, :d]]),
@@ -151,10 +152,14 @@ class MapLandmarks:
         return means, np.array([cov[:d, :d] for cov in self.covariances]).reshape(-1, d, d)
 
     def places(self) -> tuple[Array, Array]:
-        """Return the places (K, n) and covariances (K, q, q), padded with NaN; in the plane the positions alone."""
-        if not self.in_space:
+        """Return the places (K, n) and covariances (K, q, q), padded with NaN; of points of the plane the positions."""
+        if self.in_space:
+            return padded_all(self.means), padded_all(self.covariances, 2)
+        if not any(len(mean) == WALL for mean in self.means):
             return self.positions()
-        return padded_all(self.means), padded_all(self.covariances, 2)
+        sizes = [WALL if len(mean) == WALL else 2 for mean in self.means]
+        means = [mean[:n] for mean, n in zip(self.means, sizes, strict=True)]
+        return padded_all(means), padded_all([P[:n, :n] for P, n in zip(self.covariances, sizes, strict=True)], 2)
 
     def to_csv(self) -> str:
         """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations."""
@@ -201,10 +206,14 @@ class MapLandmarks:
 
 
 def refuse_other_than_points(slam: Slam, what: str) -> None:
-    """Refuse a map with landmarks of a user's own that are more than points with numbers.  Raises KalmarkError."""
+    """Refuse a map with walls, or landmarks of a user's own that are more than points with numbers.
+
+    Raises KalmarkError.
+    """
     for track in slam.tracks.confirmed.values():
         first, *others = track.model.space.kinds
-        if not is_own(type(track.model)) and (first not in (VECTOR, VECTOR3) or {*others} - {SCALAR}):
+        odd = not is_own(type(track.model)) and (first not in (VECTOR, VECTOR3) or {*others} - {SCALAR})
+        if odd or isinstance(track.model, Wall2D):
             raise KalmarkError(f"{what}: landmark {track.id!r} is a {track.model.kind}, expected points")
 
 

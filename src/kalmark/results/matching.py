@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.events import Id
 from kalmark.results.history import History, as_id
-from kalmark.results.landmarks import EUCLIDEAN, LINE, MapLandmarks
+from kalmark.results.landmarks import EUCLIDEAN, MapLandmarks
 from kalmark.results.recording import Recording
 
 LEAST = 3  # matched pairs
@@ -76,14 +76,14 @@ def by_position(landmarks: MapLandmarks, true: dict[Id, Array]) -> dict[Id, Id]:
     """Return the true landmark of each point of a map that has one: the nearest to each other, both in the map's frame.
 
     A pair counts if it is closer than half the way from the true landmark to the next true one: every error is below
-    that by construction.  Nothing if less than half of the map has a pair: by chance, in another frame, a fifth has.
+    that by construction.  Nothing if less than half of the points have a pair: by chance, in another frame, a fifth.
     """
     from scipy.spatial import cKDTree
 
     means = landmarks.positions()[0]
     d = means.shape[1]
-    points = {i: l[:d] for i, l in true.items() if len(l) != LINE}
-    mine = [k for k, kind in enumerate(landmarks.kinds) if kind in EUCLIDEAN and len(landmarks.means[k]) != LINE]
+    points = {i: l[:d] for i, l in true.items() if len(l) != 2 * d}
+    mine = [k for k, kind in enumerate(landmarks.kinds) if kind in EUCLIDEAN and len(landmarks.means[k]) != 2 * d]
     if not mine or len(points) < 2:
         return {}
     names, there, here = [*points], np.array([*points.values()]), means[mine]
@@ -94,4 +94,4 @@ def by_position(landmarks: MapLandmarks, true: dict[Id, Array]) -> dict[Id, Id]:
     pairs = {
         landmarks.ids[mine[k]]: names[i] for k, i in enumerate(nearest.tolist()) if back[i] == k and gap[k] < free[i]
     }
-    return pairs if len(pairs) >= max(LEAST, len(landmarks) / 2) else {}
+    return pairs if len(pairs) >= max(LEAST, len(mine) / 2) else {}

@@ -27,7 +27,10 @@ VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "f
 LANDMARK_COLOUR = "#d2691e"
 EUCLIDEAN_COLOUR, OTHER_COLOUR, LINE_COLOUR = "#1f5fa8", "#c8412f", "#8c1c13"
 GROUPS = {  # of landmarks that are drawn alike, by the dimensions of the scene
-    2: ((LANDMARK_COLOUR, "estimated landmarks, 3σ"),) * 3,
+    2: (
+        *((LANDMARK_COLOUR, "estimated landmarks, 3σ"),) * 2,
+        (LINE_COLOUR, "walls, 3σ of their ends"),
+    ),
     3: (
         (EUCLIDEAN_COLOUR, "Euclidean landmarks, 3σ"),
         (OTHER_COLOUR, "other landmarks, 3σ"),
@@ -174,7 +177,7 @@ def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[St
         plus = _marks("+", colour, 4 if crowded else 8, zorder) | {"markeredgewidth": 0.6 if crowded else 1.0}
         out.append(Stroke(np.array(points), plus, "true landmarks", _marks("+", colour, 7, 1)))
     if lines:
-        out.append(Stroke(joined(lines), style, "true lines", style))
+        out.append(Stroke(joined(lines, scene.d), style, "true walls" if scene.d == 2 else "true lines", style))
     tags = np.array([l for l in scene.true_landmarks.values() if len(l) == TAG]).reshape(-1, TAG)
     return [*out, Stroke(joined(squares(tags, scene.size)), style)] if len(tags) else out
 
@@ -191,8 +194,9 @@ def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
         sample = {"color": colour, "marker": "."}
         out.append(Stroke(joined(rings, scene.d), {"color": colour, "zorder": 4, **thin}, label, sample))
         out.append(Stroke(shapes.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
+    if len(shapes.lines):
+        out.append(Stroke(joined(shapes.lines, scene.d), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
     if scene.d == 3:
-        out.append(Stroke(joined(shapes.lines), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
         tags = joined(squares(shapes.tags, scene.size))
         out.append(Stroke(tags, {"color": EUCLIDEAN_COLOUR, "linewidth": 1.4, "zorder": 5}))
     return out

@@ -184,7 +184,7 @@ def series(run: Recording) -> dict[str, Any]:
         "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
         "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
-        "trueLines": xy(joined(scene.true_lines())),
+        "trueLines": xy(joined(scene.true_lines(), scene.d)),
         "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
         "repeats": xy(scene.repeats),
         "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.used.items()},
@@ -201,12 +201,12 @@ def series(run: Recording) -> dict[str, Any]:
 
 
 def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
-    """Return a map: all points, in space the endpoints of lines last, with the group that each is drawn in."""
+    """Return a map: all points, the endpoints of lines last, with the group that each is drawn in."""
     drawn = shapes(m.means, m.covariances, m.kinds, scene.d)
-    lines = {"lines": xy(joined(drawn.lines)), "tags": xy(joined(squares(drawn.tags, scene.size)))}
+    lines = {"lines": xy(joined(drawn.lines, scene.d))}
     head = {"t": round(t_s, 3), "id": [str(m.ids[row]) for row in drawn.row], "group": drawn.group.tolist()}
-    more = lines if scene.d == 3 else {}
-    return {**head, "count": len(m.ids), **more, **gaussians(drawn.means, drawn.covariances)}
+    tags = {"tags": xy(joined(squares(drawn.tags, scene.size)))} if scene.d == 3 else {}
+    return {**head, "count": len(m.ids), **lines, **tags, **gaussians(drawn.means, drawn.covariances)}
 
 
 def _camera(run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array) -> dict[str, Any]:

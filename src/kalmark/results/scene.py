@@ -23,7 +23,7 @@ from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
 from kalmark.results.history import Camera, History, Ints, Measuring
-from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, LINE, Shapes, shapes
+from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
 from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording
 from kalmark.results.truth import moved
@@ -91,7 +91,9 @@ class Scene:
         truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
         scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
         truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
-        landmarks = {i: l if d == 3 else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()}
+        landmarks = {
+            i: l if d == 3 or len(l) == 2 * d else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()
+        }
         used, last = _used_fixes(run, d), run.landmarks
         whole = shapes(*last.places(), last.kinds, d)
         now, ids = whole, tuple(last.ids)
@@ -101,7 +103,7 @@ class Scene:
         until = slice(None) if step is None else slice(step + 1)
         poses, P = history.poses, history.pose_covariances
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
-        true = [l.reshape(-1, d) if len(l) == LINE else l[None, :d] for l in landmarks.values()]
+        true = [l.reshape(-1, d) if len(l) == 2 * d else l[None, :d] for l in landmarks.values()]
         low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true])
         paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
         dead = {r: history.dead_reckoned[until][rows[until]][:, :d] for r, rows in mine.items()}
@@ -115,7 +117,7 @@ class Scene:
         twice = [np.array([at[row.landmark], at[row.other]]) for row in history.repeats if {*row[1:3]} <= at.keys()]
         return cls(
             d, paths, covariances, stretches, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
-            joined(twice, d),
+            joined([line[:, :d] for line in twice], d),
         )  # fmt: skip
 
     @property
@@ -165,12 +167,12 @@ class Scene:
         return lines or [0.6 * size * BODY]
 
     def true_lines(self) -> list[Array]:
-        """Return the true lines (2, 3)."""
-        return [l.reshape(2, 3) for l in self.true_landmarks.values() if len(l) == LINE]
+        """Return the true lines (2, d)."""
+        return [l.reshape(2, self.d) for l in self.true_landmarks.values() if len(l) == 2 * self.d]
 
     def true_points(self) -> dict[Id, Array]:
         """Return where the true landmarks are (d,), but for lines."""
-        return {i: l[: self.d] for i, l in self.true_landmarks.items() if len(l) != LINE}
+        return {i: l[: self.d] for i, l in self.true_landmarks.items() if len(l) != 2 * self.d}
 
 
 def squares(tags: Array, size: float) -> list[Array]:

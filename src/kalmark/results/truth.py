@@ -14,7 +14,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.logs.log import Log, PositionTrack
 from kalmark.results.history import Arrays, History, Named, Start, as_id, padded_all, texts
-from kalmark.results.landmarks import LINE, TAG
+from kalmark.results.landmarks import TAG
 from kalmark.results.measures import Rigid, pose_error
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
@@ -127,12 +127,12 @@ def as_rigid(pose: Array) -> Rigid:
 
 
 def moved(rigid: Rigid, landmarks: Mapping[Id, Array]) -> dict[Id, Array]:
-    """Return landmarks rotated and shifted: positions (attributes are kept), in space endpoints (6,) and poses (7,)."""
+    """Return landmarks rotated and shifted: positions (attributes are kept), endpoints (4|6,), in space poses (7,)."""
     d = len(rigid.shift)
     out = {}
     for i, l in landmarks.items():
-        if d == 3 and len(l) == LINE:
-            out[i] = rigid(l.reshape(2, 3)).ravel()
+        if len(l) == 2 * d:  # a line, in the plane a wall
+            out[i] = rigid(l.reshape(2, d)).ravel()
         else:
             out[i] = rigid.poses(l[None])[0] if d == 3 and len(l) == TAG else np.append(rigid(l[:d]), l[d:])
     return out

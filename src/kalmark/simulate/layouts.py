@@ -19,8 +19,12 @@ from kalmark.arrays import Array
 from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, expected
 from kalmark.geometry.frames3d import from_euler_pose
 
+TOUCH_M = 1e-3  # walls this near to each other meet
+STRAIGHT = 0.05  # sine of an angle between walls, below which they make no corner
+
 Count = Annotated[int, Field(ge=1)]
 Segment = Annotated[tuple[Number, Number, Number, Number, Number, Number], Field(strict=False)]
+Wall = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
 Triple = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 
 
@@ -41,7 +45,7 @@ Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)
 class Scenery:
     """What there is to see: points (N, 2|3), segments (S, 6) from end to end, tags (T, 7) as poses, in m.
 
-    `tag_sizes` (T,) are the sides of the tags.
+    In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags.
     """
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
@@ -52,7 +56,8 @@ class Scenery:
     @property
     def of_space(self) -> bool:
         """Whether it cannot be in the plane."""
-        return self.points.shape[1] == 3 or bool(len(self.segments)) or bool(len(self.tags))
+        solid = bool(len(self.segments)) and self.segments.shape[1] == 6
+        return self.points.shape[1] == 3 or solid or bool(len(self.tags))
 
 
 class OfPoints(Section):
@@ -253,6 +258,21 @@ class TagRoom(Section):
         return Scenery(tags=np.array(tags), tag_sizes=np.full(len(tags), self.size_m))
 
 
+def corners(walls: Array) -> Array:
+    """Return where walls (S, 4) meet (N, 2): where an end of one is on another that has another direction."""
+    found: list[Array] = []
+    a, u = walls[:, :2], walls[:, 2:] - walls[:, :2]
+    length = np.linalg.norm(u, axis=1)
+    for end, along, size in zip(np.vstack([a, a + u]), np.vstack([u, u]), np.tile(length, 2), strict=True):
+        off = end - a
+        t, across = np.einsum("kj,kj->k", off, u) / length, (off[:, 0] * u[:, 1] - off[:, 1] * u[:, 0]) / length
+        turned = np.abs(along[0] * u[:, 1] - along[1] * u[:, 0]) > STRAIGHT * size * length
+        meets = (np.abs(across) < TOUCH_M) & (t > -TOUCH_M) & (t < length + TOUCH_M) & turned
+        if meets.any() and not any(np.linalg.norm(end - other) < TOUCH_M for other in found):
+            found.append(end)
+    return np.array(found).reshape(-1, 2)
+
+
 class ListedTag(Section):
     """A tag: x to the right of who looks at it, y down, z away from them, into what it is stuck to."""
 
@@ -278,7 +298,7 @@ class ListedTag(Section):
 
 
 class Listed(Section):
-    """Landmarks at given places: points, segments, tags."""
+    """Landmarks at given places: points, segments, tags; walls of the plane, whose corners are points."""
 
     type: Literal["list"] = "list"
     points_m: Points = ()
@@ -287,11 +307,17 @@ class Listed(Section):
     """Both ends of each (x, y, z, x, y, z); their ids follow those of the points."""
     tags: Annotated[tuple[ListedTag, ...], Field(strict=False)] = ()
     """Poses and sizes; their ids follow those of the segments."""
+    walls_m: Annotated[tuple[Wall, ...], Field(strict=False)] = ()
+    """Both ends of each (x, y, x, y), in the plane; ids follow those of the points and of the corners of the walls."""
 
     @model_validator(mode="after")
     def _has_something(self) -> Listed:
-        if not (self.points_m or self.segments_m or self.tags):
-            raise expected("points_m, segments_m or tags")
+        if not (self.points_m or self.segments_m or self.tags or self.walls_m):
+            raise expected("points_m, segments_m, tags or walls_m")
+        if self.walls_m and (self.segments_m or self.tags or (self.points_m and len(self.points_m[0]) == 3)):
+            raise expected("walls_m without anything of space")
+        if any(wall[:2] == wall[2:] for wall in self.walls_m):
+            raise expected("walls_m with two ends each")
         if self.points_m and len(self.points_m[0]) == 2 and (self.segments_m or self.tags):
             raise expected("points [x, y, z] beside segments or tags")
         return self
@@ -299,6 +325,9 @@ class Listed(Section):
     def scenery(self, rng: Generator) -> Scenery:
         """Return what is listed."""
         points = np.array(self.points_m, dtype=np.float64) if self.points_m else np.empty((0, 3))
+        if self.walls_m:
+            walls = np.array(self.walls_m, dtype=np.float64)
+            return Scenery(np.concatenate([points.reshape(-1, 2), corners(walls)]), walls)
         segments = np.array(self.segments_m, dtype=np.float64).reshape(-1, 6)
         tags = np.array([tag.pose() for tag in self.tags]).reshape(-1, 7)
         return Scenery(points, segments, tags, np.array([tag.size_m for tag in self.tags]))

@@ -18,6 +18,7 @@ from numpy.random import Generator, SeedSequence
 
 from kalmark.arrays import Array
 from kalmark.config.building import build_robot
+from kalmark.detect.scan import RAW, Laser
 from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
@@ -32,7 +33,7 @@ from kalmark.models.protocols import (
     range_limit,
     true_control,
 )
-from kalmark.simulate import sights
+from kalmark.simulate import laser, sights
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
 from kalmark.simulate.worlds import World
@@ -44,11 +45,17 @@ ROUNDS = 10  # of a fixed point: a constant changes a control by some percent
 
 @dataclass
 class SimSensor:
-    """A sensor, where it truly sits, and what is wrong with it."""
+    """A sensor, where it truly sits, and what is wrong with it; `laser` is the detector of one whose scans are raw."""
 
     sensor: Any
     at: Array
     sensing: Sensing
+    laser: Laser | None = None
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of its scans."""
+        return tuple(self.sensor.columns) if self.laser is None else RAW[:2]
 
 
 @dataclass
@@ -128,7 +135,7 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
         truth={r.name: Trajectory(np.array(times), states[r.name][:, : len(r.pose)]) for r in robots},
         landmarks=true_landmarks(things),
         control_columns={r.name: r.motion.columns for r in robots},
-        sensor_columns={(r.name, name): s.sensor.columns for r in robots for name, s in r.sensors.items()},
+        sensor_columns={(r.name, name): s.columns for r in robots for name, s in r.sensors.items()},
     )  # fmt: skip
     mounts = {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}
     return Simulation(log, states, mounts, origins, {r.name: r.constants for r in robots})
@@ -145,7 +152,7 @@ def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
 
 
 def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
-    """Return by id the points (2|3,), segments (6,) from end to end and tags (7,)."""
+    """Return by id the points (2|3,), segments (4|6,) from end to end and tags (7,)."""
     points = things[POINTS]
     rows = {POINTS: points.centres()} | {s: t.values for s, t in things.items() if s != POINTS}
     return {i: row.copy() for s, t in things.items() for i, row in enumerate(rows[s], t.first)}
@@ -162,7 +169,8 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
     sensors = {}
     for key, mount in robot.sensors.items():
         sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
-        sensors[key] = SimSensor(*drawn_mount(mount, chance.mounts), sensing)
+        raw = mount.detector if isinstance(mount.detector, Laser) else None
+        sensors[key] = SimSensor(*drawn_mount(mount, chance.mounts), sensing, raw)
     driver = simulated.route.driver(robot.motion, world.dt_s, area, chance.route)
     model = calibrating(robot.motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
@@ -237,9 +245,15 @@ def scans(
     robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World, k: int, t_ns: int, chance: Chance
 ) -> list[tuple[Scan, tuple[Id | None, ...]]]:
     """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
-    found = []
+    found: list[tuple[Scan, tuple[Id | None, ...]]] = []
     for name, carried in robot.sensors.items():
-        if k % (carried.sensing.every or 1):
+        if not carried.sensing.scans_at(k):
+            continue
+        if carried.laser is not None:
+            y = laser.beams(carried.laser, carried.sensing, composed(robot.pose, carried.at)[0], things, chance.sight)
+            if len(y):
+                scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y)
+                found.append((scan, (None,) * len(y)))
             continue
         sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}

@@ -33,14 +33,16 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Pair = Annotated[tuple[int, int], Field(strict=False)]
 
 POINTS, SEGMENTS, TAGS = "points", "segments", "tags"
-HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
+HERE = {2: np.zeros(3), 3: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 _LOOK = {3: Point2D(), 7: Point3D()}
 _TRIES = 200  # places drawn for a false measurement before it is given up
 
 
 def looks_for(sensor: Any) -> str:
     """Return what a sensor sees: points, segments or tags."""
-    return {"Segments": SEGMENTS, "TagPose": TAGS, "TagCorners": TAGS}.get(type(sensor).__name__, POINTS)
+    return {"Segments": SEGMENTS, "Wall": SEGMENTS, "TagPose": TAGS, "TagCorners": TAGS}.get(
+        type(sensor).__name__, POINTS
+    )
 
 
 class Sighted(NamedTuple):
@@ -57,6 +59,12 @@ class Sensing(Section):
 
     every: Annotated[int, Field(ge=1)] | None = None
     """A scan at every so manieth step: at every one, or as the sensor's `preset` says."""
+    first: Annotated[int, Field(ge=1)] | None = None
+    """The first step with a scan; if absent the one that `every` says."""
+    beams: Annotated[int, Field(ge=3)] = 541
+    """Beams of a scan, where the sensor has the detector of a laser: then its scans are raw."""
+    beams_fov_deg: Annotated[float, Field(gt=0, le=360)] = 270.0
+    """Angle between the first and the last of them."""
     dropouts: Share | None = None
     """Probability that something seen is not reported: 0, or as the sensor's `preset` says."""
     outliers: Share = 0.0
@@ -75,6 +83,12 @@ class Sensing(Section):
             return self
         usual = {"every": max(1, round(1 / (preset.rate_hz * dt_s))), "dropouts": preset.dropouts}
         return self.model_copy(update={key: value for key, value in usual.items() if getattr(self, key) is None})
+
+    def scans_at(self, k: int) -> bool:
+        """Return whether there is a scan at step k."""
+        every = self.every or 1
+        first = every if self.first is None else self.first
+        return k >= first and (k - first) % every == 0
 
     @property
     def has_faults(self) -> bool:
@@ -133,7 +147,16 @@ def things_of(scenery: Scenery, dimensions: int) -> dict[str, Things]:
 
 def centre(sort: str, values: Array, dimensions: int) -> Array:
     """Return the positions (K, 2|3) of things (K, n)."""
-    return 0.5 * (values[:, :3] + values[:, 3:]) if sort == SEGMENTS else values[:, :dimensions]
+    if sort == SEGMENTS:
+        one, other = halves(values)
+        return 0.5 * (one + other)
+    return values[:, :dimensions]
+
+
+def halves(segments: Array) -> tuple[Array, Array]:
+    """Return both ends (K, 2|3) of segments (K, 4|6)."""
+    d = segments.shape[1] // 2
+    return segments[:, :d], segments[:, d:]
 
 
 def in_frame(sort: str, T: Array, values: Array) -> Array:
@@ -143,7 +166,7 @@ def in_frame(sort: str, T: Array, values: Array) -> Array:
         v: Array = look.seen_from(T, values)[0]
         return v
     if sort == SEGMENTS:
-        return np.column_stack([look.seen_from(T, values[:, at : at + 3])[0] for at in (0, 3)])
+        return np.column_stack([look.seen_from(T, ends)[0] for ends in halves(values)])
     return tag_seen_from(T, np.ascontiguousarray(values))[0]
 
 
@@ -151,7 +174,7 @@ def exact(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
     """Return which things v (K, n) of the sensor's frame it sees, and what it would measure (K, m) without noise."""
     sort = looks_for(sensor)
     if sort == SEGMENTS:
-        seen: tuple[Flags, Array] = sensor.sees_segments(HERE, v[:, :3], v[:, 3:])
+        seen: tuple[Flags, Array] = sensor.sees_segments(HERE[v.shape[1] // 2], *halves(v))
         return seen
     if sort == TAGS:
         return tags_seen(sensor, v, sizes)
@@ -242,7 +265,7 @@ def elsewhere(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generato
         places = in_ball(len(missing), 2 if plane else 3, reach_m, rng)
         moved = v[missing].copy()
         if sort == SEGMENTS:
-            shift = places - centre(sort, moved, 3)
+            shift = places - centre(sort, moved, places.shape[1])
             moved += np.column_stack([shift, shift])
         else:
             moved[:, : places.shape[1]] = places

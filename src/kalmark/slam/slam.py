@@ -36,14 +36,14 @@ from kalmark.filter.map import Map
 from kalmark.filter.maps import DENSE, grown, new_map
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import RHO, SE2, SE3, Rn
-from kalmark.management import confirm, delayed, existence, merge, reparametrize, tags
+from kalmark.management import confirm, delayed, existence, merge, reparametrize, tags, walls
 from kalmark.management import repeats as of_map
 from kalmark.management.attention import chosen, left_out
 from kalmark.management.pending import Initialization, Step
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
-from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, place_of
+from kalmark.models.protocols import Joining, Landmark, Reparametrizable, Segmented, place_of
 from kalmark.report import (
     INDEFINITE,
     Expectations,
@@ -487,6 +487,8 @@ class Slam:
             track = Track(name, channel.landmark, self._add(start), size_m=scan.size_of(k))
         except MapError as full:
             return Observation(k, id_, "ignored", None, None, str(full))
+        if channel.joins:
+            track.extent = walls.first_extent(scan, track, k)
         if not tentative:
             self.tracks.confirm(track)
             return Observation(k, id_, "new", name, None, reason)
@@ -627,6 +629,8 @@ class Slam:
         for match in matches:
             track, u = self.tracks.tentative[match.name], policy.upkeep
             track.hits, track.chances, track.unseen = track.hits + 1, track.chances + 1, -1
+            if scan.channel.joins:
+                track.extent = walls.grown(scan, [track], [match.k])[0]
             if u.confirms(track.hits):
                 confirmed[match.k] = match.name, f"confirmed: seen in {track.hits} of {track.chances} scans"
                 self._confirm(scan, track)
@@ -747,7 +751,8 @@ class Slam:
         """Simplify and extend the landmarks of a scan, and give up those that are expected and not found.  [TB] 4.4."""
         fused = [(o, self.tracks.confirmed[o.landmark]) for o in seen
                  if o.outcome == "associated" and o.landmark in self.tracks.confirmed]  # fmt: skip
-        for _, track in fused if self.reparametrize is not None else ():
+        simplifies = self.reparametrize is not None and not scan.channel.joins
+        for _, track in fused if simplifies else ():
             point = None
             with suppress(np.linalg.LinAlgError):
                 point = reparametrize.simplified(scan, track, self.reparametrize)  # type: ignore[arg-type]
@@ -759,7 +764,11 @@ class Slam:
                 old = track.slot
                 self.tracks.replace(track, slot, point.model)
                 self.map.remove(old)
-        for o, track in fused:
+        if scan.channel.joins:
+            mine = [track for _, track in fused]
+            for track, extent in zip(mine, walls.grown(scan, mine, [o.index for o, _ in fused]), strict=True):
+                track.extent = extent
+        for o, track in fused if not scan.channel.joins else ():
             if track.extent is not None and isinstance(track.model, Segmented) and track.model.extend:
                 with suppress(np.linalg.LinAlgError):
                     track.extent = reparametrize.extent(scan, track, scan.y[o.index])
@@ -821,6 +830,16 @@ class Slam:
             for gone, kept, why in self._merge_pairs(scan, found) if found else ():
                 search.was_merged(kept)
                 scan.report.merged += ((gone, kept, why),)
+        if scan.channel.joins:
+            self._join(scan, names, policy.upkeep.odds)
+
+    def _join(self, scan: ScanContext, names: Sequence[Id], odds: float) -> None:
+        """Merge walls of which segments join, of those observed and others."""
+        while (found := walls.agreeing(self.map, self.tracks, scan.channel, names, odds)) is not None:
+            merged = self._merge_pairs(scan, found)
+            scan.report.merged += tuple(merged)
+            if not merged:  # the map is full
+                break
 
     def _merge_pairs(self, scan: ScanContext, found: merge.Merge) -> list[tuple[Id, Id, str]]:
         """Constrain pairs of landmarks to be equal, through the estimator, and remove one of each.
@@ -828,10 +847,11 @@ class Slam:
         In a full map nothing is merged, nor where their difference has no covariance.
         """
         try:
-            slots = self._add_all([merge.difference(self.map, self.tracks, pair) for pair in found.pairs])
+            starts = [self._difference(pair) for pair in found.pairs]
+            slots = self._add_all(starts)
         except MapError:
             return []
-        n, count = self.tracks.confirmed[found.pairs[0][0]].model.space.size, len(slots)
+        n, count = starts[0].space.size, len(slots)
         model, R = merge.ZeroDifference(scan.channel.at, n), np.tile(merge.EQUAL_M**2 * np.eye(n), (count, 1, 1))
         update = Update(model, scan.robot, scan.channel.mount, np.array(slots), n, np.zeros((count, n)), R)
         done, merged = self.estimator.correct(self.map, update), []
@@ -841,11 +861,19 @@ class Slam:
             self.map.remove(slot)
             if not fused:
                 continue
-            self.tracks.merge(self.tracks.confirmed[kept], self.tracks.confirmed[gone])
+            one, other = self.tracks.confirmed[kept], self.tracks.confirmed[gone]
+            if isinstance(one.model, Joining):
+                one.extent = walls.united(self.map, one, other)
+            self.tracks.merge(one, other)
             self.remove(gone)
             why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
             merged.append((gone, kept, why))
         return merged
+
+    def _difference(self, pair: tuple[Id, Id]) -> Start:
+        """Return the difference of two landmarks as a block, to be observed as zero."""
+        of_walls = isinstance(self.tracks.confirmed[pair[0]].model, Joining)
+        return (walls if of_walls else merge).difference(self.map, self.tracks, pair)
 
     def _search_repeats(self, scan: ScanContext, policy: Policy) -> None:
         """Search the map for parts that are one; merge those beyond doubt, where that is wanted, and report the others.

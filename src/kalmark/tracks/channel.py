@@ -18,7 +18,7 @@ from kalmark.filter.neighbours import has_place
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
 from kalmark.models.known import known_view
-from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag
+from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
@@ -102,6 +102,8 @@ class Channel:
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
         self.models = self._models(polar)
         self.kinds = frozenset(self.models)
+        joining = (isinstance(model.landmark, protocols.Joining) for model in self.models.values())
+        self.joins = any(joining)  # it observes walls
         self._refuse_misfit()
         self.dof = self._dof()
         self.gate = threshold(self.dof)
@@ -143,6 +145,8 @@ class Channel:
             raise ModelError(f"a {sensor} does not see a landmark of the type {kind}, expected {' or '.join(seen)}")
         if kind == "polar" and tuple(self.sensor.columns) != ("range_m", "bearing_rad"):
             raise ModelError(f"a {sensor} does not start polar points, expected a sensor of ranges and bearings")
+        if kind == Wall2D.kind and seen is None:
+            raise ModelError(f"a {sensor} does not see walls, expected a Wall")
         numbers = 3 if "signature" in self.sensor.columns else 4 if kind == "polar" else 2
         if seen is None and numbers != self.landmark.space.size:
             raise ModelError(f"a {sensor} finds {numbers} numbers, a {kind} has {self.landmark.space.size}")
@@ -195,11 +199,12 @@ class Channel:
     def in_view(
         self, map_: Map, robot: int, model: ObservationModel, slots: list[int], extents: list[Array | None]
     ) -> Index:
-        """Return the indices (K,) of the `slots` in view; `extents` are the segments (2, 3) of lines, or None."""
+        """Return the indices (K,) of the `slots` in view; `extents` are the segments (2,) of lines, or None."""
         T, l = self.pose(map_, robot), map_.means(np.array(slots), model.d)
         if not isinstance(model.landmark, protocols.Segmented):
             return np.flatnonzero(self.sensor.sees(in_frame(model.landmark, T, l)))
-        p, _ = model.landmark.endpoints(l, np.array(extents))
+        ends = [model.landmark.first_ends if t is None else t for t in extents]
+        p, _ = model.landmark.endpoints(l, np.array(ends))
         return np.flatnonzero(self.sensor.sees_segments(T, p[:, 0], p[:, 1])[0])
 
     def noise(self, map_: Map, robot: int, model: ObservationModel, slots: Index, R: Array, own_noise: bool) -> Array:
@@ -268,6 +273,8 @@ def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool)
     if "size_m" in sensor.columns or "qw" in sensor.columns:
         return Tag()
     if len(at) == 3:
+        if sees_kinds(sensor) == (Wall2D.kind,):
+            return Wall2D()
         if not finds_depth(sensor) and not delayed:
             return InverseDepth2D()
         if "signature" in sensor.columns:

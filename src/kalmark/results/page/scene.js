@@ -120,7 +120,8 @@ function moving(frame) {
     traces.push(marks({...boxed(along(pick)), text: pick("id"), customdata: sigma}, {color}, many ? [3, 1.8] : [5, 3],
                       {legendgroup: name, ...quiet, hovertemplate: `%{text}: ${WHERE}<br>sigma %{customdata:.3g} m<extra></extra>`}));
   });
-  if (SPACE) traces.push(stroke(boxed(map.lines), LINE, 1.6, quiet), stroke(map.tags, TAG, 1.2, quiet));
+  traces.push(stroke(boxed(map.lines), LINE, SPACE ? 1.6 : 2.2, quiet));
+  if (SPACE) traces.push(stroke(map.tags, TAG, 1.2, quiet));
   DATA.robots.forEach((r, i) => {
     const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path", at = n ? [n - 1] : [];
     const own = {legendgroup: r.name, ...quiet};
