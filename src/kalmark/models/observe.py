@@ -3,7 +3,7 @@
 `expectation` is the readable form and serves any models.  `linearize` is how the filter's kernels ask for it: plain
 Python for a model written in Python, the compiled twin below for the built-in ones.  Both are tested to be equal.
 The head is the robot's pose or, for a mount in the map, the pose and the mount, and behind it the parameters that the
-sensor has in the map: gain and offset of its range.
+sensor has in the map, gain and offset of its range.  Sensors of the robot itself have their own: `state_view.py`.
 
 Motions have their seam at the end: a built-in one is compiled and called by its address, a user's is run in Python.
 """
@@ -24,12 +24,22 @@ from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.models import landmarks, seen, sensors
 from kalmark.models.landmarks3d import chained
-from kalmark.models.protocols import Completing, FullSensor, Landmark, Motion, Parametrized, Sensor, finds_depth
-from kalmark.models.seen import EXPECT, LOOK, residual
+from kalmark.models.protocols import (
+    Completing,
+    FullSensor,
+    Landmark,
+    Motion,
+    Parametrized,
+    Sensor,
+    finds_depth,
+    parameter_covariance,
+)
+from kalmark.models.seen import EXPECT, LOOK, VARY, residual
 
-View = tuple[int, int, int, int, Array, Array, Flags]
-# addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles
-VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
+View = tuple[int, int, int, int, Array, Array, Flags, int]
+# addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles;
+# address of the sensor's `varied`, 0 where its parameters are known
+VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1], i8))"
 LINEARIZE = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
@@ -114,11 +124,15 @@ def fix_view(antenna: Array) -> View:
 
 
 def built_in_view(
-    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: Flags
-) -> View:  # fmt: skip
-    """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,)."""
+    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: Flags, varied: Any = None
+) -> View:
+    """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,).
+
+    `varied` is that of a sensor with parameters in the map.
+    """
     linearize_at = address_of(linearize_in_plane if len(mount) == 3 else linearize_in_space, LINEARIZE)
-    return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular
+    vary_at = 0 if varied is None else address_of(varied, VARY)
+    return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular, vary_at
 
 
 def is_built_in(sensor: Any, landmark: Any) -> bool:
@@ -131,7 +145,8 @@ def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
     angular = np.array(sensor.angular, dtype=np.bool_)
     if is_built_in(sensor, landmark):
         par = np.array(sensor.parameters if isinstance(sensor, Parametrized) else NOTHING, dtype=np.float64)
-        return built_in_view(landmark.look, type(sensor).expected, int(sensor.code), mount, par, angular)
+        varied = None if parameter_covariance(sensor) is None else type(sensor).varied
+        return built_in_view(landmark.look, type(sensor).expected, int(sensor.code), mount, par, angular, varied)
     return PythonView(sensor, landmark, mount, angular)
 
 
@@ -218,7 +233,7 @@ def _linearized(
     view: View, head: Array, T: Array, T_r: Array, T_s: Array, l: Array, y: Array
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Apply the chain rule from the sensor's pose T on, T_r and T_s being its Jacobians."""
-    _, look_at, expect_at, code, at, par, angular = view
+    _, look_at, expect_at, code, at, par, angular, vary_at = view
     pose = len(at)
     if len(head) > 2 * pose:
         par = head[2 * pose :].copy()
@@ -234,14 +249,24 @@ def _linearized(
             for b in range(n):
                 for c in range(n):
                     E_h[i, a, n + c] += E_T[i, a, b] * T_s[b, c]
-        if len(head) > 2 * pose:  # gain and offset of the range, the first number
-            E_h[i, 0, 2 * n], E_h[i, 0, 2 * n + 1] = -e[i, 0] / par[0], 1.0 / par[0]
     turned(E_T, T_r)
     for i in range(k):
         for a in range(p):
             for c in range(n):
                 E_h[i, a, c] = E_T[i, a, c]
+    if len(head) > 2 * pose:
+        beside(E_h, seen.vary(vary_at, (code, par, angular, v, e)))
     return e, z, E_h, E_l
+
+
+@compiled
+def beside(E_h: Array, E_p: Array) -> None:
+    """Write E_p (K, p, c) into the last columns of E_h (K, p, h)."""
+    k, p, c = E_p.shape
+    for i in range(k):
+        for a in range(p):
+            for b in range(c):
+                E_h[i, a, E_h.shape[2] - c + b] = E_p[i, a, b]
 
 
 @compiled

@@ -256,6 +256,34 @@ class Calibrated(Parametrized, Protocol):
         """Return E_p (K, m, p): how the measurements of v (K, d) change with the parameters."""
 
 
+POSE, CHANGE, TWIST = "pose", "change", "twist"  # the views of a sensor of the state, see `models/state_view.py`
+
+
+@runtime_checkable
+class OfState(Sensor, Protocol):
+    """A sensor that measures its own robot: `views` is POSE, CHANGE or TWIST."""
+
+    views: str
+    pass_share: float
+    """The share of good readings that pass its gate."""
+
+
+@runtime_checkable
+class TimedNoise(Protocol):
+    """A sensor of the state whose noise depends on how long a reading means."""
+
+    def noise_since(self, dt_s: float) -> Array:
+        """Return the noise R (1, p, p) of a reading that means the last `dt_s` seconds."""
+
+
+@runtime_checkable
+class Drifting(Protocol):
+    """A sensor whose parameters walk at random."""
+
+    def drift(self, dt_s: float) -> Array:
+        """Return the variances (p,) that its parameters gather in `dt_s`."""
+
+
 @runtime_checkable
 class Ranging(Protocol):
     """A sensor whose first component is a range."""
@@ -393,7 +421,8 @@ _OF: dict[type, tuple[type, ...]] = {
     Sensor: (
         FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
         _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,
-        StartNoise, Checked,
+        StartNoise, Checked, OfState, TimedNoise,
+        Drifting,
     ),
     Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Placed),
 }  # fmt: skip
