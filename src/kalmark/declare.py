@@ -38,6 +38,7 @@ UNITS = {
     "_m_per_sqrt_s": "m/sqrt(s)",
     "_rad_per_sqrt_s": "rad/sqrt(s)",
     "_per_m": "1/m",
+    "_mps2": "m/s^2",
     "_mps": "m/s",
     "_radps": "rad/s",
     "_rad": "rad",

@@ -99,6 +99,15 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
         c = len(calibrating.calibration)
         found.covariance("calibration_cov", [calibrating.calibration_cov], c, {})
         _shape("calibration_effect", np.array(calibrating.calibration_effect(u[0], dt_s[0])), (k, c))
+    if isinstance(model, protocols.HasVelocity):
+        size = 6 if space.world == "space" else 3
+        b, B_r = (np.array(each) for each in zip(*map(model.body_velocity, r), strict=True))
+        _shape("b of body_velocity", b, (DRAWS, size))
+
+        def velocity(r: Array) -> Array:
+            return np.array([model.body_velocity(one)[0] for one in r])
+
+        found.jacobian("B_r", B_r, velocity, r, space, Rn(size), {"r": r})
 
 
 # ------------------------------------------------------------------ sensors

@@ -24,7 +24,7 @@ from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
 from kalmark.geometry.spaces import ROTATION, SCALAR, SE2, SE3, VECTOR3, Space
-from kalmark.models.observe import Compiled
+from kalmark.models.observe import Compiled, CompiledVelocity
 
 __all__ = ["Ackermann", "ConstantVelocity3D", "Odometry2D", "Odometry3D", "Unicycle", "Velocity3D"]
 
@@ -115,6 +115,19 @@ def coast(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Arra
     for i in range(6):
         R_u[6 + i, i] = 1.0
     return moved, R_r, R_u
+
+
+@compiled
+def velocity_of_coasting(r: Array, par: Array) -> tuple[Array, Array]:
+    """Return the velocity (v, w) of a state r (13,) in the robot's frame (6,), and its Jacobian (6, 12)."""
+    Q_t, b, B_r = np.ascontiguousarray(matrix(r[3:7]).T), np.empty(6), np.zeros((6, 12))
+    b[:3] = Q_t @ r[7:10]
+    b[3:] = r[10:]
+    B_r[:3, 3:6] = Q_t @ skew(r[7:10])
+    B_r[:3, 6:9] = Q_t
+    for i in range(3, 6):
+        B_r[i, 6 + i] = 1.0
+    return b, B_r
 
 
 Scale = Annotated[
@@ -382,7 +395,7 @@ class Velocity3D(_Motion):
 
 
 @register("motion", "constant_velocity_3d")
-class ConstantVelocity3D(_Motion):
+class ConstantVelocity3D(_Motion, CompiledVelocity):
     """Velocity and turn rate are in the state: it goes on as it goes, controls are changes of both, and needs none.
 
     The state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.  The robot coasts to the
@@ -399,6 +412,7 @@ class ConstantVelocity3D(_Motion):
     columns: ClassVar[tuple[str, ...]] = ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps")
     held: ClassVar[bool] = False
     moves: ClassVar[Any] = coast
+    velocity: ClassVar[Any] = velocity_of_coasting
     coasts: ClassVar[bool] = True
     sigmas: ClassVar[tuple[str, ...]] = (*3 * ("sigma_v_mps",), *3 * ("sigma_w_radps",))
 

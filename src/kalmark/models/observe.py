@@ -51,6 +51,10 @@ MOUNT = 4  # where a view has the mount
 MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")
 call_move = by_address(MOVE)
 
+# of the state r (size,) and parameters: the velocity in the robot's frame b (3 or 6,) and B_r (3 or 6, dof)
+VELOCITY = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], f8[::1])")
+call_velocity = by_address(VELOCITY)
+
 NOTHING = np.zeros(0)
 
 
@@ -296,6 +300,16 @@ class Compiled:
     def move(self, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
         """Return the moved state (size,), R_r (dof, dof) and R_u (dof, m) after the control u (m,).  [S] (1)."""
         return type(self).moves(r, u, self.parameters, dt_s)
+
+
+class CompiledVelocity(Compiled):
+    """A compiled motion of which the state tells how fast the robot moves: a `HasVelocity`."""
+
+    velocity: ClassVar[Any]
+
+    def body_velocity(self, r: Array) -> tuple[Array, Array]:
+        """Return the velocity of a state r (size,) in the robot's frame (3 or 6,), and its Jacobian (3 or 6, dof)."""
+        return type(self).velocity(r, self.parameters)
 
 
 def step_of(motion: Motion) -> Any:

@@ -161,6 +161,22 @@ class SelfCalibrating(Protocol):
 
 
 @runtime_checkable
+class HasVelocity(Protocol):
+    """A motion of which the state tells how fast the robot moves."""
+
+    def body_velocity(self, r: Array) -> tuple[Array, Array]:
+        """Return the velocity of a state r (size,) in the robot's frame, and its Jacobian (3 or 6, dof).
+
+        In the plane (vx, vy, w), in space (v (3), w (3)), m/s and rad/s; NaN where the state does not tell.
+        """
+
+
+@runtime_checkable
+class _NamesParameters(Protocol):
+    parameter_names: tuple[str, ...]
+
+
+@runtime_checkable
 class _InnovationSize(Protocol):
     cov_size: int
 
@@ -208,6 +224,14 @@ def calibrating(motion: object) -> SelfCalibrating | None:
 def parameter_covariance(sensor: object) -> Array | None:
     """Return the covariance (p, p) of a sensor's own parameters; by default None: they are known."""
     return sensor.parameter_cov if isinstance(sensor, Calibrated) else None
+
+
+def parameter_names(sensor: object) -> tuple[str, ...]:
+    """Return the names of a sensor's own parameters that are in the map; by default numbers."""
+    if isinstance(sensor, _NamesParameters):
+        return sensor.parameter_names
+    cov = parameter_covariance(sensor)
+    return () if cov is None else tuple(f"constant {k}" for k in range(1, len(cov) + 1))
 
 
 def innovation_size(sensor: Sensor) -> int:
@@ -417,12 +441,11 @@ def place_of(landmark: Landmark, l: Array) -> tuple[Array, Array] | None:
 
 # ------------------------------------------------------------------ spelling
 _OF: dict[type, tuple[type, ...]] = {
-    Motion: (Motion, _OfWorld, _Coasts, SelfCalibrating),
+    Motion: (Motion, _OfWorld, _Coasts, SelfCalibrating, HasVelocity),
     Sensor: (
         FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
-        _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,
-        StartNoise, Checked, OfState, TimedNoise,
-        Drifting,
+        _InnovationSize, _NamesParameters, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous,
+        FarCorrected, OwnNoise, StartNoise, Checked, OfState, TimedNoise, Drifting,
     ),
     Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Placed),
 }  # fmt: skip

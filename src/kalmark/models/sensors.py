@@ -193,6 +193,7 @@ class _Ranging(_Planar):
             raise refuse(self, "sigma_range_m", "a positive number")
 
     varied: ClassVar[Any] = by_gain_and_offset
+    parameter_names: ClassVar[tuple[str, ...]] = ("gain", "offset")
 
     @property
     def parameters(self) -> Array:

@@ -223,6 +223,11 @@ class StateSensor:
         return np.concatenate([e for e, _, _ in rows]), np.concatenate([E_v for _, _, E_v in rows])
 
     # ------------------------------------------------------------------ its constants
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(name for name, _, _ in self.constants)
+
     @cached_property
     def parameters(self) -> Array:
         """The constants (p,) of its expectation."""
@@ -458,6 +463,11 @@ class _Scaled(StateSensor):
     sigma_scale: SigmaScale = 0.0
 
     varied: ClassVar[Any] = by_gain
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The name of the gain."""
+        return ("gain",)
 
     @cached_property
     def parameters(self) -> Array:

@@ -10,9 +10,9 @@ change  its pose in the frame in which its last reading was made   a clone of r 
 twist   its velocity and turn rate, in its own frame               the robot, or clone  3, 6
 ======  =========================================================  ===================  =======================
 
-r is the robot, s the mount.  The twist is that of the robot's state where this has one (`Swift`), else the mean since
-the sensor's last reading: of the constant twist that leads from there to here.  Behind the sensor's m numbers the
-filter's measurement then has one more, the time since the last reading in seconds.
+r is the robot, s the mount.  The twist is that of the robot's state where this has one (`HasVelocity`), else the mean
+since the sensor's last reading: of the constant twist that leads from there to here.  Behind the sensor's m numbers
+the filter's measurement has one more, the time since the last reading in seconds.
 
 `Chain` functions have one form and are called by their addresses; `linearize_state` applies the chain rule from there
 on.  The corrections call it as they call any `observe.linearize`.
@@ -21,7 +21,7 @@ on.  The corrections call it as they call any `observe.linearize`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -32,44 +32,34 @@ from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.rotations import left_jacobian_inverse, left_jacobian_rate, log, matrix, skew
 from kalmark.models import seen
-from kalmark.models.observe import LINEARIZE, View
-from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState
+from kalmark.models.observe import LINEARIZE, VELOCITY, View, call_velocity
+from kalmark.models.protocols import CHANGE, POSE, TWIST, HasVelocity, OfState
 from kalmark.models.seen import EXPECT, VARY, residual
 
-# of a robot's state: its velocity and turn rate in its own frame (3,) or (6,), and their Jacobian in the state
-SWIFT = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1])")
-# of robot, mount, second block, seconds since the last reading, address of a SWIFT: v, V_r, V_s, V_l
+# of robot, mount, second block, seconds since the last reading, address of a VELOCITY: v, V_r, V_s, V_l
 CHAIN = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8, i8)")
-call_swift, call_chain = by_address(SWIFT), by_address(CHAIN)
+call_chain = by_address(CHAIN)
 
 Chain = tuple[Array, Array, Array, Array]
 
 
-@runtime_checkable
-class Swift(Protocol):
-    """A motion whose state has the robot's velocity and turn rate."""
-
-    swift: Any
-    """The function of the form SWIFT: of the state, the twist (3,) or (6,) in the robot's frame, and its Jacobian."""
-
-
 # ------------------------------------------------------------------ what is seen of a state
 @compiled
-def pose_in_plane(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def pose_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return the pose T = r o s (3,), T_r and T_s (3, 3); there is no second block."""
     T, T_r, T_s = frames.compose(r, s)
     return T, T_r, T_s, np.zeros((3, 0))
 
 
 @compiled
-def pose_in_space(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def pose_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return the pose T = r o s (7,), T_r and T_s (6, 6); there is no second block."""
     T, T_r, T_s = frames3d.compose(r, s)
     return T, T_r, T_s, np.zeros((6, 0))
 
 
 @compiled
-def change_in_plane(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def change_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return C = (l o s)^-1 o (r o s) (3,), the way of a mount s while its robot went from l to r, and Jacobians."""
     A, A_l, A_s = frames.compose(l, s)
     B, B_r, B_s = frames.compose(r, s)
@@ -80,7 +70,7 @@ def change_in_plane(r: Array, s: Array, l: Array, since: float, swift: int) -> C
 
 
 @compiled
-def change_in_space(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def change_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return C = (l o s)^-1 o (r o s) (7,), the way of a mount s while its robot went from l to r, and Jacobians."""
     A, A_l, A_s = frames3d.compose(l, s)
     B, B_r, B_s = frames3d.compose(r, s)
@@ -91,9 +81,9 @@ def change_in_space(r: Array, s: Array, l: Array, since: float, swift: int) -> C
 
 
 @compiled
-def mean_twist_in_plane(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def mean_twist_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return the constant twist (vx, vy, w) of a mount s with which its robot goes from l to r, and Jacobians."""
-    C, C_r, C_s, C_l = change_in_plane(r, s, l, since, swift)
+    C, C_r, C_s, C_l = change_in_plane(r, s, l, since, velocity)
     p, q = exponential_v(C[2])
     p_a, q_a = exponential_v_rate(C[2])
     n = p * p + q * q
@@ -105,9 +95,9 @@ def mean_twist_in_plane(r: Array, s: Array, l: Array, since: float, swift: int) 
 
 
 @compiled
-def mean_twist_in_space(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def mean_twist_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return the constant twist (v, w) (6,) of a mount s with which its robot goes from l to r, and Jacobians."""
-    C, C_r, C_s, C_l = change_in_space(r, s, l, since, swift)
+    C, C_r, C_s, C_l = change_in_space(r, s, l, since, velocity)
     turn = log(C[3:].copy())
     inverse = left_jacobian_inverse(turn)
     way, J, t = inverse @ C[:3].copy(), np.zeros((6, 6)), np.empty(6)
@@ -118,9 +108,15 @@ def mean_twist_in_space(r: Array, s: Array, l: Array, since: float, swift: int) 
 
 
 @compiled
-def twist_in_plane(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def twist_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return the twist (vx, vy, w) of a mount s of a robot with the state l (n,), and Jacobians."""
-    t, T_l = call_swift(swift, (l,))
+    t, T_l = call_velocity(velocity, (l, np.zeros(0)))
+    return carried_in_plane(t, T_l, s)
+
+
+@compiled
+def carried_in_plane(t: Array, T_l: Array, s: Array) -> Chain:
+    """Return the twist of a mount s (3,) of a robot with the twist t (3,), whose Jacobian is T_l (3, n)."""
     c, d = np.cos(s[2]), np.sin(s[2])
     x, y = t[0] - t[2] * s[1], t[1] + t[2] * s[0]
     v = np.array([c * x + d * y, c * y - d * x, t[2]])
@@ -130,9 +126,15 @@ def twist_in_plane(r: Array, s: Array, l: Array, since: float, swift: int) -> Ch
 
 
 @compiled
-def twist_in_space(r: Array, s: Array, l: Array, since: float, swift: int) -> Chain:
+def twist_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
     """Return the twist (v, w) (6,) of a mount s of a robot with the state l (n,), and Jacobians."""
-    t, T_l = call_swift(swift, (l,))
+    t, T_l = call_velocity(velocity, (l, np.zeros(0)))
+    return carried_in_space(t, T_l, s)
+
+
+@compiled
+def carried_in_space(t: Array, T_l: Array, s: Array) -> Chain:
+    """Return the twist of a mount s (7,) of a robot with the twist t (6,), whose Jacobian is T_l (6, n)."""
     R, w, p = matrix(s[3:]).T.copy(), t[3:].copy(), s[:3].copy()
     u = t[:3] + skew(w) @ p
     v, V_t, V_s = np.empty(6), np.zeros((6, 6)), np.zeros((6, 6))
@@ -159,13 +161,13 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
 
     Like `observe.linearize`: the head is the robot's pose and, if in the map, the mount and the sensor's parameters.
     """
-    _, chain_at, expect_at, swift, at, par, angular, vary_at = view
+    _, chain_at, expect_at, velocity, at, par, angular, vary_at = view
     pose, m = len(at), len(angular)
     mount = head[pose : 2 * pose].copy() if len(head) > pose else at
     if len(head) > 2 * pose:
         par = head[2 * pose :].copy()
     since = y[0, y.shape[1] - 1]
-    v, V_r, V_s, V_l = call_chain(chain_at, (head[:pose].copy(), mount, l[0].copy(), since, swift))
+    v, V_r, V_s, V_l = call_chain(chain_at, (head[:pose].copy(), mount, l[0].copy(), since, velocity))
     row, e = v.reshape((1, len(v))), y.copy()
     expected, z, E_v = seen.expect(expect_at, (0, par, angular, row, y[:, :m].copy()))
     e[:, :m] = expected
@@ -187,7 +189,7 @@ class PythonStateView:
     """A sensor of the state on its mount, evaluated in Python: `linearize_state` for a user's sensor or motion."""
 
     sensor: Any
-    swift: Any
+    motion: Any
     mount: Array
     angular: Flags
 
@@ -197,8 +199,12 @@ class PythonStateView:
         mount = head[pose : 2 * pose] if len(head) > pose else self.mount
         if len(head) > 2 * pose:
             sensor = sensor.with_parameters(head[2 * pose :])
-        chain = chain_of(sensor.views, self.swift, pose)
-        v, V_r, V_s, V_l = chain(head[:pose].copy(), np.array(mount), l[0].copy(), float(y[0, -1]))
+        if sees_state(sensor, self.motion):
+            carried: Any = carried_in_plane if pose == 3 else carried_in_space
+            v, V_r, V_s, V_l = carried(*self.motion.body_velocity(l[0]), np.array(mount))
+        else:
+            chain = _CHAINS[sensor.views, False][pose != 3]
+            v, V_r, V_s, V_l = chain(head[:pose].copy(), np.array(mount), l[0].copy(), float(y[0, -1]), 0)
         expected, E_v = sensor.expect(v[None])
         e = y.copy()
         e[:, :m] = expected
@@ -210,26 +216,19 @@ class PythonStateView:
         return e, residual(y[:, :m].copy(), expected, self.angular), np.concatenate(parts, axis=2), E_v @ V_l
 
 
-def chain_of(views: str, swift: Any, pose: int) -> Any:
-    """Return the chain function of a view, of the arguments r, s, l and the time since; `pose` is 3 or 7."""
-    function = _CHAINS[views, swift is not None][pose != 3]
-    at = 0 if swift is None else address_of(swift, SWIFT)
-    return lambda r, s, l, since=1.0: function(r, s, l, since, at)
-
-
 def state_view_of(sensor: OfState, motion: Any, mount: Array) -> Any:
     """Return the argument of `observe.linearize` for a sensor of the state on a mount, (3,) or (7,), of a robot."""
     angular = np.array(sensor.angular, dtype=np.bool_)
-    swift = swift_of(sensor, motion)
-    if not is_built_in(sensor):
-        return PythonStateView(sensor, swift, mount, angular)
+    of_state = sees_state(sensor, motion)
+    if type(sensor) not in built_in("sensor") or (of_state and type(motion) not in built_in("motion")):
+        return PythonStateView(sensor, motion, mount, angular)
     of: Any = sensor
-    chain = _CHAINS[of.views, swift is not None][len(mount) != 3]
+    chain = _CHAINS[of.views, of_state][len(mount) != 3]
     return (
         address_of(linearize_state, LINEARIZE),
         address_of(chain, CHAIN),
         address_of(type(of).expected, EXPECT),
-        0 if swift is None else address_of(swift, SWIFT),
+        address_of(type(motion).velocity, VELOCITY) if of_state else 0,
         mount,
         np.array(of.parameters, dtype=np.float64),
         angular,
@@ -237,11 +236,16 @@ def state_view_of(sensor: OfState, motion: Any, mount: Array) -> Any:
     )
 
 
-def swift_of(sensor: OfState, motion: Any) -> Any:
-    """Return the function of a motion by which a sensor sees its twist, None where it does not see it in the state."""
-    return motion.swift if sensor.views == TWIST and isinstance(motion, Swift) else None
+def sees_state(sensor: OfState, motion: Any) -> bool:
+    """Return whether a sensor sees a twist that is in the robot's state."""
+    return sensor.views == TWIST and isinstance(motion, HasVelocity)
 
 
-def is_built_in(sensor: Any) -> bool:
-    """Return whether a sensor of the state is kalmark's own."""
-    return type(sensor) in built_in("sensor")
+def view_of_state(sensor: OfState, motion: Any, mount: Array, state: Array, before: Array, since_s: float) -> Array:
+    """Return what a sensor sees of a robot in a `state`, whose pose was `before` at the last reading."""
+    pose = len(mount)
+    if sees_state(sensor, motion):
+        carried: Any = carried_in_plane if pose == 3 else carried_in_space
+        v: Array = carried(*motion.body_velocity(state), mount)[0]
+        return v
+    return _CHAINS[sensor.views, False][pose != 3](state[:pose].copy(), mount, before, since_s, 0)[0]

@@ -13,7 +13,7 @@ from kalmark.filter.estimators import Estimator, Iterating, Update
 from kalmark.filter.map import Map
 from kalmark.models import protocols
 from kalmark.models.protocols import POSE, Motion, OfState
-from kalmark.models.state_view import state_view_of, swift_of
+from kalmark.models.state_view import sees_state, state_view_of
 from kalmark.slam.checks import measurements
 
 LEAST_S = 1e-6  # between two readings that tell how the robot moved
@@ -30,7 +30,7 @@ class Reader:
         self.at: Array = np.array(at)
         self.mount, self.motion = mount, motion
         self.pose_dof = 3 if len(self.at) == 3 else 6
-        self.of_state = swift_of(sensor, motion) is not None
+        self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
         self.check = sensor.check if isinstance(sensor, protocols.Checked) else None
         self.gate = self._gate()
@@ -51,7 +51,7 @@ class Reader:
 
     def noise(self, event: Scan) -> Array:
         """Return the noise R (1, p, p) of a reading, refusing what its sensor cannot have made.  Raises EventError."""
-        if len(event.y) != 1:
+        if len(event.y) > 1:
             name = type(self.sensor).__name__
             raise EventError(f"{when(event)}: y has {len(event.y)} rows, expected one: a {name} measures its robot")
         if event.ids is not None and event.ids[0] not in (None, event.robot):

@@ -218,6 +218,8 @@ class Slam:
         R, report = reader.noise(event), Report(event, event.y)
         self.t_ns = event.t_ns
         report.gaps = self._advance(event.robot)
+        if not len(event.y):
+            return report
         reader.drift(self.map, since_s)
         reader.t_ns, held = event.t_ns, self.clones.of(key)
         if reader.counts and not held:
@@ -949,7 +951,8 @@ class Slam:
             of_channels = [channel.landmark for channel in slam._channels.values()]
             found = saved.state(slam.robots, slam._moving, slam._readers, of_channels)
         slam.t_ns, slam.map, slam.tracks, slam.clones = found.t_ns, found.map, found.tracks, found.clones
-        for key, channel in (*slam._channels.items(), *slam._readers.items()):
+        carried: dict[ChannelKey, Channel | Reader] = {**slam._channels, **slam._readers}
+        for key, channel in carried.items():
             channel.mount = slam.tracks.slots.get(mount_name(*key), -1)
         return slam
 
