@@ -40,6 +40,7 @@ UNITS = {
     "_per_sqrt_s": "1/sqrt(s)",
     "_m_per_sqrt_m": "m/sqrt(m)",
     "_per_m": "1/m",
+    "_mps2": "m/s^2",
     "_mps": "m/s",
     "_radps": "rad/s",
     "_rad": "rad",

@@ -100,8 +100,8 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         figures = {key: value for key, value in batch.items() if key != "pose_differences"}
         compared = [(label, number(v), unit) for _, label, v, unit in in_words(figures, BATCH)]
         print_table("against the batch solution", ("", "", ""), compared, align="<><")
-        if rows := difference_rows(summary):
-            print_table(DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, rows, align="<>>>")
+        if differences := difference_rows(summary):
+            print_table(DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, differences, align="<>>>")
     for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
         for line in summary.get(key, ()):
             typer.echo(f"{kind}: {line}")

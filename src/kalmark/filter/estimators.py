@@ -97,6 +97,14 @@ class Compiling(Protocol):
 
 
 @runtime_checkable
+class Iterating(Protocol):
+    """An estimator that linearises an observation more than once."""
+
+    def once(self) -> Estimator:
+        """Return the estimator that linearises everything at the prediction."""
+
+
+@runtime_checkable
 class Averaging(Protocol):
     """An estimator that can fuse the mean over matchings, as `km.association.Averaged` wants."""
 
@@ -230,6 +238,10 @@ class Invariant(_Estimator):
     def for_fixes(self) -> Invariant:
         """Return the estimator that fuses absolute positions: a large step must be iterated."""
         return Invariant(max(30, self.iterations), self.tolerance)
+
+    def once(self) -> Invariant:
+        """Return the estimator that linearises everything at the prediction."""
+        return Invariant(1, self.tolerance)
 
 
 @register("estimator", "fej")

@@ -2,6 +2,7 @@
 
 `controls.csv`  t_s, robot, the control's columns[, own noise]
 `scans.csv`     t_s, robot, sensor, id, the sensors' columns[, own noise]; a sensor leaves the others' columns empty
+`measurements.csv` t_s, robot, sensor, the sensors' columns[, own noise]: scans of one row without an id
 `fixes.csv`     t_s, robot, x_m, y_m[, z_m], own noise
 `truth.csv`     t_s, robot, x_m, y_m, theta_rad | x_m, y_m, z_m, qx, qy, qz, qw
 `landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags;
@@ -31,10 +32,11 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Id, Scan, order, shown
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
-from kalmark.logs.table import CONTROL, OBSERVATION, Refused, Row, read_table
+from kalmark.logs.table import CONTROL, OBSERVATION, READING, Refused, Row, read_table
 
 RIG = "rig.yaml"
-FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv")
+FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv")
+EVENTS = ("controls.csv", "scans.csv", "fixes.csv", "measurements.csv")
 LANDMARK3 = ("x_m", "y_m", "z_m", "x2_m", "y2_m", "z2_m", "qx", "qy", "qz", "qw")
 POSE2, POSE3 = ("x_m", "y_m", "theta_rad"), ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 WALL = ("x_m", "y_m", "x2_m", "y2_m")
@@ -49,8 +51,10 @@ NEAR = 0.65  # of difflib's ratio
 
 def read(path: Path, request: Request) -> Log:
     """Return the native log in a folder.  Raises LogError with file and line."""
-    if not any((path / name).is_file() for name in FILES[:3]):
-        raise LogError(f"{path}: no controls.csv, scans.csv or fixes.csv, expected at least one of them")
+    if not any((path / name).is_file() for name in EVENTS):
+        raise LogError(
+            f"{path}: no controls.csv, scans.csv, fixes.csv or measurements.csv, expected at least one of them"
+        )
     others = [file.name for file in path.glob("*.csv") if file.name not in FILES]
     for name in FILES:
         near = [] if (path / name).is_file() else get_close_matches(name, others, n=1, cutoff=0.85)
@@ -114,7 +118,10 @@ class _Reader:
         self.truth: dict[str, Trajectory] = {}
         self.landmarks: dict[Id, Array] = {}
         self.gps: dict[str, PositionTrack] = {}
-        self.readers = (self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps)
+        self.readers = (
+            self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps,
+            self.measurements,
+        )  # fmt: skip
 
     def note(self, row: Row) -> None:
         """Note where the controls, fixes or scans of a row begin."""
@@ -144,7 +151,7 @@ class _Reader:
                 rows.bad = True
                 raise
 
-        table = read_table(path, ("t_s", "robot", "sensor", "id"), known=OBSERVATION)
+        table = read_table(path, ("t_s", "robot", "sensor", "id"), known=(*CONTROL, *OBSERVATION, *READING))
         table.each(self.request, take, by_sensor=True)
         for (t_ns, robot, sensor), rows in scans.items():
             if rows.bad:
@@ -174,6 +181,18 @@ class _Reader:
         rows.ids.append(name)
         rows.covs.append(cov)
         rows.lines.append(row.line)
+
+    def measurements(self, path: Path) -> None:
+        """Read `measurements.csv`: one reading a row."""
+
+        def take(row: Row) -> None:
+            self.note(row)
+            y = row.values(self.columns)
+            cov = row.own_noise(self.columns[row.key], definite=True)
+            self.events.append(Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov))
+
+        table = read_table(path, ("t_s", "robot", "sensor"), known=(*CONTROL, *OBSERVATION, *READING))
+        table.each(self.request, take, by_sensor=True)
 
     def fixes(self, path: Path) -> None:
         """Read `fixes.csv`: absolute positions."""

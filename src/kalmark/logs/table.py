@@ -31,10 +31,15 @@ OBSERVATION = (
     "u_px", "v_px", "ul_px", "vl_px", "ur_px", "vr_px",
     "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
 )  # fmt: skip
-CANONICAL = (*CONTROL, *OBSERVATION)
+READING = (  # of a robot itself, by its own sensors
+    "heading_rad", "theta_rad", "roll_rad", "pitch_rad", "ax_mps2", "ay_mps2", "az_mps2", "speed_mps",
+)  # fmt: skip
+CANONICAL = (*CONTROL, *OBSERVATION, *READING)
 """The order in which known columns make a control or an observation, whatever their order in the file."""
 NOT_NEGATIVE = {"range_m": "range", "size_m": "size"}
-UNITS = {"s": "seconds", "m": "metres", "rad": "radians", "px": "pixels", "mps": "m/s", "radps": "rad/s"}
+UNITS = {
+    "s": "seconds", "m": "metres", "rad": "radians", "px": "pixels", "mps": "m/s", "radps": "rad/s", "mps2": "m/s^2",
+}  # fmt: skip
 """The units of columns, by the end of their names."""
 OTHER_UNITS = {
     "ms", "us", "ns", "sec", "secs", "seconds", "min", "h", "mm", "cm", "dm", "km", "in", "ft", "meter", "meters",

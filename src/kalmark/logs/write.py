@@ -20,6 +20,7 @@ from kalmark.logs.table import CANONICAL, cov_columns
 
 Table = tuple[list[str], list[dict[str, str]]]
 POSITION = ("x_m", "y_m", "z_m")
+EMPTY: Table = ([], [])  # measurements.csv: what has no id is written into scans.csv, too
 
 
 def write_native(log: Log, folder: Path | str) -> Path:
@@ -29,7 +30,7 @@ def write_native(log: Log, folder: Path | str) -> Path:
     unnamed column, two scans of one sensor at one time, an id that would be read as another).
     """
     folder = Path(folder)
-    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log))
+    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log), EMPTY)
     folder.mkdir(parents=True, exist_ok=True)
     for file_name, (header, rows) in zip(FILES, tables, strict=True):
         if not rows:

@@ -3,7 +3,7 @@
 `expectation` is the readable form and serves any models.  `linearize` is how the filter's kernels ask for it: plain
 Python for a model written in Python, the compiled twin below for the built-in ones.  Both are tested to be equal.
 The head is the robot's pose or, for a mount in the map, the pose and the mount, and behind it the parameters that the
-sensor has in the map: gain and offset of its range.
+sensor has in the map, gain and offset of its range.  Sensors of the robot itself have their own: `state_view.py`.
 
 Motions have their seam at the end: a built-in one is compiled and called by its address, a user's is run in Python.
 """
@@ -27,18 +27,19 @@ from kalmark.models.landmarks3d import chained
 from kalmark.models.protocols import (
     Completing,
     FullSensor,
-    HasVelocity,
     Landmark,
     Motion,
     Parametrized,
     Sensor,
     finds_depth,
+    parameter_covariance,
 )
-from kalmark.models.seen import EXPECT, LOOK, residual
+from kalmark.models.seen import EXPECT, LOOK, VARY, residual
 
-View = tuple[int, int, int, int, Array, Array, Flags]
-# addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles
-VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
+View = tuple[int, int, int, int, Array, Array, Flags, int]
+# addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles;
+# address of the sensor's `varied`, 0 where its parameters are known
+VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1], i8))"
 LINEARIZE = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
@@ -127,11 +128,15 @@ def fix_view(antenna: Array) -> View:
 
 
 def built_in_view(
-    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: Flags
-) -> View:  # fmt: skip
-    """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,)."""
+    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: Flags, varied: Any = None
+) -> View:
+    """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,).
+
+    `varied` is that of a sensor with parameters in the map.
+    """
     linearize_at = address_of(linearize_in_plane if len(mount) == 3 else linearize_in_space, LINEARIZE)
-    return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular
+    vary_at = 0 if varied is None else address_of(varied, VARY)
+    return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular, vary_at
 
 
 def is_built_in(sensor: Any, landmark: Any) -> bool:
@@ -144,7 +149,8 @@ def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
     angular = np.array(sensor.angular, dtype=np.bool_)
     if is_built_in(sensor, landmark):
         par = np.array(sensor.parameters if isinstance(sensor, Parametrized) else NOTHING, dtype=np.float64)
-        return built_in_view(landmark.look, type(sensor).expected, int(sensor.code), mount, par, angular)
+        varied = None if parameter_covariance(sensor) is None else type(sensor).varied
+        return built_in_view(landmark.look, type(sensor).expected, int(sensor.code), mount, par, angular, varied)
     return PythonView(sensor, landmark, mount, angular)
 
 
@@ -231,7 +237,7 @@ def _linearized(
     view: View, head: Array, T: Array, T_r: Array, T_s: Array, l: Array, y: Array
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     """Apply the chain rule from the sensor's pose T on, T_r and T_s being its Jacobians."""
-    _, look_at, expect_at, code, at, par, angular = view
+    _, look_at, expect_at, code, at, par, angular, vary_at = view
     pose = len(at)
     if len(head) > 2 * pose:
         par = head[2 * pose :].copy()
@@ -247,14 +253,24 @@ def _linearized(
             for b in range(n):
                 for c in range(n):
                     E_h[i, a, n + c] += E_T[i, a, b] * T_s[b, c]
-        if len(head) > 2 * pose:  # gain and offset of the range, the first number
-            E_h[i, 0, 2 * n], E_h[i, 0, 2 * n + 1] = -e[i, 0] / par[0], 1.0 / par[0]
     turned(E_T, T_r)
     for i in range(k):
         for a in range(p):
             for c in range(n):
                 E_h[i, a, c] = E_T[i, a, c]
+    if len(head) > 2 * pose:
+        beside(E_h, seen.vary(vary_at, (code, par, angular, v, e)))
     return e, z, E_h, E_l
+
+
+@compiled
+def beside(E_h: Array, E_p: Array) -> None:
+    """Write E_p (K, p, c) into the last columns of E_h (K, p, h)."""
+    k, p, c = E_p.shape
+    for i in range(k):
+        for a in range(p):
+            for b in range(c):
+                E_h[i, a, E_h.shape[2] - c + b] = E_p[i, a, b]
 
 
 @compiled
@@ -312,23 +328,4 @@ def step(model: Any, r: Array, u: Array, dt_s: float) -> tuple[Array, Array, Arr
 def _compiled_step(model: Any, r: Any, u: Any, dt_s: Any) -> Any:
     if isinstance(model, types.BaseTuple):
         return lambda model, r, u, dt_s: call_move(model[0], (r, u, model[1], dt_s))
-    return None
-
-
-def velocity_of(motion: HasVelocity) -> Any:
-    """Return the argument of `body_velocity`: address and parameters of a built-in motion, else the motion."""
-    if type(motion) in built_in("motion") and isinstance(motion, CompiledVelocity):
-        return address_of(type(motion).velocity, VELOCITY), motion.parameters
-    return motion
-
-
-def body_velocity(model: Any, r: Array) -> tuple[Array, Array]:
-    """Return the velocity of a state r (size,) in the robot's frame (3 or 6,), and its Jacobian (3 or 6, dof)."""
-    return call_velocity(model[0], (r, model[1])) if isinstance(model, tuple) else model.body_velocity(r)
-
-
-@overload(body_velocity, strict=False)  # type: ignore[untyped-decorator]  # strict: the annotations differ
-def _compiled_velocity(model: Any, r: Any) -> Any:
-    if isinstance(model, types.BaseTuple):
-        return lambda model, r: call_velocity(model[0], (r, model[1]))
     return None

@@ -196,6 +196,11 @@ class HasVelocity(Protocol):
 
 
 @runtime_checkable
+class _NamesParameters(Protocol):
+    parameter_names: tuple[str, ...]
+
+
+@runtime_checkable
 class _InnovationSize(Protocol):
     cov_size: int
 
@@ -263,6 +268,14 @@ def parameter_covariance(sensor: object) -> Array | None:
     return sensor.parameter_cov if isinstance(sensor, Calibrated) else None
 
 
+def parameter_names(sensor: object) -> tuple[str, ...]:
+    """Return the names of a sensor's own parameters that are in the map; by default numbers."""
+    if isinstance(sensor, _NamesParameters):
+        return sensor.parameter_names
+    cov = parameter_covariance(sensor)
+    return () if cov is None else tuple(f"constant {k}" for k in range(1, len(cov) + 1))
+
+
 def innovation_size(sensor: Sensor) -> int:
     """Return how many numbers an innovation has; by default as many as the measurement."""
     return sensor.cov_size if isinstance(sensor, _InnovationSize) else len(sensor.columns)
@@ -307,6 +320,34 @@ class Calibrated(Parametrized, Protocol):
 
     def parameters_jacobian(self, v: Array) -> Array:
         """Return E_p (K, m, p): how the measurements of v (K, d) change with the parameters."""
+
+
+POSE, CHANGE, TWIST = "pose", "change", "twist"  # the views of a sensor of the state, see `models/state_view.py`
+
+
+@runtime_checkable
+class OfState(Sensor, Protocol):
+    """A sensor that measures its own robot: `views` is POSE, CHANGE or TWIST."""
+
+    views: str
+    pass_share: float
+    """The share of good readings that pass its gate."""
+
+
+@runtime_checkable
+class TimedNoise(Protocol):
+    """A sensor of the state whose noise depends on how long a reading means."""
+
+    def noise_since(self, dt_s: float) -> Array:
+        """Return the noise R (1, p, p) of a reading that means the last `dt_s` seconds."""
+
+
+@runtime_checkable
+class Drifting(Protocol):
+    """A sensor whose parameters walk at random."""
+
+    def drift(self, dt_s: float) -> Array:
+        """Return the variances (p,) that its parameters gather in `dt_s`."""
 
 
 @runtime_checkable
@@ -460,8 +501,8 @@ _OF: dict[type, tuple[type, ...]] = {
     ),
     Sensor: (
         FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
-        _InnovationSize, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous, FarCorrected, OwnNoise,
-        StartNoise, Checked,
+        _InnovationSize, _NamesParameters, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous,
+        FarCorrected, OwnNoise, StartNoise, Checked, OfState, TimedNoise, Drifting,
     ),
     Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Joining, Placed),
 }  # fmt: skip

@@ -29,7 +29,9 @@ from kalmark.models import cameras, landmarks3d, lines, tags
 LOOK = signature_of("Tuple((f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))(f8[::1], f8[:, ::1])")
 # of the sensor's code, parameters and angles, views v and measurements y (K, m): e (K, m), innovations z (K, p), E_v
 EXPECT = signature_of("Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1]))(i8, f8[::1], b1[::1], f8[:, ::1], f8[:, ::1])")
-look, expect = by_address(LOOK), by_address(EXPECT)
+# of the same, with what is expected: how the expectations change with the sensor's parameters, E_p (K, p, c)
+VARY = signature_of("f8[:, :, ::1](i8, f8[::1], b1[::1], f8[:, ::1], f8[:, ::1])")
+look, expect, vary = by_address(LOOK), by_address(EXPECT), by_address(VARY)
 
 
 # ------------------------------------------------------------------ landmarks

@@ -21,10 +21,30 @@ from kalmark.geometry.directions import inv_spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import cameras, lines, seen, tags, walls
+from kalmark.models.state_sensors import (
+    AbsolutePose2D,
+    AbsolutePose3D,
+    BodyVelocity2D,
+    BodyVelocity3D,
+    Gps2D,
+    Gps3D,
+    Gravity,
+    GroundSpeed,
+    Gyro2D,
+    Gyro3D,
+    Heading,
+    Height,
+    Inclination,
+    Odometer2D,
+    Odometer3D,
+    Speed,
+)
 
 __all__ = [
-    "Bearing", "Omnidirectional", "PinHole", "Position2D", "Position3D", "Range", "RangeBearing", "RangeBearing3D",
-    "RangeBearingSignature", "Segments", "Stereo", "TagCorners", "TagPose", "Wall",
+    "AbsolutePose2D", "AbsolutePose3D", "Bearing", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity",
+    "GroundSpeed", "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D",
+    "Omnidirectional", "PinHole", "Position2D", "Position3D", "Range", "RangeBearing", "RangeBearing3D",
+    "RangeBearingSignature", "Segments", "Speed", "Stereo", "TagCorners", "TagPose", "Wall",
 ]  # fmt: skip
 
 TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed
@@ -39,8 +59,8 @@ RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE = range(1, 6)  
 # parameters that several sensors have
 BearingNoise = Annotated[Positive, "Noise of the bearing."]
 PixelNoise = Annotated[Positive, "Noise of each pixel coordinate."]
-Width = Annotated[Positive, "Width of the image."]
-Height = Annotated[Positive, "Height of the image."]
+ImageWidth = Annotated[Positive, "Width of the image."]
+ImageHeight = Annotated[Positive, "Height of the image."]
 Numbers = Annotated[tuple[float, ...], Within()]
 
 
@@ -95,6 +115,15 @@ def in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple
             for j in range(E_v.shape[2]):
                 E_v[i, 0, j] /= par[0]
     return e, seen.residual(y, e, angular), E_v
+
+
+@compiled
+def by_gain_and_offset(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+    """Return E_p (K, m, 2): how measurements e (K, m), the first a range, change with its gain and offset."""
+    E_p = np.zeros((len(e), e.shape[1], 2))
+    for i in range(len(e)):
+        E_p[i, 0, 0], E_p[i, 0, 1] = -e[i, 0] / par[0], 1.0 / par[0]
+    return E_p
 
 
 class _Sensor:
@@ -162,6 +191,9 @@ class _Ranging(_Planar):
     def __post_init__(self) -> None:
         if not (self.sigma_range_m or self.sigma_range_rel):
             raise refuse(self, "sigma_range_m", "a positive number")
+
+    varied: ClassVar[Any] = by_gain_and_offset
+    parameter_names: ClassVar[tuple[str, ...]] = ("gain", "offset")
 
     @property
     def parameters(self) -> Array:
@@ -521,8 +553,8 @@ class _PinHole(_Camera):
     fy_px: Annotated[Positive, "Focal length, down."] = 320.0
     cx_px: Annotated[Number, "Principal point, from the left."] = 320.0
     cy_px: Annotated[Number, "Principal point, from above."] = 240.0
-    width_px: Width = 640
-    height_px: Height = 480
+    width_px: ImageWidth = 640
+    height_px: ImageHeight = 480
 
     @cached_property
     def intrinsics(self) -> Array:
@@ -590,8 +622,8 @@ class Omnidirectional(_Camera):
     back_projection: Annotated[
         Numbers, "Polynomial from the distance from the centre to the ray's height, lowest power first."
     ] = FISHEYE_BACK
-    width_px: Width = 1280
-    height_px: Height = 800
+    width_px: ImageWidth = 1280
+    height_px: ImageHeight = 800
     sigma_px: PixelNoise = 1.0
 
     def __post_init__(self) -> None:
@@ -747,4 +779,4 @@ class TagCorners(_Lens):
                 raise EventError(f"observation {i}: size_m is {size}, expected a positive length")
 
 
-BUILT_IN = built_in("sensor")
+BUILT_IN = built_in("sensor")  # those of landmarks and, by their import, those of the state

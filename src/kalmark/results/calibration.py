@@ -8,18 +8,19 @@ to a direction that nothing told of.  C^-1/2 is the symmetric root: directions s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.declare import unit_of
 from kalmark.results.history import Biased, Mounted
 from kalmark.results.readings import describe_pose
 from kalmark.results.words import figure
 
-AXES = {3: ("x", "y", "theta"), 5: ("x", "y", "theta", "gain", "offset"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
-UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m", "gain": ""}  # of the others: deg
+AXES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
+UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m"} | dict.fromkeys(("theta", "roll", "pitch", "yaw"), "deg")
 UNOBSERVED = 0.9  # of its prior sigma: so much is left of a direction that counts as not observed
 SINGULAR = 1e-12  # eigenvalues of a prior's correlations that are zero
 NAMED = 0.01  # the least share of an axis in a direction that is named
@@ -50,14 +51,15 @@ class Direction(NamedTuple):
         return ", ".join(f"{axis} {share:.2f}" for axis, share in self.axes.items())
 
 
-def directions(prior: Array, posterior: Array) -> list[Direction]:
+def directions(prior: Array, posterior: Array, constants: Sequence[str] = ()) -> list[Direction]:
     """Return the directions of a mount between a prior and a posterior covariance, the least observed first.
 
-    The covariances are (3, 3) or (6, 6); (5, 5) with gain and offset of a range.
+    The covariances are (3, 3) or (6, 6), and more with the `constants` of the sensor behind.
     Axes that the prior knows exactly are left out.  Turns are about the axes of the robot.
     """
     open_ = np.flatnonzero(np.diagonal(prior) > 0)
-    names = [AXES[len(prior)][i] for i in open_]
+    axes_of = (*AXES[len(prior) - len(constants)], *constants)
+    names = [axes_of[i] for i in open_]
     sigma = np.sqrt(np.diagonal(prior)[open_])
     C, P = (cov[np.ix_(open_, open_)] / np.outer(sigma, sigma) for cov in (prior, posterior))
     values, vectors = np.linalg.eigh(C)
@@ -69,7 +71,7 @@ def directions(prior: Array, posterior: Array) -> list[Direction]:
     for ratio, shares in zip(ratios[::-1].tolist(), axes.T[::-1] ** 2, strict=True):
         order = np.argsort(-shares, kind="stable").tolist()
         first, named = order[0], {names[i]: float(shares[i]) for i in order if shares[i] >= NAMED}
-        unit = UNITS.get(names[first], "deg")
+        unit = UNITS.get(names[first], unit_of(names[first]))
         before = float(np.degrees(sigma[first]) if unit == "deg" else sigma[first])
         found.append(Direction(named, math.sqrt(max(ratio, 0.0)) * before, before, unit))
     return found
@@ -77,16 +79,16 @@ def directions(prior: Array, posterior: Array) -> list[Direction]:
 
 def mount_figures(mount: Mounted) -> dict[str, Any]:
     """Return where the filter believes a sensor to sit that calibrates itself, how far that is known, what was seen."""
-    d, pose, dof = (3, 7, 6) if len(mount.mean) == 7 else (2, 3, 3)
+    d, pose, dof = (3, 7, 6) if len(mount.mean) - len(mount.constants) == 7 else (2, 3, 3)
     sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
     found = [
         {"direction": str(each), "sigma": each.sigma, "prior_sigma": each.prior, "unit": each.unit, "ratio": each.ratio}
-        for each in directions(mount.prior, mount.covariance)
+        for each in directions(mount.prior, mount.covariance, mount.constants)
     ]
     return describe_pose(mount.mean[:pose]) | {
         "sigma_position_m": float(sigma[:d].max()),
         "sigma_rotation_deg": math.degrees(sigma[d:dof].max()),
-        **_range_figures(mount.mean[pose:], mount.covariance[dof:, dof:]),
+        **_constant_figures(mount.constants, mount.mean[pose:], mount.covariance[dof:, dof:]),
         "directions": found,
     }
 
@@ -98,14 +100,15 @@ def bias_figures(bias: Biased) -> dict[str, float]:
     return found | {f"sigma_{column}": sigma for column, sigma in zip(bias.columns, sigmas, strict=True)}
 
 
-def _range_figures(parameters: Array, P: Array) -> dict[str, float]:
-    """Return scale and bias of a range by its gain and offset (2,), nothing for those of a sensor that has none."""
-    if len(parameters) != 2:
-        return {}
-    gain, offset = parameters.tolist()
-    J = np.array([[-1.0 / gain, 0.0], [-offset / gain, 1.0]]) / gain
-    sigma = np.sqrt(np.diagonal(J @ P @ J.T)).tolist()
-    return {"scale": 1.0 / gain, "bias_m": offset / gain, "sigma_scale": sigma[0], "sigma_bias_m": sigma[1]}
+def _constant_figures(names: Sequence[str], values: Array, P: Array) -> dict[str, float]:
+    """Return a sensor's constants with their sigmas: scale and bias for a gain and an offset, others as named."""
+    found, J = dict(zip(names, values.tolist(), strict=True)), np.eye(len(names))
+    if "gain" in found:
+        gain, offset = found.pop("gain"), found.pop("offset", None)
+        J = np.array([[-1.0 / gain, 0.0], [-(offset or 0.0) / gain, 1.0]])[: len(names), : len(names)] / gain
+        found = {"scale": 1.0 / gain} | ({} if offset is None else {"bias_m": offset / gain})
+    sigmas = np.sqrt(np.maximum(np.diagonal(J @ P @ J.T), 0.0)).tolist()
+    return found | {f"sigma_{name}": sigma for name, sigma in zip(found, sigmas, strict=True)}
 
 
 def _found(summary: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str, str]]:

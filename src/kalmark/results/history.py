@@ -111,14 +111,15 @@ class Measuring(NamedTuple):
 class Mounted(NamedTuple):
     """A sensor that calibrates itself: its name in the map, and its mount (3,) or (7,) at the end.
 
-    `covariance` at the end and `prior`, that before the first event, (3, 3) or (6, 6), are in the robot's frame.  Gain
-    and offset of its range follow where they are in the map, too.
+    `covariance` at the end and `prior`, that before the first event, (3, 3) or (6, 6), are in the robot's frame.  The
+    `constants` of the sensor itself follow where they are in the map, too.
     """
 
     name: str
     mean: Vector
     covariance: Matrix
     prior: Matrix
+    constants: Names = ()
 
 
 class Biased(NamedTuple):

@@ -15,7 +15,7 @@ from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import to_euler
 from kalmark.logs import FORMATS
 from kalmark.logs.log import Log
-from kalmark.models.protocols import calibrating, state_columns
+from kalmark.models.protocols import calibrating, parameter_names, state_columns
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import Biased, Camera, Measuring, Mounted
@@ -175,15 +175,11 @@ def sensors(slam: Slam) -> tuple[Measuring, ...]:
 
 def mounts(slam: Slam) -> tuple[Mounted, ...]:
     """Return the mounts of the sensors that calibrate themselves, as estimated and as given."""
-    named = {
-        f"{robot.name}.{key}": mount.block(key)
-        for robot in slam.robots.values()
-        for key, mount in robot.sensors.items()
-    }
+    named = {f"{robot.name}.{key}": mount for robot in slam.robots.values() for key, mount in robot.sensors.items()}
     return tuple(
-        Mounted(name, slam.mean(name), slam.covariance(name), block[2])
-        for name, block in named.items()
-        if block is not None and _in_map(slam, name)
+        Mounted(name, mean, slam.covariance(name), block[2], parameter_names(mount.sensor)[: len(mean) - len(mount.at)])
+        for name, mount in named.items()
+        if (block := mount.block(name)) is not None and _in_map(slam, name) and len(mean := slam.mean(name))
     )
 
 

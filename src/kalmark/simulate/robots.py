@@ -26,6 +26,10 @@ from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.models.observe import composed
 from kalmark.models.protocols import (
+    POSE,
+    Drifting,
+    OfState,
+    TimedNoise,
     calibrating,
     coasts,
     diffusion_of,
@@ -33,6 +37,7 @@ from kalmark.models.protocols import (
     range_limit,
     true_control,
 )
+from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.simulate import laser, sights
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
@@ -41,6 +46,7 @@ from kalmark.slam.robot import Mount, Robot
 
 Key = tuple[int, str, str]
 ROUNDS = 10  # of a fixed point: a constant changes a control by some percent
+WILD = 30.0  # by so many of its own errors an outlier of a sensor of the state is off
 
 
 @dataclass
@@ -51,6 +57,7 @@ class SimSensor:
     at: Array
     sensing: Sensing
     laser: Laser | None = None
+    last: tuple[int, Array] | None = None  # step and robot's pose of the last reading of a sensor of the state
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -190,8 +197,11 @@ def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
     at = np.array(mount.at)
     if mount.cov is not None:
         at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(mount.cov, rng))
-    if parameter_covariance(sensor) is None:
+    cov = parameter_covariance(sensor)
+    if cov is None:
         return sensor, at
+    if isinstance(sensor, OfState):
+        return sensor.with_parameters(sensor.parameters + gaussian(cov, rng)), at  # type: ignore[attr-defined]
     scale, bias_m = rng.normal([sensor.scale, sensor.bias_m], [sensor.sigma_scale, sensor.sigma_bias_m]).tolist()
     return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0), at
 
@@ -255,6 +265,11 @@ def scans(
                 scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y)
                 found.append((scan, (None,) * len(y)))
             continue
+        if isinstance(carried.sensor, OfState):
+            read = reading(robot, carried, k, world.dt_s, chance)
+            if read is not None:
+                found.append((Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=read), (robot.name,)))
+            continue
         sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
         sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight)
@@ -266,6 +281,28 @@ def scans(
             scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=told)
             found.append((scan, tuple(real[i] for i in kept)))
     return found
+
+
+def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Chance) -> Array | None:
+    """Return what a sensor of the state reads at step k (1, m); None of the first one that counts from the last.
+
+    Its constants walk at random.  A twist that is not in the robot's state is the mean since the last reading.
+    """
+    of, at = carried.sensor, carried.at
+    before, k_before = (robot.states[0][: len(robot.pose)], 0) if carried.last is None else carried.last[::-1]
+    since_s, first, carried.last = (k - k_before) * dt_s, carried.last is None, (k, robot.pose.copy())
+    if isinstance(of, Drifting) and (Q := of.drift(since_s)).any():
+        of = carried.sensor = of.with_parameters(of.parameters + chance.sight.normal(0.0, np.sqrt(Q)))  # type: ignore[attr-defined]
+    counts = of.views != POSE and not sees_state(of, robot.motion)
+    v = view_of_state(of, robot.motion, at, robot.state, np.array(before), since_s)
+    e, wild = of.expect(v[None])[0], chance.faults.uniform(size=2)
+    R = of.noise_since(since_s)[0] if counts and isinstance(of, TimedNoise) else of.noise(e)[0]
+    error = gaussian(R, chance.sight) * (WILD if wild[0] < carried.sensing.outliers else 1.0)
+    if (counts and first) or wild[1] < (carried.sensing.dropouts or 0.0):
+        return None
+    if len(error) == len(e[0]):
+        return np.asarray(e + error)
+    return SE3.plus(e[0], error)[None]  # a pose of space has more numbers than errors
 
 
 def seen_by(sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator) -> Sighted:

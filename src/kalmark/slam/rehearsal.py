@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +11,9 @@ from kalmark.arrays import Array
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import frames, frames3d
 from kalmark.models.check import views
-from kalmark.models.protocols import SegmentVisible, image_size
+from kalmark.models.protocols import TWIST, OfState, SegmentVisible, image_size
 from kalmark.models.sensors import Spatial
-from kalmark.slam.robot import Mount, Robot
+from kalmark.slam.robot import IDENTITY, Mount, Robot
 
 ROUNDS = 12  # of a control and scans: enough for whatever waits for several
 SEEN = 3  # observations in a scan
@@ -27,12 +28,18 @@ def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Ite
     `pose` gives where a robot's sensor, both by name, is when it is asked, (3,) or (7,).
     """
     robots, t_s = list(robots), 0.0
-    scenes = {(r.name, name): _Scene(mount, pose(r.name, name)) for r in robots for name, mount in r.sensors.items()}
+    mounts = {(robot.name, name): mount for robot in robots for name, mount in robot.sensors.items()}
+    readings = {key: _reading(m.sensor, len(m.at)) for key, m in mounts.items() if isinstance(m.sensor, OfState)}
+    scenes = {key: _Scene(mount, pose(*key)) for key, mount in mounts.items() if key not in readings}
     for k in range(ROUNDS):
         for robot in robots:
             t_s += STEP_S
             yield Control(t_s, robot.name, np.full(len(robot.motion.columns), MOVING))
             for name in robot.sensors:
+                if (robot.name, name) in readings:
+                    t_s += STEP_S
+                    yield Scan(t_s, robot.name, name, readings[robot.name, name])
+                    continue
                 y = scenes[robot.name, name].measured(pose(robot.name, name))
                 for ids in ([f"{name} {i}" for i in range(len(y))], None):
                     t_s += STEP_S
@@ -40,6 +47,12 @@ def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Ite
             if k == ROUNDS - 2:
                 size = 2 if robot.motion.space.axes == 1 else 3
                 yield Fix(t_s, robot.name, np.asarray(robot.start)[:size], np.eye(size))
+
+
+def _reading(sensor: Any, pose: int) -> Array:
+    """Return what a sensor of the state reads of a robot that stands at the origin; a pose has 3 or 7 numbers."""
+    still = np.zeros((1, 3 if pose == 3 else 6))
+    return np.asarray(sensor.expect(still if sensor.views == TWIST else np.array([IDENTITY[pose]]))[0])
 
 
 class _Scene:

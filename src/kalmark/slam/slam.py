@@ -43,7 +43,7 @@ from kalmark.management.pending import Initialization, Step
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.observe import fix_view
-from kalmark.models.protocols import Joining, Landmark, Reparametrizable, Segmented, place_of
+from kalmark.models.protocols import Joining, Landmark, OfState, Reparametrizable, Segmented, place_of, world_of
 from kalmark.report import (
     INDEFINITE,
     Expectations,
@@ -67,6 +67,7 @@ from kalmark.slam.checks import (
 )
 from kalmark.slam.motion import HeldInput, Moving, Part, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
+from kalmark.slam.reader import Reader
 from kalmark.slam.robot import Robot, mount_name, robots_given
 from kalmark.tracks.channel import Channel, ObservationModel, Parts
 from kalmark.tracks.clones import Clones
@@ -122,6 +123,7 @@ class Slam:
         self._moving: dict[str, Moving] = {}
         self._channels: dict[ChannelKey, Channel] = {}
         self._policies: dict[ChannelKey, Policy] = {}
+        self._readers: dict[ChannelKey, Reader] = {}
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
         self._inner = {bias_name(name) for name in self.robots}
         self._inner |= {mount_name(name, key) for name, robot in self.robots.items() for key in robot.sensors}
@@ -150,6 +152,10 @@ class Slam:
             if block is not None:  # the mount calibrates itself
                 mount_slot = self.map.add(*block)
                 self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
+            if isinstance(mount.sensor, OfState):
+                refuse_other_world(self.robots, type(mount.sensor).__name__, world_of(mount.sensor))
+                self._readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot)
+                continue
             association = mount.association or self.association
             channel = channel_of(self.robots, mount, mount_slot, self.landmark_type, association, self.estimator)
             self._channels[robot.name, name] = channel
@@ -202,6 +208,8 @@ class Slam:
 
     def _scan(self, event: Scan) -> Report:
         key = event.robot, event.sensor
+        if key in self._readers:
+            return self._read(event, self._readers[key])
         if key not in self._channels:
             names = sorted(self.robots[event.robot].sensors)
             raise EventError(f"{when(event)}: sensor is {event.sensor!r}, expected one of {names}")
@@ -229,6 +237,34 @@ class Slam:
             if gaps and any(o.outcome == "associated" for o in report.observations):
                 self._moving[event.robot].held.located(event.t_ns)
         self._maintain(scan, policy)
+        return report
+
+    def _read(self, event: Scan, reader: Reader) -> Report:
+        """Correct by what a sensor measures of its own robot; leave a clone where its next reading counts from here."""
+        key, robot, since_s = (event.robot, event.sensor), self._moving[event.robot].slot, reader.since_s(event)
+        R, report = reader.noise(event), Report(event, event.y)
+        self.t_ns = event.t_ns
+        report.gaps = self._advance(event.robot)
+        if not len(event.y):
+            return report
+        reader.drift(self.map, since_s)
+        reader.t_ns, held = event.t_ns, self.clones.of(key)
+        if reader.counts and not held:
+            report.blank(R.shape[1])
+            report.observations = (
+                Observation(0, None, "ignored", None, None, "the first reading: none to count from"),
+            )
+        else:
+            update = reader.update(self.map, robot, self.clones[held[-1]] if held else -1, event, R, since_s)
+            done = self._corrected(update, event, reader.estimator(self.estimator))
+            done = done._replace(e=done.e[:, : event.width])
+            report.e, report.z, report.Z = done.e, done.z, done.Z
+            report.judged = (Judged([0], [None], [event.robot], done, reader.gate),)
+        if reader.counts:
+            with suppress(MapError):  # it is full: the next reading is the first again
+                self._clone(key, event.t_ns)
+            for slot in self.clones.refer(key, set(self.clones.of(key)) - set(held)):
+                self.map.remove(slot)
         return report
 
     def _fix(self, event: Fix) -> Report:
@@ -549,7 +585,10 @@ class Slam:
         if step.added:
             pending = replace(pending, hypotheses=tuple(self._add_all(step.added)))
         if step.keep:
-            pending = replace(pending, measurements=(*pending.measurements, scan.measurement(k, self._clone(scan))))
+            pending = replace(
+                pending,
+                measurements=(*pending.measurements, scan.measurement(k, self._clone(scan.key, scan.event.t_ns))),
+            )
         if step.start is not None:
             track.slot, track.size_m = self._add(step.start), scan.size_of(k)
             track.pending = None
@@ -575,7 +614,7 @@ class Slam:
         if not delayed.has_moved(scan, held[-1] if held else None, way):
             return [Observation(k, i, "deferred", None, None, "until the robot has moved on") for k, i in ids.items()]
         try:
-            clone = self._clone(scan)
+            clone = self._clone(scan.key, scan.event.t_ns)
         except MapError as full:
             return [Observation(k, i, "ignored", None, None, str(full)) for k, i in ids.items()]
         made = {k: scan.measurement(k, clone) for k in ids}
@@ -679,7 +718,7 @@ class Slam:
             track.measurements = mine
         self._release(scan.key)
         try:
-            clone = self._clone(scan)
+            clone = self._clone(scan.key, scan.event.t_ns)
         except MapError:  # it is full: these measurements are lost
             return
         for k, track in waiting.items():
@@ -725,15 +764,15 @@ class Slam:
             raise
         return slots
 
-    def _clone(self, scan: ScanContext) -> int:
-        """Clone the pose from which a scan was made; return its number.  Raises MapError where the map is full."""
-        event, dof = scan.event, scan.channel.pose_dof
-        number = self.clones.now(event.robot, event.t_ns)
+    def _clone(self, key: ChannelKey, t_ns: int) -> int:
+        """Clone the pose of a channel's robot; return the clone's number.  Raises MapError where the map is full."""
+        number = self.clones.now(key[0], t_ns)
         if number is None:
-            mean, index = self.map.mean(scan.robot)[: len(scan.channel.at)], self.map.index(scan.robot)[:dof]
-            slot = self.map.augment(SE2 if dof == 3 else SE3, mean, index, np.eye(dof), np.zeros((dof, dof)))
-            number = self.clones.enter(slot, event.robot, event.t_ns)
-        self.clones.clones[number].users.add(scan.key)
+            robot, space = self._moving[key[0]].slot, SE2 if self.robots[key[0]].motion.space.axes == 1 else SE3
+            mean, index, dof = self.map.mean(robot)[: space.size], self.map.index(robot)[: space.dof], space.dof
+            slot = self.map.augment(space, mean, index, np.eye(dof), np.zeros((dof, dof)))
+            number = self.clones.enter(slot, key[0], t_ns)
+        self.clones.clones[number].users.add(key)
         return number
 
     def _release(self, key: ChannelKey) -> None:
@@ -741,7 +780,7 @@ class Slam:
         used = {m.clone for track in self.tracks.tentative.values() for m in track.measurements
                 if (m.robot, m.sensor) == key}  # fmt: skip
         used |= {m.clone for pending in self.tracks.waiting() if pending.channel == key for m in pending.measurements}
-        if self._policies[key].delayed is not None:
+        if key in self._readers or self._policies[key].delayed is not None:
             used.update(self.clones.of(key)[-1:])
         for slot in self.clones.refer(key, used):
             self.map.remove(slot)
@@ -1106,7 +1145,12 @@ class Slam:
                 twin.map.finish()
 
     def _sensor_pose(self, robot: str, sensor: str) -> Array:
-        return self._channels[robot, sensor].pose(self.map, self._moving[robot].slot)
+        channel = self._channels.get((robot, sensor))
+        return (
+            self.map.mean(self._moving[robot].slot)
+            if channel is None
+            else channel.pose(self.map, self._moving[robot].slot)
+        )
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:
@@ -1117,7 +1161,8 @@ class Slam:
             self.robots, self.association, self.estimator, self.landmark_type, self.upkeep, self.reparametrize,
             self.map_type, self.numbers,
         )  # fmt: skip
-        state.save(Path(path), settings, state.State(self.t_ns, self.map, self.tracks, self.clones, self._moving))
+        events = state.State(self.t_ns, self.map, self.tracks, self.clones, self._moving, self._readers)
+        state.save(Path(path), settings, events)
 
     @staticmethod
     def load(
@@ -1134,9 +1179,10 @@ class Slam:
         with saved.errors():
             slam = Slam(**saved.settings)
             of_channels = [channel.landmark for channel in slam._channels.values()]
-            found = saved.state(slam.robots, slam._moving, of_channels)
+            found = saved.state(slam.robots, slam._moving, slam._readers, of_channels)
         slam.t_ns, slam.map, slam.tracks, slam.clones = found.t_ns, found.map, found.tracks, found.clones
-        for key, channel in slam._channels.items():
+        carried: dict[ChannelKey, Channel | Reader] = {**slam._channels, **slam._readers}
+        for key, channel in carried.items():
             channel.mount = slam.tracks.slots.get(mount_name(*key), -1)
         return slam
 

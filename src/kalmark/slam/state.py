@@ -43,9 +43,10 @@ from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark
 from kalmark.slam.gaps import Gaps
 from kalmark.slam.motion import Moving, bias_block, bias_name
+from kalmark.slam.reader import Reader
 from kalmark.slam.robot import Mount, Robot, mount_name
 from kalmark.tracks.clones import Clone, Clones, Measurement
-from kalmark.tracks.track import Pending, Status, Track, Tracks
+from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
@@ -73,6 +74,7 @@ class State(NamedTuple):
     tracks: Tracks
     clones: Clones
     moving: dict[str, Moving]
+    readers: dict[ChannelKey, Reader]
 
 
 def settings(
@@ -134,6 +136,7 @@ def _state(state: State) -> Description:
             name: [m.error, *(getattr(m.held, key) for key in OF_MOVING), _watched(m.held.gaps)]
             for name, m in state.moving.items()
         },
+        "readers": [[*key, reader.t_ns] for key, reader in state.readers.items()],
     }
 
 
@@ -207,16 +210,20 @@ class Saved:
             said = " ".join(str(error).split())
             raise MapError(f"{self.path}: {type(error).__name__}: {said}, expected a map written by save()") from error
 
-    def state(self, robots: Mapping[str, Robot], moving: dict[str, Moving], own: Sequence[Landmark]) -> State:
+    def state(
+        self, robots: Mapping[str, Robot], moving: dict[str, Moving], readers: dict[ChannelKey, Reader],
+        own: Sequence[Landmark],
+    ) -> State:  # fmt: skip
         """Return the state, `own` being the landmark models of the user's that it may have.
 
-        `moving` are the robots as they are after construction.  Raises MapError if the parts do not fit together.
+        `moving` are the robots, `readers` the sensors of their states, as they are after construction.  Raises
+        MapError if the parts do not fit together.
         """
         s, given = self._state, [*own]
         if self._landmarks is not None:
             given.append(self._landmarks)
         map_ = restored_map(s["map"], partial(_array, self._members))
-        state = State(_time(s["t_ns"]), map_, Tracks(robots), Clones(), moving)
+        state = State(_time(s["t_ns"]), map_, Tracks(robots), Clones(), moving, readers)
         tracks, clones = state.tracks, state.clones
         for name, slot in s["blocks"]:
             tracks.enter_block(name, slot, robot=name in robots)
@@ -245,6 +252,8 @@ class Saved:
                 m.held.u, m.held.N = _array(self._members, f"u{i}", (k,)), _array(self._members, f"N{i}", (k, k))
             if m.held.gaps is not None:
                 m.held.gaps.restore(_watching(watched, k))
+        for robot, sensor, t_ns in s["readers"]:
+            readers[robot, sensor].t_ns = _time(t_ns)
         _check_owners(robots, state)
         _check_measurements(robots, state)
         return state

@@ -1,0 +1,558 @@
+"""Sensors that measure their own robot: its pose, its velocity, or how it moved since their last reading.
+
+Each makes one reading at a time.  What it sees is a `view` of the state (`models/state_view.py`).  A reading outside
+the gate that `pass_share` of good readings pass is left out.  Constants of a sensor with a sigma, or with a random
+walk, are in the map and are estimated (docs/state_sensors.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import KW_ONLY, replace
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags
+from kalmark.compiled import compiled
+from kalmark.declare import NotNegative, Number, Positive, Probability, declared, refuse, register
+from kalmark.errors import EventError
+from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
+from kalmark.models import seen
+from kalmark.models.protocols import CHANGE, POSE, TWIST
+from kalmark.models.seen import residual
+
+__all__ = [
+    "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
+    "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D", "Speed",
+]  # fmt: skip
+
+STILL_MPS = 1e-6  # a ground speed below which its direction means nothing
+STANDARD_GRAVITY = 9.80665  # m/s^2
+
+
+# ------------------------------------------------------------------ what is expected: e, z and E_v of one reading
+@compiled
+def heading(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the heading of a pose v (1, 3) or (1, 7), of the sensor's x axis, less the declination `par`."""
+    if v.shape[1] == 3:
+        e, E_v = np.array([[v[0, 2] - par[0]]]), np.zeros((1, 1, 3))
+        E_v[0, 0, 2] = 1.0
+    else:
+        Q, E_v = matrix(v[0, 3:].copy()), np.zeros((1, 1, 6))
+        e = np.array([[math.atan2(Q[1, 0], Q[0, 0]) - par[0]]])
+        steep = Q[2, 0] / (Q[0, 0] ** 2 + Q[1, 0] ** 2)
+        E_v[0, 0, 3], E_v[0, 0, 4], E_v[0, 0, 5] = -Q[0, 0] * steep, -Q[1, 0] * steep, 1.0
+    return e, residual(y, e, angular), E_v
+
+
+@compiled
+def place(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the position of a pose v (1, 3) or (1, 7)."""
+    d = y.shape[1]
+    e, E_v = v[:, :d].copy(), np.zeros((1, d, 3 if v.shape[1] == 3 else 6))
+    for i in range(d):
+        E_v[0, i, i] = 1.0
+    return e, y - e, E_v
+
+
+@compiled
+def pose_in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect a pose v (1, 3) itself."""
+    E_v = np.zeros((1, 3, 3))
+    E_v[0] = np.eye(3)
+    return v.copy(), residual(y, v, angular), E_v
+
+
+@compiled
+def height(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the height of a pose v (1, 7), with the bias `par`."""
+    e, E_v = np.array([[v[0, 2] + par[0]]]), np.zeros((1, 1, 6))
+    E_v[0, 0, 2] = 1.0
+    return e, y - e, E_v
+
+
+@compiled
+def inclination(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect roll and pitch of a pose v (1, 7)."""
+    euler, E_q = to_euler(v[0, 3:].copy())
+    e, E_v = np.array([[euler[0], euler[1]]]), np.zeros((1, 2, 6))
+    E_v[0, :, 3:] = E_q[:2]
+    return e, residual(y, e, angular), E_v
+
+
+@compiled
+def gravity(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect what an accelerometer at rest measures at a pose v (1, 7): g upwards, `par` = (g, bias (3,))."""
+    R, up = matrix(v[0, 3:].copy()).T.copy(), np.array([0.0, 0.0, par[0]])
+    e, E_v = (R @ up + par[1:]).reshape((1, 3)), np.zeros((1, 3, 6))
+    E_v[0, :, 3:] = R @ skew(up)
+    return e, y - e, E_v
+
+
+@compiled
+def rates(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the turn rates of a twist v (1, 3) or (1, 6), with their biases `par`."""
+    k = len(par)
+    e, E_v = np.empty((1, k)), np.zeros((1, k, v.shape[1]))
+    for i in range(k):
+        at = v.shape[1] - k + i
+        e[0, i], E_v[0, i, at] = v[0, at] + par[i], 1.0
+    return e, y - e, E_v
+
+
+@compiled
+def velocity(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the first numbers of the velocity of a twist v (1, 3) or (1, 6), divided by the gain `par`."""
+    m = y.shape[1]
+    e, E_v = np.empty((1, m)), np.zeros((1, m, v.shape[1]))
+    for i in range(m):
+        e[0, i], E_v[0, i, i] = v[0, i] / par[0], 1.0 / par[0]
+    return e, y - e, E_v
+
+
+@compiled
+def ground_speed(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the speed of a twist v (1, 3) or (1, 6), whatever its direction."""
+    d, square, E_v = 2 if v.shape[1] == 3 else 3, 0.0, np.zeros((1, 1, v.shape[1]))
+    for i in range(d):
+        square += v[0, i] * v[0, i]
+    speed = math.sqrt(square)
+    if speed > STILL_MPS:
+        for i in range(d):
+            E_v[0, 0, i] = v[0, i] / speed
+    e = np.array([[speed]])
+    return e, y - e, E_v
+
+
+@compiled
+def increment(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect a change of pose v (1, 3) or (1, 7), its way divided by the gain `par`, its turn a rotation vector."""
+    m = y.shape[1]
+    d = m // 3 + 1  # 2 numbers of 3 are the way in the plane, 3 of 6 in space
+    e, E_v = np.empty((1, m)), np.zeros((1, m, m))
+    for i in range(d):
+        e[0, i], E_v[0, i, i] = v[0, i] / par[0], 1.0 / par[0]
+    if m == 3:
+        e[0, 2], E_v[0, 2, 2] = v[0, 2], 1.0
+    else:
+        turn = log(v[0, 3:].copy())
+        e[0, 3:] = turn
+        E_v[0, 3:, 3:] = left_jacobian_inverse(turn)
+    return e, residual(y, e, angular), E_v
+
+
+# ------------------------------------------------------------------ and how that changes with the sensor's constants
+@compiled
+def less(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+    """Return E_p (1, 1, 1) of a constant that is taken off."""
+    return -np.ones((1, 1, 1))
+
+
+@compiled
+def plus(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+    """Return E_p (1, m, c) of constants that are added to the last numbers of a measurement."""
+    m, c = e.shape[1], len(par)
+    E_p = np.zeros((1, m, c))
+    for i in range(m):
+        E_p[0, i, c - m + i] = 1.0
+    return E_p
+
+
+@compiled
+def plus_gravity(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+    """Return E_p (1, 3, 4) of g and of the biases of an accelerometer."""
+    Q, E_p = matrix(v[0, 3:].copy()), plus(code, par, angular, v, e)
+    for i in range(3):
+        E_p[0, i, 0] = Q[2, i]
+    return E_p
+
+
+@compiled
+def by_gain(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+    """Return E_p (1, m, 1) of the gain of all that are no angles."""
+    E_p = np.zeros((1, e.shape[1], 1))
+    for i in range(e.shape[1]):
+        if not angular[i]:
+            E_p[0, i, 0] = -e[0, i] / par[0]
+    return E_p
+
+
+Bias = Annotated[Number, "Constant part of every reading."]
+Scale = Annotated[Positive, "Reading for each metre, or metre a second, in truth."]
+SigmaBias = Annotated[NotNegative, "Standard deviation of the bias; above 0 it is in the map and is estimated."]
+SigmaScale = Annotated[NotNegative, "Standard deviation of the scale; above 0 it is in the map and is estimated."]
+Walk = Annotated[NotNegative, "Random walk of the bias; above 0 it is in the map and is estimated."]
+
+
+@declared
+class StateSensor:
+    """What all sensors of the state share.
+
+    `constants` are, for each number that `expected` takes, the parameter, that of its sigma, and that of its walk.
+    """
+
+    _: KW_ONLY
+    pass_share: Annotated[Probability, "Share of good readings that pass the gate; others are left out."] = 0.9999
+
+    columns: ClassVar[tuple[str, ...]]
+    sigmas: ClassVar[tuple[str, ...]]
+    views: ClassVar[str]
+    expected: ClassVar[Any]
+    varied: ClassVar[Any] = None
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = ()
+    code: ClassVar[int] = 0
+    sees_kinds: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def angular(self) -> tuple[bool, ...]:
+        """Which components are angles: those in rad."""
+        return tuple(column.endswith("_rad") for column in self.columns)
+
+    def noise(self, y: Array) -> Array:
+        """Return the noise R (1, p, p) of a reading y (1, m)."""
+        return np.tile(np.diag([vars(self)[name] ** 2 for name in self.sigmas]), (len(y), 1, 1))
+
+    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
+        """Return the expected readings (K, m) of views v (K, d), and E_v (K, p, errors of the view)."""
+        y = np.zeros((len(v), len(self.columns))) if y is None else y
+        par, angular = np.array(self.parameters), np.array(self.angular, dtype=np.bool_)
+        of = type(self).expected
+        rows = [of(0, par, angular, np.ascontiguousarray(v[k : k + 1]), np.array(y[k : k + 1])) for k in range(len(v))]
+        return np.concatenate([e for e, _, _ in rows]), np.concatenate([E_v for _, _, E_v in rows])
+
+    # ------------------------------------------------------------------ its constants
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(name for name, _, _ in self.constants)
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The constants (p,) of its expectation."""
+        return np.array([vars(self)[name] for name, _, _ in self.constants], dtype=np.float64)
+
+    @cached_property
+    def parameter_cov(self) -> Array | None:
+        """Their covariance (p, p), None if they are known and stay as they are."""
+        sigmas = np.array([vars(self).get(name, 0.0) for _, name, _ in self.constants])
+        return np.diag(sigmas**2) if sigmas.any() or self._walks.any() else None
+
+    @cached_property
+    def _walks(self) -> Array:
+        return np.array([vars(self).get(name, 0.0) for _, _, name in self.constants])
+
+    def with_parameters(self, parameters: Array) -> Self:
+        """Return the sensor with other constants (p,)."""
+        names = [name for name, _, _ in self.constants]
+        return replace(self, **dict(zip(names, np.asarray(parameters).tolist(), strict=True)))
+
+    def parameters_jacobian(self, v: Array) -> Array:
+        """Return E_p (K, m, p): how the readings of views v (K, d) change with the constants."""
+        e, par, angular = self.expect(v)[0], np.array(self.parameters), np.array(self.angular, dtype=np.bool_)
+        rows = [np.ascontiguousarray(each)[None] for each in v]
+        return np.concatenate(
+            [type(self).varied(0, par, angular, row, each[None]) for row, each in zip(rows, e, strict=True)]
+        )
+
+    def drift(self, dt_s: float) -> Array:
+        """Return the variances (p,) that the constants gather in `dt_s`."""
+        return np.asarray(self._walks**2 * dt_s)
+
+
+# ------------------------------------------------------------------ of the pose
+@register("sensor", "heading")
+class Heading(StateSensor):
+    """A compass: the heading of the sensor's x axis, from the map's x axis to the left, less the declination."""
+
+    sigma_heading_rad: Annotated[Positive, "Noise of the heading."] = 0.05
+    _: KW_ONLY
+    declination_rad: Annotated[Number, "Heading in the map of what reads 0."] = 0.0
+    sigma_declination_rad: Annotated[
+        NotNegative, "Standard deviation of the declination; above 0 it is in the map and is estimated."
+    ] = 0.0
+
+    columns: ClassVar[tuple[str, ...]] = ("heading_rad",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_heading_rad",)
+    views: ClassVar[str] = POSE
+    expected: ClassVar[Any] = heading
+    varied: ClassVar[Any] = less
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (("declination_rad", "sigma_declination_rad", ""),)
+
+
+@declared
+class _Gps(StateSensor):
+    sigma_m: Annotated[Positive, "Noise of each coordinate."] = 1.0
+
+    views: ClassVar[str] = POSE
+    expected: ClassVar[Any] = place
+
+
+@register("sensor", "gps")
+class Gps2D(_Gps):
+    """The position of an antenna, at its mount, in the map's frame: GPS, a total station, a beacon system."""
+
+    world: ClassVar[str] = "plane"
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 2
+
+
+@register("sensor", "gps")
+class Gps3D(_Gps):
+    """The position of an antenna, at its mount, in the map's frame."""
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 3
+
+
+@register("sensor", "absolute_pose")
+class AbsolutePose2D(StateSensor):
+    """A pose in the map's frame: motion capture, another localisation."""
+
+    sigma_m: Annotated[Positive, "Noise of each coordinate."] = 0.01
+    sigma_theta_rad: Annotated[Positive, "Noise of the heading."] = 0.01
+
+    world: ClassVar[str] = "plane"
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "theta_rad")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m", "sigma_m", "sigma_theta_rad")
+    views: ClassVar[str] = POSE
+    expected: ClassVar[Any] = pose_in_plane
+
+
+@register("sensor", "absolute_pose")
+class AbsolutePose3D(StateSensor):
+    """A pose in the map's frame: motion capture, another localisation."""
+
+    sigma_m: Annotated[Positive, "Noise of each coordinate."] = 0.01
+    sigma_rotation_rad: Annotated[Positive, "Noise of the rotation about each axis."] = 0.01
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    sigmas: ClassVar[tuple[str, ...]] = (*("sigma_m",) * 3, *("sigma_rotation_rad",) * 3)
+    cov_size: ClassVar[int] = 6
+    views: ClassVar[str] = POSE
+    expected: ClassVar[Any] = seen.tag_pose
+
+    def check(self, y: Array) -> None:
+        """Refuse a quaternion that is none."""
+        norm = float(np.linalg.norm(y[0, 3:]))
+        if abs(norm - 1) > 1e-6:
+            raise EventError(f"the quaternion has the norm {norm:.9g}, expected 1")
+
+
+@register("sensor", "height")
+class Height(StateSensor):
+    """Height above the map's origin: a barometer, with the drift of its bias."""
+
+    sigma_z_m: Annotated[Positive, "Noise of the height."] = 0.3
+    _: KW_ONLY
+    bias_m: Bias = 0.0
+    sigma_bias_m: SigmaBias = 0.0
+    sigma_bias_m_per_sqrt_s: Walk = 0.0
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("z_m",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_z_m",)
+    views: ClassVar[str] = POSE
+    expected: ClassVar[Any] = height
+    varied: ClassVar[Any] = plus
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (("bias_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s"),)
+
+
+@register("sensor", "inclination")
+class Inclination(StateSensor):
+    """Roll and pitch of the sensor: an inclinometer, a vertical reference."""
+
+    sigma_rad: Annotated[Positive, "Noise of each angle."] = 0.01
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("roll_rad", "pitch_rad")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_rad",) * 2
+    views: ClassVar[str] = POSE
+    expected: ClassVar[Any] = inclination
+
+
+@register("sensor", "gravity")
+class Gravity(StateSensor):
+    """An accelerometer where its robot does not accelerate: it measures g, upwards, in its own frame."""
+
+    sigma_mps2: Annotated[Positive, "Noise of each component, accelerations that are not told included."] = 0.2
+    _: KW_ONLY
+    gravity_mps2: Annotated[Positive, "Acceleration of gravity."] = STANDARD_GRAVITY
+    bias_x_mps2: Bias = 0.0
+    bias_y_mps2: Bias = 0.0
+    bias_z_mps2: Bias = 0.0
+    sigma_bias_mps2: SigmaBias = 0.0
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("ax_mps2", "ay_mps2", "az_mps2")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps2",) * 3
+    views: ClassVar[str] = POSE
+    expected: ClassVar[Any] = gravity
+    varied: ClassVar[Any] = plus_gravity
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (
+        ("gravity_mps2", "", ""), *((f"bias_{axis}_mps2", "sigma_bias_mps2", "") for axis in "xyz"),
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------ of the velocity
+@declared
+class _Gyro(StateSensor):
+    sigma_radps: Annotated[NotNegative, "Noise of a reading."] = 0.002
+    _: KW_ONLY
+    sigma_rad_per_sqrt_s: Annotated[
+        NotNegative, "Angle random walk, the density of a data sheet: what a reading has besides, by the time it means."
+    ] = 0.0
+    sigma_bias_radps: SigmaBias = 0.0
+    sigma_bias_radps_per_sqrt_s: Walk = 0.0
+
+    views: ClassVar[str] = TWIST
+    expected: ClassVar[Any] = rates
+    varied: ClassVar[Any] = plus
+
+    def __post_init__(self) -> None:
+        if not (self.sigma_radps or self.sigma_rad_per_sqrt_s):
+            raise refuse(self, "sigma_radps", "a positive number")
+
+    def noise_since(self, dt_s: float) -> Array:
+        """Return the noise R (1, m, m) of a reading that means the time since the last one, `dt_s`."""
+        variance = self.sigma_radps**2 + self.sigma_rad_per_sqrt_s**2 / dt_s
+        return variance * np.eye(len(self.columns))[None]
+
+
+@register("sensor", "gyro")
+class Gyro2D(_Gyro):
+    """A gyroscope: the turn rate, with the bias of the sensor and its random walk."""
+
+    _: KW_ONLY
+    bias_radps: Bias = 0.0
+
+    world: ClassVar[str] = "plane"
+    columns: ClassVar[tuple[str, ...]] = ("w_radps",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_radps",)
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (
+        ("bias_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s"),
+    )
+
+
+@register("sensor", "gyro")
+class Gyro3D(_Gyro):
+    """A gyroscope: the rates about the sensor's axes, with the biases of the sensor and their random walk."""
+
+    _: KW_ONLY
+    bias_x_radps: Bias = 0.0
+    bias_y_radps: Bias = 0.0
+    bias_z_radps: Bias = 0.0
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("wx_radps", "wy_radps", "wz_radps")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_radps",) * 3
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
+        (f"bias_{axis}_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s") for axis in "xyz"
+    )
+
+
+@declared
+class _Scaled(StateSensor):
+    """A sensor with a scale.  In the map is the gain = 1 / scale: so what a wrong scale does is linear in its error."""
+
+    _: KW_ONLY
+    scale: Scale = 1.0
+    sigma_scale: SigmaScale = 0.0
+
+    varied: ClassVar[Any] = by_gain
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The name of the gain."""
+        return ("gain",)
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The gain (1,)."""
+        return np.array([1.0 / self.scale])
+
+    @cached_property
+    def parameter_cov(self) -> Array | None:
+        """Its variance (1, 1), None if it is known."""
+        return np.array([[self.sigma_scale**2 / self.scale**4]]) if self.sigma_scale else None
+
+    def with_parameters(self, parameters: Array) -> Self:
+        """Return the sensor with another gain (1,)."""
+        return replace(self, scale=1.0 / float(parameters[0]))
+
+
+@declared
+class _Velocity(_Scaled):
+    sigma_mps: Annotated[Positive, "Noise of each component."] = 0.05
+
+    views: ClassVar[str] = TWIST
+    expected: ClassVar[Any] = velocity
+
+
+@register("sensor", "body_velocity")
+class BodyVelocity2D(_Velocity):
+    """The velocity in the sensor's frame: optical flow, a Doppler log, wheels that do not slip."""
+
+    world: ClassVar[str] = "plane"
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",) * 2
+
+
+@register("sensor", "body_velocity")
+class BodyVelocity3D(_Velocity):
+    """The velocity in the sensor's frame: a Doppler log, optical flow with a height."""
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",) * 3
+
+
+@register("sensor", "speed")
+class Speed(_Velocity):
+    """The velocity along the sensor's x axis: wheel speeds."""
+
+    columns: ClassVar[tuple[str, ...]] = ("v_mps",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",)
+
+
+@register("sensor", "ground_speed")
+class GroundSpeed(StateSensor):
+    """The speed, whatever its direction: as GPS receivers tell it."""
+
+    sigma_mps: Annotated[Positive, "Noise of the speed."] = 0.1
+
+    columns: ClassVar[tuple[str, ...]] = ("speed_mps",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",)
+    views: ClassVar[str] = TWIST
+    expected: ClassVar[Any] = ground_speed
+
+
+# ------------------------------------------------------------------ of the way since the last reading
+@declared
+class _Odometer(_Scaled):
+    sigma_m: Annotated[Positive, "Noise of each coordinate of one increment."] = 0.01
+    sigma_rad: Annotated[Positive, "Noise of each angle of one increment."] = 0.01
+
+    views: ClassVar[str] = CHANGE
+    expected: ClassVar[Any] = increment
+
+
+@register("sensor", "odometer")
+class Odometer2D(_Odometer):
+    """How the sensor moved since its last reading, in the frame where it was then: a second odometry, scan matching."""
+
+    world: ClassVar[str] = "plane"
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m", "sigma_m", "sigma_rad")
+
+
+@register("sensor", "odometer")
+class Odometer3D(_Odometer):
+    """How the sensor moved since its last reading, in the frame where it was then; its turn is a rotation vector."""
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    sigmas: ClassVar[tuple[str, ...]] = (*("sigma_m",) * 3, *("sigma_rad",) * 3)

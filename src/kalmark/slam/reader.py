@@ -1,0 +1,99 @@
+"""A reader: a sensor that measures its own robot, on its mount, as the filter uses it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import EventError
+from kalmark.events import Scan, when
+from kalmark.filter.estimators import Estimator, Iterating, Update
+from kalmark.filter.map import Map
+from kalmark.models import protocols
+from kalmark.models.protocols import POSE, Motion, OfState
+from kalmark.models.state_view import sees_state, state_view_of
+from kalmark.slam.checks import measurements
+
+LEAST_S = 1e-6  # between two readings that tell how the robot moved
+
+
+class Reader:
+    """A sensor of the state of a robot that moves by `motion`; `mount` is the slot of its mount, -1 for none.
+
+    `counts`: what it measures counts from its last reading, where a clone of the robot's pose was left.
+    """
+
+    def __init__(self, sensor: OfState, motion: Motion, at: Array, mount: int) -> None:
+        self.sensor: Any = sensor
+        self.at: Array = np.array(at)
+        self.mount, self.motion = mount, motion
+        self.pose_dof = 3 if len(self.at) == 3 else 6
+        self.of_state = sees_state(sensor, motion)
+        self.counts = sensor.views != POSE and not self.of_state
+        self.check = sensor.check if isinstance(sensor, protocols.Checked) else None
+        self.gate = self._gate()
+        self.t_ns: int | None = None  # of its last reading
+        self._view: Any = None
+
+    def _gate(self) -> float:
+        from scipy.stats import chi2
+
+        return float(chi2.ppf(self.sensor.pass_share, protocols.innovation_size(self.sensor)))
+
+    @property
+    def view(self) -> Any:
+        """What `linearize` takes; made when it is first needed, as compiled code is."""
+        if self._view is None:
+            self._view = state_view_of(self.sensor, self.motion, self.at)
+        return self._view
+
+    def noise(self, event: Scan) -> Array:
+        """Return the noise R (1, p, p) of a reading, refusing what its sensor cannot have made.  Raises EventError."""
+        if len(event.y) > 1:
+            name = type(self.sensor).__name__
+            raise EventError(f"{when(event)}: y has {len(event.y)} rows, expected one: a {name} measures its robot")
+        if event.ids is not None and event.ids[0] not in (None, event.robot):
+            raise EventError(f"{when(event)}: id {event.ids[0]!r}, expected none: {event.sensor!r} measures its robot")
+        return measurements(event, self.sensor, self.check)
+
+    def since_s(self, event: Scan) -> float:
+        """Return how long ago the last reading was, 0 for the first.  Raises EventError where that is too short."""
+        if self.t_ns is None:
+            return 0.0
+        since_s = (event.t_ns - self.t_ns) * 1e-9
+        if self.counts and since_s < LEAST_S:
+            raise EventError(f"{when(event)}: {event.sensor!r} was read at that time already, expected one reading")
+        return since_s
+
+    def drift(self, map_: Map, since_s: float) -> None:
+        """Let the sensor's constants walk since the last reading."""
+        if self.mount < 0 or not isinstance(self.sensor, protocols.Drifting):
+            return
+        Q = self.sensor.drift(since_s)
+        if Q.any():
+            rows = map_.index(self.mount)[-len(Q) :]
+            map_.predict(rows, np.eye(len(Q)), np.diag(Q))
+
+    def update(self, map_: Map, robot: int, clone: int, event: Scan, R: Array, since_s: float) -> Update:
+        """Return the correction by a reading with the noise R (1, p, p); `clone` is where it counts from."""
+        if event.cov is None and isinstance(self.sensor, protocols.TimedNoise) and self.counts:
+            R = self.sensor.noise_since(since_s)
+        slot, d = (clone, len(self.at)) if self.counts else (robot, len(map_.mean(robot)) if self.of_state else 0)
+        given = np.column_stack([event.y, [since_s]])
+        return Update(self.view, robot, self.mount, np.array([slot]), d, given, np.ascontiguousarray(R), self.gate)
+
+    def estimator(self, estimator: Estimator) -> Estimator:
+        """Return how a reading is fused: absolute poses with iterations, how the robot moved without.
+
+        What one step was is a new unknown each time, constants of the sensor are not.  The iterated estimate is the
+        mode of all of them together, which is no mode of the constants (docs/state_sensors.md).
+        """
+        if self.sensor.views == POSE:
+            return estimator.for_fixes()
+        return estimator.once() if isinstance(estimator, Iterating) else estimator
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but the compiled view, whose addresses mean nothing to another process."""
+        return self.__dict__ | {"_view": None}
