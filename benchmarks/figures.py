@@ -163,6 +163,17 @@ def motions() -> Iterator[Figure]:
         yield Figure("Motions", f"`{world}`: pose ANEES (3) / in band / NEES of its constants (1) / runs inside 99.7 %",
                      "90 % in the band / 97 of 100", f"python benchmarks/motions.py {world}",
                      row(world, "{1} / {5} / {7} / {9} of {11}"))  # fmt: skip
+    for world, dof, estimator in (
+        ("compass_and_gyro", 3, "invariant"),
+        ("compass_and_gyro", 3, "ekf"),
+        ("diver", 6, "invariant"),
+    ):
+        name = (
+            f"`{world}`, `{estimator}`: pose ANEES ({dof}) / in band / NEES of its constants (1) / runs inside 99.7 %"
+        )
+        yield Figure("Sensors of the state", name, "" if estimator == "ekf" else "90 % in the band / 97 of 100",
+                     f"python benchmarks/motions.py {world} --estimator {estimator}",
+                     row(world, "{1} / {5} / {7} / {9} of {11}"))  # fmt: skip
     for world in ("slipping_unicycle", "constant_velocity", "constant_turn_rate"):
         yield Figure("Motions", f"`{world}`: pose ANEES (3) / in band / ANEES of the whole state (1)", "90 % in the band",
                      f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip

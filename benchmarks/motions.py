@@ -1,11 +1,12 @@
-"""How consistent each motion model is: runs of its own shipped world, scored against the truth.
+"""How consistent motions and sensors of the state are: runs of a shipped world each, scored against the truth.
 
     python benchmarks/motions.py [WORLD ...] [--runs 100]
 
 The runs are those of `kalmark campaign WORLD --runs 100`.  Printed for each: the mean pose ANEES (3) and how many steps
 are inside the 95 % band of so many runs; the ANEES of a state with more than a pose, by its degrees of freedom; at the
-end of the runs the mean NEES of the constants of the controls (radii, track, biases, scales) in the map, by their
-number, and how many runs are inside the 99.7 % bound; and by what factor the constants are known better than before.
+end of the runs the mean NEES of the constants of controls and sensors (radii, track, biases, scales, declination) in
+the map, by their number, and how many runs are inside the 99.7 % bound; and by what factor the constants are known
+better than before.  With `--estimator ekf` by the textbook filter.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ways import pin
 
 from kalmark.campaign.scoring import score
 from kalmark.config.building import build_slam
-from kalmark.models.protocols import calibrating
+from kalmark.models.protocols import calibrating, parameter_covariance
 from kalmark.results.measures import anees_interval
 from kalmark.simulate import load_world
 from kalmark.simulate.robots import simulation
@@ -29,7 +30,7 @@ from kalmark.slam.motion import bias_name
 
 WORLDS = (
     "differential_drive", "tricycle", "omnidirectional", "mecanum", "slipping_unicycle", "constant_velocity",
-    "constant_turn_rate",
+    "constant_turn_rate", "compass_and_gyro", "diver",
 )  # fmt: skip
 BOUND = 0.9973  # of three sigmas
 
@@ -45,28 +46,38 @@ class Scored(NamedTuple):
     diverged: bool
 
 
-def run(name: str, seed: SeedSequence) -> Scored:
+def run(name: str, seed: SeedSequence, estimator: str) -> Scored:
     """Simulate, filter and score one run of a world."""
     pin()
-    world = load_world(name)
+    world = load_world(name, [f"filter.estimator.type={estimator}"])
     simulated = simulation(world, seed)
     slam = build_slam(world.config(), simulated.log)
     scores = score(slam, simulated, world.times(), map_every=world.steps)
     (robot,) = slam.robots.values()
-    model, value, better = calibrating(robot.motion), np.nan, np.zeros(0)
-    if model is not None:
-        truth, block = simulated.constants[robot.name], bias_name(robot.name)
-        d, P = slam.mean(block) - truth, slam.covariance(block)
-        value, better = float(d @ np.linalg.solve(P, d)), np.sqrt(np.diag(model.calibration_cov) / np.diag(P))
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # error, covariance and prior of each block
+    if (model := calibrating(robot.motion)) is not None:
+        block = bias_name(robot.name)
+        found.append(
+            (slam.mean(block) - simulated.constants[robot.name], slam.covariance(block), model.calibration_cov)
+        )
+    for key, mount in robot.sensors.items():
+        if (prior := parameter_covariance(mount.sensor)) is not None:
+            truth, c = simulated.sensors[robot.name, key].parameters, len(prior)
+            mean, P = slam.mean(f"{robot.name}.{key}"), slam.covariance(f"{robot.name}.{key}")
+            open_ = np.diag(P)[-c:] > 0
+            pick = np.ix_(open_, open_)
+            found.append(((mean[-c:] - truth)[open_], P[-c:, -c:][pick], prior[pick]))
+    value = sum(float(d @ np.linalg.solve(P, d)) for d, P, _ in found) if found else np.nan
+    better = np.concatenate([np.sqrt(np.diag(C) / np.diag(P)) for _, P, C in found] or [np.zeros(0)])
     state = scores.series["state"][0] / scores.series["state_dof"][0]
     return Scored(scores.series["pose"][0], state, value, len(better), better, scores.diverged)
 
 
-def report(name: str, runs: int) -> None:
+def report(name: str, runs: int, estimator: str) -> None:
     """Print the row of a world."""
-    scored = Parallel(n_jobs=2)(delayed(run)(name, seed) for seed in SeedSequence(0).spawn(runs))
+    scored = Parallel(n_jobs=2)(delayed(run)(name, seed, estimator) for seed in SeedSequence(0).spawn(runs))
     pose = np.mean([one.pose for one in scored], axis=0)
-    low, high = anees_interval(3, runs)
+    low, high = anees_interval(3 * load_world(name).dimensions - 3, runs)
     known = np.isfinite(pose)
     inside = np.mean((pose[known] > low) & (pose[known] < high))
     line = f"{name:20s} pose {np.mean(pose[known]):5.2f}, in the band {inside:5.1%}"
@@ -87,9 +98,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("worlds", nargs="*", default=WORLDS)
     parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--estimator", default="invariant")
     given = parser.parse_args()
     for name in given.worlds:
-        report(name, given.runs)
+        report(name, given.runs, given.estimator)
 
 
 if __name__ == "__main__":

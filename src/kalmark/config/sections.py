@@ -44,7 +44,7 @@ NotNegative = Annotated[float, Field(ge=0, le=FAR, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=FAR, allow_inf_nan=False)]
 
 # What the contract names and later versions bring: refused by name, not as a spelling mistake.
-LATER = {"motion": ("inertial",), "sensor": ("position_fix",)}
+LATER = {"motion": ("inertial",)}
 
 
 class Section(BaseModel):

@@ -89,7 +89,7 @@ class Simulation:
 
     `states` are the true states (steps + 1, n) of each robot, `mounts` where its sensors truly sit, `origins` (by time,
     robot and sensor) what each observation of a scan is really of: an id, or None for a false one; `constants` (c,)
-    those by which each robot's controls are wrong.
+    those by which each robot's controls are wrong; `sensors` are the true ones at the end, by robot and name.
     """
 
     log: Log
@@ -97,6 +97,7 @@ class Simulation:
     mounts: dict[tuple[str, str], Array]
     origins: dict[Key, tuple[Id | None, ...]]
     constants: dict[str, Array] = field(default_factory=dict)
+    sensors: dict[tuple[str, str], Any] = field(default_factory=dict)
 
 
 class Chance:
@@ -145,7 +146,8 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
         sensor_columns={(r.name, name): s.columns for r in robots for name, s in r.sensors.items()},
     )  # fmt: skip
     mounts = {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}
-    return Simulation(log, states, mounts, origins, {r.name: r.constants for r in robots})
+    carried = {(r.name, name): s.sensor for r in robots for name, s in r.sensors.items()}
+    return Simulation(log, states, mounts, origins, {r.name: r.constants for r in robots}, carried)
 
 
 def scenery_of(world: World, rng: Generator) -> dict[str, Things]:

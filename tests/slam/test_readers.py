@@ -1,0 +1,148 @@
+"""Sensors of the state through `Slam.process`: consistency, resuming, gates, turned worlds, refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.arrays import Array
+from kalmark.errors import EventError
+from kalmark.geometry.frames import compose, inverse
+
+STEP_S = 0.1
+ARM = np.array([0.5, -0.1, 0.0])
+SCALE, BIAS = 1.05, 0.01
+
+
+def robot(start: Any = (0.0, 0.0, 0.0)) -> km.Robot:
+    sensors = {
+        "gyro": km.Mount(km.sensors.Gyro2D(0.002, sigma_bias_radps=0.05)),
+        "compass": km.Mount(km.sensors.Heading(0.05)),
+        "wheels": km.Mount(km.sensors.Speed(0.02, sigma_scale=0.1), at=(0.0, 0.1, 0.0)),
+        "matcher": km.Mount(km.sensors.Odometer2D(0.01, 0.005), at=(0.1, 0.0, 0.2)),
+        "receiver": km.Mount(km.sensors.Gps2D(0.5), at=(0.3, 0.2, 0.0), cov=np.diag([0.04, 0.04, 0.0])),
+    }
+    return km.Robot("r", motion=km.motion.Unicycle(sigma_v_mps=0.1, sigma_w_radps=0.1), start=start, sensors=sensors)
+
+
+def events(seed: int, steps: int = 150, start: Any = (0.0, 0.0, 0.0)) -> tuple[list[Any], Array]:
+    """Return the events of one robot that really has what its sensors are uncertain of, and where it is in the end."""
+    rng, x, u, found = np.random.default_rng(seed), np.array(start), np.array([1.0, 0.3]), []
+    motion, at = km.motion.Unicycle(), np.array([0.1, 0.0, 0.2])
+    found.append(km.Control(0.0, "r", u))
+    for k in range(1, steps + 1):
+        t_s, before, done = k * STEP_S, x, u + rng.normal(0, 0.1, 2)
+        x = motion.move(x, done, STEP_S)[0]
+        way = compose(inverse(compose(before, at)[0])[0], compose(x, at)[0])[0]
+        speed = SCALE * (done[0] - 0.1 * done[1])
+        found.append(km.Scan(t_s, "r", "compass", [[x[2] + rng.normal(0, 0.05)]]))
+        found.append(km.Scan(t_s, "r", "gyro", [[done[1] + BIAS + rng.normal(0, 0.002)]]))
+        found.append(km.Scan(t_s, "r", "matcher", [way + rng.normal(0, [0.01, 0.01, 0.005])]))
+        antenna = compose(x, ARM)[0][:2] + rng.normal(0, 0.5, 2)
+        found += [km.Scan(t_s, "r", "receiver", [antenna])] if k % 10 == 0 else []
+        found.append(km.Scan(t_s, "r", "wheels", [[speed + rng.normal(0, 0.02)]]))
+        u = np.array([1.0, 0.3 * np.sin(0.05 * k)])
+        found.append(km.Control(t_s, "r", u))
+    return found, x
+
+
+def ran(log: list[Any], estimator: Any = None, start: Any = (0.0, 0.0, 0.0)) -> km.Slam:
+    slam = km.Slam(robot(start), estimator=estimator)
+    for event in log:
+        slam.process(event)
+    return slam
+
+
+@pytest.mark.parametrize("estimator", [km.estimators.Invariant(), km.estimators.Ekf(), km.estimators.Fej()])
+def test_poses_and_constants_are_as_wrong_as_the_filter_says(estimator: Any) -> None:
+    nees, constants = [], []
+    for seed in range(12):
+        log, truth = events(seed)
+        slam = ran(log, estimator)
+        error = slam.robots["r"].motion.space.minus(slam.mean("r"), truth)
+        nees.append(error @ np.linalg.solve(slam.covariance("r"), error))
+        for name, i, value in (("gyro", 3, BIAS), ("wheels", 3, 1 / SCALE), ("receiver", 0, ARM[0])):
+            mean, P = slam.mean(f"r.{name}"), slam.covariance(f"r.{name}")
+            constants.append((mean[i] - value) ** 2 / P[i, i])
+    assert 1.3 < np.mean(nees) < 5.6  # 99.7 % of the mean of 12 chi-squares of 3 are within 1.5 and 5.3
+    assert 0.4 < np.mean(constants) < 1.9
+
+
+def test_a_run_that_is_resumed_ends_bit_for_bit_where_it_would_have(tmp_path: Path) -> None:
+    log, _ = events(0, 40)
+    whole = ran(log)
+    first = ran(log[:107])
+    first.save(tmp_path / "map.kmk")
+    second = km.Slam.load(tmp_path / "map.kmk")
+    for event in log[107:]:
+        second.process(event)
+    np.testing.assert_array_equal(second.mean("r"), whole.mean("r"))
+    np.testing.assert_array_equal(second.covariance("r", "r.gyro"), whole.covariance("r", "r.gyro"))
+
+
+def test_a_run_that_is_turned_and_shifted_gives_the_same_estimate_turned_and_shifted() -> None:
+    moved = np.array([30.0, -20.0, 2.0])
+    log, _ = events(3, 60)
+    turned = []
+    for event in log:
+        y: Any = None if isinstance(event, km.Control) else event.y
+        if isinstance(event, km.Scan) and event.sensor == "compass":
+            y = y + moved[2]
+        elif isinstance(event, km.Scan) and event.sensor == "receiver":
+            y = compose(moved, np.append(y[0], 0.0))[0][None, :2]
+        turned.append(event if y is None else km.Scan(t_ns=event.t_ns, robot="r", sensor=event.sensor, y=y))
+    here, there = ran(log), ran(turned, start=tuple(moved))
+    np.testing.assert_allclose(there.mean("r"), compose(moved, here.mean("r"))[0], atol=1e-9)
+    np.testing.assert_allclose(there.mean("r.wheels"), here.mean("r.wheels"), atol=1e-10)
+
+
+def test_a_reading_far_from_what_is_expected_is_rejected_and_changes_nothing() -> None:
+    slam = ran(events(1, 20)[0])
+    before, P = slam.mean("r"), slam.covariance("r")
+    o = slam.process(km.Scan(2.0, "r", "receiver", [[60.0, 0.0]])).observations[0]
+    assert (o.outcome, o.landmark) == ("rejected", "r")
+    np.testing.assert_array_equal(slam.mean("r"), before)
+    np.testing.assert_array_equal(slam.covariance("r"), P)
+
+
+def test_the_first_reading_of_what_counts_from_the_last_one_is_ignored() -> None:
+    slam = km.Slam(robot())
+    o = slam.process(km.Scan(0.0, "r", "matcher", [[0.0, 0.0, 0.0]])).observations[0]
+    assert (o.outcome, o.reason) == ("ignored", "the first reading: none to count from")
+    assert slam.process(km.Scan(0.1, "r", "matcher", [[0.0, 0.0, 0.0]])).observations[0].outcome == "associated"
+
+
+def test_what_is_no_reading_is_refused_with_one_line_and_changes_nothing() -> None:
+    slam = ran(events(2, 10)[0])
+    before = slam.mean("r")
+    for y, ids, said in (
+        ([[0.1], [0.2]], None, "y has 2 rows, expected one: a Gyro2D measures its robot"),
+        ([[0.1]], [7], "id 7, expected none: 'gyro' measures its robot"),
+        ([[0.1, 0.2]], None, "y has 2 columns, expected 1: w_radps"),
+    ):
+        with pytest.raises(EventError, match=r"scan at t=1\.5 s") as error:
+            slam.process(km.Scan(1.5, "r", "gyro", y, ids))
+        assert said in str(error.value)
+        np.testing.assert_array_equal(slam.mean("r"), before)
+    with pytest.raises(EventError, match="was read at that time already, expected one reading"):
+        slam.process(km.Scan(1.0, "r", "gyro", [[0.1]]))
+
+
+def test_velocities_in_the_state_are_measured_where_they_are() -> None:
+    """A robot that coasts in space: a Doppler log and a gyroscope on a lever arm find its velocity and its rates."""
+    sensors = {
+        "log": km.Mount(km.sensors.BodyVelocity3D(0.01), at=(0.5, 0.2, -0.1, 0.0, 0.0, 0.0, 1.0)),
+        "gyro": km.Mount(km.sensors.Gyro3D(0.001)),
+    }
+    cov = np.diag([*[1e-6] * 6, *[1.0] * 3, *[0.25] * 3])
+    of = km.Robot("r", motion=km.motion.ConstantVelocity3D(), sensors=sensors, cov=cov)
+    slam, w, v = km.Slam(of), np.array([0.1, -0.2, 0.3]), np.array([1.0, 0.5, -0.2])
+    for k in range(10):
+        slam.process(km.Scan(0.001 * k, "r", "gyro", [w]))
+        slam.process(km.Scan(0.001 * k, "r", "log", [v + np.cross(w, [0.5, 0.2, -0.1])]))
+    np.testing.assert_allclose(slam.mean("r")[7:], [*v, *w], atol=0.01)
+    assert np.sqrt(np.diag(slam.covariance("r"))[6:]).max() < 0.02
