@@ -27,7 +27,7 @@ from kalmark.logs import Log, find_data, open_log
 from kalmark.logs.bag.first_config import first_config
 from kalmark.logs.bag.survey import survey
 from kalmark.logs.source import placed
-from kalmark.logs.tagslam import frame_of, read_cameras, read_scene
+from kalmark.logs.tagslam import SIGMA, Scene, frame_of, read_cameras, read_scene
 from kalmark.results.mcap import export
 from kalmark.results.record import record
 from kalmark.slam.slam import Slam
@@ -81,11 +81,19 @@ def edited(lines: list[str], where: Path, own: Log) -> list[str]:
     usual = max(set(sizes.values()), key=list(sizes.values()).count)
     others = {str(tag): size for tag, size in sizes.items() if size != usual}
     size = f"size_m: {usual}" + (f", sizes: {json.dumps(others)}" if others else "")
-    noise = "sigma_x_m: 0.003, sigma_y_m: 0.003, sigma_z_m: 0.003, sigma_rotation_rad: 0.003"
+    noise = odometry_noise(scene, scans)
     out = [re.sub(r"size_m: [0-9.]+", size, line) for line in lines]
     out = [re.sub(r"(\w+_tags\w*): \{type: tag_corners.*", rf"\1: {json.dumps(section)}", line) for line in out]
     moved = "motion: {type: odometry_3d"
     return [line.replace(moved, f"{moved}, {noise}") for line in out]
+
+
+def odometry_noise(scene: Scene, scans: list[Scan]) -> str:
+    """Return the noise of the odometry's increments: that of TagSLAM's file over the usual interval of the scans."""
+    share = np.sqrt(np.median(np.diff([scan.t_ns for scan in scans])) * 1e-9)
+    body: dict[str, Any] = next(iter(scene.odometry.values()), {})
+    m, rad = (share * float(body.get(f"odom_{what}_noise", SIGMA)) for what in ("translation", "rotation"))
+    return f"sigma_x_m: {m:.4f}, sigma_y_m: {m:.4f}, sigma_z_m: {m:.4f}, sigma_rotation_rad: {rad:.4f}"
 
 
 def mcap(name: str, folder: Path) -> None:
