@@ -313,6 +313,19 @@ def tuning() -> Iterator[Figure]:
             yield Figure("Tuning by the first half", name, wanted, command, row(f"{start} {aim}:", shown))
 
 
+def bags() -> Iterator[Figure]:
+    """Yield bags with the configurations that `kalmark bag` wrote, and logs as MCAP and back."""
+    section, command = "ROS bags", "python benchmarks/bags.py"
+    yield Figure(section, "nav2 bag, no line edited: fixes / rejected / off, median / largest", "no fix rejected", command,
+                 row("nav2:", "{6} / {7} / {10} m / {13} m"))  # fmt: skip
+    for test, edits in ((1, 2), (13, 2), (22, 3)):
+        name = f"TagSLAM test {test} by topic, {edits} lines edited: RMS of the corners, px (by its importer)"
+        yield Figure(section, name, "as its importer", command, row(f"tags, test {test}:", "{10} {12}"))
+    for name in ("mrclam", "victoria_park_known"):
+        yield Figure(section, f"`{name}` as MCAP and back: events / log / map", "the same to the last bit", command,
+                     row(f"mcap, {name}:", "{0} / {7} {8} / {10} {11}"))  # fmt: skip
+
+
 def partial_measurements() -> Iterator[Figure]:
     """Yield the figures of ranges alone and bearings alone."""
     section, command = "Ranges alone", "python benchmarks/range_only.py"
@@ -488,6 +501,7 @@ def figures() -> list[Figure]:
         partial_measurements,
         space,
         commands,
+        bags,
         speed,
         structure,
     )

@@ -105,6 +105,23 @@ def test_the_controls_are_the_differences_of_the_poses(bags: dict[str, Path]) ->
     np.testing.assert_allclose(here, poses[-1], atol=1e-9)
 
 
+def test_increments_end_at_the_scans_where_odometry_is_slower_than_them(tmp_path: Path) -> None:
+    messages = [odometry(T0 + t * 10**9, pose(2 * t, 0, 0.1 * t)) for t in range(3)]
+    seen = {"header": header(T0, "sonar"), "range": 2.0, "max_range": 9.0}
+    for t in (5 * 10**8, 75 * 10**7, 15 * 10**8, 25 * 10**8):
+        messages.append(Outgoing("/sonar", "sensor_msgs/msg/Range", T0 + t, seen | {"header": header(T0 + t, "s")}))
+    path = bag_of(tmp_path, sorted(messages, key=lambda message: message.t_ns))
+    topics = {"/odom": {"type": "odometry_2d", "at": "scans"}, "/sonar": {"type": "scan", "landmark": 1}}
+    log = open_log(path, topics=topics)
+    controls = [event for event in log.events if isinstance(event, Control)]
+    assert [line.split(": ", 1)[1] for line in log.skipped] == ["/odom: 1 scans and fixes outside the odometry"]
+    assert [c.t_ns - T0 for c in controls] == [75 * 10**7, 15 * 10**8]
+    np.testing.assert_allclose([c.u[2] for c in controls], [0.025, 0.075], atol=1e-12)
+    np.testing.assert_allclose([c.u[0] for c in controls], [0.5 * np.cos(0.05), 1.5 * np.cos(0.075)], atol=1e-12)
+    with pytest.raises(LogError, match="own_noise is True, expected False with at: scans"):
+        open_log(path, topics=topics | {"/odom": topics["/odom"] | {"own_noise": True}})
+
+
 def test_fixes_are_metres_east_and_north_of_the_origin(bags: dict[str, Path]) -> None:
     log = open_log(bags["sqlite3"], topics={"/odom": TOPICS["/odom"], "/fix": TOPICS["/fix"]})
     t_ns, poses = drive()

@@ -23,6 +23,8 @@ IDS, CLUSTERS = ("id", "ids", "track_id", "label"), ("cluster", "cluster_id", "s
 SPACE = ("", "odometry_3d", "velocity_3d")
 COASTING = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3}
 AT_REST = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
+SLOW = 0.5
+"""An odometry of less than two messages for each of a sensor's gives increments that end at its scans."""
 NEAR_NS = 500_000_000
 LEAST_WAY_M = 2.0
 GUESS = "GUESS:"
@@ -45,6 +47,7 @@ def first_config(found: Survey, file: Path | None = None) -> str:
         f"# A first configuration of {found.path.name}, by `kalmark bag`.  Look at each line with {GUESS[:-1]}.",
         "log:",
         f"  path: {quoted(path)}",
+        "  format: bag",
     ]
     if found.holds_log:
         return "\n".join([*head, "  # kalmark wrote this bag: it holds a whole log, and no topics are needed", ""])
@@ -163,7 +166,9 @@ class _Writer:
         """Return the entries of the topics that are used, each with the reason."""
         used: dict[str, tuple[dict[str, Any], str]] = {}
         if isinstance(control, TopicSummary):
-            used[control.name] = ({"type": kind}, self.of_control(control))
+            slow = control.offers.pose is not None and any(scan.rate_hz > SLOW * control.rate_hz for scan in scans)
+            entry: dict[str, Any] = {"type": kind} | ({"at": "scans"} if slow and "odometry" in kind else {})
+            used[control.name] = (entry, self.of_control(control))
         elif control is not None:
             entry = {"type": kind, "frame": control[0], "child_frame": control[1]}
             name = next(topic.name for topic in topics if _has_frames(topic))

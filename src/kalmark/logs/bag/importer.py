@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,14 @@ from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.geodesy import local
 from kalmark.logs.bag.messages import BEAM, MESSAGES, POINT, POSE, Message, Place, Pose, Seen
 from kalmark.logs.bag.reading import Bag, Received, find_bag, has_header, stamp
-from kalmark.logs.bag.topics import Fixes, Noisy, Placed, Posed, Scans, Topic, Truths, topic_of
+from kalmark.logs.bag.topics import Fixes, Moved, Noisy, Placed, Posed, Scans, Topic, Truths, topic_of
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, placed, seconds
 from kalmark.logs.table import Refused
 
 BASES = ("base_link", "base_footprint")
 LEVEL = math.cos(math.radians(5))  # a sensor tilted by less is taken as level
+FOREVER_S = 1e9
 DAY_NS = 86_400_000_000_000
 _AXES2, _AXES3 = [0, 1], [0, 1, 2]
 
@@ -77,6 +79,7 @@ class _Importer:
         self.paths: dict[str, dict[int, Array]] = {}
         self.positions: dict[str, dict[int, Array]] = {}
         self.last: dict[str, tuple[int, Array]] = {}
+        self.ways: dict[str, dict[int, Array]] = {}
         self.origins: dict[str, Array] = {}
         self.left_out: Counter[tuple[str, str]] = Counter()
         self.clocks: dict[bool, tuple[str, int]] = {}
@@ -151,6 +154,7 @@ class _Importer:
         self.look_ahead()
         for received in self.bag.messages(self.topics):
             self.take(received)
+        self.interpolated()
         for (name, reason), count in sorted(self.left_out.items()):
             self.request.leave_out(count, f"{self.bag.path}: {name}: {count} {reason}")
         for name in self.topics:
@@ -242,6 +246,9 @@ class _Importer:
                 return
             raise Refused(f"time after {seconds(before[0])} s, expected times that never run backwards")
         self.last[received.topic] = (t_ns, pose.frame)
+        if isinstance(topic, Moved) and topic.at == "scans":
+            self.ways.setdefault(received.topic, {})[t_ns] = pose.frame
+            return
         if before is None:
             return
         cov, dt_s = None, (t_ns - before[0]) * 1e-9
@@ -250,12 +257,31 @@ class _Importer:
             if twist is None:
                 raise Refused("the message has no covariance, expected one for `own_noise`")
             cov = twist * dt_s**2
-        step = compose(inverse(before[1])[0], pose.frame)[0]
-        if self.in_space(topic.robot):
-            u = np.append(step[:3], rotations.log(step[3:]))
-        else:
-            u, cov = increment(in_plane(before[1]), in_plane(pose.frame)), None if cov is None else flat(cov)
-        self.control(topic, t_ns, u, cov)
+        if cov is not None and not self.in_space(topic.robot):
+            cov = flat(cov)
+        self.control(topic, t_ns, self.step(topic, before[1], pose.frame), cov)
+
+    def step(self, topic: Topic, a: Array, b: Array) -> Array:
+        """Return the control that leads from the pose a (7,) to b: an increment of the plane or of space."""
+        if not self.in_space(topic.robot):
+            return increment(in_plane(a), in_plane(b))
+        step = compose(inverse(a)[0], b)[0]
+        return np.append(step[:3], rotations.log(step[3:]))
+
+    def interpolated(self) -> None:
+        """Add the increments that end at the scans and fixes of a robot, on the interpolated path of its odometry.
+
+        Those outside the path are left out: how the robot moved to them is not known.
+        """
+        for name, way in self.ways.items():
+            topic, path = self.topics[name], Trajectory(np.array([*way]), np.array([*way.values()]))
+            first, last, every = path.t_ns[0], path.t_ns[-1], len(self.events)
+            self.events = [e for e in self.events if e.robot != topic.robot or first <= e.t_ns <= last]
+            if len(self.events) < every:
+                self.left_out[name, "scans and fixes outside the odometry"] += every - len(self.events)
+            t_ns = sorted({event.t_ns for event in self.events if event.robot == topic.robot})
+            for t, (a, b) in zip(t_ns[1:], pairwise(path.at(t_ns, max_gap_s=FOREVER_S)), strict=True):
+                self.control(topic, t, self.step(topic, a, b), None)
 
     def velocity(self, topic: Topic, t_ns: int, offer: Message, message: Any) -> None:
         """Take a velocity, held from now on."""

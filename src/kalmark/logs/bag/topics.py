@@ -48,15 +48,29 @@ class Noisy:
     own_noise: Annotated[bool, "Take the covariance of the message's twist instead of the motion's noise."] = False
 
 
+@declared
+class Moved(Posed, Noisy):
+    """Increments of odometry: differences of poses, of successive ones or at the times of scans."""
+
+    at: Annotated[
+        Literal["messages", "scans"],
+        "Where increments end: at the messages, or, on the interpolated path, at the scans: for slow odometry.",
+    ] = "messages"
+
+    def __post_init__(self) -> None:
+        if self.at == "scans" and self.own_noise:
+            raise refuse(self, "own_noise", "False with at: scans")
+
+
 @register("topic", "odometry_2d")
-class Odometry2DTopic(Posed, Noisy):
+class Odometry2DTopic(Moved):
     """Increments of odometry in the plane: differences of successive poses."""
 
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
 
 
 @register("topic", "odometry_3d")
-class Odometry3DTopic(Posed, Noisy):
+class Odometry3DTopic(Moved):
     """Increments of odometry in space: differences of successive poses."""
 
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")

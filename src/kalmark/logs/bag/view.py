@@ -107,7 +107,7 @@ def placed(place: Array) -> Array:
 
 def markers(t_ns: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the fields of a MarkerArray that replaces all markers of its topic."""
-    clear = {"header": header(t_ns, MAP), "action": DELETE_ALL}
+    clear = {"header": header(t_ns, MAP), "action": DELETE_ALL, "pose": {"orientation": {"w": 1.0}}}
     return {"markers": [clear, *rows]}
 
 
