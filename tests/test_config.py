@@ -91,7 +91,7 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ("robots.each.motion.sigma_v_mps='1'", "robots.each.motion.sigma_v_mps: got '1', expected a number"),
         (
             "robots.each.motion.type=unicicle",
-            "got 'unicicle', expected one of unicycle, odometry_2d, ackermann, odome",
+            "got 'unicicle', expected one of unicycle, odometry_2d, ackermann, differential_drive",
         ),
         ("robots.each.motion.type=inertial", "got 'inertial', which is not available yet, expected one of unic"),
         ("robots.each.motion=3", "robots.each.motion: got 3, expected a mapping with a type: one of unicycle, od"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ STEP = (0.08, 0.0, 0.02)  # an increment each tenth of a second: .8 m/s and .2 r
 LASER = {"laser": km.Mount(km.sensors.RangeBearing(0.03, 0.01))}
 
 
-def driven(motion: km.motion.Odometry2D | km.motion.Unicycle, u: tuple[float, ...], **of_robot: object) -> km.Slam:
+def driven(motion: Any, u: tuple[float, ...], **of_robot: object) -> km.Slam:
     """Return the filter of a robot after 40 controls, the last of them at 4 s."""
     slam = km.Slam([km.Robot("r", motion, sensors=LASER, **of_robot)])  # type: ignore[arg-type]
     for k in range(1, 41):
@@ -62,6 +63,18 @@ def test_a_velocity_that_is_held_too_long_is_noticed_at_the_next_scan() -> None:
     (gap,) = slam.process(km.Scan(7.1, "r", "laser", [], None)).gaps
     assert (gap.kind, gap.start_ns, gap.end_ns) == ("held", 4_000_000_000, 7_100_000_000)
     assert gap.sigma_m == pytest.approx(1.2 * 0.8 * 3.0 / 2, rel=1e-2)  # about the motion that is held
+
+
+def test_a_gap_is_as_wide_for_a_robot_with_more_than_a_pose_and_for_one_that_counts_its_wheels() -> None:
+    unicycle, slipping = (
+        driven(motion, (0.8, 0.2)).process(km.Scan(7.1, "r", "laser", [], None)).gaps[0]
+        for motion in (km.motion.Unicycle(0.01, 0.01), km.motion.SlippingUnicycle(0.01, 0.01))
+    )
+    assert (slipping.sigma_m, slipping.sigma_rad) == pytest.approx((unicycle.sigma_m, unicycle.sigma_rad))
+    wheels = driven(km.motion.DifferentialDrive(0.1, 0.1, 0.5), (0.75, 0.85))  # 0.8 m/s, 0.2 rad/s
+    (gap,) = wheels.process(km.Control(7.0, "r", (0.75, 0.85))).gaps
+    (same,) = odometer().process(km.Control(7.0, "r", STEP)).gaps
+    assert (gap.sigma_m, gap.sigma_rad) == pytest.approx((same.sigma_m, same.sigma_rad), rel=1e-3)
 
 
 def test_a_gap_grows_as_one_while_scans_go_on_without_a_landmark() -> None:

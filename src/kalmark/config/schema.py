@@ -248,7 +248,7 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
     allowed = {*has, *(SIGMAS[name[0]] for name in has)}
     for key in dict.fromkeys((*STATES["plane"], *STATES["space"], *SIGMAS.values())):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
-            what = "slip" if "slip" in key else "such velocity"
+            what = "slip" if "slip" in key else "velocity like this"
             raise expected(f"0: {motion.type} has no {what} in its state", "start", key)
 
 

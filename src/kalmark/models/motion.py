@@ -25,10 +25,8 @@ from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
 from kalmark.geometry.spaces import ROTATION, SCALAR, SE3, VECTOR3, Space
-from kalmark.models.coasting import ConstantTurnRate, ConstantVelocity
 from kalmark.models.kinematics import MotionModel, PlanarMotion, Scale, TurnPerMetre, TurnScale, arc
 from kalmark.models.observe import CompiledVelocity
-from kalmark.models.wheels import DifferentialDrive, Mecanum, Omnidirectional, SlippingUnicycle, Tricycle
 
 __all__ = [
     "Ackermann", "ConstantTurnRate", "ConstantVelocity", "ConstantVelocity3D", "DifferentialDrive", "Mecanum",
@@ -335,3 +333,8 @@ class ConstantVelocity3D(MotionModel, CompiledVelocity):
             return None
         way = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
         return np.kron(way, np.diag([v, v, v, w, w, w]))
+
+
+# after those above, which messages and the page of the configuration name first
+from kalmark.models.wheels import DifferentialDrive, Mecanum, Omnidirectional, SlippingUnicycle, Tricycle  # noqa: E402, I001
+from kalmark.models.coasting import ConstantTurnRate, ConstantVelocity  # noqa: E402

@@ -114,7 +114,7 @@ class Gaps:
             D[:] = 0.0
         self.adrift = self.adrift or bool(D.any())
         kind = "held" if self.motion.held else "increments"
-        sigmas = np.sqrt(D.diagonal()[[0, len(D) - 1 if len(D) < 6 else 5]]).tolist()
+        sigmas = np.sqrt(D.diagonal()[[0, 2 if self.motion.space.axes == 1 else 5]]).tolist()
         self.noticed = Gap(self.robot, kind, self.last_ns, t_ns, *sigmas)
         return D if D.any() else None
 

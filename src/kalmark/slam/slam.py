@@ -380,7 +380,7 @@ class Slam:
         if not held.is_adrift:
             return query
         r = self.map.mean(scan.robot)
-        if len(r) != 3 or self.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2:
+        if len(scan.pose()) != 3 or self.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2:
             held.recovered()
             return query
         T = None
@@ -388,7 +388,8 @@ class Slam:
             T = relocalized(query)
         if T is None:
             return query
-        self.map.set_predicted(scan.robot, compose(T, compose(inverse(scan.pose())[0], r)[0])[0])
+        pose = compose(T, compose(inverse(scan.pose())[0], r[:3])[0])[0]
+        self.map.set_predicted(scan.robot, np.append(pose, r[3:]))
         return Query(scan)
 
     def _correct(
