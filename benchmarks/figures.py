@@ -281,6 +281,12 @@ def gaps() -> Iterator[Figure]:
     yield Figure(
         section, "wrong maps without an alarm / right maps with one", "0 / 0", command, row("total", "{2} / {3}")
     )
+    section, command = "Walls", "python benchmarks/walls.py"
+    for name, wanted in (("invariant", ("3 / 90 %", "0 / 0")), ("ekf", ("", ""))):
+        yield Figure(section, f"hall of walls and corners, raw laser, no ids, 50 runs, `{name}`: pose ANEES / steps in its band",
+                     wanted[0], command, row(name, "{0} / {1} %"))  # fmt: skip
+        yield Figure(section, f"the same, `{name}`: walls / on no true wall / there twice",
+                     wanted[1], command, row(name, "{4} / {5} / {6}"))  # fmt: skip
     section, command = "Repeats", "python benchmarks/repeats.py"
     yield Figure(section, "halls mapped twice (gaps of 2, 4 and 16 s ignored): found at the end / merged to 24 pillars",
                  "95 %", command, row("mapped twice", "{0} / {1} of {2}"))  # fmt: skip

@@ -1,7 +1,7 @@
 """A hall of walls and corners from a raw laser, without ids: is the covariance right, and is any wall mapped twice?
 
-    python benchmarks/walls.py                  # 20 runs of the shipped world hall_of_walls, both estimators
-    python benchmarks/walls.py --runs 50 --set steps=600
+    python benchmarks/walls.py                  # 50 runs of the shipped world hall_of_walls, both estimators
+    python benchmarks/walls.py --runs 20 --set steps=1200
 
 A line an estimator: pose ANEES (3 is right), the share of steps in its 95 % band, the position's RMSE, then over all
 runs the walls of the maps, those that are on no true wall (`false`), and those that another wall of the same map joins
@@ -56,7 +56,7 @@ def placed_on(ends: Array, true: Array) -> tuple[int, float, float] | None:
 def main() -> None:
     """Print the lines."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--set", nargs="*", default=[], help="what is different of the world: steps=600")
     options = parser.parse_args()
     estimators: dict[str, dict[str, Any]] = {"invariant": {"type": "invariant"}, "ekf": {"type": "ekf"}}

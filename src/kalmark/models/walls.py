@@ -76,6 +76,12 @@ def wall(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Arr
     return e, z, E_v
 
 
+def facing(y: Array) -> Array:
+    """Return segments y (K, 4) with distances of at least 0: the same lines, told from the other side."""
+    other = np.column_stack([-y[:, 0], wrap(y[:, 1] + math.pi), -y[:, 3], -y[:, 2]])
+    return np.asarray(np.where(y[:, :1] < 0.0, other, y))
+
+
 def axes(alpha: Array) -> tuple[Array, Array]:
     """Return the normals n and the directions tau (K, 2) of walls whose normals have the directions alpha (K,)."""
     c, s = np.cos(alpha), np.sin(alpha)

@@ -24,7 +24,9 @@ from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE3
 from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.protocols import StartNoise, range_limit, world_of
+from kalmark.models.sensors import Wall
 from kalmark.models.tags import corners, tag_seen_from
+from kalmark.models.walls import facing
 from kalmark.simulate.layouts import Scenery
 
 Indices = Index
@@ -199,7 +201,8 @@ def noisy(sensor: Any, e: Array, rng: Generator, cov: Array | None = None) -> Ar
         return np.array([SE3.plus(pose, d) for pose, d in zip(e, n, strict=True)])
     y = e.copy()
     y[:, : n.shape[1]] += n  # a tag's size is known, not measured
-    return np.where(sensor.angular, wrap(y), y) if len(sensor.angular) == y.shape[1] else y
+    y = np.where(sensor.angular, wrap(y), y) if len(sensor.angular) == y.shape[1] else y
+    return facing(y) if isinstance(sensor, Wall) else y  # noise may take a line to the other side
 
 
 def possible(sensor: Any, y: Array) -> Indices:
