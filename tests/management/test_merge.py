@@ -192,7 +192,7 @@ def test_in_a_full_map_nothing_is_merged_and_nothing_lost(tmp_path: Path) -> Non
     slam.map.storage.limit_bytes = slam.map.storage.nbytes  # type: ignore[union-attr]
     for i in range(1000):
         try:
-            slam.add_landmark(f"far{i}", [1000.0 + i, 0.0])
+            slam.add_landmark(f"far{i}", [1000.0 + i, 0.0], np.zeros((2, 2)))
         except MapError:
             break
     before = slam.landmarks().ids

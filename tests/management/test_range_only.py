@@ -228,7 +228,7 @@ def test_in_a_full_map_ranges_are_ignored_with_the_reason_until_there_is_room(wa
     placed: list[int] = []
     while len(placed) < 70:
         try:
-            slam.add_landmark(1000 + len(placed), [1000.0 + len(placed), 0.0])
+            slam.add_landmark(1000 + len(placed), [1000.0 + len(placed), 0.0], np.zeros((2, 2)))
         except MapError:
             break
         placed.append(1000 + len(placed))

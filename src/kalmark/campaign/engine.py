@@ -112,6 +112,8 @@ def _odd_models(motion: Any, mount: Mount) -> str:
 
 def _odd_filter(config: Config, name: str, landmarks: int) -> str:
     """Return what of a filter the engine does not run."""
+    if config.map.known is not None:
+        return "the batched engine has no known maps"
     slam = build_slam(config)
     robot = slam.robots[name]
     ((key, mount),) = robot.sensors.items()

@@ -261,7 +261,7 @@ class _Scorer:
         points: dict[Id, Array] = {}
         for name, true in self.true_id.items():
             model, truth = slam.landmark_model(name), self.log.landmarks.get(true)  # type: ignore[arg-type]
-            if model is None or truth is None:
+            if model is None or truth is None or slam.is_known(name):
                 continue
             if model.space in (POINT2, POINT3) and len(truth) == self.d:
                 points[name] = truth

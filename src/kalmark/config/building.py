@@ -9,14 +9,15 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from kalmark.config.opening import described, open_run
+from kalmark.config.opening import described, known_path, open_run
 from kalmark.config.reading import did_you_mean, load_config
-from kalmark.config.schema import Config, covariance_of, pose_of, state_of
+from kalmark.config.schema import TRUTH, Config, covariance_of, pose_of, state_of
 from kalmark.config.sections import model_of
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW, Laser
-from kalmark.errors import LogError, ModelError
+from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Scan
+from kalmark.logs.known_map import KnownLandmark, read_known
 from kalmark.logs.log import Log, true_start
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import coasts, state_columns
@@ -38,7 +39,28 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
         "landmarks": _made(config, ("landmarks",), model_of, config.landmarks, robots[0].motion.space.world),
     }
     kept_map = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
-    return _made(config, ("robots",), Slam, robots, **types, **kept_map, upkeep=kept)
+    slam: Slam = _made(config, ("robots",), Slam, robots, **types, **kept_map, upkeep=kept)
+    for landmark in _known(config, log):
+        try:
+            slam.add_landmark(*landmark)
+        except MapError as error:
+            raise config.error(("map", "known"), f"got {m.known!r}, {error}") from None
+    return slam
+
+
+def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
+    """Return the landmarks known beforehand, of a file or of the log's truth."""
+    given, exact = config.map.known, config.map.exact
+    if given is None:
+        return []
+    if given == TRUTH:
+        if log is None or not log.landmarks:
+            raise config.error(("map", "known"), "got truth, expected a log that has true landmarks")
+        return [KnownLandmark(name, place, None) for name, place in log.landmarks.items()]
+    try:
+        return read_known(known_path(config), exact)
+    except LogError as error:
+        raise config.error(("map", "known"), str(error)) from None
 
 
 def slam_from_config(path_or_name: str | Path) -> Slam:

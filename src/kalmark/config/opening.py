@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.config.reading import config_of, did_you_mean, resolve_config, shipped_configs
-from kalmark.config.schema import Config
+from kalmark.config.schema import TRUTH, Config
 from kalmark.config.tree import OVERRIDE, Tree, read_tree
 from kalmark.errors import ConfigError, LogError
 from kalmark.logs import FORMATS, find_data, open_log
@@ -32,7 +32,19 @@ def open_run(
     alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
     log = open_config_log(alone)
     refuse_idle(tree, log)
-    return config_of(laid_over(tree, log), path).model_copy(update={"log": alone.log}), log
+    config = config_of(laid_over(tree, log), path)
+    found = {"known": str(known_path(config))} if config.map.known not in (None, TRUTH) else {}
+    return config.model_copy(update={"log": alone.log, "map": config.map.model_copy(update=found)}), log
+
+
+def known_path(config: Config) -> Path:
+    """Return where the known map is: beside the configuration, or where logs are looked for.
+
+    Raises LogError, naming all places.
+    """
+    own = config.file is not None and config.file not in shipped_configs().values()
+    beside = config.file.resolve().parent if config.file and own and not config.overridden("map", "known") else None
+    return find_data(str(config.map.known), beside).resolve()
 
 
 def described(config: Config, log: Log) -> Config:

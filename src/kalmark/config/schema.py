@@ -361,6 +361,9 @@ AnyRobot = Annotated[
 ]
 
 
+TRUTH = "truth"  # what stands for a file with the true landmarks
+
+
 class MapConfig(Section):
     """How the covariance is kept."""
 
@@ -370,6 +373,11 @@ class MapConfig(Section):
     """In what a postponed map keeps what is at rest; `float32` takes half the memory."""
     reparametrize: Linearity = 0.03
     """Inverse-depth and anchored points become Euclidean below this linearity index; or off."""
+
+    known: str | None = None
+    """Landmarks known beforehand: a landmarks.csv beside this file or in KALMARK_DATA, or `truth`: those of the log."""
+    exact: bool = False
+    """Take the landmarks of `known` as exact, whatever the columns cov_... of the file say."""
 
     @property
     def linearity(self) -> float | None:

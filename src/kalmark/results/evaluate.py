@@ -168,8 +168,8 @@ def known_landmarks(run: Recording) -> MapLandmarks:
 def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
     """Return the landmark errors, raw and after their own rigid alignment, over the ids that map and truth share.
 
-    Points that are not Euclidean yet count if they are known to a hundredth of the extent of the true map: the depth of
-    the others is still open.
+    Those known exactly do not count.  Points that are not Euclidean yet count if they are known to a hundredth of the
+    extent of the true map: the depth of the others is still open.
     """
     true = {str(i): l for i, l in truth.landmarks_in_map().items()}
     if not true:
@@ -181,6 +181,7 @@ def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
         k
         for k, (i, kind, place) in enumerate(zip(landmarks.ids, landmarks.kinds, landmarks.means, strict=True))
         if str(i) in true
+        and i not in landmarks.exact
         and 2 * d not in (len(place), len(true[str(i)]))
         and (kind in EUCLIDEAN or _sigma(covariances[k]) < SETTLED * extent)
     ]

@@ -21,7 +21,7 @@ import csv
 import io
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -113,7 +113,8 @@ class MapLandmarks:
     """The landmarks of a map: ids, kinds, places with covariances and how often each was observed.
 
     The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
-    in the map is (`kalmark.results.landmarks`); NaN if its model does not say where it is.
+    in the map is (`kalmark.results.landmarks`); NaN if its model does not say where it is.  `exact` are those known
+    exactly beforehand, which the filter had outside its map.
     """
 
     ids: list[Id]
@@ -122,14 +123,15 @@ class MapLandmarks:
     covariances: list[Array]
     observations: list[int]
     in_space: bool = False
+    exact: frozenset[Id] = frozenset()
 
     def __len__(self) -> int:
         return len(self.ids)
 
     @classmethod
-    def of(cls, slam: Slam) -> MapLandmarks:
-        """Return the places of the landmarks of a filter's map."""
-        table = slam.landmarks()
+    def of(cls, slam: Slam, *, exactly_known: bool = True) -> MapLandmarks:
+        """Return the places of the landmarks of a filter's map, and of those known exactly beside it."""
+        table = slam.landmarks(exactly_known=exactly_known)
         in_space = any(robot.motion.space.world == "space" for robot in slam.robots.values())
         d = 3 if in_space else 2
         means, covariances = [np.full(d, np.nan)] * len(table), [np.full((d, d), np.nan)] * len(table)
@@ -143,7 +145,21 @@ class MapLandmarks:
             for k, mean, covariance in zip(rows, *found, strict=True) if found is not None else ():
                 means[k], covariances[k] = mean, covariance
         observations = [int(count) for count in table.observations]
-        return cls(list(table.ids), list(table.kinds), means, covariances, observations, in_space)
+        exact = frozenset(name for name in table.ids if slam.is_known(name))
+        return cls(list(table.ids), list(table.kinds), means, covariances, observations, in_space, exact)
+
+    def split(self) -> tuple[MapLandmarks, MapLandmarks]:
+        """Return the landmarks of the map, and those known exactly beside it."""
+        rows = range(len(self))
+        mapped = self._of([k for k in rows if self.ids[k] not in self.exact])
+        return mapped, self._of([k for k in rows if self.ids[k] in self.exact])
+
+    def _of(self, rows: list[int]) -> MapLandmarks:
+        """Return the landmarks of these rows."""
+        return MapLandmarks(
+            [self.ids[k] for k in rows], [self.kinds[k] for k in rows], [self.means[k] for k in rows],
+            [self.covariances[k] for k in rows], [self.observations[k] for k in rows], self.in_space, self.exact,
+        )  # fmt: skip
 
     def positions(self) -> tuple[Array, Array]:
         """Return the positions (K, d) and their covariances (K, d, d), of lines their first endpoints."""
@@ -162,7 +178,10 @@ class MapLandmarks:
         return padded_all(means), padded_all([P[:n, :n] for P, n in zip(self.covariances, sizes, strict=True)], 2)
 
     def to_csv(self) -> str:
-        """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations."""
+        """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations.
+
+        If there are any known exactly, `known` is "exactly" in their rows.
+        """
         axes = [
             _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
             for kind, mean in zip(self.kinds, self.means, strict=True)
@@ -174,12 +193,14 @@ class MapLandmarks:
         pairs = [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations"])
+        known = ["known"] if self.exact else []
+        writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations", *known])
         for i, names in enumerate(axes):
             at, row = ({name: j for j, name in enumerate(of)} for of in (names, _errors(names)))
             mean = [repr(float(self.means[i][at[name]])) if name in at else "" for name in columns]
             cov = [repr(float(self.covariances[i][row[a], row[b]])) if {a, b} <= row.keys() else "" for a, b in pairs]
-            writer.writerow([self.ids[i], self.kinds[i], *mean, *cov, self.observations[i]])
+            known = ["exactly" if self.ids[i] in self.exact else ""] if self.exact else []
+            writer.writerow([self.ids[i], self.kinds[i], *mean, *cov, self.observations[i], *known])
         return out.getvalue()
 
     @classmethod
@@ -187,7 +208,7 @@ class MapLandmarks:
         """Read a ``landmarks.csv``.  Raises RunError naming file and line."""
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
-            table = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ()))
+            table, exact = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ())), set[Id]()
             for number, row in enumerate(rows, start=2):
                 try:
                     names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
@@ -200,9 +221,10 @@ class MapLandmarks:
                     table.means.append(np.array([float(row[name]) for name in names]))
                     table.covariances.append(cov)
                     table.observations.append(int(row["observations"]))
+                    exact |= {table.ids[-1]} if row.get("known") else set()
                 except (KeyError, TypeError, ValueError) as error:
                     raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
-        return table
+        return replace(table, exact=frozenset(exact))
 
 
 def refuse_other_than_points(slam: Slam, what: str) -> None:

@@ -44,6 +44,7 @@ GROUND, SHADOW, TICK, SOFT = "#d7dbe1", "#c3c8d0", "#7a818c", "#555b66"
 NAMED: dict[str, Any] = {"color": "#1e4d2b", "fontsize": 7, "ha": "center", "va": "bottom", "zorder": 9}
 POSE_COLOUR = "#d62f2f"
 ALARM_COLOUR = "#b3261e"
+KNOWN_COLOUR = "#2f7d4f"
 INCHES = {2: 8.3, 3: 13.6}  # what the panels are wide together
 LINE_INCHES, CHARACTERS = 0.17, 13  # the height of a line of text, and how many fit an inch
 
@@ -158,7 +159,12 @@ def strokes(scene: Scene) -> list[Stroke]:
     aligned = "position fixes (aligned, not used)"
     out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
     out += [Stroke(fixes, cross, "fixes used", cross | {"markersize": 5}) for fixes in scene.used.values()]
-    out += _true_strokes(scene, truth, crowded) + _landmark_strokes(scene, crowded) + _robot_strokes(scene)
+    out += (
+        _true_strokes(scene, truth, crowded)
+        + _known_strokes(scene)
+        + _landmark_strokes(scene, crowded)
+        + _robot_strokes(scene)
+    )
     if len(scene.repeats):
         twice = {"color": ALARM_COLOUR, "linewidth": 0.9, "alpha": 0.8, "zorder": 5}
         out.append(Stroke(scene.repeats, twice, "landmarks mapped twice", twice))
@@ -180,6 +186,14 @@ def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[St
         out.append(Stroke(joined(lines, scene.d), style, "true walls" if scene.d == 2 else "true lines", style))
     tags = np.array([l for l in scene.true_landmarks.values() if len(l) == TAG]).reshape(-1, TAG)
     return [*out, Stroke(joined(squares(tags, scene.size)), style)] if len(tags) else out
+
+
+def _known_strokes(scene: Scene) -> list[Stroke]:
+    """Return the landmarks that were known exactly beforehand."""
+    if not len(scene.known):
+        return []
+    mark = _marks("^", KNOWN_COLOUR, 2.5 if len(scene.known) > CROWD else 6, 5) | {"markerfacecolor": "none"}
+    return [Stroke(scene.known, mark, "landmarks known exactly", mark | {"markersize": 6})]
 
 
 def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:

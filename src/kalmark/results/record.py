@@ -176,7 +176,7 @@ class _Recorder:
             self.due, self.kept = self.due + due, self.kept + len(self.maps[-1].ids)
 
     def _snapshot(self) -> MapSnapshot:
-        landmarks = MapLandmarks.of(self.slam)
+        landmarks = MapLandmarks.of(self.slam, exactly_known=False)
         ids, kinds = tuple(landmarks.ids), tuple(landmarks.kinds)
         return MapSnapshot(len(self.reports) - 1, self.reports[-1].t_ns, ids, *landmarks.places(), kinds)
 

@@ -184,6 +184,7 @@ def series(run: Recording) -> dict[str, Any]:
         "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
         "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
+        "knownLandmarks": {"id": [str(i) for i in scene.known_ids], **xy(scene.known)},
         "trueLines": xy(joined(scene.true_lines(), scene.d)),
         "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
         "repeats": xy(scene.repeats),

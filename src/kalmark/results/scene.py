@@ -58,6 +58,7 @@ class Scene:
     its steps, positions by `dead` reckoning (N, d), true ones (S, d; NaN: unknown), fixes (F, 2) to score with and
     those `used` by the filter (F, d).
     `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
+    `known` (N, d) are the landmarks known exactly and `known_ids` their names.
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
     corners of the box to draw, the same for all steps.
     """
@@ -77,6 +78,8 @@ class Scene:
     low: Array
     high: Array
     repeats: Array
+    known: Array
+    known_ids: tuple[Id, ...]
 
     @classmethod
     def of(cls, run: Recording, step: int | None = None) -> Scene:
@@ -94,7 +97,7 @@ class Scene:
         landmarks = {
             i: l if d == 3 or len(l) == 2 * d else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()
         }
-        used, last = _used_fixes(run, d), run.landmarks
+        used, (last, exact) = _used_fixes(run, d), run.landmarks.split()
         whole = shapes(*last.places(), last.kinds, d)
         now, ids = whole, tuple(last.ids)
         if step is not None:
@@ -104,7 +107,8 @@ class Scene:
         poses, P = history.poses, history.pose_covariances
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
         true = [l.reshape(-1, d) if len(l) == 2 * d else l[None, :d] for l in landmarks.values()]
-        low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true])
+        known_at = exact.positions()[0][:, :d]
+        low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true, known_at])
         paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
         dead = {r: history.dead_reckoned[until][rows[until]][:, :d] for r, rows in mine.items()}
         stretches = {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()}
@@ -117,7 +121,7 @@ class Scene:
         twice = [np.array([at[row.landmark], at[row.other]]) for row in history.repeats if {*row[1:3]} <= at.keys()]
         return cls(
             d, paths, covariances, stretches, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
-            joined([line[:, :d] for line in twice], d),
+            joined([line[:, :d] for line in twice], d), known_at, tuple(exact.ids),
         )  # fmt: skip
 
     @property

@@ -15,6 +15,7 @@ from ruamel.yaml import YAML
 from kalmark.config.opening import merged
 from kalmark.config.reading import resolve_name, run_plugins, shipped_configs, validate
 from kalmark.config.schema import (
+    TRUTH,
     Config,
     Plugins,
     RobotConfig,
@@ -171,6 +172,10 @@ class World(Section):
     def _laid_over(self, values: dict[str, Any]) -> Tree:
         """Return `values` with `filter` laid over, its keys remembering where they were written."""
         tree = Tree(values=merged(values, deepcopy(self.filter)))
+        known = tree.values.get("map", {}).get("known")
+        if isinstance(known, str) and known != TRUTH and self._file is not None:  # beside the world, if it is there
+            beside = self._file.resolve().parent / known
+            tree.values["map"]["known"] = str(beside) if beside.exists() else known
         for table, source in ((tree.places, "places"), (tree.keys, "keys")):
             written: dict[tuple[str, ...], str] = getattr(self._tree, source, {})
             table |= {path[1:]: place for path, place in written.items() if path[:1] == ("filter",)}

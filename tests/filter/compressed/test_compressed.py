@@ -303,7 +303,7 @@ def test_a_landmark_that_does_not_fit_is_ignored_with_a_reason_and_all_else_goes
     assert [r.startswith("the map is full: 128 rows take") for r in reasons] == [True]
     assert max(differences(*slams)) < 1e-9
     with pytest.raises(km.KalmarkError, match="the map is full"):
-        slams[0].add_landmark("surveyed", (1.0, 2.0))
+        slams[0].add_landmark("surveyed", (1.0, 2.0), np.zeros((2, 2)))
 
 
 def test_in_a_map_too_full_for_the_error_of_a_control_the_robot_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:

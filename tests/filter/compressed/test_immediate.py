@@ -104,7 +104,7 @@ def test_a_map_that_remembers_an_immediate_correction_and_a_removal_can_be_saved
     slam.save(tmp_path / "map.kmk")
     again = km.Slam.load(tmp_path / "map.kmk")
     for each in (slam, again):
-        each.add_landmark("new", [3.0, 4.0])
+        each.add_landmark("new", [3.0, 4.0], np.zeros((2, 2)))
         each.process(km.Scan(103.0, "r", "lidar", y[:1], seen))
     names = ["r", *slam.landmarks().ids]
     assert again.landmarks().ids == slam.landmarks().ids

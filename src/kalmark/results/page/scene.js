@@ -1,7 +1,7 @@
 "use strict";
 /* The map of a run, in the plane or in space, where it turns under the mouse, and the images of cameras at the slider. */
 const AXES = DATA.dof === 3 ? ["x", "y"] : ["x", "y", "z"], SPACE = AXES.length === 3;
-const TRUTH = SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)", FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = "#8c1c13", ALARM = "#b3261e";
+const TRUTH = SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)", FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = "#8c1c13", ALARM = "#b3261e", KNOWN = "#2f7d4f";
 const MEASURED = "#7d838d", SEGMENT = "rgba(58,104,200,0.55)";
 const GROUPS = !SPACE ? [["#d2691e", "landmarks, 3 sigma"]] :
   [["#1f5fa8", "landmarks, 3 sigma"], ["#c8412f", "landmarks that are not Euclidean, 3 sigma"], [LINE, "lines, 3 sigma of their ends"]];
@@ -96,6 +96,10 @@ function still() {
   if (l.x.length)
     traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],
                       {name: "true landmarks", hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
+  const known = DATA.knownLandmarks;
+  if (known.x.length)
+    traces.push(marks({...boxed(known), text: known.id}, {symbol: SPACE ? "diamond-open" : "triangle-up-open", color: KNOWN}, [9, 4],
+                      {name: "landmarks known exactly", hovertemplate: `%{text}, known exactly: ${WHERE}<extra></extra>`}));
   return traces;
 }
 

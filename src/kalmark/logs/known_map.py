@@ -1,0 +1,74 @@
+"""A map known beforehand, from a ``landmarks.csv``: that of a survey, of a log's truth, or of the folder of a run."""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import LogError
+from kalmark.events import Id
+from kalmark.logs.source import Request
+from kalmark.logs.table import Refused, Row, read_table
+
+PLACES = ("x_m", "y_m", "z_m", "signature", "qx", "qy", "qz", "qw")
+KINDS = {
+    ("x_m", "y_m"), ("x_m", "y_m", "signature"), ("x_m", "y_m", "z_m"), ("x_m", "y_m", "z_m", *PLACES[4:]),
+}  # fmt: skip
+LETTERS = {"x_m": "x", "y_m": "y", "z_m": "z", "signature": "s"}
+TURNS = ("rx", "ry", "rz")  # of a pose's error, after its position
+
+
+class KnownLandmark(NamedTuple):
+    """A landmark of a known map: its place (n,), and the covariance of its error, None of one known exactly."""
+
+    id: Id
+    mean: Array
+    cov: Array | None
+
+
+def read_known(path: Path, exact: bool = False) -> list[KnownLandmark]:
+    """Return the landmarks of a ``landmarks.csv``: id, x_m, y_m[, z_m][, signature | qx, qy, qz, qw], cov_xx, ...
+
+    Those with empty columns of the covariance, or with none, are known exactly; with `exact` all are.  Raises LogError
+    naming file and line.
+    """
+    found: dict[Id, KnownLandmark] = {}
+
+    def take(row: Row) -> None:
+        name, names = row.id(), tuple(n for n in PLACES if n in row.table.index and row.text(n))
+        if name is None:
+            raise Refused("id is empty, expected the landmark's id")
+        if name in found:
+            raise Refused(f"id {name} is in this file already, expected each landmark once")
+        if names not in KINDS:
+            raise Refused(f"{', '.join(names) or 'no place'}, expected the place of a point or the pose of a tag")
+        mean = np.array(row.numbers(names))
+        found[name] = KnownLandmark(name, mean, None if exact else _covariance(row, names))
+
+    def refuse(line: str) -> None:
+        raise LogError(line)
+
+    table = read_table(path, ("id", "x_m", "y_m"), allowed=("kind", "observations", "known", *PLACES[2:]))
+    table.each(Request(None, refuse, []), take, timed=False)
+    return [*found.values()]
+
+
+def _covariance(row: Row, names: tuple[str, ...]) -> Array | None:
+    """Return the covariance of a landmark's error, None if its columns are empty or zero."""
+    letters = [LETTERS[name] for name in names if name in LETTERS] + [*TURNS] * ("qw" in names)
+    cov = np.zeros((len(letters), len(letters)))
+    pairs = list(combinations_with_replacement(range(len(letters)), 2))
+    columns = [f"cov_{letters[i]}{letters[j]}" for i, j in pairs]
+    given = [column for column in columns if column in row.table.index and row.text(column)]
+    if not given:
+        return None
+    if given != columns:
+        missing = next(column for column in columns if column not in given)
+        raise Refused(f"{missing} is empty, expected all of {', '.join(columns)}, or none")
+    for (i, j), value in zip(pairs, row.numbers(tuple(columns)), strict=True):
+        cov[i, j] = cov[j, i] = value
+    return cov if cov.any() else None
