@@ -152,7 +152,7 @@ def draw(path: Path, title: str, t_s: Array, panels: Sequence[tuple[str, float, 
 
     figure = Figure(figsize=(9, 2.5 * len(panels)), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(len(panels), 1, sharex=True)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axis, panel in zip(axes, panels, strict=True):
         _draw_panel(axis, t_s, *panel)
     axes[-1].set_xlabel("time (s)")
@@ -251,7 +251,8 @@ class Campaign:
         panels = [
             (self.label(n), self.ideal(n), {of: Anees(n, scores, self.skip) for of, scores in self.scores.items()})
             for n in self._names()
-        ]
+            if any(np.isfinite(score.series[n]).any() for scores in self.scores.values() for score in scores)
+        ]  # of a map without landmarks none has a NEES
         draw(folder / "anees.png", title, t_s, panels)
         return folder
 

@@ -5,7 +5,7 @@ Those of one kind are rows of one array.  The few near a place are found in a tr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,7 +138,7 @@ class KnownLandmarks:
         return len(self._at)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._at
+        return isinstance(name, Hashable) and name in self._at
 
     def __iter__(self) -> Iterator[Id]:
         return iter(self._at)
