@@ -1127,15 +1127,20 @@ class Slam:
             replace(robot, sensors={name: replace(mount, detector=None) for name, mount in robot.sensors.items()})
             for robot in self.robots.values()
         ]
-        for kind in ("dense", "postponed") if self._may_grow else (self.map_type,):
+        kinds = ("dense", "postponed") if self._may_grow else (self.map_type,)
+        surveyed: list[tuple[Any, ...]] = []
+        for kind, in_known_map in [*((kind, False) for kind in kinds), *[(kinds[0], True)] * bool(self.tracks.known)]:
             twin = Slam(
                 robots, self.association, self.estimator, self.landmark_type, kind, self.reparametrize, self.numbers,
                 self.upkeep,
             )  # fmt: skip
+            for landmark in surveyed if in_known_map else ():
+                twin.add_landmark(*landmark)
             for event in rehearsal(robots, twin._sensor_pose):
                 with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
                     twin.process(event)
             twin.covariance(*twin.robots, *twin.tracks.confirmed)
+            surveyed = [(track.id, twin.mean(track.id), None, track.model) for track in twin.tracks.confirmed.values()]
             for track in twin.tracks.confirmed.values():
                 if isinstance(track.model, Reparametrizable):
                     track.model.to_point(twin.mean(track.id)[None])
