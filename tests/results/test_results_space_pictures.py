@@ -170,7 +170,7 @@ def test_any_camera_s_measurements_are_points_of_its_images(run: Run, columns: A
     camera = Camera("rover", "eye", FORWARD, (640.0, 480.0), columns, run.history.cameras[0].corners)
     Z = np.tile(4.0 * np.eye(m), (count, 1, 1))
     history = replace(run.history, y=y, e=y + 3.0, z=np.full((count, m), -3.0), Z=Z, cameras=(camera,))
-    history = replace(history, unmeasured_step=np.zeros(0, dtype=np.int64))
+    history = replace(history, unmeasured_step=np.full_like(history.unmeasured_step, -1))
     seen = images(history, camera, int(history.step[-1]))
     assert [image.side for image in seen] == sides
     assert all(s.measured.shape == s.expected.shape == (points, 2) for image in seen for s in image.sightings)

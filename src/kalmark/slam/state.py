@@ -261,7 +261,7 @@ class Saved:
     def _enter_known(self, tracks: Tracks, own: Sequence[Landmark]) -> None:
         """Enter the landmarks known exactly.  Raises MapError where one is there twice."""
         for i, of in enumerate(self._state["known"]):
-            model = _model(of["model"], own)
+            model = _model(of["model"], own, f"landmark {next(iter(of['names']), '')!r}")
             values = _array(self._members, f"known{i}", (len(of["names"]), model.space.size))
             for name, value, count in zip(of["names"], values, of["counts"], strict=True):
                 if name in tracks.slots or name in tracks.known:
@@ -354,7 +354,7 @@ def _track(record: Description, own: Sequence[Landmark]) -> Track:
     return track
 
 
-def _model(record: Description, own: Sequence[Landmark], what: str = "landmarks known exactly") -> Landmark:
+def _model(record: Description, own: Sequence[Landmark], what: str) -> Landmark:
     """Return the model of a landmark: one of the user's `own`, or the registered one that a file describes."""
     model = next((landmark for landmark in own if same(landmark, record)), None)
     found: Landmark = model or restored("landmark", record, what, "landmarks")
