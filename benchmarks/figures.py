@@ -388,21 +388,6 @@ def commands() -> Iterator[Figure]:
                      "python benchmarks/warm.py 9ae1bee", row(f"{verb}, added:", "{0} s / {3} s / {7}"))  # fmt: skip
 
 
-def known_maps() -> Iterator[Figure]:
-    """Yield the figures of localisation."""
-    section, command = "Known maps", "python benchmarks/localization.py steps"
-    for how, name in (("ids", "with ids"), ("auto", "without ids, `auto`")):
-        yield Figure(section, f"a step with 4,000 exactly known landmarks over one with 10, {name}", "1.2 at most", command,
-                     row(f"{how} ratio", "{0}"))  # fmt: skip
-    yield Figure(section, "memory of 4,000 exactly known landmarks / rows in P", "", command,
-                 row("ids known 4000:", "{4} MB / {6}"))  # fmt: skip
-    yield Figure(section, "starts anywhere in a hall of 24 known pillars: found / wrong / median time", "95 of 100 / 0", 
-                 "python benchmarks/localization.py hall --runs 100", row("start:", "{1} of {3} / {5} / {10} s"))  # fmt: skip
-    yield Figure(section, "world `localization`, 100 runs: pose ANEES / % of steps inside", "3 / 90 %",
-                 "kalmark campaign localization --runs 100 --out out/localization",
-                 saved("out/localization/summary.json", "{estimators[invariant][pose_anees]:.2f} / {estimators[invariant][pose_inside]:.1%}"))  # fmt: skip
-
-
 def speed() -> Iterator[Figure]:
     """Yield the ratios of times within one run, and microseconds for orientation."""
     section, command = "Speed", "python benchmarks/step.py"
