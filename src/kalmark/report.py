@@ -188,6 +188,7 @@ class Report:
     `compared` are the landmarks that observations were compared with, `seen_at` (K, 2 or 3) is where these seemed to
     come from.  `gaps` are times without controls, up to now, for which the pose was widened.
     `repeats` were found in the map after the scan, and not merged.
+    `replaced` is how far, in m, a robot was moved to where the last fixes place it that it did not believe.
     """
 
     __slots__ = (
@@ -202,6 +203,7 @@ class Report:
         "merged",
         "removed",
         "repeats",
+        "replaced",
         "seen_at",
         "y",
         "z",
@@ -216,6 +218,7 @@ class Report:
         self.late: tuple[Late, ...] = ()
         self.gaps: tuple[Gap, ...] = ()
         self.repeats: tuple[Repeat, ...] = ()
+        self.replaced = 0.0
         self.compared: Compared | None = None
         self.seen_at: Array = NOTHING
         self.y = y

@@ -41,7 +41,7 @@ class Controlled(NamedTuple):
 class UsedFix(NamedTuple):
     """A fix that the filter was given: y (d,), innovation z (d,) and its covariance Z (d, d), d = 2 or 3.
 
-    `used`: not rejected.
+    `used`: not rejected.  `moved_m` is how far the robot was moved, as the last fixes agreed that it was elsewhere.
     """
 
     t_ns: int
@@ -50,6 +50,7 @@ class UsedFix(NamedTuple):
     y: Vector
     z: Vector
     Z: Matrix
+    moved_m: float = 0.0
 
 
 class Change(NamedTuple):

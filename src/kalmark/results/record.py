@@ -154,7 +154,9 @@ class _Recorder:
             self.reckoned[event.robot].take(event)
         elif type(event) is Fix:
             used = all(o.outcome == "associated" for o in report.observations)
-            self.fixes.append(UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0]))
+            self.fixes.append(
+                UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0], report.replaced)
+            )
         if type(event) is not Scan:
             return
         self.step_ns.append(math.nan if self.compiler.was_busy else self.spent_ns)

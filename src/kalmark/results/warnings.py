@@ -209,6 +209,10 @@ def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
 def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     if run.stopped:
         yield f"the filter stopped: {run.stopped}"
+    begin_ns = run.history.t_ns[0] if len(run.history.t_ns) else 0
+    for fix in (fix for fix in run.history.fixes if fix.moved_m > 0):
+        when = f"{(fix.t_ns - begin_ns) * 1e-9:.1f} s after the first scan"
+        yield f"{fix.robot} was lost {when}: its fixes agreed that it was {fix.moved_m:.1f} m away; it was moved there"
     lost = [name for name, figures in summary["robots"].items() if figures.get("diverged")]
     if lost:
         names = ", ".join(lost)

@@ -12,7 +12,7 @@ the scans correct them like all else.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self
 
@@ -38,6 +38,7 @@ from kalmark.models.protocols import (
 )
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
+from kalmark.slam.replacing import LeftOut
 
 NO_NOISE, NOWHERE = np.zeros((0, 0)), np.zeros(0)
 
@@ -161,6 +162,7 @@ class Moving:
     """A robot in the map: its motion, its slot, the control it holds.
 
     `bias` and `error` are the slots of the constants of its controls and of a shared error, None where there is none.
+    `left_out` are the last fixes, if they were outside the gate.
     """
 
     motion: Motion
@@ -168,6 +170,7 @@ class Moving:
     bias: int | None
     held: HeldInput
     error: int | None = None
+    left_out: list[LeftOut] = field(default_factory=list)
 
     @cached_property
     def moves_itself(self) -> bool:

@@ -55,6 +55,7 @@ from kalmark.report import (
     Report,
     outcomes_of,
 )
+from kalmark.slam import replacing
 from kalmark.slam.checks import (
     covariance,
     fault_of,
@@ -80,6 +81,7 @@ UNEXPLAINED = "no landmark explains this measurement"
 SINGULAR = "what it may be cannot be computed: a matrix is singular"
 CURE = "start anew from a pose that is less certain, or with larger sigmas of controls and sensors"
 HEADING_RAD = 0.3  # a sigma above which a correction is not linearised at the prediction
+FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes stay within
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
@@ -274,12 +276,34 @@ class Slam:
         gaps = self._advance(event.robot)
         slot, report = self._moving[event.robot].slot, Report(event, event.y.reshape(1, size))
         report.gaps = gaps
-        gate, R = self.association.threshold(size, self.estimator.default_gate), event.cov.reshape(1, size, size)
+        gate, R = self.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
         update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
         done = self._corrected(update, event, self.estimator.for_fixes())
         report.e, report.z, report.Z = done.e, done.z, done.Z
         report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)
+        left_out = self._moving[event.robot].left_out
+        if done.fused[0]:
+            left_out.clear()
+        else:
+            del left_out[: len(left_out) + 1 - replacing.KEPT]
+            left_out.append(replacing.LeftOut(event.y, event.cov, done.e[0]))
+            report.replaced = self._replace(event.robot)
         return report
+
+    def _replace(self, name: str) -> float:
+        """Move a robot to where its fixes place it, if they agree; return how far, m, 0 where they do not."""
+        moving = self._moving[name]
+        space = moving.motion.space
+        size, dof = (3, 3) if space.axes == 1 else (7, 6)
+        mean, index = self.map.mean(moving.slot), self.map.index(moving.slot)
+        found = replacing.replaced(mean[:size], self.map.covariance([moving.slot])[:dof, :dof], moving.left_out)
+        if found is None:
+            return 0.0
+        self.map.predict(index[:dof], np.zeros((dof, dof)), found.cov)
+        self.map.set_predicted(moving.slot, np.concatenate([found.pose, mean[size:]]))
+        self.clones.moved(name)
+        moving.left_out.clear()
+        return float(np.linalg.norm(found.pose[: dof // 2] - mean[: dof // 2]))
 
     # ------------------------------------------------------------------ motion
     def _advance(self, *names: str) -> tuple[Gap, ...]:

@@ -44,6 +44,7 @@ from kalmark.models.protocols import Landmark
 from kalmark.slam.gaps import Gaps
 from kalmark.slam.motion import Moving, bias_block, bias_name
 from kalmark.slam.reader import Reader
+from kalmark.slam.replacing import LeftOut
 from kalmark.slam.robot import Mount, Robot, mount_name
 from kalmark.tracks.clones import Clone, Clones, Measurement
 from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
@@ -133,11 +134,15 @@ def _state(state: State) -> Description:
         "latest": state.clones.latest,
         "numbered": state.clones.numbered,
         "moving": {
-            name: [m.error, *(getattr(m.held, key) for key in OF_MOVING), _watched(m.held.gaps)]
+            name: [m.error, *(getattr(m.held, key) for key in OF_MOVING), _watched(m.held.gaps), _left_out(m)]
             for name, m in state.moving.items()
         },
         "readers": [[*key, reader.t_ns] for key, reader in state.readers.items()],
     }
+
+
+def _left_out(moving: Moving) -> list[list[Any]]:
+    return [[part.tolist() for part in one] for one in moving.left_out]
 
 
 def _record(value: Any) -> Description:
@@ -244,7 +249,12 @@ class Saved:
         clones.latest = {robot: _count(number, "number of a clone") for robot, number in s["latest"].items()}
         clones.numbered = _count(s["numbered"], "number of clones")
         for i, (name, m) in enumerate(moving.items()):
-            error, t_ns, fresh, watched = s["moving"][name]
+            error, t_ns, fresh, watched, left_out = s["moving"][name]
+            d = 2 if m.motion.space.axes == 1 else 3
+            m.left_out = [
+                LeftOut(_numbers(y).reshape(d), _numbers(R).reshape(d, d), _numbers(p).reshape(d))
+                for y, R, p in left_out
+            ]
             k, m.slot, m.error = len(m.motion.columns), tracks.slots[name], error
             m.bias = tracks.slots.get(bias_name(name))
             m.held.t_ns, m.held.fresh = _time(t_ns), bool(fresh)

@@ -1,0 +1,74 @@
+"""A robot that is elsewhere than the filter believes, placed again by fixes that agree with each other.
+
+A fix outside its gate is left out.  A filter that has lost its robot would leave out all of them.  So the last fixes
+that were left out, one after the other, are compared with where the filter believed the robot to be: if a shift and a
+turn about the vertical axis lead from there to all of them, within their noise, the robot is moved by it.  What that
+does not determine, and all correlation of the robot with the map, is given up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.geometry.angles import rotation, wrap
+from kalmark.geometry.rotations import exp, multiply
+
+NEEDED, KEPT = 5, 30  # fixes that must agree, and the last so many that are compared
+SHARE = 0.999  # of agreeing fixes that are believed
+LOOSE = 2.0  # sigmas of a fix, for what the robot's motion adds between the fixes
+TURN_RAD = 0.3  # to so much they must tell the heading
+
+
+class LeftOut(NamedTuple):
+    """A fix y (d,) with covariance R (d, d) that was left out when the filter believed the robot at p (d,)."""
+
+    y: Array
+    R: Array
+    p: Array
+
+
+class Replaced(NamedTuple):
+    """The robot's new pose (3,) or (7,), and the covariance (3, 3) or (6, 6) of that."""
+
+    pose: Array
+    cov: Array
+
+
+def replaced(pose: Array, P: Array, left_out: Sequence[LeftOut]) -> Replaced | None:
+    """Return where a robot is that is believed at `pose`, with the covariance P; None where fixes do not tell."""
+    from scipy.stats import chi2
+
+    if len(left_out) < NEEDED:
+        return None
+    y, p = (np.array([getattr(one, name) for one in left_out]) for name in ("y", "p"))
+    R, d = np.mean([one.R for one in left_out], axis=0) * LOOSE**2, y.shape[1]
+    y0, p0 = y.mean(axis=0), p.mean(axis=0)
+    a, b = p[:, :2] - p0[:2], y[:, :2] - y0[:2]
+    variance = 0.5 * float(np.trace(R[:2, :2])) / max(float(np.sum(a**2)), 1e-300)
+    if variance > TURN_RAD**2:
+        return None
+    yaw = float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)))
+    turned = np.column_stack([a @ rotation(yaw).T, p[:, 2:] - p0[2:]])
+    residuals = y - y0 - turned
+    if np.einsum("ki,ij,kj->", residuals, np.linalg.inv(R), residuals) > chi2.ppf(SHARE, d * len(y) - d - 1):
+        return None
+    new, cov = pose.copy(), P.copy()
+    arm = rotation(yaw) @ (pose[:2] - p0[:2])
+    new[:2], new[2:d] = y0[:2] + arm, pose[2:d] + y0[2:] - p0[2:]
+    heading = 2 if d == 2 else 5
+    cov[:d, :d] = R / len(y)
+    cov[:d, d:] = cov[d:, :d] = 0.0
+    cov[heading, :], cov[:, heading] = 0.0, 0.0
+    across = np.array([-arm[1], arm[0]])  # what an error of the turn does to a robot that is not amid its fixes
+    cov[:2, :2] += variance * np.outer(across, across)
+    cov[:2, heading] = cov[heading, :2] = variance * across
+    cov[heading, heading] = variance
+    if d == 2:
+        new[2] = wrap(pose[2] + yaw)
+    else:
+        new[3:] = multiply(exp(np.array([0.0, 0.0, yaw])), pose[3:])
+    return Replaced(new, cov)
