@@ -31,8 +31,9 @@ OBSERVATION = (
     "u_px", "v_px", "ul_px", "vl_px", "ur_px", "vr_px",
     "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
 )  # fmt: skip
-READING = (  # of a robot itself, by its own sensors
-    "heading_rad", "theta_rad", "roll_rad", "pitch_rad", "ax_mps2", "ay_mps2", "az_mps2", "speed_mps",
+READING = (  # of a robot itself by its own sensors, and of senders
+    "heading_rad", "theta_rad", "rssi_dbm", "difference_m", "roll_rad", "pitch_rad",
+    "ax_mps2", "ay_mps2", "az_mps2", "speed_mps",
 )  # fmt: skip
 CANONICAL = (*CONTROL, *OBSERVATION, *READING)
 """The order in which known columns make a control or an observation, whatever their order in the file."""

@@ -21,6 +21,7 @@ from kalmark.geometry.directions import inv_spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import cameras, lines, seen, tags, walls
+from kalmark.models.radio import RangeDifference2D, RangeDifference3D, SignalStrength2D, SignalStrength3D
 from kalmark.models.state_sensors import (
     AbsolutePose2D,
     AbsolutePose3D,
@@ -44,7 +45,8 @@ __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "Bearing", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity",
     "GroundSpeed", "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D",
     "Omnidirectional", "PinHole", "Position2D", "Position3D", "Range", "RangeBearing", "RangeBearing3D",
-    "RangeBearingSignature", "Segments", "Speed", "Stereo", "TagCorners", "TagPose", "Wall",
+    "RangeBearingSignature", "RangeDifference2D", "RangeDifference3D", "Segments",
+    "SignalStrength2D", "SignalStrength3D", "Speed", "Stereo", "TagCorners", "TagPose", "Wall",
 ]  # fmt: skip
 
 TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed

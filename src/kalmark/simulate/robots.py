@@ -29,6 +29,7 @@ from kalmark.models.protocols import (
     POSE,
     Drifting,
     OfState,
+    Ranging,
     TimedNoise,
     calibrating,
     coasts,
@@ -202,8 +203,8 @@ def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
     cov = parameter_covariance(sensor)
     if cov is None:
         return sensor, at
-    if isinstance(sensor, OfState):
-        return sensor.with_parameters(sensor.parameters + gaussian(cov, rng)), at  # type: ignore[attr-defined]
+    if not isinstance(mount.sensor, Ranging):
+        return sensor.with_parameters(sensor.parameters + gaussian(cov, rng)), at
     scale, bias_m = rng.normal([sensor.scale, sensor.bias_m], [sensor.sigma_scale, sensor.sigma_bias_m]).tolist()
     return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0), at
 

@@ -1,0 +1,184 @@
+"""What radio receivers and microphones measure of a landmark that sends: its strength, its difference of arrival.
+
+Neither finds where a landmark is at once: they correct landmarks that other sensors have started, or a survey.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import KW_ONLY, replace
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Self, cast
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags
+from kalmark.compiled import compiled
+from kalmark.declare import Limit, NotNegative, Number, Positive, declared, register
+
+__all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
+
+NEAREST_M = 1e-3  # nearer than this a receiver and what it hears are at one place
+DECIBELS = 10.0 / math.log(10.0)  # in one unit of a natural logarithm of power
+
+
+@compiled
+def strength(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the strength of what is at v (K, d): `par` = (strength at 1 m, exponent).  Log-distance path loss."""
+    k, d = v.shape
+    e, E_v = np.empty((k, 1)), np.zeros((k, 1, d))
+    for i in range(k):
+        square = NEAREST_M * NEAREST_M
+        for j in range(d):
+            square += v[i, j] * v[i, j]
+        e[i, 0] = par[0] - par[1] * DECIBELS * 0.5 * math.log(square)
+        for j in range(d):
+            E_v[i, 0, j] = -par[1] * DECIBELS * v[i, j] / square
+    return e, y - e, E_v
+
+
+@compiled
+def by_path_loss(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+    """Return E_p (K, 1, 2): how strengths e (K, 1) change with the strength at 1 m and the exponent."""
+    E_p = np.empty((len(e), 1, 2))
+    for i in range(len(e)):
+        E_p[i, 0, 0], E_p[i, 0, 1] = 1.0, (e[i, 0] - par[0]) / par[1]
+    return E_p
+
+
+@compiled
+def difference(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect how much farther v (K, d) is from the right receiver than from the left one, `par` m from each other."""
+    k, d = v.shape
+    e, E_v = np.zeros((k, 1)), np.zeros((k, 1, d))
+    for i in range(k):
+        for sign in (1.0, -1.0):  # the right receiver is at y = -par / 2
+            square = NEAREST_M * NEAREST_M
+            for j in range(d):
+                x = v[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)
+                square += x * x
+            distance = math.sqrt(square)
+            e[i, 0] += sign * distance
+            for j in range(d):
+                E_v[i, 0, j] += sign * (v[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)) / distance
+    return e, y - e, E_v
+
+
+@declared
+class _Receiver:
+    """What both share: a point of either world, and a largest distance."""
+
+    _: KW_ONLY
+    range_max_m: Annotated[Limit, "Farthest landmark that is heard."] = math.inf
+
+    columns: ClassVar[tuple[str, ...]]
+    sigmas: ClassVar[tuple[str, ...]]
+    expected: ClassVar[Callable[..., tuple[Array, Array, Array]]]
+    angular: ClassVar[tuple[bool, ...]] = (False,)
+    additive: ClassVar[bool] = True
+    code: ClassVar[int] = 0
+
+    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
+        """Return the expected measurements (K, 1) of v (K, d), and E_v (K, 1, d)."""
+        v, nothing, of = np.ascontiguousarray(v, dtype=np.float64), np.zeros((len(v), 1)), cast(Any, self)
+        e, _, E_v = type(self).expected(0, np.array(of.parameters), np.zeros(1, dtype=np.bool_), v, nothing)
+        return e, E_v
+
+    def noise(self, y: Array) -> Array:
+        """Return the noise R (K, 1, 1) of measurements y (K, 1)."""
+        return np.full((len(y), 1, 1), vars(self)[self.sigmas[0]] ** 2)
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, d) are near enough."""
+        near: Flags = np.linalg.norm(v, axis=1) <= self.range_max_m
+        return near
+
+
+@declared
+class _SignalStrength(_Receiver):
+    sigma_db: Annotated[Positive, "Noise of the strength, shadows and reflections included."] = 4.0
+    _: KW_ONLY
+    strength_dbm: Annotated[Number, "Strength at a distance of 1 m."] = -40.0
+    exponent: Annotated[Positive, "Of the path loss: 2 in free space, 2 to 4 indoors."] = 2.0
+    sigma_strength_db: Annotated[
+        NotNegative, "Standard deviation of the strength at 1 m; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_exponent: Annotated[
+        NotNegative, "Standard deviation of the exponent; above 0 it is in the map and is estimated."
+    ] = 0.0
+
+    columns: ClassVar[tuple[str, ...]] = ("rssi_dbm",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_db",)
+    expected: ClassVar[Any] = strength
+    varied: ClassVar[Any] = by_path_loss
+    parameter_names: ClassVar[tuple[str, ...]] = ("strength_dbm", "exponent")
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The strength at 1 m and the exponent (2,)."""
+        return np.array([self.strength_dbm, self.exponent])
+
+    @property
+    def parameter_cov(self) -> Array | None:
+        """Their covariance (2, 2), None if both are known."""
+        sigmas = np.array([self.sigma_strength_db, self.sigma_exponent])
+        return np.diag(sigmas**2) if sigmas.any() else None
+
+    def with_parameters(self, parameters: Array) -> Self:
+        """Return the sensor with another strength at 1 m and another exponent (2,)."""
+        at_1_m, exponent = np.asarray(parameters).tolist()
+        return replace(self, strength_dbm=at_1_m, exponent=exponent)
+
+    def parameters_jacobian(self, v: Array) -> Array:
+        """Return E_p (K, 1, 2): how the strengths of v (K, d) change with strength at 1 m and exponent."""
+        e, nothing = self.expect(v)[0], np.zeros(1, dtype=np.bool_)
+        return np.asarray(by_path_loss(0, np.array(self.parameters), nothing, np.ascontiguousarray(v), e))
+
+
+@register("sensor", "signal_strength")
+class SignalStrength2D(_SignalStrength):
+    """Received signal strength of a landmark that sends, by the log-distance path loss."""
+
+    world: ClassVar[str] = "plane"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
+
+
+@register("sensor", "signal_strength")
+class SignalStrength3D(_SignalStrength):
+    """Received signal strength of a landmark that sends, by the log-distance path loss."""
+
+    world: ClassVar[str] = "space"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+
+
+@declared
+class _RangeDifference(_Receiver):
+    sigma_m: Annotated[Positive, "Noise of the difference."] = 0.05
+    _: KW_ONLY
+    baseline_m: Annotated[Positive, "From the right receiver to the left one, along the sensor's y axis."] = 0.5
+
+    columns: ClassVar[tuple[str, ...]] = ("difference_m",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",)
+    expected: ClassVar[Any] = difference
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The baseline (1,)."""
+        return np.array([self.baseline_m])
+
+
+@register("sensor", "range_difference")
+class RangeDifference2D(_RangeDifference):
+    """Time difference of arrival at two receivers, times the speed of light or sound: right less left."""
+
+    world: ClassVar[str] = "plane"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
+
+
+@register("sensor", "range_difference")
+class RangeDifference3D(_RangeDifference):
+    """Time difference of arrival at two receivers, times the speed of light or sound: right less left."""
+
+    world: ClassVar[str] = "space"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
