@@ -42,7 +42,8 @@ def test_keys_and_defaults_are_those_of_the_models(role: str) -> None:
         keys = {key: value for key, value in section.model_dump().items() if key in own}
         assert keys.keys() == own.keys(), name
         for key, value in keys.items():
-            left_open = len({next(p.default for p in parameters(m) if p.name == key) for m in models}) > 1
+            defaults = {p.default for m in models for p in parameters(m) if p.name == key}
+            left_open = len(defaults) > 1
             assert value == (None if left_open else own[key].default), (name, key)
 
 

@@ -53,8 +53,9 @@ def test_pages_call_kalmark_and_python_as_the_readme_says_once_the_environment_i
 
 
 ROLES = {  # what a row of CONTRIBUTING is about, and where that is
-    "a sensor in the plane": lambda: classes_of("sensor", "plane"),
-    "a sensor in space": lambda: classes_of("sensor", "space"),
+    "a sensor in the plane": lambda: [one for one in classes_of("sensor", "plane") if not of_state(one)],
+    "a sensor in space": lambda: [one for one in classes_of("sensor", "space") if not of_state(one)],
+    "a sensor of the robot itself": lambda: [one for one in classes_of("sensor") if of_state(one)],
     "a landmark in the plane": lambda: classes_of("landmark", "plane"),
     "a landmark in space": lambda: classes_of("landmark", "space"),
     "a motion": lambda: classes_of("motion"),
@@ -63,6 +64,10 @@ ROLES = {  # what a row of CONTRIBUTING is about, and where that is
     "an association": lambda: classes_of("association"),
     "a verb": lambda: [command.callback for command in app.registered_commands if not command.hidden],
 }
+
+
+def of_state(sensor: Any) -> bool:
+    return hasattr(sensor, "views")
 
 
 def classes_of(role: str, world: str = "") -> list[Any]:

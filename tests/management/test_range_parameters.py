@@ -17,7 +17,7 @@ from kalmark.results.readings import mounts
 
 AT = np.array([0.3, -0.2, 0.4])
 UNKNOWN = {"sigma_scale": 0.1, "sigma_bias_m": 0.3}
-SENSORS = [km.sensors.Range(), km.sensors.RangeBearing(), km.sensors.RangeBearingSignature()]
+SENSORS = [km.sensors.Range(**UNKNOWN), km.sensors.RangeBearing(**UNKNOWN), km.sensors.RangeBearingSignature(**UNKNOWN)]
 
 
 def views(sensor: Any) -> tuple[Any, Any]:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.compiled import address_of
 from kalmark.filter.prediction import in_world
 from kalmark.geometry.spaces import Rn, Space
-from kalmark.models.observe import body_velocity, step, step_of, velocity_of
+from kalmark.models.observe import VELOCITY, call_velocity, step, step_of
 from kalmark.models.protocols import HasVelocity, coasts, diffusion_of, true_control
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
@@ -74,9 +75,8 @@ def turning(r: Array) -> Array:
 
 @pytest.mark.parametrize("motion", COASTING, ids=lambda motion: type(motion).__name__)
 def test_the_velocity_of_a_state_is_called_by_address(motion: Any) -> None:
-    r, model = drawn(motion.space, np.random.default_rng(13)), velocity_of(motion)
-    assert isinstance(model, tuple), "built-in models take the compiled way"
-    for ours, written in zip(body_velocity(model, r), motion.body_velocity(r), strict=True):
+    r, address = drawn(motion.space, np.random.default_rng(13)), address_of(type(motion).velocity, VELOCITY)
+    for ours, written in zip(call_velocity(address, (r, np.zeros(0))), motion.body_velocity(r), strict=True):
         np.testing.assert_array_equal(ours, written)
 
 

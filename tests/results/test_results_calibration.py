@@ -106,7 +106,7 @@ def test_a_robot_that_drives_straight_on_observes_which_way_its_sensor_looks_but
         seen = np.array([km.geometry.observe(np.array([0.3 + 0.2 * k, 0.1, 0.25]), p)[0] for p in points])
         slam.process(Scan(t_s=k, robot="r", sensor="laser", y=seen, ids=list(range(9))))
     (mounted,) = mounts(slam)
-    found = directions(mounted.prior, mounted.covariance)
+    found = directions(mounted.prior, mounted.covariance, mounted.constants)
     assert [round(each.ratio, 6) for each in found[:2]] == [1.0, 1.0]
     assert {next(iter(each.axes)) for each in found[:2]} == {"x", "y"}
     assert str(found[2]).startswith("theta")

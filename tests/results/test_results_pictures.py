@@ -134,7 +134,12 @@ def test_the_page_names_figures_in_the_words_of_the_command_line(run: Run, capsy
     print_summary("", summary)
     printed = capsys.readouterr().out
     assert "landmark sigma, the filter's over the batch's" in printed
-    shown = [label.strip() for key, label, _ in (*TOTALS, *BATCH) if key in summary | summary["batch"]]
+    shown = [
+        label.strip()
+        for keys, of in ((TOTALS, summary), (BATCH, summary["batch"]))
+        for key, label, _ in keys
+        if key in of
+    ]
     assert len(shown) > 12
     for label in shown:
         assert escape(label) in table

@@ -170,7 +170,7 @@ def test_the_folder_holds_the_files_of_the_contract(run: Run, tmp_path: Path) ->
     run.save(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {
         "summary.json", "config.yaml", "trajectory_rover.tum", "landmarks.csv", "associations.csv", "history.npz",
-        "map.png", "report.html", "map.kmk", "notes.txt",
+        "map.png", "report.html", "map.kmk", "notes.txt", "sensor_rover_lidar.png",
     }  # fmt: skip
     with np.load(tmp_path / "history.npz", allow_pickle=False) as arrays:
         assert {"t", "robot", "mean", "covariance", "y", "e", "z", "Z", "landmark"} <= set(arrays.files)

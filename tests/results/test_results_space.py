@@ -138,7 +138,10 @@ def pretended(models: list[Any], means: list[Any], covariances: list[Any]) -> An
     space = SimpleNamespace(motion=SimpleNamespace(space=SE3))
     ends = {2: np.array([2.0, 3.0])}
     return SimpleNamespace(
-        landmarks=lambda: table, landmark_model=models.__getitem__, segment_ends=ends.get, robots={"r": space}
+        landmarks=lambda exactly_known=True: table,
+        landmark_model=models.__getitem__,
+        segment_ends=ends.get,
+        robots={"r": space},
     )
 
 

@@ -232,7 +232,7 @@ def test_a_log_of_space_is_written_and_read_back(tmp_path: Path) -> None:
         ),
         ("robots.rover={motion: {type: unicycle}, route: {type: wander}}", "all move in the plane, or all in space"),
         ("world={type: random_box, min_m: [1, 0, 0], max_m: [0, 1, 1]}", "expected max_m nowhere below min_m"),
-        ("world={type: list}", "expected points_m, segments_m or tags"),
+        ("world={type: list}", "expected points_m, segments_m, tags or walls_m"),
         ("world={type: list, points_m: [[1, 2], [1, 2, 3]]}", "expected points .x, y., or all of them .x, y, z."),
         ("robots={r: {motion: {type: unicycle}, route: {type: wander}}}", "its landmarks are in space"),
     ],

@@ -138,7 +138,7 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
     E_v = _expect(model, v, y)[1] if spatial else E_v
     kept = _finite("e of expect", y, v)
     v, y, E_v = v[kept], y[kept], E_v[kept]
-    p = E_v.shape[1] if spatial else m
+    p = E_v.shape[1]
     found.jacobian("E_v", E_v, lambda x: _changing(model, x, y), v, view, Rn(p) if spatial else measured, {"v": v})
     found.covariance("noise", model.noise(y), p, {"y": y})
     if isinstance(model, protocols.NonAdditiveSensor) and not model.additive:
@@ -193,6 +193,8 @@ def _inverse(model: Any, y: Array, view: Space, measured: Space, found: _Finding
 
 def views(model: Any, rng: Rng) -> tuple[Array, Space]:
     """Return views (K, d) that a sensor can have, and their space."""
+    if isinstance(model, protocols.OfState):
+        return _views_of_state(model, rng)
     d = _size_of_view(model, rng)
     if d == SE3.size:
         return np.array([SE3.plus(FACING, rng.normal(0, 0.1, 6)) for _ in range(DRAWS)]), SE3
@@ -204,6 +206,16 @@ def views(model: Any, rng: Rng) -> tuple[Array, Space]:
         v[:, 3] = rng.uniform(0.01, 1, len(v))  # an inverse distance
     seen = v[model.sees(v)] if isinstance(model, protocols.Visible) and "sees_segments" not in dir(model) else v
     return (seen if len(seen) else v)[:DRAWS], Rn(d)
+
+
+def _views_of_state(model: Any, rng: Rng) -> tuple[Array, Space]:
+    """Return twists or poses (K, d) of a robot, in the plane if the sensor may be there."""
+    plane = protocols.world_of(model) != "space"
+    if model.views == protocols.TWIST:
+        return rng.normal(0, 1, (DRAWS, 3 if plane else 6)), Rn(3 if plane else 6)
+    if plane:
+        return rng.normal(0, 1, (DRAWS, 3)), SE2
+    return np.array([SE3.plus(FACING, rng.normal(0, 0.1, 6)) for _ in range(DRAWS)]), SE3
 
 
 def _size_of_view(model: Any, rng: Rng) -> int:

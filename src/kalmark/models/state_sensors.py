@@ -335,6 +335,10 @@ class AbsolutePose3D(StateSensor):
     views: ClassVar[str] = POSE
     expected: ClassVar[Any] = seen.tag_pose
 
+    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
+        """Return the poses v (K, 7) themselves, and how the innovations of y (K, 7) change with them (K, 6, 6)."""
+        return super().expect(v, v if y is None else y)
+
     def check(self, y: Array) -> None:
         """Refuse a quaternion that is none."""
         norm = float(np.linalg.norm(y[0, 3:]))
