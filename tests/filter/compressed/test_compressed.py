@@ -263,7 +263,7 @@ def test_the_invariant_form_equals_a_dense_filter_that_freezes_the_same_landmark
     for i in [*book.inactive]:
         book.activate(i)
     P, sigma = slam.covariance(*order), np.sqrt(np.diag(book.P))
-    # what the variances keep for rounding (`kernels.KEPT`, `RAISED`), the book does not; and a correction of 3 m down to
+    # what the variances keep for rounding (`kernels.KEPT`, `RAISED`), the book does not; a correction of 3 m down to
     # .05 m within one full update leaves that much rounding, whatever the linear algebra
     np.testing.assert_allclose(mean, book.x, rtol=0, atol=2e-7 if slowly else 5e-8)
     np.testing.assert_allclose(P / np.outer(sigma, sigma), book.P / np.outer(sigma, sigma), rtol=0, atol=5e-8)
