@@ -309,6 +309,7 @@ def test_a_saved_run_finds_its_log_again(tmp_path: Path) -> None:
     loaded = Run.load(tmp_path / "run")
     found, wanted = loaded.evaluate(batch=True)["batch"], compare(run, solve_batch(run, log))
     for one, other in zip(found.pop("pose_differences"), wanted.pop("pose_differences"), strict=True):
+        assert one.pop("robot") == other.pop("robot")
         assert one == pytest.approx(other, rel=1e-6)
     assert found == pytest.approx(wanted, rel=1e-6)
 

@@ -142,6 +142,7 @@ def pretended(models: list[Any], means: list[Any], covariances: list[Any]) -> An
         landmark_model=models.__getitem__,
         segment_ends=ends.get,
         robots={"r": space},
+        is_known=lambda name: False,
     )
 
 

@@ -268,7 +268,7 @@ def model_of(section: Any, world: str = "plane") -> Any:
     """
     if section is None:
         return None
-    model = class_of(section.of_role, section.of_name, world)
+    model = class_of(section.of_role, section.of_name, section.of_world or world)
     given = {own.name: value for own in parameters(model) if (value := getattr(section, own.name)) is not None}
     return model(**given)
 

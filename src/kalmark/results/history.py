@@ -360,7 +360,7 @@ def rows_of(prefix: str, cls: type[R], named: Named, joined: bool = False) -> tu
     for name, hint in get_type_hints(cls, include_extras=True).items():
         if joined and hint in (str, Names):
             values: list[Any] = list(next(lines, ()))
-            told.append([tuple(text.split(",")) for text in values] if hint == Names else values)
+            told.append([tuple(text.split(",")) if text else () for text in values] if hint == Names else values)
         elif hint in TYPES:
             told.append(named[f"{prefix}_{name}"].tolist())
         else:
