@@ -301,7 +301,7 @@ class Listed(Section):
     """Landmarks at given places: points, segments, tags; walls of the plane, whose corners are points."""
 
     type: Literal["list"] = "list"
-    points_m: Points = ()
+    points_m: Points | None = None
     """One (x, y) or (x, y, z) each; their ids are 1, 2, ..."""
     segments_m: Annotated[tuple[Segment, ...], Field(strict=False)] = ()
     """Both ends of each (x, y, z, x, y, z); their ids follow those of the points."""
