@@ -145,7 +145,7 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
         found.covariance("noise_at", model.noise_at(v), p, {"v": v})
     if "invert" in dir(model):
         _inverse(model, y, view, measured, found)
-    if isinstance(model, protocols.Calibrated):
+    if isinstance(model, protocols.Calibrated) and len(model.parameters):
         a = np.tile(model.parameters, (len(v), 1))
         own = Rn(a.shape[1])
         E_p, of = model.parameters_jacobian(v), lambda x: _expect(model.with_parameters(x[0]), v, y)[0]

@@ -250,6 +250,8 @@ class StateSensor:
 
     def parameters_jacobian(self, v: Array) -> Array:
         """Return E_p (K, m, p): how the readings of views v (K, d) change with the constants."""
+        if type(self).varied is None:
+            return np.zeros((len(v), len(self.columns), 0))
         e, par, angular = self.expect(v)[0], np.array(self.parameters), np.array(self.angular, dtype=np.bool_)
         rows = [np.ascontiguousarray(each)[None] for each in v]
         return np.concatenate(
