@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.arrays import Array
-from kalmark.errors import EventError
+from kalmark.errors import EventError, ModelError
 from kalmark.geometry.frames import compose, inverse
 
 STEP_S = 0.1
@@ -146,3 +146,19 @@ def test_velocities_in_the_state_are_measured_where_they_are() -> None:
         slam.process(km.Scan(0.001 * k, "r", "log", [v + np.cross(w, [0.5, 0.2, -0.1])]))
     np.testing.assert_allclose(slam.mean("r")[7:], [*v, *w], atol=0.01)
     assert np.sqrt(np.diag(slam.covariance("r"))[6:]).max() < 0.02
+
+
+def test_an_empty_reading_moves_the_robot_and_corrects_nothing() -> None:
+    slam = ran(events(2, 10)[0])
+    P = slam.covariance("r.gyro")
+    for ids in (None, ()):
+        assert slam.process(km.Scan(1.2, "r", "gyro", (), ids)).observations == ()
+    np.testing.assert_array_equal(slam.covariance("r.gyro"), P)
+    assert slam.process(km.Scan(1.3, "r", "gyro", [[0.1]])).observations[0].outcome == "associated"
+
+
+def test_a_rate_of_the_state_needs_a_noise_of_each_reading() -> None:
+    density = km.sensors.Gyro2D(0.0, sigma_rad_per_sqrt_s=0.01)
+    km.Slam(km.Robot("r", motion=km.motion.Unicycle(), sensors={"gyro": km.Mount(density)}))
+    with pytest.raises(ModelError, match="Gyro2D: the noise of one reading is 0, expected a positive number"):
+        km.Slam(km.Robot("r", motion=km.motion.ConstantTurnRate(), sensors={"gyro": km.Mount(density)}))

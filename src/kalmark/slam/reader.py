@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.errors import EventError
+from kalmark.errors import EventError, ModelError
 from kalmark.events import Scan, when
 from kalmark.filter.estimators import Estimator, Iterating, Update
 from kalmark.filter.map import Map
@@ -29,9 +29,11 @@ class Reader:
         self.sensor: Any = sensor
         self.at: Array = np.array(at)
         self.mount, self.motion = mount, motion
-        self.pose_dof = 3 if len(self.at) == 3 else 6
         self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
+        if self.of_state and not np.diagonal(sensor.noise(np.zeros((1, len(sensor.columns))))[0]).all():
+            name, wanted = type(sensor).__name__, "a positive number for each component"
+            raise ModelError(f"{name}: the noise of one reading is 0, expected {wanted}: the state has the velocity")
         self.check = sensor.check if isinstance(sensor, protocols.Checked) else None
         self.gate = self._gate()
         self.t_ns: int | None = None  # of its last reading
@@ -54,8 +56,9 @@ class Reader:
         if len(event.y) > 1:
             name = type(self.sensor).__name__
             raise EventError(f"{when(event)}: y has {len(event.y)} rows, expected one: a {name} measures its robot")
-        if event.ids is not None and event.ids[0] not in (None, event.robot):
-            raise EventError(f"{when(event)}: id {event.ids[0]!r}, expected none: {event.sensor!r} measures its robot")
+        odd = [i for i in event.ids or () if i not in (None, event.robot)]
+        if odd:
+            raise EventError(f"{when(event)}: id {odd[0]!r}, expected none: {event.sensor!r} measures its robot")
         return measurements(event, self.sensor, self.check)
 
     def since_s(self, event: Scan) -> float:
@@ -78,7 +81,7 @@ class Reader:
 
     def update(self, map_: Map, robot: int, clone: int, event: Scan, R: Array, since_s: float) -> Update:
         """Return the correction by a reading with the noise R (1, p, p); `clone` is where it counts from."""
-        if event.cov is None and isinstance(self.sensor, protocols.TimedNoise) and self.counts:
+        if event.cov is None and isinstance(self.sensor, protocols.TimedNoise) and since_s > 0:
             R = self.sensor.noise_since(since_s)
         slot, d = (clone, len(self.at)) if self.counts else (robot, len(map_.mean(robot)) if self.of_state else 0)
         given = np.column_stack([event.y, [since_s]])
