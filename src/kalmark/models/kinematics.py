@@ -216,3 +216,34 @@ class PlanarMotion(MotionModel):
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
         """Return the covariance (3, 3) of the white noise gathered in `dt_s`, in the robot's frame."""
         return None if self._density is None or not u.any() else self._density * dt_s
+
+
+@declared
+class SpeedAndTurn(PlanarMotion):
+    """A speed and a turn rate, each held until the next control: what a unicycle takes, whether it slips or not."""
+
+    sigma_v_mps: Annotated[NotNegative, "Error of the speed held over its interval."] = 0.1
+    sigma_w_radps: Annotated[NotNegative, "Error of the turn rate held over its interval."] = 0.05
+    sigma_v_bias_mps: Annotated[
+        NotNegative, "Constant part of the speed's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_w_bias_radps: Annotated[
+        NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_v_scale: Scale = 0.0
+    sigma_w_scale: TurnScale = 0.0
+    sigma_turn_rad_per_m: TurnPerMetre = 0.0
+
+    columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
+    held: ClassVar[bool] = True
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_w_radps")
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("v_mps", "sigma_v_bias_mps"),
+        ("w_radps", "sigma_w_bias_radps"),
+        ("v_scale", "sigma_v_scale"),
+        ("w_scale", "sigma_w_scale"),
+        ("turn_rad_per_m", "sigma_turn_rad_per_m"),
+    )
+
+    def _effects(self, u: Array, dt_s: float) -> Array:
+        return np.array([[1.0, 0.0, u[0], 0.0, 0.0], [0.0, 1.0, 0.0, u[1], abs(u[0])]])

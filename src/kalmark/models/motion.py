@@ -25,7 +25,7 @@ from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
 from kalmark.geometry.spaces import ROTATION, SCALAR, SE3, VECTOR3, Space
-from kalmark.models.kinematics import MotionModel, PlanarMotion, Scale, TurnPerMetre, TurnScale, arc
+from kalmark.models.kinematics import MotionModel, PlanarMotion, Scale, SpeedAndTurn, TurnPerMetre, TurnScale, arc
 from kalmark.models.observe import CompiledVelocity
 
 __all__ = [
@@ -124,38 +124,13 @@ def _halves(u: Array) -> Array:
 
 
 @register("motion", "unicycle")
-class Unicycle(PlanarMotion):
+class Unicycle(SpeedAndTurn):
     """Speed and turn rate, each held until the next control.
 
     A control is u = (v m/s, w rad/s); the exact arc of [F] with both its limits.
     """
 
-    sigma_v_mps: Annotated[NotNegative, "Error of the speed held over its interval."] = 0.1
-    sigma_w_radps: Annotated[NotNegative, "Error of the turn rate held over its interval."] = 0.05
-    sigma_v_bias_mps: Annotated[
-        NotNegative, "Constant part of the speed's error; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_w_bias_radps: Annotated[
-        NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_v_scale: Scale = 0.0
-    sigma_w_scale: TurnScale = 0.0
-    sigma_turn_rad_per_m: TurnPerMetre = 0.0
-
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
-    held: ClassVar[bool] = True
     moves: ClassVar[Any] = unicycle
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_w_radps")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("v_mps", "sigma_v_bias_mps"),
-        ("w_radps", "sigma_w_bias_radps"),
-        ("v_scale", "sigma_v_scale"),
-        ("w_scale", "sigma_w_scale"),
-        ("turn_rad_per_m", "sigma_turn_rad_per_m"),
-    )
-
-    def _effects(self, u: Array, dt_s: float) -> Array:
-        return np.array([[1.0, 0.0, u[0], 0.0, 0.0], [0.0, 1.0, 0.0, u[1], abs(u[0])]])
 
 
 @register("motion", "odometry_2d")

@@ -20,6 +20,7 @@ from kalmark.models.kinematics import (
     WEIGHTS,
     PlanarMotion,
     Scale,
+    SpeedAndTurn,
     TurnPerMetre,
     TurnScale,
     add_noise,
@@ -298,7 +299,7 @@ class Mecanum(PlanarMotion):
 
 
 @register("motion", "slipping_unicycle")
-class SlippingUnicycle(PlanarMotion):
+class SlippingUnicycle(SpeedAndTurn):
     """Speed and turn rate, held until the next control, of a robot that slips sideways: the slip is in the state.
 
     A control is u = (v m/s, w rad/s).  The state is pose and slip, the velocity to the left as a share of the speed:
@@ -307,35 +308,11 @@ class SlippingUnicycle(PlanarMotion):
     from step to step `sigma_across_m_per_sqrt_s` of any motion of the plane is enough.
     """
 
-    sigma_v_mps: Annotated[NotNegative, "Error of the speed held over its interval."] = 0.1
-    sigma_w_radps: Annotated[NotNegative, "Error of the turn rate held over its interval."] = 0.05
     sigma_slip_per_sqrt_s: Annotated[NotNegative, "Random walk of the slip, while it moves."] = 0.02
-    sigma_v_bias_mps: Annotated[
-        NotNegative, "Constant part of the speed's error; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_w_bias_radps: Annotated[
-        NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_v_scale: Scale = 0.0
-    sigma_w_scale: TurnScale = 0.0
-    sigma_turn_rad_per_m: TurnPerMetre = 0.0
 
     space: ClassVar[Space] = Space("SE2 with slip", (VECTOR, HEADING, SCALAR))
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
-    held: ClassVar[bool] = True
     moves: ClassVar[Any] = slipping
     state_columns: ClassVar[tuple[str, ...]] = ("slip",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_w_radps")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("v_mps", "sigma_v_bias_mps"),
-        ("w_radps", "sigma_w_bias_radps"),
-        ("v_scale", "sigma_v_scale"),
-        ("w_scale", "sigma_w_scale"),
-        ("turn_rad_per_m", "sigma_turn_rad_per_m"),
-    )
-
-    def _effects(self, u: Array, dt_s: float) -> Array:
-        return np.array([[1.0, 0.0, u[0], 0.0, 0.0], [0.0, 1.0, 0.0, u[1], abs(u[0])]])
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
         """Return the covariance (4, 4) of the walks of pose and slip in `dt_s`, in the frame where the robot ends."""
