@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.arrays import Array
-from kalmark.errors import EventError, ModelError
+from kalmark.errors import EventError, MapError, ModelError
 from kalmark.geometry.frames import compose, inverse
 
 STEP_S = 0.1
@@ -162,3 +162,8 @@ def test_a_rate_of_the_state_needs_a_noise_of_each_reading() -> None:
     km.Slam(km.Robot("r", motion=km.motion.Unicycle(), sensors={"gyro": km.Mount(density)}))
     with pytest.raises(ModelError, match="Gyro2D: the noise of one reading is 0, expected a positive number"):
         km.Slam(km.Robot("r", motion=km.motion.ConstantTurnRate(), sensors={"gyro": km.Mount(density)}))
+
+
+def test_what_measures_its_robot_expects_no_landmark() -> None:
+    with pytest.raises(MapError, match="sensor 'gyro' of 'r' measures its robot, expected one of landmarks"):
+        km.Slam(robot()).expect("r", "gyro")

@@ -381,29 +381,22 @@ class Slam:
             return [(None, SINGULAR) if i is None else (i, "") for i in query.ids]
 
     def _started(self, scan: ScanContext, query: Query) -> Located | None:
-        """Move a robot that may be anywhere in a known map to where its scan fits; None of a robot that may not.
-
-        Its mean alone: the covariance says that it may be there.
-        """
+        """Move a robot that may be anywhere in a known map to where its scan fits; None of a robot that may not."""
         if not self.tracks.known:
             return None
-        r = self.map.mean(scan.robot)
-        if not is_lost(r, self.map.covariance([scan.robot]), self.tracks):
+        pose, dof = self.map.mean(scan.robot)[: len(scan.channel.at)], scan.channel.pose_dof
+        if not is_lost(pose, self.map.covariance([scan.robot])[:dof, :dof], self.tracks):
             return None
         found = located(query)
         if found.T is not None:
-            self.map.set_predicted(scan.robot, compose(found.T, compose(inverse(scan.pose())[0], r)[0])[0])
+            self._put(scan, found.T)
         return found
 
     def _relocalized(self, scan: ScanContext, query: Query) -> Query:
-        """Move a robot whose heading a gap has left unknown to where its scan fits; return what to ask then.
-
-        Its mean alone: the covariance says that it may be there.
-        """
+        """Move a robot whose heading a gap has left unknown to where its scan fits; return what to ask then."""
         held = self._moving[scan.event.robot].held
         if not held.is_adrift:
             return query
-        r = self.map.mean(scan.robot)
         if len(scan.pose()) != 3 or self.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2:
             held.recovered()
             return query
@@ -412,9 +405,17 @@ class Slam:
             T = relocalized(query)
         if T is None:
             return query
+        self._put(scan, T)
+        return Query(scan)
+
+    def _put(self, scan: ScanContext, T: Array) -> None:
+        """Move a robot of the plane so that the sensor of a scan is at T (3,).
+
+        Its mean alone: the covariance says that it may be there.
+        """
+        r = self.map.mean(scan.robot)
         pose = compose(T, compose(inverse(scan.pose())[0], r[:3])[0])[0]
         self.map.set_predicted(scan.robot, np.append(pose, r[3:]))
-        return Query(scan)
 
     def _correct(
         self, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],
@@ -1041,6 +1042,8 @@ class Slam:
         `in_view` of those in view alone.  Robots may be among the `names`.  A robot that lags is where it was (`lags`).
         Nothing changes.  Raises MapError.
         """
+        if (robot, sensor) in self._readers:
+            raise MapError(f"sensor {sensor!r} of {robot!r} measures its robot, expected one of landmarks")
         if (robot, sensor) not in self._channels:
             known = ", ".join(f"{r!r} {s!r}" for r, s in self._channels) or "none"
             raise MapError(f"robot {robot!r} has no sensor {sensor!r}, expected one of: {known}")
@@ -1175,12 +1178,8 @@ class Slam:
                 twin.map.finish()
 
     def _sensor_pose(self, robot: str, sensor: str) -> Array:
-        channel = self._channels.get((robot, sensor))
-        return (
-            self.map.mean(self._moving[robot].slot)
-            if channel is None
-            else channel.pose(self.map, self._moving[robot].slot)
-        )
+        channel, slot = self._channels.get((robot, sensor)), self._moving[robot].slot
+        return self.map.mean(slot) if channel is None else channel.pose(self.map, slot)
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:
