@@ -56,6 +56,6 @@ def digest_of_saved(slam: km.Slam) -> str:
 
 def _digest(slam: km.Slam, map_: Any) -> str:
     found = hashlib.sha256()
-    for part in parts((slam.t_ns, map_, slam.tracks, slam.clones, slam._moving)):
+    for part in parts((slam.t_ns, map_, slam.tracks, slam.clones, slam.state.moving)):
         found.update(part)
     return found.hexdigest()

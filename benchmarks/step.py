@@ -58,7 +58,7 @@ class Kernels(Way):
         self.first = first
         for event in first:
             self.slam.process(event)
-        self.map, self.model = self.slam.map, self.slam._channels["r", "lidar"].models["point"].model
+        self.map, self.model = self.slam.map, self.slam.state.channels["r", "lidar"].models["point"].model
         self.index, self.N = self.map.index(0), np.diag(ODOMETRY**2)
         self.noise = np.tile(np.diag(SIGHT**2), (SIGHTINGS, 1, 1))
 

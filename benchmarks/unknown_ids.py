@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -83,9 +84,8 @@ def foresee(config_path: str, overrides: list[str]) -> None:
     config, log = cfg.open_run(config_path, None, overrides)
     built = cfg.build_slam(config, log)
     seer = Foreseen(getattr(built.association, "gate", "default"))
-    slam = km.Slam(
-        built.robots.values(), seer, built.estimator, built.landmark_type, built.map_type, upkeep=built.upkeep
-    )
+    settings = replace(built.state.settings, association=seer)
+    slam = km.Slam(built.robots.values(), **vars(settings))
     record(slam, log, progress=False)
     nearest, best, gap = np.array(seer.told, dtype=float).T
     print(f"{len(gap)} observations of landmarks that are in the map, all fused by their ids")

@@ -117,7 +117,7 @@ def test_points_become_euclidean_below_the_linearity_index_of_the_map(
     path = tmp_path / "my.yaml"
     path.write_text("seed: 1")
     config = load_config(path, [] if value is None else [f"map.reparametrize={value}"])
-    assert build_slam(config).reparametrize == linearity
+    assert build_slam(config).state.settings.reparametrize == linearity
     for bad in ("-1", "true", "on", ".inf"):
         with pytest.raises(ConfigError, match="expected a number > 0, or off"):
             load_config(path, [f"map.reparametrize={bad}"])
@@ -130,7 +130,7 @@ def test_a_landmark_that_a_sensor_does_not_see_is_refused_by_its_place(opened: A
 
 def test_a_point_is_of_the_world_of_the_robots(opened: Any) -> None:
     slam = build_slam(*opened(EMPTY, log_of("a")))
-    assert slam.landmark_type == km.landmarks.Point3D()
+    assert slam.state.settings.landmarks == km.landmarks.Point3D()
 
 
 def test_a_robot_of_space_without_a_start_starts_at_the_truth(opened: Any) -> None:

@@ -132,9 +132,10 @@ def test_a_filter_built_in_python_is_recorded_with_its_landmarks_and_map(tmp_pat
     own = km.landmarks.InverseDepth2D(prior_rho_per_m=0.2)
     slam = km.Slam([robot], landmarks=own, map="postponed", numbers="float32", reparametrize=0.1)
     restored = again(slam, tmp_path)
-    assert restored.landmark_type == own
-    assert (restored.map_type, restored.numbers, restored.reparametrize) == ("postponed", "float32", 0.1)
-    assert again(km.Slam([robot], reparametrize=None), tmp_path).reparametrize is None
+    assert restored.state.settings.landmarks == own
+    settings = restored.state.settings
+    assert (settings.map, settings.numbers, settings.reparametrize) == ("postponed", "float32", 0.1)
+    assert again(km.Slam([robot], reparametrize=None), tmp_path).state.settings.reparametrize is None
 
 
 @pytest.mark.parametrize("way", [km.initialization.Trilateration(poses=30), km.initialization.Hypotheses(count=9)])

@@ -77,7 +77,7 @@ def slam_of(own: Any) -> km.Slam:
 
 def models(slam: km.Slam) -> list[Any]:
     robot = slam.robots["crawler"]
-    return [robot.motion, robot.sensors["eye"].sensor, slam.landmark_type, slam.association, slam.estimator]
+    return [robot.motion, robot.sensors["eye"].sensor, slam.state.settings.landmarks, slam.association, slam.estimator]
 
 
 def kalmark(*arguments: str | Path, folder: Path) -> str:

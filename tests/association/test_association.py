@@ -125,7 +125,7 @@ def test_what_is_asked_jointly_is_the_same_of_a_postponed_map_and_of_a_dense_one
             slam.map.index(slam.slot("r"))
         scan = km.Scan(1, "r", "l", km.geometry.observe(ORIGIN, points)[0])
         context = ScanContext(
-            slam.map, slam.tracks, slam.clones, slam.estimator, slam._channels["r", "l"], slam.slot("r"), scan,
+            slam.map, slam.tracks, slam.clones, slam.estimator, slam.state.channels["r", "l"], slam.slot("r"), scan,
             (None,) * 6, np.zeros((6, 2, 2)), km.Report(scan, scan.y),
         )  # fmt: skip
         asked.append(Query(context).jointly(np.array([3, 3, 0]), [3, 4, 3]))

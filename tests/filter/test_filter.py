@@ -268,7 +268,7 @@ def test_the_plain_python_source_of_a_correction_equals_the_compiled_one() -> No
             for event in drive(20, 13, WORLD):
                 slam.process(event)
             m, slots, y = slam.map, np.array([slam.slot(i) for i in (1, 2, 3)]), np.full((3, 2), 2.0)
-            view, R3 = slam._channels["r", "lidar"].models["point"].model, np.tile(R, (3, 1, 1))
+            view, R3 = slam.state.channels["r", "lidar"].models["point"].model, np.tile(R, (3, 1, 1))
             function(view, m.whole, (0, -1, slots, 2, y, R3, np.inf), last)
             maps.append((m.x[: m.n].copy(), full(m)))
         np.testing.assert_allclose(maps[0][0], maps[1][0], atol=1e-9)

@@ -57,7 +57,7 @@ def test_a_map_that_waited_is_that_of_one_that_was_told_from_the_start(postponed
     for poses in (20, 0):
         slam = slam_of(km.Upkeep(confirm=12, within=14, keep_poses=poses), view_m=30.0)
         if postponed:
-            slam.map = CompressedMap.from_dense(slam.map, most=60)
+            slam.state.map = CompressedMap.from_dense(slam.map, most=60)
         run(slam, drive(14, view_m=30.0)[0])
         e = slam.mean("r") - told.mean("r")
         worse = [np.trace(C) / np.trace(told.covariance(nearest(told, p))) for _, _, p, C, _ in slam.landmarks()]

@@ -259,7 +259,7 @@ def test_how_far_fixes_are_from_the_estimate_is_a_curve_of_the_page_with_a_gap_w
     xy[3, 1] += 50.0
     fixes = [Fix(t_ns=t, robot="rover", y=y, cov=0.01 * np.eye(2)) for t, y in zip(t_ns, xy, strict=True)]
     slam = slam_for(log)
-    slam.association = ByIdentity(gate=0.9973)
+    slam.state.settings = replace(slam.state.settings, association=ByIdentity(gate=0.9973))
     run = record(slam, sorted([*log.events, *fixes], key=lambda e: e.t_ns), progress=False)
     data = page_data(report_html(run))
     (rover,) = data["innovations"]

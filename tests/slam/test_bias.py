@@ -153,7 +153,7 @@ def test_a_bias_stays_right_in_a_postponed_map() -> None:
         slam_of(PRIOR, estimator=EKF, map="dense"),
         slam_of(PRIOR, estimator=EKF),
     )
-    postponed.map = CompressedMap.from_dense(postponed.map, most=40)
+    postponed.state.map = CompressedMap.from_dense(postponed.map, most=40)
     for slam in (dense, postponed):
         run(slam, events)
     np.testing.assert_allclose(postponed.mean("r bias"), dense.mean("r bias"), atol=1e-9)

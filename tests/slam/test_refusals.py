@@ -11,7 +11,7 @@ from state_digest import digest
 import kalmark as km
 from kalmark.errors import DivergedError, EventError, MapError
 from kalmark.report import INDEFINITE
-from kalmark.slam.slam import SINGULAR
+from kalmark.slam.starting import SINGULAR
 
 ESTIMATORS = [km.estimators.Ekf(), km.estimators.Invariant(), km.estimators.Fej()]
 MAPS = ["dense", "postponed"]

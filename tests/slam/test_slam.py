@@ -34,7 +34,7 @@ def started(**kwargs: Any) -> km.Slam:
 
 def state(slam: km.Slam) -> tuple[Any, ...]:
     m = slam.map
-    held = [(moving.held.t_ns, moving.held.fresh) for moving in slam._moving.values()]
+    held = [(moving.held.t_ns, moving.held.fresh) for moving in slam.state.moving.values()]
     counts = {name: track.observations for name, track in slam.tracks.confirmed.items()}
     return (m.x.tobytes(), m.P.tobytes(), m.n, slam.t_ns, list(slam.tracks.slots), held, counts)
 

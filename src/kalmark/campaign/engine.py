@@ -117,7 +117,7 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
     slam = build_slam(config)
     robot = slam.robots[name]
     ((key, mount),) = robot.sensors.items()
-    policy, channel = slam._policies[name, key], slam._channels[name, key]
+    policy, channel = slam.state.policies[name, key], slam.state.channels[name, key]
     if why := _odd_models(robot.motion, mount):
         return why
     if type(slam.estimator) not in (Ekf, Invariant):
@@ -127,7 +127,8 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
     plain = mount.attention == EVERYTHING and mount.detector is None and mount.initialization is None
     if not plain or policy.upkeep.p_detect is not None:
         return "the batched engine uses all that is seen, and keeps it"
-    if slam.map_type == "postponed" or (slam.map_type == "auto" and landmarks > DENSE):
+    kind = slam.state.settings.map
+    if kind == "postponed" or (kind == "auto" and landmarks > DENSE):
         return f"the batched engine has dense maps, of up to {DENSE} landmarks"
     return ""
 
@@ -515,7 +516,7 @@ class _Filter:
     def __init__(self, slam: Slam, name: str, landmarks: int) -> None:
         robot, estimator = slam.robots[name], slam.estimator
         ((key, mount),) = robot.sensors.items()
-        channel, motion = slam._channels[name, key], robot.motion
+        channel, motion = slam.state.channels[name, key], robot.motion
         assert isinstance(motion, MOTIONS) and isinstance(mount.sensor, RangeBearing)
         correct = corrections.compiled_invariant if isinstance(estimator, Invariant) else textbook
         self.ways = (

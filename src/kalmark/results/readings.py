@@ -52,7 +52,8 @@ def model(value: Any) -> dict[str, Any]:
 def describe(slam: Any, log: Any = None) -> dict[str, Any]:
     """Return the configuration of a Slam: log, robots, sensors, landmarks, association, estimator, map."""
     out: dict[str, Any] = {}
-    models = [slam.landmark_type, slam.association, slam.estimator, *(robot.motion for robot in slam.robots.values())]
+    settings = slam.state.settings
+    models = [settings.landmarks, slam.association, slam.estimator, *(robot.motion for robot in slam.robots.values())]
     for mount in (mount for robot in slam.robots.values() for mount in robot.sensors.values()):
         models += [mount.sensor, *(vars(mount)[part] for part in PARTS)]
     own: list[Any] = [type(each) for each in models]
@@ -63,13 +64,13 @@ def describe(slam: Any, log: Any = None) -> dict[str, Any]:
     if plugins:
         out["plugins"] = plugins
     out["robots"] = {name: _robot(robot) for name, robot in slam.robots.items()}
-    if slam.landmark_type is not None:
-        out["landmarks"] = model(slam.landmark_type)
+    if settings.landmarks is not None:
+        out["landmarks"] = model(settings.landmarks)
     out["association"] = model(slam.association)
-    out["upkeep"] = _keys(slam.upkeep)
+    out["upkeep"] = _keys(settings.upkeep)
     out["estimator"] = model(slam.estimator)
-    reparametrize = "off" if slam.reparametrize is None else float(slam.reparametrize)
-    out["map"] = {"type": slam.map_type, "numbers": slam.numbers, "reparametrize": reparametrize}
+    reparametrize = "off" if settings.reparametrize is None else float(settings.reparametrize)
+    out["map"] = {"type": settings.map, "numbers": settings.numbers, "reparametrize": reparametrize}
     return out
 
 

@@ -27,7 +27,8 @@ class Policy:
     `deferred` starts landmarks with ids from several measurements, `delayed` any landmark from cloned poses (None: at
     first sight).  `starts` are the answers to an observation without an id that start one.  `averages`: the association
     may answer with mixtures; `holds_back`: its pairs are tested against chance; `reviews`: landmarks may change after a
-    scan; the last `keep_poses` clones are kept for tentative landmarks.
+    scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the
+    last `keep_poses` clones are kept for tentative landmarks.
     """
 
     association: Association
@@ -40,10 +41,13 @@ class Policy:
     averages: bool
     holds_back: bool
     reviews: bool
+    linear: float
     keep_poses: int
 
 
-def policy_of(mount: Mount, channel: Channel, association: Association, upkeep: Upkeep) -> Policy:
+def policy_of(
+    mount: Mount, channel: Channel, association: Association, upkeep: Upkeep, linear: float | None
+) -> Policy:  # fmt: skip
     """Return the policy for the scans of a mount.
 
     Raises ModelError if its initialisation does not fit its sensor.
@@ -57,6 +61,7 @@ def policy_of(mount: Mount, channel: Channel, association: Association, upkeep: 
     return Policy(
         association, upkeep, mount.attention, mount.detector, _deferred(mount), delayed, _starts(association, upkeep),
         averages(association), upkeep.hold_back and not weighs(association), reviews,
+        0.0 if channel.joins else linear or 0.0,
         upkeep.keep_poses if delayed is None else 0,
     )  # fmt: skip
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.events import Control, Event, Fix, Scan
+from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.filter.compressed.map import CompressedMap
 from kalmark.geometry import frames, frames3d
 from kalmark.models.check import views
-from kalmark.models.protocols import TWIST, OfState, SegmentVisible, image_size
+from kalmark.models.protocols import TWIST, Landmark, OfState, Reparametrizable, SegmentVisible, image_size
 from kalmark.models.sensors import Spatial
+from kalmark.slam.estimate import Estimate
 from kalmark.slam.robot import IDENTITY, Mount, Robot
 
 ROUNDS = 12  # of a control and scans: enough for whatever waits for several
@@ -20,6 +24,40 @@ SEEN = 3  # observations in a scan
 STEP_S = 0.5
 MOVING = 0.5  # each number of a control
 LOST_PIXELS = 0.2  # of an image, at its border
+
+
+def without_detectors(robots: Iterable[Robot]) -> list[Robot]:
+    """Return the robots with sensors that take measurements, not raw scans."""
+    return [
+        replace(robot, sensors={name: replace(mount, detector=None) for name, mount in robot.sensors.items()})
+        for robot in robots
+    ]
+
+
+def rehearse(twin: Estimate, process: Callable[[Event], object]) -> list[tuple[Id, Array, Landmark]]:
+    """Let a twin of a Slam take made-up events by `process`, and use all that they lead to.
+
+    Return the landmarks that it has then: name, mean and model.
+    """
+
+    def pose(robot: str, sensor: str) -> Array:
+        channel, slot = twin.state.channels.get((robot, sensor)), twin.state.moving[robot].slot
+        return twin.map.mean(slot) if channel is None else channel.pose(twin.map, slot)
+
+    for event in rehearsal(twin.robots.values(), pose):
+        with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
+            process(event)
+    tracks = [*twin.tracks.confirmed.values()]
+    twin.covariance(*twin.robots, *twin.tracks.confirmed)
+    found = [(track.id, twin.mean(track.id), track.model) for track in tracks]
+    for track in tracks:
+        if isinstance(track.model, Reparametrizable):
+            track.model.to_point(twin.mean(track.id)[None])
+    for track in tracks:
+        twin.map.remove(track.slot)
+    if isinstance(twin.map, CompressedMap):
+        twin.map.finish()
+    return found
 
 
 def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:

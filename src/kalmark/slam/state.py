@@ -1,591 +1,177 @@
-"""A Slam on disk: one zip of arrays, a JSON description and their checksums, never pickle: loading runs nothing of it.
-
-The settings are what a Slam is constructed with, the state is what events have made of it.  Registered models are saved
-by name and parameters, others by name alone, to be given again.
-"""
+"""What a Slam is made of and what events have made of it; how blocks and clones enter the map and leave it."""
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import math
-import os
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
-from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
-import kalmark.association
-import kalmark.filter.estimators
-import kalmark.management.attention
-import kalmark.management.initialization
-import kalmark.management.upkeep
-import kalmark.models.landmarks
-import kalmark.models.motion
-import kalmark.models.sensors  # noqa: F401 - all of these register what a file names
-from kalmark.arrays import Array
+from kalmark.arrays import Index
 from kalmark.association import Association
-from kalmark.declare import by_class_name, registered_name
-from kalmark.errors import KalmarkError, MapError
-from kalmark.events import Id
-from kalmark.filter.estimators import Estimator
+from kalmark.errors import DivergedError, MapError, ModelError
+from kalmark.events import Event, Id, when
+from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.filter.map import Map
-from kalmark.filter.maps import restored as restored_map
-from kalmark.geometry.spaces import SE2, SE3, Rn, Space
-from kalmark.management.hypotheses import POLAR
+from kalmark.filter.maps import DENSE, grown, new_map
+from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.protocols import Landmark
-from kalmark.slam.gaps import Gaps
-from kalmark.slam.motion import Moving, bias_block, bias_name
+from kalmark.models.protocols import Landmark, OfState, world_of
+from kalmark.slam.checks import fault_of
+from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
+from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
 from kalmark.slam.reader import Reader
-from kalmark.slam.replacing import LeftOut
-from kalmark.slam.robot import Mount, Robot, mount_name
-from kalmark.tracks.clones import Clone, Clones, Measurement
-from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
+from kalmark.slam.robot import Robot, mount_name
+from kalmark.tracks.channel import Channel, Parts
+from kalmark.tracks.clones import Clones
+from kalmark.tracks.scan import Start
+from kalmark.tracks.track import ChannelKey, Tracks
 
-Description = dict[str, Any]
-
-VERSION = 10
-DESCRIPTION, SUMS = "slam.json", "sha256"
-OF_TRACKS = (
-    "recent",
-    "last_scan",
-    "changes",
-    "searched",
-    "unnamed",
-    "experience",
-)  # what `Tracks` knows beside the tracks
-PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
-NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
-OF_MOVING = ("t_ns", "fresh")
-OF_GAPS = ("gaps", "max_speed_mps", "max_turn_radps")  # of a robot
+CURE = "start anew from a pose that is less certain, or with larger sigmas of controls and sensors"
 
 
-class State(NamedTuple):
-    """What events have made of a Slam."""
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """What a Slam is constructed with beside its robots, as `Slam` explains it."""
 
-    t_ns: int | None
-    map: Map
-    tracks: Tracks
-    clones: Clones
-    moving: dict[str, Moving]
-    readers: dict[ChannelKey, Reader]
-
-
-def settings(
-    robots: Mapping[str, Robot], association: Association, estimator: Estimator, landmarks: Landmark | None,
-    upkeep: Upkeep, reparametrize: float | None, map_type: str, numbers: str,
-) -> Description:  # fmt: skip
-    """Return a description of what a Slam was constructed with."""
-    models = {"association": association, "estimator": estimator, "landmarks": landmarks, "upkeep": upkeep}
-    return {
-        "robots": [robot_described(robot) for robot in robots.values()],
-        **{role: None if model is None else described(model) for role, model in models.items()},
-        **{"reparametrize": reparametrize, "map": map_type, "numbers": numbers},
-    }
+    association: Association
+    estimator: Estimator
+    landmarks: Landmark | None
+    map: str
+    reparametrize: float | None
+    numbers: str
+    upkeep: Upkeep
 
 
-# ---------------------------------------------------------------------- saving
-def save(path: Path, settings: Description, state: State) -> None:
-    """Write settings and state; the file appears whole or not at all.  A model's own memory is not written.
+class State:
+    """The map, the tracks and the clones of some robots, with the channels and readers of their sensors.
 
-    Raises MapError if the file cannot be written, or an id is neither an integer nor a text.
+    `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed.
+    Raises ModelError if robots, sensors and landmarks do not fit together.
     """
-    description = {"kalmark": VERSION, "settings": settings, "state": _state(state)}
-    members = {DESCRIPTION: json.dumps(description, default=_plain, allow_nan=False).encode()}
-    members |= {f"{name}.npy": _npy(array) for name, array in _arrays(state)}
-    sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in members.items()).encode()
-    temporary = path.with_name(path.name + ".part")
-    try:
+
+    def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
+        self.settings, self.robots = settings, robots
+        self.t_ns: int | None = None
+        self.map: Map = new_map(settings.map, settings.numbers)
+        self.tracks, self.clones = Tracks(robots), Clones()
+        self.moving: dict[str, Moving] = {}
+        self.channels: dict[ChannelKey, Channel] = {}
+        self.policies: dict[ChannelKey, Policy] = {}
+        self.readers: dict[ChannelKey, Reader] = {}
+        self.inner = {bias_name(name) for name in robots}
+        self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}
+        for robot in robots.values():
+            self._place(robot)
+        self.may_grow = settings.map == "auto" and not any(policy.averages for policy in self.policies.values())
+
+    @property
+    def estimator(self) -> Estimator:
+        """How the map is predicted and corrected."""
+        return self.settings.estimator
+
+    def _place(self, robot: Robot) -> None:
+        """Enter a robot, the bias of its controls and its mounts into the map.  Raises ModelError."""
+        settings = self.settings
+        if robot.name in self.inner:
+            raise ModelError(f"robot {robot.name!r} has the name of another's bias or mount, expected different names")
+        refuse_other_world(self.robots, f"robot {robot.name!r}", robot.motion.space.world)
+        slot = self.map.add(robot.motion.space, robot.start, robot.cov)
+        self.tracks.enter_block(robot.name, slot, robot=True)
+        bias = bias_block(robot.motion)
+        bias_slot = None if bias is None else self.map.add(*bias)
+        if bias_slot is not None:
+            self.tracks.enter_block(bias_name(robot.name), bias_slot)
+        self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, HeldInput(robot.motion, robot.watch()))
+        for name, mount in robot.sensors.items():
+            mount_slot, block = -1, mount.block(name)
+            if block is not None:  # the mount calibrates itself
+                mount_slot = self.map.add(*block)
+                self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
+            if isinstance(mount.sensor, OfState):
+                refuse_other_world(self.robots, type(mount.sensor).__name__, world_of(mount.sensor))
+                self.readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot)
+                continue
+            association = mount.association or settings.association
+            channel = channel_of(self.robots, mount, mount_slot, settings.landmarks, association, self.estimator)
+            self.channels[robot.name, name] = channel
+            upkeep = mount.upkeep or settings.upkeep
+            self.policies[robot.name, name] = policy_of(mount, channel, association, upkeep, settings.reparametrize)
+
+    def rows(self, parts: Parts) -> Index:
+        """Return the rows of some blocks, of each the first so many."""
+        for slot, _ in parts[:-1]:
+            self.map.index(slot)  # to activate a block may move those that are active
+        return np.concatenate([self.map.index(slot)[:count] for slot, count in parts])
+
+    def add(self, start: Start) -> int:
+        """Add a block computed from others; return its slot.  Raises MapError where the map is full.  [S] (35)-(38)."""
+        return self.map.augment(start.space, start.mean, self.rows(start.parts), start.G, start.Q)
+
+    def add_all(self, starts: Iterable[Start]) -> list[int]:
+        """Add blocks, all or none of them; return their slots.  Raises MapError where the map is full."""
+        slots: list[int] = []
         try:
-            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-                for name, data in (members | {SUMS: sums}).items():
-                    archive.writestr(name, data)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise MapError(f"{path}: {error.strerror}, expected a file that can be written") from error
-
-
-def _state(state: State) -> Description:
-    tracks = state.tracks
-    all_ = [*tracks.confirmed.values(), *tracks.tentative.values(), *tracks.pending.values()]
-    blocks = {name: slot for name, slot in tracks.slots.items() if name not in tracks.confirmed}
-    return {
-        "t_ns": state.t_ns,
-        "map": state.map.state(),
-        "blocks": [[_id(name), slot] for name, slot in blocks.items()],
-        "tracks": [_record(track) | {"id": _id(track.id)} for track in all_],
-        "candidates": [[*key, [_record(c) for c in candidates]] for key, candidates in tracks.candidates.items()],
-        "known": [
-            {"model": of.model, "names": [*map(_id, of.names)], "counts": of.counts.tolist()}
-            for of in tracks.known.of_kind.values()
-        ],
-        "reserved": sorted(map(_id, tracks.reserved)),
-        **{name: getattr(tracks, name) for name in OF_TRACKS},
-        "clones": [[number, _record(clone)] for number, clone in state.clones.clones.items()],
-        "latest": state.clones.latest,
-        "numbered": state.clones.numbered,
-        "moving": {
-            name: [m.error, *(getattr(m.held, key) for key in OF_MOVING), _watched(m.held.gaps), _left_out(m)]
-            for name, m in state.moving.items()
-        },
-        "readers": [[*key, reader.t_ns] for key, reader in state.readers.items()],
-    }
-
-
-def _left_out(moving: Moving) -> list[list[Any]]:
-    return [[part.tolist() for part in one] for one in moving.left_out]
-
-
-def _record(value: Any) -> Description:
-    """Return a record as its fields."""
-    return {field.name: getattr(value, field.name) for field in fields(value)}
-
-
-def _plain(value: Any) -> Any:
-    """Return what JSON has no word for: arrays as lists, records as their fields, models as they are described."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, set | frozenset):
-        return sorted(map(_id, value), key=str) if not all(isinstance(v, tuple) for v in value) else sorted(value)
-    if isinstance(value, Status):
-        return value.value
-    if isinstance(value, Measurement | Pending):
-        return _record(value)
-    if isinstance(value, Landmark):
-        return described(value)
-    raise MapError(f"{value!r} cannot be saved, expected a number or a text")
-
-
-def _id(name: Any) -> Any:
-    name = name.item() if isinstance(name, np.generic) else name
-    if not isinstance(name, int | str):
-        raise MapError(f"landmark {name!r} cannot be saved, expected an id that is an integer or a text")
-    return name
-
-
-def _arrays(state: State) -> Iterator[tuple[str, Array]]:
-    yield from state.map.arrays()
-    for i, of in enumerate(state.tracks.known.of_kind.values()):
-        yield f"known{i}", of.values
-    for i, moving in enumerate(state.moving.values()):
-        if moving.held.u is not None and moving.held.N is not None:
-            yield f"u{i}", moving.held.u
-            yield f"N{i}", moving.held.N
-
-
-def _npy(array: Array) -> bytes:
-    file = io.BytesIO()
-    np.lib.format.write_array(file, np.ascontiguousarray(array, dtype="<f8"), (1, 0), allow_pickle=False)
-    return file.getvalue()
-
-
-# ---------------------------------------------------------------------- loading
-@dataclass(frozen=True)
-class Saved:
-    """A file that was written by `save`: the settings to construct a Slam with, and the state it then takes over."""
-
-    path: Path
-    settings: Description
-    _state: Description
-    _members: dict[str, bytes]
-    _landmarks: Landmark | None = None  # the user's own, given again
-
-    @contextmanager
-    def errors(self) -> Iterator[None]:
-        """Turn whatever a damaged file leads to into a MapError that names the file."""
-        try:
-            yield
-        except KalmarkError as error:
-            raise MapError(f"{self.path}: {error}") from error
-        except OSError as error:
-            said = error.strerror or error
-            raise MapError(f"{self.path}: {said}, expected a map written by save()") from error
-        except Exception as error:  # a damaged file fails in any way: in zlib, json, numpy or a model
-            said = " ".join(str(error).split())
-            raise MapError(f"{self.path}: {type(error).__name__}: {said}, expected a map written by save()") from error
-
-    def state(
-        self, robots: Mapping[str, Robot], moving: dict[str, Moving], readers: dict[ChannelKey, Reader],
-        own: Sequence[Landmark],
-    ) -> State:  # fmt: skip
-        """Return the state, `own` being the landmark models of the user's that it may have.
-
-        `moving` are the robots, `readers` the sensors of their states, as they are after construction.  Raises
-        MapError if the parts do not fit together.
-        """
-        s, given = self._state, [*own]
-        if self._landmarks is not None:
-            given.append(self._landmarks)
-        map_ = restored_map(s["map"], partial(_array, self._members))
-        state = State(_time(s["t_ns"]), map_, Tracks(robots), Clones(), moving, readers)
-        tracks, clones = state.tracks, state.clones
-        for name, slot in s["blocks"]:
-            tracks.enter_block(name, slot, robot=name in robots)
-        for record in s["tracks"]:
-            _enter(tracks, _track(record, given), len(map_.spaces))
-        for robot, sensor, candidates in s["candidates"]:
-            tracks.candidates[robot, sensor] = [_pending(c) for c in candidates]
-        self._enter_known(tracks, given)
-        tracks.reserve(s["reserved"])
-        for name in OF_TRACKS:
-            setattr(tracks, name, s[name])
-        tracks.experience = float(s["experience"][0]), float(s["experience"][1])
-        for name in ("changes", "searched", "unnamed"):
-            setattr(tracks, name, _count(s[name], name))
-        for number, c in s["clones"]:
-            users = {(str(robot), str(sensor)) for robot, sensor in c["users"]}
-            clones.clones[_count(number, "number of a clone")] = Clone(c["slot"], c["robot"], c["t_ns"], users)
-        clones.latest = {robot: _count(number, "number of a clone") for robot, number in s["latest"].items()}
-        clones.numbered = _count(s["numbered"], "number of clones")
-        for i, (name, m) in enumerate(moving.items()):
-            error, t_ns, fresh, watched, left_out = s["moving"][name]
-            d = 2 if m.motion.space.axes == 1 else 3
-            m.left_out = [
-                LeftOut(_numbers(y).reshape(d), _numbers(R).reshape(d, d), _numbers(p).reshape(d))
-                for y, R, p in left_out
-            ]
-            k, m.slot, m.error = len(m.motion.columns), tracks.slots[name], error
-            m.bias = tracks.slots.get(bias_name(name))
-            m.held.t_ns, m.held.fresh = _time(t_ns), bool(fresh)
-            if f"u{i}.npy" in self._members:
-                m.held.u, m.held.N = _array(self._members, f"u{i}", (k,)), _array(self._members, f"N{i}", (k, k))
-            if m.held.gaps is not None:
-                m.held.gaps.restore(_watching(watched, k))
-        for robot, sensor, t_ns in s["readers"]:
-            readers[robot, sensor].t_ns = _time(t_ns)
-        _check_owners(robots, state)
-        _check_measurements(robots, state)
-        return state
-
-    def _enter_known(self, tracks: Tracks, own: Sequence[Landmark]) -> None:
-        """Enter the landmarks known exactly.  Raises MapError where one is there twice."""
-        for i, of in enumerate(self._state["known"]):
-            model = _model(of["model"], own, f"landmark {next(iter(of['names']), '')!r}")
-            values = _array(self._members, f"known{i}", (len(of["names"]), model.space.size))
-            for name, value, count in zip(of["names"], values, of["counts"], strict=True):
-                if name in tracks.slots or name in tracks.known:
-                    raise MapError(f"landmark {name!r} is there twice, expected each name once")
-                tracks.known.add(name, model, value)
-                tracks.known.recount(name, _count(count, f"observations of {name!r}"))
-
-
-def load(
-    path: Path, robots: Iterable[Robot] | None, association: Association | None, estimator: Estimator | None,
-    landmarks: Landmark | None,
-) -> Saved:  # fmt: skip
-    """Read a file written by `save`; models of the user's own are given again.
-
-    Raises MapError if the file is damaged, lacks a model, or was saved with other robots or landmarks.
-    """
-    saved = Saved(path, {}, {}, {})
-    with saved.errors():
-        description, members = _read(path)
-        s, state = description["settings"], description["state"]
-        found = {
-            "robots": robots_restored(s["robots"], None if robots is None else list(robots)),
-            "association": association or restored("association", s["association"], "association", "association"),
-            "estimator": estimator or restored("estimator", s["estimator"], "estimator", "estimator"),
-            "landmarks": landmark_type(
-                s["landmarks"], [t["model"] for t in (*state["tracks"], *state["known"])], landmarks
-            ),
-            "map": s["map"],
-            "numbers": s["numbers"],
-            "reparametrize": _optional(s["reparametrize"], "reparametrize", "a number", int, float),
-            "upkeep": restored("upkeep", s["upkeep"], "upkeep", "upkeep"),
-        }
-        return Saved(path, found, state, members, landmarks)
-    raise AssertionError  # `errors` has raised
-
-
-def _read(path: Path) -> tuple[Description, dict[str, bytes]]:
-    """Return the description and the arrays' files, their checksums compared."""
-    with zipfile.ZipFile(path) as archive:
-        state = json.loads(archive.read(DESCRIPTION))
-        if state.get("kalmark") != VERSION:
-            raise MapError(f"version is {state.get('kalmark')!r}, expected {VERSION}")
-        sums = {name: sum_ for sum_, name in map(str.split, archive.read(SUMS).decode().splitlines())}
-        members = {name: archive.read(name) for name in {DESCRIPTION, *sums}}
-    for name, data in members.items():
-        if hashlib.sha256(data).hexdigest() != sums.get(name):
-            raise MapError(f"{name} is damaged: its checksum is not {sums.get(name)}")
-    return state, members
-
-
-def _array(members: dict[str, bytes], name: str, shape: tuple[int, ...]) -> Array:
-    """Return an array, its header compared with what is expected before anything is made of it."""
-    file = io.BytesIO(members[f"{name}.npy"])
-    version = np.lib.format.read_magic(file)
-    got, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    if (version, got, fortran, dtype) != ((1, 0), shape, False, np.dtype("<f8")):
-        raise MapError(f"{name} is an array {got} of {dtype}, expected {shape} of float64")
-    return np.frombuffer(file.read(), "<f8").reshape(shape).astype(np.float64)
-
-
-def _enter(tracks: Tracks, track: Track, slots: int) -> None:
-    if track.slot >= slots:
-        raise MapError(f"slot of {track.id!r} is {track.slot}, expected one of {slots}")
-    if track.status is Status.CONFIRMED:
-        tracks.enter(track)
-    else:
-        of = tracks.tentative if track.status is Status.TENTATIVE else tracks.pending
-        of[track.id] = track
-
-
-def _track(record: Description, own: Sequence[Landmark]) -> Track:
-    name = record["id"]
-    model = _model(record["model"], own, f"landmark {name!r}")
-    pending = record["pending"]
-    changed = {
-        "model": model,
-        "status": Status(record["status"]),
-        "observations": _count(record["observations"], f"observations of {name!r}"),
-        "covisible": set(record["covisible"]),
-        "compared": tuple(record["compared"]),
-        "extent": None if record["extent"] is None else np.array(record["extent"], dtype=np.float64).reshape(2),
-        "size_m": _optional(record["size_m"], f"size_m of {name!r}", "a number", float),
-        "first": None if record["first"] is None else tuple(record["first"]),
-        "pending": None if pending is None else _pending(pending),
-        "measurements": [_measurement(m) for m in record["measurements"]],
-    }
-    track = Track(**(record | changed))
-    for what in ("searched", "found", "hits", "chances", "missed"):
-        _count(getattr(track, what), f"{what} of {name!r}")
-    return track
-
-
-def _model(record: Description, own: Sequence[Landmark], what: str) -> Landmark:
-    """Return the model of a landmark: one of the user's `own`, or the registered one that a file describes."""
-    model = next((landmark for landmark in own if same(landmark, record)), None)
-    found: Landmark = model or restored("landmark", record, what, "landmarks")
-    return found
-
-
-def _pending(record: Description) -> Pending:
-    arrays = {key: None if record[key] is None else _numbers(record[key]) for key in ("mean", "cov", "poses")}
-    if arrays["poses"] is not None and arrays["poses"].shape != (2, 7):
-        raise MapError(f"what is pending of {record['name']!r} has poses {record['poses']!r}, expected two")
-    changed = {
-        "channel": tuple(record["channel"]),
-        "measurements": tuple(_measurement(m) for m in record["measurements"]),
-        "hypotheses": tuple(record["hypotheses"]),
-        "log_weights": tuple(_numbers(record["log_weights"]).tolist()),
-    }
-    pending = Pending(**(record | arrays | changed))
-    if len(pending.log_weights) != len(pending.hypotheses):
-        raise MapError(f"what is pending of {pending.name!r} has {len(pending.log_weights)} weights of its hypotheses")
-    return pending
-
-
-def _measurement(record: Description) -> Measurement:
-    m = Measurement(**(record | {"y": _numbers(record["y"]), "R": _numbers(record["R"])}))
-    if m.y.ndim != 1 or m.R.ndim != 2 or m.R.shape[0] != m.R.shape[1]:
-        raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} has the noise {m.R.tolist()}")
-    return m
-
-
-def _watched(gaps: Gaps | None) -> Description | None:
-    return None if gaps is None else gaps.state()
-
-
-def _watching(record: Description, k: int) -> Description:
-    """Return what was known of the controls of a robot, which have k numbers."""
-
-    def control(value: Any) -> Array:
-        u = _numbers(value)
-        if u.shape != (k,):
-            raise MapError(f"a control is {value!r}, expected {k} numbers")
-        return u
-
-    times = {key: _time(record[key]) for key in ("last_ns", "since_ns", "until_ns", "usual_ns", "bound_ns")}
-    return times | {
-        "intervals": tuple(_count(dt, "interval of controls") for dt in record["intervals"]),
-        "pending": tuple((_count(dt, "interval of controls"), control(u)) for dt, u in record["pending"]),
-        "largest": control(record["largest"]),
-        "adrift": bool(record["adrift"]),
-    }
-
-
-def _numbers(value: Any) -> Array:
-    found = np.array(value, dtype=np.float64)
-    if not np.isfinite(found).all():
-        raise MapError(f"{value!r} is no array of finite numbers")
-    return found
-
-
-def _check_owners(robots: Mapping[str, Robot], state: State) -> None:
-    """Refuse a map whose blocks are not each one robot, one landmark or one other known thing, of their shapes."""
-    owners = _owners(robots, state)
-    used = [i for i, space in enumerate(state.map.spaces) if space is not None]
-    if sorted(_count(slot, f"slot of {what}") for what, slot, _ in owners) != used:
-        raise MapError(f"the slots of the map are not used once each: {len(owners)} names, {len(used)} blocks")
-    for what, slot, space in owners:
-        block = state.map.spaces[slot]
-        if block is None or block.kinds != space.kinds:
-            raise MapError(f"{what} is a {space.name} of {space.size} numbers, its block in the map is {block}")
-
-
-def _owners(robots: Mapping[str, Robot], state: State) -> list[tuple[str, int, Space]]:
-    """Return what each block is, its slot and its space.  Raises MapError for names without a block."""
-    tracks = state.tracks
-    spaces: dict[Id, Space] = {name: robot.motion.space for name, robot in robots.items()}
-    mounts = {mount_name(name, key): mount.block(key) for name, r in robots.items() for key, mount in r.sensors.items()}
-    spaces |= {name: block[0] for name, block in mounts.items() if block is not None}
-    biased = {name: block for name, r in robots.items() if (block := bias_block(r.motion)) is not None}
-    spaces |= {bias_name(name): block[0] for name, block in biased.items()}
-    spaces |= {name: track.model.space for name, track in tracks.confirmed.items()}
-    if robots.keys() & tracks.confirmed.keys() or spaces.keys() != tracks.slots.keys():
-        raise MapError("the slots' names are not those of the robots and landmarks")
-    owners = [(f"{name!r}", slot, spaces[name]) for name, slot in tracks.slots.items()]
-    owners += [(f"tentative {name!r}", t.slot, t.model.space) for name, t in tracks.tentative.items()]
-    owners += [(f"a hypothesis of {p.name!r}", slot, POLAR) for p in tracks.waiting() for slot in p.hypotheses]
-    for number, clone in state.clones.clones.items():
-        pose = SE2 if robots[clone.robot].motion.space.axes == 1 else SE3
-        owners.append((f"clone {number}", clone.slot, pose))
-    errors = [(name, m) for name, m in state.moving.items() if m.error is not None]
-    owners += [(f"the error of {name!r}", m.error, Rn(len(m.motion.columns))) for name, m in errors]  # type: ignore[misc]
-    return owners
-
-
-def _check_measurements(robots: Mapping[str, Robot], state: State) -> None:
-    """Refuse measurements that were not made from a clone of the map by a sensor of its robots."""
-    tracks, clones = state.tracks, state.clones
-    measured = [m for t in tracks.tentative.values() for m in t.measurements]
-    for m in (*measured, *(m for p in tracks.waiting() for m in p.measurements)):
-        if m.clone not in clones.clones or (m.robot, m.sensor) not in clones.clones[m.clone].users:
-            raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} does not fit the clones of the map")
-        if m.y.shape != (len(robots[m.robot].sensors[m.sensor].sensor.columns),):
-            raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} is {m.y.tolist()}")
-    channels = {(name, sensor) for name, robot in robots.items() for sensor in robot.sensors}
-    if not {*clones.users(), *(p.channel for p in tracks.waiting()), *tracks.candidates} <= channels:
-        raise MapError("clones or pending measurements are of sensors that there are not")
-
-
-def _count(value: Any, what: str) -> int:
-    if type(value) is not int or value < 0:
-        raise MapError(f"{what} is {value!r}, expected an integer of at least 0")
-    return value
-
-
-def _optional(value: Any, what: str, expected: str, *kinds: type) -> Any:
-    if value is not None and type(value) not in kinds:
-        raise MapError(f"{what} is {value!r}, expected {expected} or none")
-    return value
-
-
-def _time(value: Any) -> int | None:
-    return _optional(value, "t_ns", "an integer", int)
-
-
-# ---------------------------------------------------------------------- models and robots
-def described(model: Any) -> Description:
-    """Return a model that has a name in configurations as its class and parameters, another as its class alone."""
-    name = type(model).__name__
-    if registered_name(type(model)) is None:
-        return {"python": name, "kind": model.kind if isinstance(model, Landmark) else ""}
-    return {"type": name, **{f.name: _parameter(vars(model)[f.name]) for f in fields(model)}}
-
-
-def _parameter(value: Any) -> Any:
-    """Return NumPy's numbers as Python's, and those JSON has no word for as text."""
-    if isinstance(value, tuple):
-        return [_parameter(v) for v in value]
-    value = value.item() if isinstance(value, np.generic) else value
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def restored(kind: str, description: Description, what: str, argument: str) -> Any:
-    """Make a registered model again; of another, say which argument of `load` has to give it."""
-    if "python" in description:
-        raise MapError(f"{what} is {_name(description)}, a model of your own: give the {argument} to load() again")
-    model = by_class_name(kind, description["type"])
-    if model is None:
-        raise MapError(f"{what} is {description['type']!r}, expected one of kalmark's, or of a plugin that is loaded")
-    parameters = {k: v for k, v in description.items() if k != "type"}
-    return model(**{k: float(v) if v in NOT_FINITE else v for k, v in parameters.items()})
-
-
-def _name(description: Description) -> str:
-    return str(description.get("type") or description["python"])
-
-
-def same(landmark: Any, description: Description | None) -> bool:
-    """Return whether a landmark type is the one that was saved."""
-    if description is None:
-        return False
-    mine = described(landmark)
-    return _name(mine) == _name(description) and mine.get("kind") == description.get("kind")
-
-
-def robot_described(robot: Robot) -> Description:
-    """Return a robot with its motion, its start and its mounted sensors."""
-    mounts = [
-        [name, {"at": list(mount.at), "cov": _listed(mount.cov), **_parts(mount)}]
-        for name, mount in robot.sensors.items()
-    ]
-    moved = {"motion": described(robot.motion), "columns": list(robot.motion.columns)}
-    watched = {key: vars(robot)[key] for key in OF_GAPS}
-    start = {"start": list(robot.start), "cov": _listed(robot.cov)}
-    return {"name": robot.name, **moved, **start, **watched, "sensors": mounts}
-
-
-def _parts(mount: Mount) -> Description:
-    return {role: None if (model := vars(mount)[role]) is None else described(model) for role in PARTS}
-
-
-def _listed(cov: Any) -> Any:
-    return None if cov is None else np.asarray(cov).tolist()
-
-
-def _robot_restored(d: Description) -> Robot:
-    who, mounts = f"robot {d['name']!r}", {}
-    for name, m in d["sensors"]:
-        what = f"{who}: sensor {name!r}"
-        said = {"sensor": what} | {role: f"{what}: {role}" for role in PARTS[1:]}
-        parts = {role: restored(role, m[role], said[role], "robots") for role in PARTS if m.get(role) is not None}
-        mounts[name] = Mount(at=m["at"], cov=m["cov"], **parts)
-    motion = restored("motion", d["motion"], f"{who}: motion", "robots")
-    return Robot(d["name"], motion, d["start"], mounts, d["cov"], **{key: d[key] for key in OF_GAPS})
-
-
-def robots_restored(saved: list[Description], given: list[Robot] | None) -> list[Robot]:
-    """Return the robots in the order saved: restored, or those given again if they are the same."""
-    if given is None:
-        return [_robot_restored(d) for d in saved]
-    for robot in given:
-        if not isinstance(robot, Robot):
-            raise MapError(f"robots holds {robot!r}, expected nothing but robots")
-    names = [d["name"] for d in saved]
-    got = [robot.name for robot in given]
-    if sorted(got) != sorted(names):
-        raise MapError(f"robots are {got}, expected {names}")
-    given = sorted(given, key=lambda robot: names.index(robot.name))
-    for robot, d in zip(given, saved, strict=True):
-        for what, mine, expected in (
-            ("motion is", type(robot.motion).__name__, _name(d["motion"])),
-            ("columns of the motion are", list(robot.motion.columns), d["columns"]),
-            ("sensors are", sorted(map(str, robot.sensors)), sorted(str(name) for name, _ in d["sensors"])),
-        ):
-            if mine != expected:
-                raise MapError(f"robot {robot.name!r}: {what} {mine}, expected {expected}")
-    return given
-
-
-def landmark_type(saved: Description | None, of_tracks: list[Description], given: Landmark | None) -> Landmark | None:
-    """Return the slam's type of landmark; one given again must be one that was saved, of the slam or of a track."""
-    if given is not None and same(given, saved):
-        return given
-    if given is not None and not any(same(given, d) for d in of_tracks):
-        names = sorted({_name(d) for d in (saved, *of_tracks) if d is not None})
-        raise MapError(f"landmarks is {type(given).__name__}, expected {' or '.join(names) or 'None'}")
-    return None if saved is None else restored("landmark", saved, "landmarks", "landmarks")
+            for start in starts:
+                slots.append(self.add(start))
+        except MapError:
+            for slot in slots:
+                self.map.remove(slot)
+            raise
+        return slots
+
+    def clone(self, key: ChannelKey, t_ns: int) -> int:
+        """Clone the pose of a channel's robot; return the clone's number.  Raises MapError where the map is full."""
+        number = self.clones.now(key[0], t_ns)
+        if number is None:
+            robot, space = self.moving[key[0]].slot, SE2 if self.robots[key[0]].motion.space.axes == 1 else SE3
+            mean, index, dof = self.map.mean(robot)[: space.size], self.map.index(robot)[: space.dof], space.dof
+            slot = self.map.augment(space, mean, index, np.eye(dof), np.zeros((dof, dof)))
+            number = self.clones.enter(slot, key[0], t_ns)
+        self.clones.clones[number].users.add(key)
+        return number
+
+    def release(self, key: ChannelKey) -> None:
+        """Remove the clones that no measurement of a channel needs any more; a delayed start needs the last one."""
+        used = {m.clone for track in self.tracks.tentative.values() for m in track.measurements
+                if (m.robot, m.sensor) == key}  # fmt: skip
+        used |= {m.clone for pending in self.tracks.waiting() if pending.channel == key for m in pending.measurements}
+        if key in self.readers or self.policies[key].delayed is not None:
+            used.update(self.clones.of(key)[-1:])
+        for slot in self.clones.refer(key, used):
+            self.map.remove(slot)
+
+    def remove(self, name: Id) -> None:
+        """Remove a landmark; its place goes to the next new one."""
+        if name in self.tracks.known:
+            self.tracks.known.remove(name)
+            return
+        slot = self.tracks.slot(name)
+        if name not in self.tracks.confirmed:
+            what = "robot" if name in self.robots else "sensor's mount or a control's bias"
+            raise MapError(f"{name!r} is a {what}, expected a landmark")
+        self.map.remove(slot)
+        self.tracks.remove(name)
+
+    def let_grow(self) -> None:
+        """Compress the map from so many landmarks on that it pays; not where matchings are averaged."""
+        if self.may_grow and len(self.tracks.confirmed) > DENSE:
+            spaces = (track.model.space for track in self.tracks.confirmed.values())
+            self.map = grown(self.map, spaces, self.settings.numbers)
+
+    def is_there(self, name: Id) -> bool:
+        """Return whether a name is that of a block, or of a landmark known exactly."""
+        return name in self.tracks.slots or name in self.tracks.known
+
+    def corrected(self, update: Update, event: Event, estimator: Estimator | None = None) -> Correction:
+        """Correct the map.  Raises DivergedError if the robot is lost for good."""
+        done = (estimator or self.estimator).correct(self.map, update)
+        if not done.valid:
+            self.refuse_lost(event)
+        return done
+
+    def refuse_lost(self, event: Event) -> None:
+        """Raise DivergedError if the covariance of an event's robot is none: no measurement can bring it back."""
+        fault = fault_of(self.map.covariance([self.moving[event.robot].slot]))
+        if fault:
+            raise DivergedError(f"{when(event)}: the covariance of {event.robot!r} {fault}; {CURE}")

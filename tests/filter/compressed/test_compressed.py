@@ -31,7 +31,7 @@ def slam_of(estimator: Any, most: int | None = None, cov: Any = None, names: str
     robots = [km.Robot(name, motion, START, {"lidar": lidar}, cov) for name in names]
     slam = km.Slam(robots, km.association.ByIdentity("off"), estimator, map="dense")
     if most is not None:
-        slam.map = CompressedMap.from_dense(slam.map, most=most)
+        slam.state.map = CompressedMap.from_dense(slam.map, most=most)
     return slam
 
 
@@ -326,7 +326,7 @@ def test_in_a_map_too_full_for_the_error_of_a_control_the_robot_drives_on(monkey
 def test_float32_keeps_what_is_inactive_to_its_precision_in_half_the_memory() -> None:
     slams = [slam_of(km.estimators.Ekf()) for _ in range(2)]
     for slam, numbers in zip(slams, (np.float64, np.float32), strict=True):
-        slam.map = CompressedMap.from_dense(slam.map, Triangle(numbers), most=60)  # type: ignore[arg-type]
+        slam.state.map = CompressedMap.from_dense(slam.map, Triangle(numbers), most=60)  # type: ignore[arg-type]
         for event in drive(220, 1):
             slam.process(event)
     x, P = differences(*slams)

@@ -25,7 +25,7 @@ def robot_of(cov: Any) -> km.Robot:
 def passes(slam: km.Slam, most: int | None) -> km.Slam:
     """Drive 20 m among WORLD from an uncertain start, learning then by two fixes where that was, turned by .2 rad."""
     if most is not None:
-        slam.map = CompressedMap.from_dense(slam.map, most=most)
+        slam.state.map = CompressedMap.from_dense(slam.map, most=most)
     rng, truth = np.random.default_rng(4), np.zeros(3)
     for t in range(1, 101):
         u = np.array([0.2, 0.0, 0.0])

@@ -67,7 +67,7 @@ def test_robots_in_mid_interval_removed_slots_and_new_names_resume_bit_for_bit(
     straight = head(
         km.Slam(robots(), km.association.NearestNeighbour(), estimator, map=map_, upkeep=km.Upkeep(confirm=1))
     )
-    assert any(moving.error is not None for moving in straight._moving.values()), (
+    assert any(moving.error is not None for moving in straight.state.moving.values()), (
         "a held control's error is a block of the map"
     )
     assert straight.map._free, "a slot is free"
@@ -122,7 +122,6 @@ class Cart(km.motion.Unicycle):
 
 def slam_of_trees(landmarks: Any) -> km.Slam:
     slam = km.Slam(robots(), landmarks=landmarks)
-    slam.landmark_type = landmarks  # type: ignore[attr-defined, unused-ignore]
     return head(slam, ids=["oak", "elm"])
 
 
@@ -130,7 +129,6 @@ def test_the_type_of_landmark_is_restored(tmp_path: Path) -> None:
     sensor = km.pointwise(lambda v: v, np.eye(3), inverse=lambda y: y)
     rover = [km.Robot("rover", km.motion.Unicycle(), sensors={"nose": km.Mount(sensor)})]
     slam = km.Slam(rover, landmarks=km.landmarks.PointSignature2D())
-    slam.landmark_type = km.landmarks.PointSignature2D()  # type: ignore[attr-defined, unused-ignore]
     slam.save(tmp_path / "map.kmk")
     back = km.Slam.load(tmp_path / "map.kmk", rover)
     back.process(km.Scan(0, "rover", "nose", [[1.0, 2.0, 5.0]], [1]))
@@ -147,7 +145,7 @@ def test_a_users_type_of_landmark_is_wanted_again_and_works(tmp_path: Path) -> N
         km.Slam.load(tmp_path / "map.kmk", landmarks=km.landmarks.PointSignature2D())
     resumed = km.Slam.load(tmp_path / "map.kmk", landmarks=Tree())
     assert resumed.landmarks().kinds == ["tree"] * 4
-    assert [m.kind for m in (channel.landmark for channel in resumed._channels.values())] == ["tree", "tree"]
+    assert [m.kind for m in (channel.landmark for channel in resumed.state.channels.values())] == ["tree", "tree"]
     for slam in (straight, resumed):
         slam.process(km.Scan(1.3, "a", "camera", [[2.8, -1.0], [6.0, 2.5]], [2, 1]))
     assert bits(resumed) == bits(straight)
@@ -284,12 +282,12 @@ def assert_consistent(slam: km.Slam) -> None:
         assert (atoms[:, 1] >= x_at).all() and (atoms[:, 1] < x_at + x_size).all()
         assert (atoms[:, 2] >= p_at).all() and (atoms[:, 2] < p_at + p_size).all()
     owned = [*slam.tracks.slots.values()]
-    owned += [moving.error for moving in slam._moving.values() if moving.error is not None]
+    owned += [moving.error for moving in slam.state.moving.values() if moving.error is not None]
     assert sorted(owned + removed) == list(range(len(m.blocks)))
     for name, robot in slam.robots.items():
         space = m.spaces[slam.tracks.slots[name]]
         assert space is not None and space.kinds == robot.motion.space.kinds
-        held = slam._moving[name].held
+        held = slam.state.moving[name].held
         assert held.u is not None and held.N is not None
         assert held.N.shape == (*held.u.shape, len(robot.motion.columns))
 

@@ -1,0 +1,88 @@
+"""Corrections by observations of landmarks: in the map, known exactly, or by means over matchings.  [S] (26)-(30)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from kalmark.association.averaging import average, outcomes
+from kalmark.association.protocol import Decision, Mixture
+from kalmark.filter.estimators import Averaging
+from kalmark.management import tags
+from kalmark.management.attention import chosen
+from kalmark.report import INDEFINITE, Judged, Observation
+from kalmark.slam.policy import Policy
+from kalmark.slam.state import State
+from kalmark.tracks.channel import ObservationModel
+from kalmark.tracks.scan import ScanContext
+
+
+def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],
+    decisions: Sequence[Decision],
+) -> tuple[list[Judged], list[Observation]]:  # fmt: skip
+    """Fuse observations of landmarks in the map, the groups of those of one type at once.  [S] (26)-(30)."""
+    report, found, most = scan.report, list[Observation](), policy.attention.updates
+    judged: list[Judged] = []
+    if most is not None and sum(len(rows) for _, rows in groups) > most:
+        groups, out = chosen(scan, policy.attention, groups, decisions)
+        why = f"not among the {most} of most information"
+        found += [Observation(k, scan.ids[k], "ignored", decisions[k][0], None, why) for k in out]  # type: ignore[arg-type]
+    if policy.attention.sequential:
+        groups = [(model, [k]) for model, rows in groups for k in rows]
+    if not len(report.e) and (len(groups) != 1 or len(groups[0][1]) < len(scan.y)):
+        report.blank(scan.channel.dof)
+    for model, rows in groups:
+        if not rows:
+            continue
+        names: list[Any] = [decisions[k][0] for k in rows]
+        slots = state.tracks.slots_of(names)
+        if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:
+            state.estimator.correct(state.map, near)
+        done = state.corrected(scan.update(model, slots, rows), scan.event)
+        report.fill(rows, done)
+        state.tracks.count(names, done.fused.tolist())
+        judged.append(Judged(rows, scan.ids, names, done, scan.channel.gate))
+    return judged, found + _average(state, scan, decisions) if policy.averages else found
+
+
+def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions: Sequence[Decision]
+) -> list[Judged]:  # fmt: skip
+    """Correct by observations of landmarks known exactly, as by fixes.  docs/localization.md."""
+    report, known, m = scan.report, state.tracks.known, scan.y.shape[1]
+    groups = state.tracks.known_by_model(scan.channel, [name for name, _ in decisions])
+    if policy.attention.sequential:
+        groups = [(model, [k]) for model, rows in groups for k in rows]
+    if groups and len(groups[0][1]) < len(scan.y):
+        report.blank(scan.channel.dof)
+    judged = []
+    for model, rows in groups:
+        names: list[Any] = [decisions[k][0] for k in rows]
+        l, estimator = known.means(names), state.estimator.for_fixes()
+        if scan.channel.far is not None:
+            slots = np.full(len(rows), scan.robot)
+            if (near := tags.approach(scan, model.exactly, slots, rows, l)) is not None:
+                estimator.correct(state.map, near)
+        done = state.corrected(scan.known_update(model, l, rows), scan.event, estimator)
+        done = done._replace(e=done.e[:, :m])
+        report.fill(rows, done)
+        known.count(names, done.fused.tolist())
+        judged.append(Judged(rows, scan.ids, names, done, scan.channel.gate))
+    return judged
+
+
+def _average(state: State, scan: ScanContext, decisions: Sequence[Decision]) -> list[Observation]:
+    """Correct by the mean over the matchings among the decisions.  [F]."""
+    found = average(scan, decisions)
+    if found is None:
+        return []
+    assert isinstance(state.estimator, Averaging)
+    d2, valid = state.estimator.average(state.map, found.update, found.pairs, found.weights)
+    if not valid:
+        state.refuse_lost(scan.event)
+        rows = [k for k in found.rows.tolist() if isinstance(decisions[k][0], Mixture)]
+        return [Observation(k, None, "rejected", None, None, INDEFINITE) for k in rows]
+    of_these = outcomes(found, decisions, d2)
+    state.tracks.count([o.landmark for o in of_these], [o.outcome == "associated" for o in of_these])
+    return of_these

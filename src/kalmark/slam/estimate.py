@@ -1,0 +1,174 @@
+"""What the filter estimates, as it can be read: means, covariances, places, expectations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.association import Association
+from kalmark.errors import MapError
+from kalmark.events import Id
+from kalmark.filter.estimators import Estimator
+from kalmark.filter.map import Map
+from kalmark.models.protocols import Landmark, Segmented, place_of
+from kalmark.report import Expectations, LandmarkTable
+from kalmark.slam.robot import Robot
+from kalmark.slam.state import State
+from kalmark.tracks.clones import Clones
+from kalmark.tracks.expecting import expectations
+from kalmark.tracks.track import Tracks
+
+
+class Estimate:
+    """Robots and landmarks as one joint Gaussian, read by their names; `state` is where it is kept."""
+
+    def __init__(self, state: State) -> None:
+        self.state = state
+
+    @property
+    def t_ns(self) -> int | None:
+        """The time of the last event, None before the first."""
+        return self.state.t_ns
+
+    @property
+    def robots(self) -> dict[str, Robot]:
+        """The robots by name."""
+        return self.state.robots
+
+    @property
+    def association(self) -> Association:
+        """What decides which landmark was observed, where a mount has none of its own."""
+        return self.state.settings.association
+
+    @property
+    def estimator(self) -> Estimator:
+        """How the map is predicted and corrected."""
+        return self.state.estimator
+
+    @property
+    def map(self) -> Map:
+        """The joint Gaussian over blocks in slots."""
+        return self.state.map
+
+    @property
+    def tracks(self) -> Tracks:
+        """One record a landmark, and the names of all blocks."""
+        return self.state.tracks
+
+    @property
+    def clones(self) -> Clones:
+        """The window of cloned poses."""
+        return self.state.clones
+
+    def is_known(self, name: Id) -> bool:
+        """Return whether a landmark is known exactly: it is outside the map, and no scan moves it."""
+        return name in self.tracks.known
+
+    def mean(self, name: Id) -> Array:
+        """Return the mean (size,) of a landmark or robot: x, y, heading in m and rad, or x, y, z, qx, qy, qz, qw."""
+        known = self.tracks.known
+        return known.mean(name) if name in known else self.map.mean(self.slot(name))
+
+    def covariance(self, *names: Id) -> Array:
+        """Return the joint covariance (n, n) of robots and landmarks, in the given order, in standard coordinates."""
+        if not names:
+            raise MapError("covariance of nothing was asked for, expected names of robots or landmarks")
+        known = self.tracks.known
+        slots = [self.slot(name) for name in names if name not in known]
+        P = self.map.covariance(slots) if slots else np.zeros((0, 0))
+        if len(slots) == len(names):
+            return P
+        dofs = [known.model(name).space.dof if name in known else -1 for name in names]
+        sizes = [len(self.map.rows(self.slot(name))) if d < 0 else d for name, d in zip(names, dofs, strict=True)]
+        rows = np.flatnonzero(np.repeat(np.array(dofs) < 0, sizes))
+        out = np.zeros((sum(sizes), sum(sizes)))
+        out[np.ix_(rows, rows)] = P
+        return out
+
+    def landmarks(self, *, exactly_known: bool = True) -> LandmarkTable:
+        """Return ids, kinds, means, covariances and numbers of observations of all landmarks.
+
+        Those known exactly, outside the map, come last and have the covariance 0; or without them.
+        """
+        tracks = self.tracks.confirmed.values()
+        kinds, counts = [track.model.kind for track in tracks], [track.observations for track in tracks]
+        means, covs = [self.mean(track.id) for track in tracks], [self.covariance(track.id) for track in tracks]
+        names, known = [track.id for track in tracks], self.tracks.known
+        for name in known if exactly_known else ():
+            space = known.model(name).space
+            names.append(name)
+            kinds.append(known.model(name).kind)
+            means.append(known.mean(name))
+            covs.append(np.zeros((space.dof, space.dof)))
+            counts.append(known.observations(name))
+        return LandmarkTable(names, kinds, means, covs, counts)
+
+    def expect(
+        self, robot: str, sensor: str, names: Iterable[Id] | None = None, *, in_view: bool = False
+    ) -> Expectations:  # fmt: skip
+        """Return what a sensor should measure of landmarks, by default of all, from where its robot is.
+
+        In view or not and why, expectations, their covariances and Jacobians, as a correction would have them; with
+        `in_view` of those in view alone.  Robots may be among the `names`.  A robot that lags is where it was (`lags`).
+        Nothing changes.  Raises MapError.
+        """
+        if (robot, sensor) in self.state.readers:
+            raise MapError(f"sensor {sensor!r} of {robot!r} measures its robot, expected one of landmarks")
+        if (robot, sensor) not in self.state.channels:
+            known = ", ".join(f"{r!r} {s!r}" for r, s in self.state.channels) or "none"
+            raise MapError(f"robot {robot!r} has no sensor {sensor!r}, expected one of: {known}")
+        chosen = None if names is None else [*names]
+        for name in chosen or ():
+            if not self.is_known(name):
+                self.slot(name)
+            if self.tracks.sort(name) is None:
+                raise MapError(f"{name!r} is a sensor's mount or a control's bias, expected a landmark or a robot")
+        return expectations(self.map, self.tracks, self.state.channels[robot, sensor], robot, sensor, chosen, in_view)
+
+    def slot(self, name: Id) -> int:
+        """Return the slot of a robot or landmark in `map`."""
+        return self.tracks.slot(name)
+
+    def place(self, name: Id) -> tuple[Array, Array]:
+        """Return where a robot or a landmark is: mean (2 or 3,) and covariance, m and m^2, in the map's frame.
+
+        A landmark's model says where it is (`Placed`); of a line it is its point nearest to the anchor or the origin.
+        Raises MapError for a landmark whose model does not say where it is.
+        """
+        mean, P, model = self.mean(name), self.covariance(name), self.landmark_model(name)
+        if model is None:
+            d = 2 if next(iter(self.robots.values())).motion.space.axes == 1 else 3
+            return mean[:d], P[:d, :d]
+        placed = place_of(model, mean[None])
+        if placed is None:
+            raise MapError(f"{name!r} is a {model.kind}, which does not say where it is, expected a model with place()")
+        (p,), (P_l,) = placed
+        return p, P_l @ P @ P_l.T
+
+    def lags(self, robot: str) -> bool:
+        """Return whether a robot is still where it was before the last event: nothing has asked for it yet."""
+        return self.state.moving[robot].held.lags(self.t_ns or 0)
+
+    def landmark_model(self, name: Id) -> Landmark | None:
+        """Return the model of a landmark, None of what is no landmark of the map."""
+        track = self.tracks.confirmed.get(name)
+        if track is None and name in self.tracks.known:
+            return self.tracks.known.model(name)
+        return None if track is None else track.model
+
+    def segment(self, name: Id) -> tuple[Array, Array]:
+        """Return the ends (2, 3) of the segment observed of a line so far, and their covariances (2, 3, 3)."""
+        model, extent = self.landmark_model(name), self.segment_ends(name)
+        if extent is None or not isinstance(model, Segmented):
+            raise MapError(f"{name!r} is no line of the map, expected one with ends")
+        p, P_l = model.endpoints(self.mean(name)[None], extent[None])
+        return p[0], P_l[0] @ self.covariance(name) @ P_l[0].swapaxes(1, 2)
+
+    def segment_ends(self, name: Id) -> Array | None:
+        """Return the extent of the segment observed so far as abscissas (2,) on its line; None of what is no line."""
+        track = self.tracks.confirmed.get(name)
+        if track is None and name in self.tracks.known:
+            return self.tracks.known.extent(name)
+        return None if track is None else track.extent

@@ -1,0 +1,85 @@
+"""Map management after the corrections of a scan: what landmarks become, and which of them go.  [TB] 4.4."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from kalmark.errors import MapError
+from kalmark.events import Id
+from kalmark.management import existence, reparametrize, walls
+from kalmark.management import repeats as of_map
+from kalmark.models.protocols import Segmented
+from kalmark.report import Observation
+from kalmark.slam import merging, tentative
+from kalmark.slam.policy import Policy
+from kalmark.slam.state import State
+from kalmark.tracks.scan import ScanContext
+
+
+def review(state: State, scan: ScanContext, policy: Policy, seen: Sequence[Observation]) -> None:
+    """Simplify and extend the landmarks of a scan, and give up those that are expected and not found.  [TB] 4.4."""
+    fused = [(o, state.tracks.confirmed[o.landmark]) for o in seen
+             if o.outcome == "associated" and o.landmark in state.tracks.confirmed]  # fmt: skip
+    for _, track in fused if policy.linear else ():
+        point = None
+        with suppress(np.linalg.LinAlgError):
+            point = reparametrize.simplified(scan, track, policy.linear)
+        if point is not None:
+            try:
+                slot = state.add(point.start)
+            except MapError:  # it is full: they stay what they are
+                break
+            old = track.slot
+            state.tracks.replace(track, slot, point.model)
+            state.map.remove(old)
+    if scan.channel.joins:
+        mine = [track for _, track in fused]
+        for track, extent in zip(mine, walls.grown(scan, mine, [o.index for o, _ in fused]), strict=True):
+            track.extent = extent
+    for o, track in fused if not scan.channel.joins else ():
+        if track.extent is not None and isinstance(track.model, Segmented) and track.model.extend:
+            with suppress(np.linalg.LinAlgError):
+                track.extent = reparametrize.extent(scan, track, scan.y[o.index])
+    if policy.attention.delete:
+        _give_up(state, scan, policy, {o.landmark: o.outcome for o in seen})
+
+
+def _give_up(state: State, scan: ScanContext, policy: Policy, found: dict[Id | None, str]) -> None:
+    """Count the landmarks in view and those observed; remove the ones too seldom found, each with its reason."""
+    names = state.tracks.observable(scan.channel)
+    for model, rows in state.tracks.by_model(scan.channel, names):
+        tracks = [state.tracks.confirmed[names[i]] for i in rows]
+        slots, extents = [track.slot for track in tracks], [track.extent for track in tracks]
+        for i in scan.channel.in_view(state.map, scan.robot, model, slots, extents).tolist():
+            track = tracks[i]
+            if found.get(track.id) == "ignored":
+                continue
+            track.searched, track.found = track.searched + 1, track.found + (track.id in found)
+            reason = policy.attention.hopeless(track.searched, track.found, track.observations)
+            if reason:
+                state.remove(track.id)
+                scan.report.removed += ((track.id, reason),)
+
+
+def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
+    """Map management after a scan: landmarks that are gone, that are one, tentative ones without hope."""
+    report, ids = scan.report, scan.event.ids
+    for judgement in existence.judged(scan, policy.upkeep) if policy.upkeep.p_detect is not None else ():
+        track = state.tracks.confirmed[judgement.name]
+        track.log_odds, track.missed = judgement.log_odds, judgement.missed
+        if judgement.gone:
+            state.remove(track.id)
+            why = f"should be in view and was not seen, {judgement.missed} scans in a row"
+            report.removed += ((track.id, why),)
+    if ids is None or None in ids:
+        merging.merge_seen(state, scan, policy)
+        if policy.upkeep.repeats != "off" and of_map.is_due(state.tracks):
+            merging.search_repeats(state, scan, policy)
+    if state.tracks.tentative:
+        tentative.drop(state, scan, policy)
+    for key in state.clones.users() if state.clones.clones else ():
+        state.release(key)
+    state.let_grow()

@@ -1,0 +1,130 @@
+"""Landmarks that are one, and parts of the map that are one: constrained to be equal, and one of each removed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from kalmark.errors import MapError
+from kalmark.events import Id
+from kalmark.filter.estimators import Update
+from kalmark.management import merge, walls
+from kalmark.management import repeats as of_map
+from kalmark.models.protocols import Joining
+from kalmark.report import Repeat
+from kalmark.slam.policy import Policy
+from kalmark.slam.state import State
+from kalmark.tracks.scan import ScanContext, Start
+
+
+def merge_seen(state: State, scan: ScanContext, policy: Policy) -> None:
+    """Merge landmarks that are one; report each that is gone, the one it is now, and why."""
+    seen: list[Any] = [o.landmark for o in scan.report.observations if o.outcome in ("associated", "new")]
+    names = [name for name in seen if name in state.tracks.confirmed]
+    state.tracks.note_scan(names)
+    if not policy.upkeep.merge:
+        return
+    unnamed: list[Any] = [o.landmark for o in scan.report.observations if o.id is None]
+    search = merge.Search(state.tracks, [name for name in unnamed if name in names])
+    while (name := search.next()) is not None:
+        track = state.tracks.confirmed[name]
+        if search.is_first_pass:
+            track.compared = track.observations, state.tracks.changes
+        found = None
+        with suppress(np.linalg.LinAlgError):
+            found = merge.proposal(state.map, state.tracks, name, scan.robot, scan.pose(), policy.upkeep.odds)
+        for gone, kept, why in _merge_pairs(state, scan, found) if found else ():
+            search.was_merged(kept)
+            scan.report.merged += ((gone, kept, why),)
+    if scan.channel.joins:
+        _join(state, scan, names, policy.upkeep.odds)
+
+
+def _join(state: State, scan: ScanContext, names: Sequence[Id], odds: float) -> None:
+    """Merge walls of which segments join, of those observed and others."""
+    while (found := walls.agreeing(state.map, state.tracks, scan.channel, names, odds)) is not None:
+        merged = _merge_pairs(state, scan, found)
+        scan.report.merged += tuple(merged)
+        if not merged:  # the map is full
+            break
+
+
+def _merge_pairs(state: State, scan: ScanContext, found: merge.Merge) -> list[tuple[Id, Id, str]]:
+    """Constrain pairs of landmarks to be equal, through the estimator, and remove one of each.
+
+    In a full map nothing is merged, nor where their difference has no covariance.
+    """
+    try:
+        starts = [_difference(state, pair) for pair in found.pairs]
+        slots = state.add_all(starts)
+    except MapError:
+        return []
+    n, count = starts[0].space.size, len(slots)
+    model, R = merge.ZeroDifference(scan.channel.at, n), np.tile(merge.EQUAL_M**2 * np.eye(n), (count, 1, 1))
+    update = Update(model, scan.robot, scan.channel.mount, np.array(slots), n, np.zeros((count, n)), R)
+    done, merged = state.estimator.correct(state.map, update), []
+    others = f", with {count - 1} others" if count > 1 else ""
+    ordered = merge.order(state.tracks, found.pairs)
+    for slot, (kept, gone), d2, fused in zip(slots, ordered, done.d2.tolist(), done.fused.tolist(), strict=True):
+        state.map.remove(slot)
+        if not fused:
+            continue
+        one, other = state.tracks.confirmed[kept], state.tracks.confirmed[gone]
+        if isinstance(one.model, Joining):
+            one.extent = walls.united(state.map, one, other)
+        state.tracks.merge(one, other)
+        state.remove(gone)
+        why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
+        merged.append((gone, kept, why))
+    return merged
+
+
+def _difference(state: State, pair: tuple[Id, Id]) -> Start:
+    """Return the difference of two landmarks as a block, to be observed as zero."""
+    of_walls = isinstance(state.tracks.confirmed[pair[0]].model, Joining)
+    return (walls if of_walls else merge).difference(state.map, state.tracks, pair)
+
+
+def search_repeats(state: State, scan: ScanContext, policy: Policy) -> None:
+    """Search the map for parts that are one; merge those beyond doubt, where that is wanted, and report the others.
+
+    One is merged at a time: it changes the map.
+    """
+    state.tracks.searched = state.tracks.changes
+    found: list[Repeat] = []
+    with suppress(np.linalg.LinAlgError):
+        found = of_map.repeats(state.map, state.tracks)
+    for repeat in found:
+        if policy.upkeep.repeats == "merge" and repeat.sure and (repeat.agrees or _displace(state, scan, repeat)):
+            merged = _merge_pairs(state, scan, merge.Merge(repeat.pairs, repeat.score))
+            scan.report.merged += tuple((gone, kept, f"{why}, {of_map.IN_A_REPEAT}") for gone, kept, why in merged)
+            found = [other for other in found if other is not repeat]
+            break
+    scan.report.repeats = tuple(found)
+
+
+def _displace(state: State, scan: ScanContext, repeat: Repeat) -> bool:
+    """Move the newer part of a repeat, of an error that is unknown until now, onto the older one.
+
+    It has the robot and all that it has not finished if it is there.  Not with several robots, nor where blocks
+    of the map may belong to either part.
+    """
+    inside = of_map.is_in(repeat.newer, state.tracks)
+    if len(state.robots) > 1 or inside is None or state.tracks.pending:
+        return False
+    slots = [state.tracks.slot(name) for name in repeat.newer]
+    if inside:
+        slots += [scan.robot, *(track.slot for track in state.tracks.tentative.values())]
+        slots += [clone.slot for clone in state.clones.clones.values()]
+    try:
+        moved = of_map.displacement(state.map, slots, repeat)
+    except np.linalg.LinAlgError:
+        return False
+    rows = state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots))
+    state.map.predict(rows, moved.F, moved.Q)
+    for slot, mean in zip(moved.slots, moved.means, strict=True):
+        state.map.set_predicted(slot, mean)
+    return True

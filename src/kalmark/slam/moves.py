@@ -1,0 +1,54 @@
+"""Moving robots up to an event, by the controls they hold.  [S] 2.4: prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+
+import numpy as np
+
+from kalmark.errors import EventError, MapError
+from kalmark.events import seconds
+from kalmark.geometry.spaces import Rn
+from kalmark.report import Gap
+from kalmark.slam.motion import Part
+from kalmark.slam.state import State
+
+
+def advance(state: State, *names: str) -> tuple[Gap, ...]:
+    """Move robots up to now by the controls they hold, all or none of them; return gaps in their controls."""
+    assert state.t_ns is not None
+    with ExitStack() as clocks:
+        helds = [clocks.enter_context(state.moving[name].held) for name in names]
+        moves = [(name, held.advance(state.t_ns)) for name, held in zip(names, helds, strict=True)]
+        for name, part in moves if len(moves) > 1 else ():
+            refuse_nowhere(state, name, [] if part is None else [part])
+        for name, part in moves:
+            if part is not None:
+                move(state, name, part)
+        return tuple(gap for held in helds for gap in held.noticed())
+
+
+def refuse_nowhere(state: State, name: str, parts: Sequence[Part]) -> None:
+    """Refuse, before anything has moved, parts of a robot's controls that lead nowhere."""
+    if not state.moving[name].leads_somewhere(state.map, parts):
+        raise _nowhere(state, name, parts[-1])
+
+
+def _nowhere(state: State, name: str, part: Part) -> EventError:
+    what = f"{name!r} at t={seconds(state.t_ns or 0)} s"
+    return EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
+
+
+def move(state: State, name: str, part: Part) -> None:
+    """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
+    moving = state.moving[name]
+    if not isinstance(moving.model, tuple):  # a user's: nothing is known of it
+        refuse_nowhere(state, name, [part])
+    shared = moving.error is None and not (part.first and part.last) and part.N.any()
+    if shared and moving.leads_somewhere(state.map, [part]):
+        with suppress(MapError):  # it is full: each part has an error of its own
+            moving.error = state.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
+    if not state.estimator.predict(state.map, moving.movement(state.map, part)):
+        raise _nowhere(state, name, part)
+    state.clones.moved(name)

@@ -1,0 +1,86 @@
+"""Corrections by what is measured of a robot alone: fixes, and readings of its sensors of the state."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+
+from kalmark.errors import MapError
+from kalmark.events import Fix, Scan
+from kalmark.filter.estimators import Update
+from kalmark.models.observe import fix_view
+from kalmark.report import Judged, Observation, Report
+from kalmark.slam import moves, replacing
+from kalmark.slam.checks import refuse_bad_fix
+from kalmark.slam.reader import Reader
+from kalmark.slam.state import State
+
+ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes stay within
+
+
+def read(state: State, event: Scan, reader: Reader) -> Report:
+    """Correct by what a sensor measures of its own robot; leave a clone where its next reading counts from here."""
+    key, robot, since_s = (event.robot, event.sensor), state.moving[event.robot].slot, reader.since_s(event)
+    R, report = reader.noise(event), Report(event, event.y)
+    state.t_ns = event.t_ns
+    report.gaps = moves.advance(state, event.robot)
+    if not len(event.y):
+        return report
+    reader.drift(state.map, since_s)
+    reader.t_ns, held = event.t_ns, state.clones.of(key)
+    if reader.counts and not held:
+        report.blank(R.shape[1])
+        report.observations = (Observation(0, None, "ignored", None, None, "the first reading: none to count from"),)
+    else:
+        update = reader.update(state.map, robot, state.clones[held[-1]] if held else -1, event, R, since_s)
+        done = state.corrected(update, event, reader.estimator(state.estimator))
+        done = done._replace(e=done.e[:, : event.width])
+        report.e, report.z, report.Z = done.e, done.z, done.Z
+        report.judged = (Judged([0], [None], [event.robot], done, reader.gate),)
+    if reader.counts:
+        with suppress(MapError):  # it is full: the next reading is the first again
+            state.clone(key, event.t_ns)
+        for slot in state.clones.refer(key, set(state.clones.of(key)) - set(held)):
+            state.map.remove(slot)
+    return report
+
+
+def fix(state: State, event: Fix) -> Report:
+    """Correct by a position from outside; place a robot again where fixes that agree say that it is lost."""
+    pose, size = (3, 2) if state.robots[event.robot].motion.space.axes == 1 else (7, 3)
+    refuse_bad_fix(event, size)
+    state.t_ns = event.t_ns
+    gaps = moves.advance(state, event.robot)
+    slot, report = state.moving[event.robot].slot, Report(event, event.y.reshape(1, size))
+    report.gaps = gaps
+    gate, R = state.settings.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
+    update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
+    done = state.corrected(update, event, state.estimator.for_fixes())
+    report.e, report.z, report.Z = done.e, done.z, done.Z
+    report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)
+    left_out = state.moving[event.robot].left_out
+    if done.fused[0]:
+        left_out.clear()
+    else:
+        del left_out[: len(left_out) + 1 - replacing.KEPT]
+        left_out.append(replacing.LeftOut(event.y, event.cov, done.e[0]))
+        report.replaced = _replace(state, event.robot)
+    return report
+
+
+def _replace(state: State, name: str) -> float:
+    """Move a robot to where its fixes place it, if they agree; return how far, m, 0 where they do not."""
+    moving = state.moving[name]
+    space = moving.motion.space
+    size, dof = (3, 3) if space.axes == 1 else (7, 6)
+    mean, index = state.map.mean(moving.slot), state.map.index(moving.slot)
+    found = replacing.replaced(mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out)
+    if found is None:
+        return 0.0
+    state.map.predict(index[:dof], np.zeros((dof, dof)), found.cov)
+    state.map.set_predicted(moving.slot, np.concatenate([found.pose, mean[size:]]))
+    state.clones.moved(name)
+    moving.left_out.clear()
+    return float(np.linalg.norm(found.pose[: dof // 2] - mean[: dof // 2]))

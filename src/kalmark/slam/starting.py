@@ -1,0 +1,181 @@
+"""New landmarks: at first sight, from several measurements of one id, or from cloned poses.  [S] (32)-(38), [T] 2."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
+from kalmark.errors import MapError
+from kalmark.events import Id
+from kalmark.management import delayed, tags, walls
+from kalmark.management.pending import Initialization, Step
+from kalmark.report import Observation
+from kalmark.slam.policy import Policy
+from kalmark.slam.state import State
+from kalmark.tracks.scan import ScanContext
+from kalmark.tracks.track import Pending, Status, Track
+
+UNEXPLAINED = "no landmark explains this measurement"
+SINGULAR = "what it may be cannot be computed: a matrix is singular"
+
+
+def initialize(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
+    """Add a landmark, if its measurement determines it."""
+    try:
+        return _initialized(state, scan, policy, k, name, reason)
+    except np.linalg.LinAlgError:
+        return Observation(k, scan.ids[k], "ignored", None, None, SINGULAR)
+
+
+def _initialized(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
+    """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
+    channel, id_ = scan.channel, scan.ids[k]
+    refusal = _refusal(state, scan, policy, k, name, reason)
+    if refusal is not None:
+        return refusal
+    if policy.deferred is not None and not isinstance(name, Answer):
+        return _defer(state, scan, policy.deferred, k, name)
+    start, space = scan.start_of(k), channel.landmark.space
+    if start.mean.shape != (space.size,):
+        found = f"it finds {len(start.mean)} numbers, a {channel.landmark.kind} has {space.size}"
+        return Observation(k, id_, "ignored", None, None, found)
+    if not start.is_finite:
+        return Observation(k, id_, "ignored", None, None, UNEXPLAINED)
+    held = name is DEFERRED
+    tentative = held or (name in (NEW, REMAP) and policy.upkeep.confirm > 1)
+    name = state.tracks.new_name() if isinstance(name, Answer) else name
+    try:
+        track = Track(name, channel.landmark, state.add(start), size_m=scan.size_of(k))
+    except MapError as full:
+        return Observation(k, id_, "ignored", None, None, str(full))
+    if channel.joins:
+        track.extent = walls.first_extent(scan, track, k)
+    if not tentative:
+        state.tracks.confirm(track)
+        return Observation(k, id_, "new", name, None, reason)
+    track.status, state.tracks.tentative[name] = Status.TENTATIVE, track
+    if policy.upkeep.keep_poses:
+        track.first = scan.event.t_ns, *scan.key, k
+    if held:
+        return Observation(k, None, "deferred", name, None, reason)
+    why = f"first sighting: {reason}" if reason else "first sighting"
+    return Observation(k, None, "tentative", name, None, why)
+
+
+def _refusal(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation | None:
+    """Return what becomes of an observation that can start no landmark, None of one that can."""
+    id_, sensor = scan.ids[k], type(scan.channel.sensor).__name__
+    if name is None or isinstance(name, Mixture):
+        return Observation(k, id_, "ignored", None, None, reason)
+    if name in (DEFERRED, REMAP) and name not in policy.starts:
+        return Observation(k, id_, "deferred", None, None, reason)
+    if name == scan.event.robot:
+        return Observation(k, id_, "ignored", None, None, "a robot does not see itself")
+    state.tracks.reserve([id_])
+    if name in state.tracks.slots or name in state.tracks.known:
+        return Observation(k, id_, "rejected", name, None, f"it is no {scan.channel.landmark.kind}")
+    if policy.deferred is None and not scan.channel.starts_landmarks:
+        return Observation(k, id_, "ignored", None, None, f"a {sensor} measurement alone cannot start a landmark")
+    if not isinstance(name, Answer) or policy.deferred is None:
+        return None
+    if not scan.channel.is_ambiguous:
+        why = f"a {sensor} measurement without an id cannot start a landmark"
+        return Observation(k, id_, "ignored", None, None, why)
+    return None if tags.is_clear(scan, k) else Observation(k, id_, "deferred", None, None, tags.MIRRORED)
+
+
+def _defer(state: State, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:
+    """Take a measurement that alone does not determine a landmark; start the landmark if all of them do."""
+    track = state.tracks.pending.get(name)
+    track = track or Track(name, scan.channel.landmark, status=Status.PENDING, pending=Pending(scan.key, name))
+    try:
+        step = way.observe(scan, k, track.pending or Pending(scan.key, name))
+        if step.start is not None and not step.start.is_finite:
+            step = Step("ignored", UNEXPLAINED)
+        _take(state, scan, k, track, step)
+        if not step.reason and step.start is None:
+            assert track.pending is not None
+            step = way.solve(scan, track.pending)
+            _take(state, scan, k, track, step)
+    except MapError as full:
+        return Observation(k, scan.ids[k], "ignored", None, None, str(full))
+    return Observation(k, scan.ids[k], step.outcome, name if step.start else None, None, step.reason)
+
+
+def _take(state: State, scan: ScanContext, k: int, track: Track, step: Step) -> None:
+    """Do what a step of an initialiser asks for.  Raises MapError where the map is full."""
+    pending = step.pending or track.pending
+    assert pending is not None
+    for correction in step.corrections:
+        state.map.predict(state.rows(correction.parts), correction.F, correction.Q)
+        state.map.set_predicted(correction.slot, correction.mean)
+    if step.added:
+        pending = replace(pending, hypotheses=tuple(state.add_all(step.added)))
+    if step.keep:
+        pending = replace(
+            pending,
+            measurements=(*pending.measurements, scan.measurement(k, state.clone(scan.key, scan.event.t_ns))),
+        )
+    if step.start is not None:
+        track.slot, track.size_m = state.add(step.start), scan.size_of(k)
+        track.pending = None
+        state.tracks.pending.pop(track.id, None)
+        state.tracks.confirm(track, step.measurements)
+    elif step.outcome != "ignored":
+        track.pending, state.tracks.pending[track.id] = pending, track
+    for slot in step.removed:
+        state.map.remove(slot)
+    state.release(scan.key)
+
+
+def start_delayed(
+    state: State, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision]
+) -> list[Observation]:
+    """Keep measurements of no landmark as pending; start the landmarks that enough of them determine.  [T] 2."""
+    names = {k: decisions[k][0] for k in new}
+    ids: dict[int, Id | None] = {k: None for k, n in names.items() if n is NEW}
+    ids |= {k: n for k, n in names.items() if isinstance(n, int | str) and not state.is_there(n)}
+    ids, way, key = {k: ids[k] for k in new if k in ids}, policy.delayed, scan.key
+    if way is None or not ids:
+        return []
+    held = state.clones.of(key)
+    if not delayed.has_moved(scan, held[-1] if held else None, way):
+        return [Observation(k, i, "deferred", None, None, "until the robot has moved on") for k, i in ids.items()]
+    try:
+        clone = state.clone(scan.key, scan.event.t_ns)
+    except MapError as full:
+        return [Observation(k, i, "ignored", None, None, str(full)) for k, i in ids.items()]
+    made = {k: scan.measurement(k, clone) for k in ids}
+    try:
+        candidates, best = delayed.joined(scan, way, state.tracks.candidates.get(key, []), made, ids)
+    except np.linalg.LinAlgError:
+        state.release(key)
+        return [Observation(k, i, "ignored", None, None, SINGULAR) for k, i in ids.items()]
+    found = []
+    for k, i in ids.items():
+        try:
+            outcome, name = delayed.started(scan, way, candidates, best[k]), None
+        except np.linalg.LinAlgError:
+            found.append(Observation(k, i, "deferred", None, None, SINGULAR))
+            continue
+        candidates, reason = outcome.candidates, outcome.reason
+        if outcome.start is not None and outcome.used is not None:
+            try:
+                slot = state.add(outcome.start)
+            except MapError as full:
+                reason = str(full)
+            else:
+                name = state.tracks.new_name() if best[k].name is None else best[k].name
+                assert name is not None
+                state.tracks.confirm(Track(name, scan.channel.landmark, slot), len(outcome.used.measurements))
+                candidates = delayed.unexplained(scan, candidates, outcome.used, slot)
+        found.append(Observation(k, i, "deferred" if name is None else "new", name, None, reason))
+    for number in state.clones.of(key)[: -way.poses]:
+        candidates = delayed.without_clone(scan, candidates, number)
+    state.tracks.candidates[key] = candidates
+    state.release(key)
+    return found
