@@ -32,7 +32,7 @@ none.  What the invariant estimator does about inverse distances is in `filter/p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -287,6 +287,7 @@ def mount_space(pose: int, parameters: int = 0) -> Space:
     return Space(mount.name, (*mount.kinds, *(SCALAR,) * parameters)) if parameters else mount
 
 
+@lru_cache
 def Rn(n: int) -> Space:
     """Return the space of n plain numbers that no rotation of the world changes."""
     return Space(f"R{n}", (SCALAR,) * n)

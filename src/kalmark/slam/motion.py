@@ -33,14 +33,13 @@ from kalmark.models.protocols import (
     StateDiffusion,
     calibrating,
     coasts,
-    diffusion_of,
     true_control,
 )
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
 from kalmark.slam.replacing import LeftOut
 
-NO_NOISE, NOWHERE = np.zeros((0, 0)), np.zeros(0)
+NO_NOISE = np.zeros((0, 0))
 
 
 class Part(NamedTuple):
@@ -191,14 +190,14 @@ class Moving:
             return [], nothing(len(part.u)), part.u
         slots, columns, u = [], [], part.u
         if self.error is not None:
-            slots, columns = [self.error], [np.eye(len(u))]
+            slots, columns = [self.error], [identity(len(u))]
         if self.bias is not None and isinstance(self.motion, NonlinearCalibration):
             a = map_.mean(self.bias)
             true, U_a = true_control(self.motion, u, a, part.dt_s)
             slots, columns, u = [*slots, self.bias], [*columns, U_a], true - U_a @ a
         elif self.bias is not None and isinstance(self.motion, SelfCalibrating):
             slots, columns = [*slots, self.bias], [*columns, self.motion.calibration_effect(u, part.dt_s)]
-        return slots, np.hstack(columns), u
+        return slots, np.hstack(columns) if len(columns) > 1 else columns[0], u
 
     def leads_somewhere(self, map_: Map, parts: Sequence[Part]) -> bool:
         """Return whether parts of its controls, one after the other, lead to finite places, with finite covariances."""
@@ -212,9 +211,15 @@ class Moving:
             r = moved[0]
         return True
 
+    def _diffusion(self, map_: Map, part: Part) -> Array | None:
+        motion: Any = self.motion
+        if self.moves_itself:
+            return motion.diffusion_at(map_.mean(self.slot), part.u, part.dt_s)
+        return motion.diffusion(part.u, part.dt_s)
+
     def movement(self, map_: Map, part: Part) -> Movement:
         """Return what one part of its control does to the robot in a map."""
-        D = diffusion_of(self.motion, map_.mean(self.slot) if self.moves_itself else NOWHERE, part.u, part.dt_s)
+        D = self._diffusion(map_, part)
         if part.unknown is not None:
             D = part.unknown if D is None else part.unknown + D
         shared, (slots, B, u) = self.error is not None, self.added(map_, part)
@@ -236,6 +241,12 @@ def bias_block(motion: Motion) -> tuple[Space, Array, Array] | None:
     return (
         None if model is None else (Rn(len(model.calibration)), np.zeros(len(model.calibration)), model.calibration_cov)
     )
+
+
+@lru_cache
+def identity(size: int) -> Array:
+    """Return the effect (size, size) of an error of the control itself."""
+    return np.eye(size)
 
 
 @lru_cache
