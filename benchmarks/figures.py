@@ -361,6 +361,8 @@ def partial_measurements() -> Iterator[Figure]:
     woods = "kalmark run lost_in_the_woods_bearing --out out/woods_bearing"
     yield Figure(section, "Lost in the Woods without ranges: aligned position / landmarks", ".132 m", woods,
                  saved("out/woods_bearing/summary.json", "{robot[ate_m]:.3f} m / {landmark_rmse_m:.3f} m"))  # fmt: skip
+    yield Figure(section, "ranges that tell the depth of what a bearing or a camera began, used of 160; NEES", "150, in band",
+                 "python -m pytest tests -k tells_the_depth", passes)  # fmt: skip
     for sensor in ("laser", "sonar", "camera", "rgbd", "arva", "rfid"):
         yield Figure("Presets of [S] Table 2", f"`{sensor}`, 50 runs: pose ANEES", "3",
                      "python examples/05_table2.py 50", row(sensor, "{0}"))  # fmt: skip

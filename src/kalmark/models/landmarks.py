@@ -6,6 +6,7 @@ expected of the rest.  How they look from a sensor is in `landmarks2d`, `landmar
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -152,6 +153,7 @@ class _Depth(_Landmark):
 
     space: ClassVar[Space]
     point: ClassVar[Any]
+    look_at_point: ClassVar[Any]  # what `look` is to a sensor that finds depth
 
     def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
         """Return l (K, n) on rays at inverse distances v (K, d + 1), L_T (K, n, 6 or 3), L_v (K, n, d + 1)."""
@@ -208,6 +210,7 @@ class InverseDepth2D(_BecomesPoint):
     look: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_seen_from)
     of: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_from_view)
     point: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_to_point)
+    look_at_point: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_as_point)
     index: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_linearity)
 
 
@@ -223,6 +226,7 @@ class InverseDepth3D(_BecomesPoint):
     look: ClassVar[Any] = staticmethod(seen.inverse_depth)
     of: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_from_view)
     point: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_to_point)
+    look_at_point: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_as_point)
     index: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_linearity)
 
 
@@ -238,6 +242,7 @@ class AnchoredHomogeneous(_BecomesPoint):
     look: ClassVar[Any] = staticmethod(seen.anchored)
     of: ClassVar[Any] = staticmethod(landmarks3d.anchored_from_view)
     point: ClassVar[Any] = staticmethod(landmarks3d.anchored_to_point)
+    look_at_point: ClassVar[Any] = staticmethod(landmarks3d.anchored_as_point)
     index: ClassVar[Any] = staticmethod(landmarks3d.anchored_linearity)
 
 
@@ -253,6 +258,39 @@ class Homogeneous(_Depth):
     look: ClassVar[Any] = staticmethod(seen.homogeneous)
     of: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_from_view)
     point: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_to_point)
+    look_at_point: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_as_point)
+
+
+@dataclass(frozen=True)
+class AsPoint:
+    """A point of unknown depth as a sensor that finds depth sees it: its Euclidean point."""
+
+    ray: Any
+
+    @property
+    def kind(self) -> str:
+        """That of the point of unknown depth."""
+        return self.ray.kind
+
+    @property
+    def space(self) -> Space:
+        """That of the point of unknown depth."""
+        return self.ray.space
+
+    @property
+    def look(self) -> Any:
+        """The compiled view of a built-in one."""
+        return self.ray.look_at_point
+
+    def seen_from(self, T: Array, l: Array) -> tuple[Array, Array, Array]:
+        """Return the points v (K, d) in the frame T, V_T (K, d, 3 or 6), V_l (K, d, n)."""
+        p, P_l = self.ray.to_point(l)
+        v, V_T, V_p = (Point2D() if p.shape[1] == 2 else Point3D()).seen_from(T, p)
+        return v, V_T, V_p @ P_l
+
+    def from_view(self, T: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return what the point of unknown depth does."""
+        return self.ray.from_view(T, v)
 
 
 @register("landmark", "tag")

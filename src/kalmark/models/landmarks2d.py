@@ -138,10 +138,21 @@ def polar_to_point(l: Array) -> tuple[Array, Array]:
 @compiled
 def polar_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return v (K, 2) of polar points l (K, 4), V_T (K, 2, 3) and V_l (K, 2, 4)."""
-    p, P_l = polar_to_point(l)
+    return through_point(T, *polar_to_point(l))
+
+
+@compiled
+def inverse_depth_as_point(T: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the points v (K, 2) of inverse-depth points l (K, 4) in the frame T, V_T (K, 2, 3) and V_l (K, 2, 4)."""
+    return through_point(T, *inverse_depth_to_point(l))
+
+
+@compiled
+def through_point(T: Array, p: Array, P_l: Array) -> tuple[Array, Array, Array]:
+    """Return points p (K, 2) in the frame T, v (K, 2), V_T (K, 2, 3) and V_l (K, 2, 4), by their P_l (K, 2, 4)."""
     v, V_T, V_p = to_frame_many(T, p)
-    V_l = np.empty((len(l), 2, 4))
-    for i in range(len(l)):
+    V_l = np.empty((len(p), 2, 4))
+    for i in range(len(p)):
         for a in range(2):
             for b in range(4):
                 V_l[i, a, b] = V_p[i, a, 0] * P_l[i, 0, b] + V_p[i, a, 1] * P_l[i, 1, b]

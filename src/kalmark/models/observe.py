@@ -141,7 +141,8 @@ def built_in_view(
 
 def is_built_in(sensor: Any, landmark: Any) -> bool:
     """Return whether both are kalmark's own, and no user's subclass of them."""
-    return type(sensor) in sensors.BUILT_IN and type(landmark) in landmarks.BUILT_IN
+    known = type(landmark.ray if isinstance(landmark, landmarks.AsPoint) else landmark) in landmarks.BUILT_IN
+    return known and type(sensor) in sensors.BUILT_IN
 
 
 def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:

@@ -221,16 +221,7 @@ def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
 
 def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history, total = run.history, int(summary["observations"])
-    by_design = np.logical_or.reduce([np.char.startswith(history.reason, start) for start in ATTENTION])
-    for outcome in ("ignored", "rejected"):
-        mine = (history.outcome == outcome) & ~by_design
-        if 2 * int(mine.sum()) <= total:
-            continue
-        reason, number = Counter(history.reason[mine].tolist()).most_common(1)[0]
-        if reason == NO_ID:
-            yield f"{number} observations have no id and were ignored; try --set association.type=auto"
-        else:
-            yield f"{int(mine.sum())} of {total} observations were {outcome}, most often: {reason or 'no reason given'}"
+    yield from _unused(run)
     if not total:
         yield "no observation was made: there is nothing to map"
     elif not summary["landmarks"]:
@@ -242,6 +233,26 @@ def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     if turns.any():
         yield f"{int(turns.sum())} bearings beyond 2 pi rad: are they in degrees?"
     yield from _images(run)
+
+
+def _unused(run: Recording) -> Iterator[str]:
+    """Tell of sensors most of whose observations could not be used."""
+    history, robots = run.history, run.history.robot[run.history.step]
+    by_design = np.logical_or.reduce([np.char.startswith(history.reason, start) for start in ATTENTION])
+    pairs = sorted(set(zip(robots.tolist(), history.sensor.tolist(), strict=True)))
+    for robot, sensor in pairs:
+        own = (robots == robot) & (history.sensor == sensor)
+        of = f" of {sensor!r} of {robot!r}" if len(pairs) > 1 else ""
+        for outcome in ("ignored", "rejected"):
+            mine = own & (history.outcome == outcome) & ~by_design
+            if 2 * int(mine.sum()) <= int(own.sum()):
+                continue
+            reason, number = Counter(history.reason[mine].tolist()).most_common(1)[0]
+            if reason == NO_ID:
+                yield f"{number} observations{of} have no id and were ignored; try --set association.type=auto"
+                continue
+            said = reason or "no reason given"
+            yield f"{int(mine.sum())} of {int(own.sum())} observations{of} were {outcome}, most often: {said}"
 
 
 def _images(run: Recording) -> Iterator[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.association.averaging import average, outcomes
 from kalmark.association.protocol import Decision, Mixture
 from kalmark.filter.estimators import Averaging
-from kalmark.management import tags
+from kalmark.management import depths, tags
 from kalmark.management.attention import chosen
 from kalmark.report import INDEFINITE, Judged, Observation
 from kalmark.slam.policy import Policy
@@ -39,6 +39,8 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         names: list[Any] = [decisions[k][0] for k in rows]
         slots = state.tracks.slots_of(names)
         if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:
+            state.estimator.correct(state.map, near)
+        if scan.channel.depths and (near := depths.approach(scan, model, slots, rows)) is not None:
             state.estimator.correct(state.map, near)
         done = state.corrected(scan.update(model, slots, rows), scan.event)
         report.fill(rows, done)

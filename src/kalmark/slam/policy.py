@@ -15,7 +15,17 @@ from kalmark.management.pending import Initialization
 from kalmark.management.tags import Mirrored
 from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.protocols import Ambiguous, Intersecting, Landmark, Ranging, Reparametrizable, Segmented, world_of
+from kalmark.models.landmarks import AsPoint
+from kalmark.models.protocols import (
+    Ambiguous,
+    Intersecting,
+    Landmark,
+    OfState,
+    Ranging,
+    Reparametrizable,
+    Segmented,
+    world_of,
+)
 from kalmark.slam.robot import Mount, Robot
 from kalmark.tracks.channel import Channel, default_landmark
 
@@ -56,7 +66,8 @@ def policy_of(
     if delayed is not None and not (isinstance(mount.sensor, Intersecting) and channel.landmark.kind == "point"):
         what = f"a {type(mount.sensor).__name__} does not start a {channel.landmark.kind} late"
         raise ModelError(f"{what}: expected one that has meet(), and points of the plane")
-    kinds = [model.landmark for model in channel.models.values()]
+    seen = [model.landmark for model in channel.models.values()]
+    kinds = [kind.ray if isinstance(kind, AsPoint) else kind for kind in seen]
     reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
     return Policy(
         association, upkeep, mount.attention, mount.detector, _deferred(mount), delayed, _starts(association, upkeep),
@@ -105,12 +116,13 @@ def channel_of(
     landmark = landmark_of(mount)
     refuse_other_world(robots, type(mount.sensor).__name__, world_of(mount.sensor))
     refuse_other_world(robots, landmark.kind, landmark.space.world)
-    polar = any(landmark_of(m).kind == "polar" for robot in robots.values() for m in robot.sensors.values())
+    mounts = (m for robot in robots.values() for m in robot.sensors.values() if not isinstance(m.sensor, OfState))
+    others = list({other.kind: other for other in map(landmark_of, mounts)}.values())
 
     def threshold(dof: int) -> float:
         return association.threshold(dof, estimator.default_gate)
 
-    return Channel(mount.sensor, mount.at, slot, landmark, threshold, polar)
+    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others)
 
 
 def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:

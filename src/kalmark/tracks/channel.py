@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,7 +18,7 @@ from kalmark.filter.neighbours import has_place
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
 from kalmark.models.known import known_view
-from kalmark.models.landmarks import InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
+from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
@@ -90,17 +90,18 @@ class KnownModel(ObservationModel):
 class Channel:
     """A sensor of a robot on its mount `at`, whose slot is `mount` (-1: not in the map), starting `landmark`s.
 
-    `threshold` gives the gate on d2 from the size of an innovation.  `polar`: another sensor starts polar points.
+    `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
     """
 
     def __init__(
-        self, sensor: Sensor, at: Array, mount: int, landmark: Landmark, threshold: Callable[[int], float], polar: bool
-    ) -> None:
+        self, sensor: Sensor, at: Array, mount: int, landmark: Landmark, threshold: Callable[[int], float],
+        others: Sequence[Landmark],
+    ) -> None:  # fmt: skip
         self.sensor: Any = sensor
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
-        self.models = self._models(polar)
+        self.models = self._models(others)
         self.kinds = frozenset(self.models)
         joining = (isinstance(model.landmark, protocols.Joining) for model in self.models.values())
         self.joins = any(joining)  # it observes walls
@@ -120,18 +121,27 @@ class Channel:
         self.far: ObservationModel | None = None  # of poses, for measurements far from what is expected
         if isinstance(sensor, protocols.FarCorrected):
             self.far = ObservationModel(landmark, TagPose(), self.at)
+        self.depths = any(isinstance(model.landmark, AsPoint) for model in self.models.values())
 
-    def _models(self, polar: bool) -> dict[str, ObservationModel]:
+    def _models(self, others: Sequence[Landmark]) -> dict[str, ObservationModel]:
         """Return the models of all kinds of blocks that this sensor can observe: its landmarks and those like them."""
+        polar = any(other.kind == "polar" for other in others)
         seen = [*(sees_kinds(self.sensor) or ())]
         if self.landmark.kind == "polar" or (self.landmark.kind == "point" and polar):  # whichever a sensor starts
             seen = list(dict.fromkeys([*seen, "point", "polar"]))
-        types = [BY_KIND[kind]() for kind in seen if kind != self.landmark.kind]
+        types: list[Any] = [BY_KIND[kind]() for kind in seen if kind != self.landmark.kind]
+        if finds_depth(self.sensor) and self.landmark.kind in (*EUCLIDEAN, "polar"):
+            types += [AsPoint(ray) for ray in others if self._has_point(ray) and ray.kind not in seen]
         models: dict[str, ObservationModel] = {}
         for landmark in (*types, self.landmark):
             model = ObservationModel(landmark, self.sensor, self.at)
             models |= {kind: model for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
         return models
+
+    def _has_point(self, other: Landmark) -> bool:
+        """Return whether a landmark is a point of unknown depth in the world of this sensor's points."""
+        of_depth = isinstance(other, protocols.UnknownDepth) and isinstance(other, protocols.Pointed)
+        return of_depth and other.space.world == self.landmark.space.world
 
     def _refuse_misfit(self) -> None:
         """Refuse a kind of landmark that one of kalmark's own sensors does not observe."""
