@@ -142,6 +142,10 @@ def space() -> Iterator[Figure]:
         text = f"{{estimators[{estimator}][pose_anees]:.2f}} / {{estimators[{estimator}][joint_anees]:.2f}}"
         yield Figure("Space", f"`house`, lines, `{estimator}`: pose ANEES (6) / joint (1)", "", house,
                      saved("out/campaign-house/summary.json", text))  # fmt: skip
+    for sensor in ("stereo", "pinhole", "laser in space", "laser", "range"):
+        yield Figure("Space", f"mount of a {sensor}, 5 cm and 1.5° wrong: pose ANEES / in band / NEES of the mount / inside 99.7 %",
+                     "- / 85 % / - / 48 of 50", "python benchmarks/mounts.py",
+                     row(sensor, "{1} / {6} / {8} / {10} of 50"))  # fmt: skip
     yield Figure("Space", "`self_calibration`: mount 5 cm and 1.5° wrong an axis; error / below 3 sigma",
                  ".1°, 5 mm / 96 %", "kalmark campaign self_calibration --runs 50 --skip 30 --estimator invariant",
                  saved("out/campaign-self_calibration/summary.json",

@@ -278,7 +278,8 @@ def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool)
     """Return the type of landmark that a sensor at `at` (3,) or (7,) starts by default.
 
     Homogeneous points move with steps of the robot (`generator`), not with those of a mount: a mount's place that
-    cannot be observed would seem to be.
+    cannot be observed would seem to be.  Stereo pixels are linear in an inverse distance, not in a distance: with a
+    mount in the map, the bias of poor depths would end up there.
     """
     if "size_m" in sensor.columns or "qw" in sensor.columns:
         return Tag()
@@ -292,9 +293,10 @@ def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool)
         return Polar2D() if _arcs_matter(sensor) else Point2D()
     if "point3" not in (sees_kinds(sensor) or ("point3",)):
         return kinds.AnchoredHomogeneousLine()
+    anchored = kinds.AnchoredHomogeneous()
     if finds_depth(sensor):
-        return Point3D()
-    return kinds.AnchoredHomogeneous() if calibrated else kinds.Homogeneous()
+        return anchored if calibrated and anchored.kind in (sees_kinds(sensor) or ()) else Point3D()
+    return anchored if calibrated else kinds.Homogeneous()
 
 
 def _arcs_matter(sensor: Sensor) -> bool:
