@@ -134,8 +134,45 @@ def drive(seconds: float = 40.0, hz: float = 10.0) -> tuple[np.ndarray, np.ndarr
     return t_ns, poses
 
 
-def robot_among_posts(seed: int = 1) -> list[Outgoing]:
-    """Return odometry (10 Hz), a laser (5 Hz), satellite fixes (1 Hz), tf and truth of a robot."""
+GYRO_BIAS, IMU_TURN = 0.01, np.pi / 2  # rad/s; how its x axis is turned from the robot's
+
+
+def imu(
+    t_ns: int, w: Any, q: Any = (0.0, 0.0, 0.0, 1.0), spread: float = 0.0, a: Any = (0.0, 0.0, 9.8), topic: str = "/imu"
+) -> Outgoing:
+    """Return an Imu: rates (3,), orientation (4,) with the variance `spread`, unknown at 0 and absent at -1."""
+    fields: dict[str, Any] = {"header": header(t_ns, "imu")}
+    fields["angular_velocity"] = dict(zip("xyz", map(float, w), strict=True))
+    fields["angular_velocity_covariance"] = np.diag([1e-4, 1e-4, 1e-4]).ravel()
+    fields["orientation"] = dict(zip("xyzw", map(float, q), strict=True))
+    fields["orientation_covariance"] = np.diag([spread] * 3).ravel()
+    fields["linear_acceleration"] = dict(zip("xyz", map(float, a), strict=True))
+    return Outgoing(topic, "sensor_msgs/msg/Imu", t_ns, fields)
+
+
+def field(t_ns: int, b: Any) -> Outgoing:
+    """Return a MagneticField (3,)."""
+    fields = {"header": header(t_ns, "imu"), "magnetic_field": dict(zip("xyz", map(float, b), strict=True))}
+    return Outgoing("/mag", "sensor_msgs/msg/MagneticField", t_ns, fields)
+
+
+def robot_among_posts(seed: int = 1, inertial: bool = True) -> list[Outgoing]:
+    """Return odometry (10 Hz), a laser (5 Hz), satellite fixes (1 Hz), an Imu (50 Hz), tf and truth of a robot."""
+    out, random = _robot_among_posts(seed), np.random.default_rng(seed + 100)
+    if not inertial:
+        return out
+    t_ns, poses = drive()
+    here = pose(0.1, 0, IMU_TURN)
+    units = [tf("/tf_static", int(t_ns[0]), transform("base_link", "imu", int(t_ns[0]), here))]
+    w, dt_ns = 2 * np.pi / 40.0, 20_000_000
+    for t in range(int(t_ns[0]), int(t_ns[-1]), dt_ns):
+        heading = poses[0, 2] + w * (t - t_ns[0]) * 1e-9 + IMU_TURN + random.normal(0, 0.02)
+        q = (0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2))
+        units.append(imu(t, (0.0, 0.0, w + GYRO_BIAS + random.normal(0, 0.01)), q, 0.0004))
+    return sorted([*out, *units], key=lambda message: message.t_ns)
+
+
+def _robot_among_posts(seed: int) -> list[Outgoing]:
     random = np.random.default_rng(seed)
     t_ns, poses = drive()
     out = [tf("/tf_static", int(t_ns[0]), transform("base_link", "laser", int(t_ns[0]), pose(*MOUNT, z=0.2)))]

@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
+from kalmark.geometry import rotations
 from kalmark.logs.bag.geodesy import local
 from kalmark.logs.bag.importer import BASES, DAY_NS, sensor_name, short
-from kalmark.logs.bag.messages import BEAM, CORNERS, POSE
+from kalmark.logs.bag.inertial import heading_of, heading_of_field
+from kalmark.logs.bag.messages import BEAM, CORNERS, POSE, Measured
 from kalmark.logs.bag.survey import Poses, Survey, TopicSummary, yaw
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.source import placed
@@ -28,6 +31,11 @@ SLOW = 0.5
 NEAR_NS = 500_000_000
 LEAST_WAY_M = 2.0
 GUESS = "GUESS:"
+HEADING_S, HEADING_RAD = 1.0, 0.02
+"""Headings are taken so often, and are not believed to be better: errors of a compass last."""
+NORTH_RAD, START_RAD, FIELD_RAD = 0.2, 0.1, 0.1
+"""Sigmas: of where north is, of a declination by the first heading, of a heading by a magnetic field."""
+GYRO_RADPS, BIAS = 0.005, {"sigma_bias_radps": 0.01, "sigma_bias_radps_per_sqrt_s": 0.0001}
 
 
 @dataclass
@@ -82,6 +90,8 @@ def mapping(values: dict[str, Any]) -> str:
             text = mapping(value)
         elif isinstance(value, list | tuple):
             text = f"[{', '.join(v if isinstance(v, str) else repr(float(v)) for v in value)}]"
+        elif value is None:
+            text = "null"
         else:
             words = quoted(value) if isinstance(value, str) else str(value)
             text = number(value) if isinstance(value, float) else words
@@ -94,6 +104,20 @@ def told(topic: TopicSummary) -> str:
     rate = f", {topic.rate_hz:.3g} Hz" if math.isfinite(topic.rate_hz) else ""
     frames = f", {topic.frames}" if topic.frames else ""
     return f"{topic.count} {short(topic.type).split('/')[-1]}{rate}{frames}"
+
+
+@dataclass
+class _Start:
+    """Where a robot starts: x, y, heading, their two sigmas, and why.
+
+    `north`: the map's axes are east and north; `known`: whether something tells the heading.
+    """
+
+    at: list[float]
+    sigmas: list[float]
+    why: str
+    north: bool = False
+    known: bool = True
 
 
 class _Writer:
@@ -133,13 +157,18 @@ class _Writer:
         scans = [topic for topic in topics if topic.offers.seen is not None and not _useless(topic)]
         control, kind = self.control(topics, not any(map(_in_pixels, scans)))
         used = self.used(topics, scans, control, kind)
+        start = self.start(control, used, kind in SPACE)
+        true = [self.found.named(name).poses.frames for name, (entry, _) in used.items() if entry["type"] == "truth"]
+        ahead = start.at[2] if start is not None else yaw(true[0][0]) if true else 0.0
+        readings = _Readings(self, control, kind, start, ahead)
+        used |= readings.entries(topics)
         clock = self.clock([self.found.named(name) for name in used])
         whose = {"robot": robot} if robot != "robot" else {}
         out.topics += [
             f"{quoted(name)}: {mapping(entry | whose | clock)}  # {why}" for name, (entry, why) in used.items()
         ]
         out.unused += [
-            f"{topic.name} ({short(topic.type)}): {_useless(topic) or self.why_not(topic)}"
+            f"{topic.name} ({short(topic.type)}): {_useless(topic) or readings.unused(topic) or self.why_not(topic)}"
             for topic in topics
             if topic.name not in used
         ]
@@ -150,9 +179,9 @@ class _Writer:
         elif scans:
             lines += [f"motion: {mapping(COASTING)}  # {GUESS} there is no topic of controls"]
             lines += [f"start: {mapping(AT_REST)}  # {GUESS} at rest, about"]
-        lines += self.start(control, used, space)
-        if scans:
-            lines.append("sensors:")
+        lines += [] if start is None else [readings.start()]
+        if scans or readings.sensors:
+            lines += ["sensors:", *(f"  {line}" for line in readings.sensors)]
         for topic in scans:
             lines.append(f"  {self.sensor(topic, control, space)}")
             if topic.columns == CORNERS or (space and topic.columns == POSE and _is_tag(topic)):
@@ -231,28 +260,25 @@ class _Writer:
             return "the numbers of a camera"
         if topic.offers.pose is not None or topic.offers.twist is not None:
             return "if it is `truth` or a `fix`, say so"
-        return "not read yet" if topic.what else "no type of message that kalmark reads"
+        return "no type of message that kalmark reads"
 
-    def start(self, control: Any, used: dict[str, tuple[dict[str, Any], str]], space: bool) -> list[str]:
-        """Return the line of a robot's start in the frame of its fixes, none if nothing tells it or truth does."""
+    def start(self, control: Any, used: dict[str, tuple[dict[str, Any], str]], space: bool) -> _Start | None:
+        """Return a robot's start in the frame of its fixes, None if nothing tells it or truth does."""
         if control is None or space or any(entry["type"] == "truth" for entry, _ in used.values()):
-            return []
+            return None
         fixes = [self.found.named(name) for name, (entry, _) in used.items() if entry["type"] == "fix"]
         if not fixes:
-            return []
+            return None
         fix, poses = fixes[0], control.poses if isinstance(control, TopicSummary) else self.found.pairs[control]
         if fix.offers.pose is not None:
             cov = np.zeros((6, 6)) if fix.poses.cov is None else fix.poses.cov
             sigmas = [math.sqrt(max(cov[0, 0], cov[1, 1], 1e-4)), math.sqrt(max(cov[5, 5], 1e-4))]
             first = fix.poses.frames[0]
-            at, why = [float(first[0]), float(first[1]), yaw(first)], f"{GUESS} the first pose of {fix.name}"
-        elif (found := aligned(poses, fix)) is not None:
-            at, sigmas = found
-            why = f"{GUESS} the way by odometry laid upon that by {fix.name}"
-        else:
-            at, sigmas, why = [0.0, 0.0, 0.0], [5.0, 1.5], f"{GUESS} its heading, from east to the left"
-        keys = ("x_m", "y_m", "theta_rad", "sigma_xy_m", "sigma_theta_rad")
-        return [f"start: {mapping(dict(zip(keys, [*at, *sigmas], strict=True)))}  # {why}"]
+            at = [float(first[0]), float(first[1]), yaw(first)]
+            return _Start(at, sigmas, f"{GUESS} the first pose of {fix.name}")
+        if (found := aligned(poses, fix)) is not None:
+            return _Start(*found, f"{GUESS} the way by odometry laid upon that by {fix.name}", north=True)
+        return _Start([0.0] * 3, [5.0, 1.5], f"{GUESS} its heading, from east to the left", north=True, known=False)
 
     def clock(self, topics: Sequence[TopicSummary]) -> dict[str, str]:
         """Return `time: recorded` for all if some messages have no header and the others' is another clock."""
@@ -278,9 +304,7 @@ class _Writer:
 
     def sensor(self, topic: TopicSummary, control: Any, space: bool) -> str:
         """Return the line of a sensor's section."""
-        base = control.child if isinstance(control, TopicSummary) else control[1] if control else ""
-        bases = [each for each in (base, *BASES) if each and each.lstrip("/") in self.found.frames.names()]
-        mount = self.found.frames.fixed(bases[0], topic.frame) if bases else None
+        mount = self.mount(topic, control)
         section, why = self.model(topic, space)
         if mount is None:
             section["mount"] = dict.fromkeys(placed(np.array([0.0] * 6 + [1.0])), 0.0) if space else {
@@ -289,6 +313,12 @@ class _Writer:
         else:
             why = f"{why}; its mount is that of tf".removeprefix("; ")
         return f"{sensor_name(topic.name, Scans())}: {mapping(section)}  # {why}"
+
+    def mount(self, topic: TopicSummary, control: Any) -> Array | None:
+        """Return where tf has the frame of a sensor in that of its robot."""
+        base = control.child if isinstance(control, TopicSummary) else control[1] if control else ""
+        bases = [each for each in (base, *BASES) if each and each.lstrip("/") in self.found.frames.names()]
+        return self.found.frames.fixed(bases[0], topic.frame) if bases else None
 
     def model(self, topic: TopicSummary, space: bool) -> tuple[dict[str, Any], str]:
         """Return a sensor's section, and why."""
@@ -316,6 +346,118 @@ class _Writer:
         infos = [each for each in self.found.topics if each.camera is not None]
         mine = [each for each in infos if each.frame == topic.frame] or (infos if len(infos) == 1 else [])
         return mine[0].camera if mine else None
+
+
+class _Readings:
+    """Decides which readings of inertial units and compasses are taken, for one robot, and how good they may be."""
+
+    def __init__(self, writer: _Writer, control: Any, kind: str, start: _Start | None, ahead: float) -> None:
+        self.writer, self.control, self.kind, self.begin, self.ahead = writer, control, kind, start, ahead
+        self.space = kind in SPACE
+        self.sensors: list[str] = []
+        self.taken: set[str] = set()
+        self.heading: float | None = None  # the first that was measured, and taken
+
+    def entries(self, topics: Sequence[TopicSummary]) -> dict[str, tuple[dict[str, Any], str]]:
+        """Return the entries of the topics that are used, each with the reason."""
+        used = {}
+        for topic in sorted(topics, key=lambda each: each.offers.rates is None):  # compasses last
+            if {"rates", "attitude"} & topic.first.keys() and (entry := self.unit(topic)) is not None:
+                used[topic.name] = (entry, told(topic))
+            elif "field" in topic.first and not self.space and self.heading is None:
+                used[topic.name] = (self.compass(topic), told(topic))
+        return used
+
+    def unused(self, topic: TopicSummary) -> str:
+        """Return why a topic of an inertial unit or a compass is not used, "" if it is no such."""
+        if topic.offers.rates is not None:
+            return topic.error or "no rates, and no covariance of its orientation"
+        if topic.offers.field is not None:
+            return "headings by a magnetic field are for the plane, and for robots without another heading"
+        return ""
+
+    def unit(self, topic: TopicSummary) -> dict[str, Any] | None:
+        """Return the entry of an inertial unit, None if nothing of it is taken; note its sensors."""
+        entry: dict[str, Any] = {"type": "imu"}
+        rates, attitude = topic.first.get("rates"), topic.first.get("attitude")
+        spread = None if attitude is None or attitude.cov is None else np.diagonal(attitude.cov)
+        level = self.space and spread is not None and spread[:2].min() > 0
+        if rates is None:
+            entry["gyro"] = None
+        else:
+            entry |= self.gyro(topic, rates)
+        if attitude is not None and spread is not None and spread[2] > 0:
+            entry |= {"heading": self.named("compass", topic)}
+            self.compass_line(entry["heading"], topic, attitude.v, max(math.sqrt(spread[2]), HEADING_RAD))
+        if level and spread is not None:
+            entry |= {"inclination": self.named("level", topic)}
+            section = {"type": "inclination", "sigma_rad": max(math.sqrt(spread[:2].max()), HEADING_RAD)}
+            self.line(entry["inclination"], section, topic, f"{GUESS} its noise")
+        if {"heading", "inclination"} & entry.keys():
+            entry["every_s"] = HEADING_S
+        return None if entry == {"type": "imu", "gyro": None} else entry
+
+    def gyro(self, topic: TopicSummary, rates: Measured) -> dict[str, Any]:
+        """Return what an entry says of the rates; note their sensor."""
+        name = self.named("gyro", topic)
+        sigma, why = GYRO_RADPS, f"{GUESS} its noise and its bias"
+        if rates.cov is not None and rates.cov[2, 2] > 0:
+            sigma, why = math.sqrt(rates.cov[2, 2]), f"{GUESS} its bias; its noise is that of its message"
+        at = {}
+        if "odometry" in self.kind:
+            at = {"at": "controls"}
+            usual = self.control.rate_hz if isinstance(self.control, TopicSummary) else math.nan
+            many = topic.rate_hz / usual
+            sigma /= math.sqrt(many) if many > 1 else 1.0
+        self.line(name, {"type": "gyro", "sigma_radps": sigma} | BIAS, topic, why)
+        return {"gyro": name} | at
+
+    def compass(self, topic: TopicSummary) -> dict[str, Any]:
+        """Return the entry of a magnetic field; note its sensor."""
+        name = self.named("compass", topic)
+        self.compass_line(name, topic, topic.first["field"].v, FIELD_RAD)
+        return {"type": "compass", "sensor": name, "every_s": HEADING_S}
+
+    def compass_line(self, name: str, topic: TopicSummary, v: Array, sigma: float) -> None:
+        """Note a sensor of headings, its declination such that its first heading is that of the start."""
+        mount = self.writer.mount(topic, self.control)
+        R = np.eye(3) if mount is None else rotations.matrix(np.array(mount[3:]))
+        heading = heading_of(v, np.eye(3) if self.space else R) if len(v) == 4 else heading_of_field(R @ v)
+        self.heading = heading if self.heading is None else self.heading
+        section: dict[str, Any] = {"type": "heading", "sigma_heading_rad": sigma}
+        if self.begin is not None and self.begin.north:
+            section |= {"declination_rad": 0.0, "sigma_declination_rad": NORTH_RAD}
+            self.line(name, section, topic, f"{GUESS} its north is true north, or nearly")
+            return
+        ahead = heading_of(np.array([0.0, 0, 0, 1]), R.T) if self.space else 0.0  # of the sensor, at the start
+        off = 0.0 if heading is None else math.remainder(self.ahead + ahead - heading, 2 * math.pi)
+        section |= {"declination_rad": off, "sigma_declination_rad": START_RAD}
+        self.line(name, section, topic, f"{GUESS} its first heading is that of the start")
+
+    def start(self) -> str:
+        """Return the line of the robot's start; a heading that nothing else tells is that of the compass."""
+        begin = self.begin
+        assert begin is not None
+        at, sigmas, why = begin.at, begin.sigmas, begin.why
+        if not begin.known and self.heading is not None:
+            at, sigmas = [*at[:2], self.heading], [sigmas[0], NORTH_RAD]
+            why = f"{GUESS} its heading is that of its compass"
+        keys = ("x_m", "y_m", "theta_rad", "sigma_xy_m", "sigma_theta_rad")
+        return f"start: {mapping(dict(zip(keys, [*at, *sigmas], strict=True)))}  # {why}"
+
+    def named(self, name: str, topic: TopicSummary) -> str:
+        """Return the name of a sensor, with that of its topic if another has it."""
+        name = f"{sensor_name(topic.name, Scans())}_{name}" if name in self.taken else name
+        self.taken.add(name)
+        return name
+
+    def line(self, name: str, section: dict[str, Any], topic: TopicSummary, why: str) -> None:
+        """Note the line of a sensor; a mount that tf does not have is to be given where it counts."""
+        if self.writer.mount(topic, self.control) is not None:
+            why = f"{why}; its mount is that of tf"
+        else:
+            why = f"{why}; {GUESS} its axes are those of the robot"
+        self.sensors.append(f"{quoted(name)}: {mapping(section)}  # {why}")
 
 
 def _parts(topic: TopicSummary) -> int:

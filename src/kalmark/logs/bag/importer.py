@@ -20,9 +20,24 @@ from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag import tables
 from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.geodesy import local
-from kalmark.logs.bag.messages import BEAM, MESSAGES, POINT, POSE, Message, Place, Pose, Seen
+from kalmark.logs.bag.inertial import GRAVITY, GYRO, HEADING, INCLINATION, heading_of, heading_of_field, means
+from kalmark.logs.bag.messages import BEAM, MESSAGES, POINT, POSE, Measured, Message, Place, Pose, Seen
 from kalmark.logs.bag.reading import Bag, Received, find_bag, has_header, stamp
-from kalmark.logs.bag.topics import Fixes, Moved, Noisy, Placed, Posed, Scans, Topic, Truths, topic_of
+from kalmark.logs.bag.topics import (
+    Carried,
+    Compass,
+    Fixes,
+    Imu,
+    Moved,
+    Noisy,
+    Placed,
+    Posed,
+    Scans,
+    Sparse,
+    Topic,
+    Truths,
+    topic_of,
+)
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, placed, seconds
 from kalmark.logs.table import Refused
@@ -74,6 +89,8 @@ class _Importer:
         self.topics = {bag.find(name): topic for name, topic in topics.items()}
         self.offers = {name: offered(bag, name, topic) for name, topic in self.topics.items()}
         self.columns = self._controls()
+        for name, topic in self.topics.items():
+            self._refuse_other_world(name, topic)
         self.events: list[Event] = []
         self.sensor_columns: dict[tuple[str, str], tuple[str, ...]] = {}
         self.paths: dict[str, dict[int, Array]] = {}
@@ -86,6 +103,8 @@ class _Importer:
         self.frames, self.of_sensor, self.base = Frames(), dict[str, str](), dict[str, str]()
         self.mounts: dict[tuple[str, str], dict[str, float]] = {}
         self.level: dict[str, tuple[Array, bool]] = {}
+        self.rates: dict[tuple[str, str], dict[int, Array]] = {}
+        self.read_ns: dict[tuple[str, str], int] = {}
 
     def _controls(self) -> dict[str, tuple[str, ...]]:
         """Return the columns of each robot's controls.  Raises LogError if two topics are those of one robot."""
@@ -99,6 +118,17 @@ class _Importer:
                 columns[topic.robot], named[topic.robot] = topic.columns, name
         return columns
 
+    def _refuse_other_world(self, name: str, topic: Topic) -> None:
+        """Refuse readings that robots of the plane, or of space, do not have.  Raises LogError."""
+        space = self.in_space(topic.robot)
+        if isinstance(topic, Compass) and space:
+            what, wanted = "headings by a magnetic field", "one of the plane"
+        elif isinstance(topic, Imu) and (topic.inclination or topic.gravity) and not space:
+            what, wanted = "inclinations or gravity", "one of space"
+        else:
+            return
+        raise LogError(f"{self.bag.path}: topic {name} gives {what} to {topic.robot!r}, expected {wanted}")
+
     def in_space(self, robot: str) -> bool:
         """Return whether a robot moves in space: by its controls; one without any does."""
         own = [topic.space for topic in self.topics.values() if topic.robot == robot and topic.columns]
@@ -107,7 +137,7 @@ class _Importer:
     # -------------------------------------------------------------- mounts
     def look_ahead(self) -> None:
         """Note the frames of sensors and robots, and those of tf that stand still: for the mounts of sensors."""
-        scans = {name for name, topic in self.topics.items() if isinstance(topic, Scans)}
+        scans = {name for name, topic in self.topics.items() if isinstance(topic, Carried)}
         if not scans:
             return
         tf = {
@@ -129,15 +159,15 @@ class _Importer:
 
     def _mount(self, name: str, scan: Topic) -> None:
         """Note where a sensor is mounted, if tf says so; in the plane also how its points are made level."""
-        assert isinstance(scan, Scans)
+        assert isinstance(scan, Carried)
         bases = (scan.base_frame, self.base.get(scan.robot), *BASES)
         base = next((each for each in bases if each and each.lstrip("/") in self.frames.names()), None)
         mount = None if base is None else self.frames.fixed(base, self.of_sensor.get(name, ""))
         if mount is None:
             return
-        key = (scan.robot, sensor_name(name, scan))
+        keys = [(scan.robot, sensor) for sensor in scan.sensors(name)]
         if self.in_space(scan.robot):
-            self.mounts[key] = placed(mount)
+            self.mounts |= dict.fromkeys(keys, placed(mount))
             return
         R = rotations.matrix(mount[3:])
         yaw = float(np.arctan2(R[1, 0], R[0, 0]))
@@ -146,7 +176,8 @@ class _Importer:
             tilt = math.degrees(math.acos(min(1.0, abs(R[2, 2]))))
             self.request.skipped.append(f"{self.bag.path}: {name} is tilted by {tilt:.0f} deg in tf, taken as level")
         self.level[name] = (np.eye(3) if raw else R, bool(raw and R[2, 2] < 0))
-        self.mounts[key] = {"x_m": float(mount[0]), "y_m": float(mount[1]), "theta_rad": yaw if raw else 0.0}
+        flat = {"x_m": float(mount[0]), "y_m": float(mount[1]), "theta_rad": yaw if raw else 0.0}
+        self.mounts |= dict.fromkeys(keys, flat)
 
     # -------------------------------------------------------------- messages
     def log(self) -> Log:
@@ -155,6 +186,7 @@ class _Importer:
         for received in self.bag.messages(self.topics):
             self.take(received)
         self.interpolated()
+        self.averaged()
         for (name, reason), count in sorted(self.left_out.items()):
             self.request.leave_out(count, f"{self.bag.path}: {name}: {count} {reason}")
         for name in self.topics:
@@ -186,6 +218,8 @@ class _Importer:
         try:
             if isinstance(topic, Scans):
                 self.scan(received, topic, offer, t_ns)
+            elif isinstance(topic, Sparse):
+                self.of_robot(received, topic, offer, t_ns)
             elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
                 self.globe(received, topic, offer.globe(received.message), t_ns)
             elif isinstance(topic, Posed):
@@ -348,6 +382,83 @@ class _Importer:
         ids = seen.ids if seen.ids else None
         self.events.append(Scan(t_ns=t_ns, robot=topic.robot, sensor=sensor, y=y, ids=ids))
 
+    def of_robot(self, received: Received, topic: Sparse, offer: Message, t_ns: int) -> None:
+        """Take what an inertial unit or a compass measured of its robot; in the plane made level."""
+        m, R = received.message, self.level.get(received.topic, (np.eye(3), False))[0]
+        if isinstance(topic, Compass):
+            b = self.measured(received, "field", offer.field(m))  # type: ignore[misc]
+            heading = None if b is None else heading_of_field(R @ b)
+            if heading is not None:
+                self.now_and_then(received, topic, topic.sensors(received.topic)[0], t_ns, HEADING, [heading])
+            elif b is not None:
+                self.left_out[received.topic, "fields that are steep"] += 1
+        elif isinstance(topic, Imu):
+            if topic.gyro:
+                self.turned(received, topic, topic.gyro, t_ns, self.measured(received, "rates", offer.rates(m)), R)  # type: ignore[misc]
+            if topic.heading or topic.inclination:
+                q = self.measured(received, "an orientation", offer.attitude(m))  # type: ignore[misc]
+                self.oriented(received, topic, t_ns, q, R)
+            a = self.measured(received, "accelerations", offer.force(m)) if topic.gravity else None  # type: ignore[misc]
+            if topic.gravity and a is not None:
+                self.now_and_then(received, topic, topic.gravity, t_ns, GRAVITY, a)
+
+    def turned(self, received: Received, topic: Imu, sensor: str, t_ns: int, w: Array | None, R: Array) -> None:
+        """Take rates (3,) about the axes of an inertial unit, or keep them for their means."""
+        if w is None:
+            return
+        space = self.in_space(topic.robot)
+        w = w if space else (R @ w)[2:]
+        if topic.at == "controls":
+            self.rates.setdefault((topic.robot, sensor), {})[t_ns] = w
+        else:
+            self.reading(received, topic.robot, sensor, t_ns, GYRO[space], w)
+
+    def oriented(self, received: Received, topic: Imu, t_ns: int, q: Array | None, R: Array) -> None:
+        """Take heading and inclination of an orientation (4,)."""
+        if q is not None and topic.heading:
+            self.now_and_then(received, topic, topic.heading, t_ns, HEADING, [heading_of(q, R)])
+        if q is not None and topic.inclination:
+            level = rotations.to_euler(np.ascontiguousarray(q))[0][:2]
+            self.now_and_then(received, topic, topic.inclination, t_ns, INCLINATION, level)
+
+    def measured(self, received: Received, what: str, told: Measured | None) -> Array | None:
+        """Return what a message measured; None, and counted, if it did not."""
+        if told is None:
+            self.left_out[received.topic, f"messages without {what}"] += 1
+            return None
+        if not np.isfinite(told.v).all():
+            raise Refused(f"{what} {told.v.tolist()}, expected finite numbers")
+        return told.v
+
+    def now_and_then(
+        self, received: Received, topic: Sparse, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any
+    ) -> None:
+        """Take a reading if the last one of its sensor was long enough before."""
+        last = self.read_ns.get((topic.robot, sensor))
+        if last is None or t_ns - last >= topic.every_s * 1e9:
+            self.reading(received, topic.robot, sensor, t_ns, columns, y)
+
+    def reading(self, received: Received, robot: str, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any) -> None:
+        """Take a reading of a sensor of the robot itself: one at a time."""
+        if self.read_ns.get((robot, sensor)) == t_ns:
+            self.left_out[received.topic, f"readings of {sensor} at the time of the one before"] += 1
+            return
+        self.read_ns[robot, sensor] = t_ns
+        self.sensor_columns.setdefault((robot, sensor), columns)
+        self.events.append(Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=[[*map(float, y)]]))
+
+    def averaged(self) -> None:
+        """Add the means of rates from one control of the robot to the next.  Raises LogError if it has none."""
+        for (robot, sensor), rates in self.rates.items():
+            ends = sorted({event.t_ns for event in self.events if isinstance(event, Control) and event.robot == robot})
+            if not ends:
+                wanted = "controls of this robot, or `at: messages`"
+                raise LogError(f"{self.bag.path}: {sensor} of {robot!r} has `at: controls`, expected {wanted}")
+            t_ns = np.array(sorted(rates))
+            found = means(t_ns, np.array([rates[t] for t in t_ns.tolist()]), ends)
+            self.sensor_columns[robot, sensor] = GYRO[self.in_space(robot)]
+            self.events += [Scan(t_ns=t, robot=robot, sensor=sensor, y=w[None]) for t, w in found]
+
     def chosen(self, name: str, topic: Scans, seen: Seen) -> tuple[tuple[str, ...], Any]:
         """Return the columns to take, and the observations (K, m), for a robot of the plane made level."""
         y = np.asarray(seen.y, dtype=np.float64).reshape(-1, len(seen.columns))
@@ -391,7 +502,7 @@ def type_of(topic: Topic) -> str:
 
 def sensor_name(name: str, scan: Scans) -> str:
     """Return the name of a topic's sensor."""
-    return scan.sensor or name.strip("/").replace("/", "_")
+    return scan.sensors(name)[0]
 
 
 def frame_id(message: Any) -> str:

@@ -1,8 +1,9 @@
 """What each type of message says of a robot: one row a type in `MESSAGES`.
 
 A row names what can be read from the message: where the robot is (`pose`), how fast it moves (`twist`), its speed and
-steering (`drive`), a position on the globe (`globe`), what a sensor saw (`seen`), frames (`transforms`), a camera
-(`camera`).  A topic of a configuration (`topics.py`) asks for one of them.  A function refuses a message by `Refused`.
+steering (`drive`), a position on the globe (`globe`), what a sensor saw (`seen`), what an inertial unit measured
+(`rates`, `attitude`, `force`), a magnetic field (`field`), frames (`transforms`), a camera (`camera`).  A topic of a
+configuration (`topics.py`) asks for one of them.  A function refuses a message by `Refused`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ CORNERS = ("u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px
 LENGTH = 1e-3  # a quaternion is of length 1 up to this
 NO_FIX = 0  # of NavSatStatus: what is below has no fix
 UNKNOWN_COVARIANCE = 0
+NOT_MEASURED = -1  # the first number of a covariance in an Imu that does not measure this
 DELETED = 2  # of Marker.action: this and what is above removes markers
 TYPES_OF_A_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
 
@@ -41,6 +43,13 @@ class Pose(NamedTuple):
 
 class Twist(NamedTuple):
     """Velocity (6,): m/s and rad/s along and about x, y, z of the robot, its covariance (6, 6) if it has one."""
+
+    v: Array
+    cov: Array | None
+
+
+class Measured(NamedTuple):
+    """Numbers that an inertial unit measured in its own frame, with their covariance (3, 3), None if it is unknown."""
 
     v: Array
     cov: Array | None
@@ -90,6 +99,10 @@ class Message:
     drive: Callable[[Any], Array] | None = None
     globe: Callable[[Any], Place | None] | None = None
     seen: Callable[[Any, Scans], Seen] | None = None
+    rates: Callable[[Any], Measured | None] | None = None
+    attitude: Callable[[Any], Measured | None] | None = None
+    force: Callable[[Any], Measured | None] | None = None
+    field: Callable[[Any], Measured | None] | None = None
     transforms: Callable[[Any], list[Transform]] | None = None
     camera: Callable[[Any], dict[str, Any]] | None = None
 
@@ -97,11 +110,16 @@ class Message:
 # ------------------------------------------------------------------ where it is, how fast it is
 def frame_of(position: Any, rotation: Any) -> Array:
     """Return the frame (7,) of a position and a quaternion, which is normalised.  Raises Refused."""
+    return np.append([position.x, position.y, position.z], unit(rotation))
+
+
+def unit(rotation: Any) -> Array:
+    """Return a geometry_msgs/Quaternion (4,), normalised.  Raises Refused."""
     q = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
     norm = float(np.linalg.norm(q))
     if not abs(norm - 1) <= LENGTH:
         raise Refused(f"quaternion has length {norm:.6g}, expected 1")
-    return np.append([position.x, position.y, position.z], q / norm)
+    return np.asarray(q / norm)
 
 
 def pose_frame(pose: Any) -> Array:
@@ -146,6 +164,26 @@ def satellite_fix(m: Any) -> Place | None:
         return None
     cov = covariance(m.position_covariance, 3) if m.position_covariance_type != UNKNOWN_COVARIANCE else None
     return Place(np.array([m.latitude, m.longitude, m.altitude]), cov)
+
+
+def vector(v: Any, cov: Any) -> Measured | None:
+    """Return what an inertial unit measured along its axes, None of what it does not measure.
+
+    Its covariance is None where it is unknown: all zeros.
+    """
+    if cov[0] == NOT_MEASURED:
+        return None
+    told = covariance(cov, 3)
+    return Measured(np.array([v.x, v.y, v.z], dtype=np.float64), told if told.any() else None)
+
+
+def attitude(m: Any) -> Measured | None:
+    """Return the orientation (4,) of a sensor_msgs/Imu: its frame in that of east, north, up; None if it has none.
+
+    Some that have none write zeros.  Raises Refused.
+    """
+    told, q = vector(m.orientation, m.orientation_covariance), m.orientation
+    return None if told is None or not any((q.x, q.y, q.z, q.w)) else Measured(unit(q), told.cov)
 
 
 def transforms(m: Any) -> list[Transform]:
@@ -264,11 +302,12 @@ def boxes_of_space(m: Any, scan: Scans) -> Seen:
     return seen
 
 
-def markers(m: Any, scan: Scans) -> Seen:
-    """Return the poses of a visualization_msgs/MarkerArray; ids are `namespace/id` where there are namespaces."""
+def markers(listed: Iterable[Any], scan: Scans) -> Seen:
+    """Return the poses of visualization_msgs/Markers; ids are `namespace/id` where there are namespaces."""
     seen = Seen(POSE)
-    several = len({each.ns for each in m.markers}) > 1
-    for each in m.markers:
+    listed = list(listed)
+    several = len({each.ns for each in listed}) > 1
+    for each in listed:
         if each.action >= DELETED:
             seen.left_out["markers that are deleted"] += 1
             continue
@@ -333,7 +372,8 @@ MESSAGES: dict[str, Message] = {
     "sensor_msgs/msg/CameraInfo": Message("camera", camera=camera),
     "vision_msgs/msg/Detection2DArray": Message("detections in an image", seen=boxes),
     "vision_msgs/msg/Detection3DArray": Message("detections in space", seen=boxes_of_space),
-    "visualization_msgs/msg/MarkerArray": Message("markers", seen=markers),
+    "visualization_msgs/msg/MarkerArray": Message("markers", seen=lambda m, scan: markers(m.markers, scan)),
+    "visualization_msgs/msg/Marker": Message("marker", seen=lambda m, scan: markers([m], scan)),
     "apriltag_msgs/msg/AprilTagDetectionArray": Message("corners of tags",
                                                         seen=lambda m, scan: _corners(scan, m.detections)),
     "apriltag_msgs/msg/ApriltagArrayStamped": Message("corners of tags",
@@ -345,7 +385,10 @@ MESSAGES: dict[str, Message] = {
     "fiducial_msgs/msg/FiducialTransformArray": Message("poses of tags", seen=tag_poses),
     "tf2_msgs/msg/TFMessage": Message("frames", transforms=transforms),
     "tf/msg/tfMessage": Message("frames", transforms=transforms),
-    # Listed by `kalmark bag`, not read yet: they wait for events of headings and rates.
-    "sensor_msgs/msg/Imu": Message("inertial unit"),
-    "sensor_msgs/msg/MagneticField": Message("magnetic field"),
+    "sensor_msgs/msg/Imu": Message(
+        "inertial unit", attitude=attitude,
+        rates=lambda m: vector(m.angular_velocity, m.angular_velocity_covariance),
+        force=lambda m: vector(m.linear_acceleration, m.linear_acceleration_covariance)),
+    "sensor_msgs/msg/MagneticField": Message(
+        "magnetic field", field=lambda m: vector(m.magnetic_field, m.magnetic_field_covariance)),
 }  # fmt: skip

@@ -12,7 +12,7 @@ from kalmark.arrays import Array
 from kalmark.geometry import rotations
 from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.importer import frame_id
-from kalmark.logs.bag.messages import MESSAGES, Message, Pose
+from kalmark.logs.bag.messages import MESSAGES, Measured, Message, Pose
 from kalmark.logs.bag.reading import Bag, has_header, stamp
 from kalmark.logs.bag.tables import holds_log
 from kalmark.logs.bag.topics import Scans
@@ -80,6 +80,8 @@ class TopicSummary:
     named: bool = False
     origin: Array | None = None
     camera: dict[str, Any] | None = None
+    first: dict[str, Measured] = field(default_factory=dict)
+    """Of an inertial unit or a compass the first rates, attitude and field."""
 
     @property
     def offers(self) -> Message:
@@ -174,6 +176,11 @@ def _look(summary: TopicSummary, m: Any, t_ns: int) -> None:
             summary.poses.take(t_ns, Pose(np.append(lla, [0.0, 0, 0, 1]), cov, summary.frame, ""))
     if offers.camera is not None and summary.camera is None:
         summary.camera = offers.camera(m)
+    for name in ("rates", "attitude", "field"):
+        read = getattr(offers, name)
+        told = None if read is None or name in summary.first else read(m)
+        if told is not None and np.isfinite(told.v).all():
+            summary.first[name] = told
     if hasattr(m, "fields"):
         summary.fields = tuple(each.name for each in m.fields)
     elif offers.seen is not None and not (summary.columns and summary.named):

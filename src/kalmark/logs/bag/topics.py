@@ -102,12 +102,25 @@ class AckermannTopic(Topic):
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
 
 
+@declared
+class Carried(Topic):
+    """What a sensor measured that the robot carries."""
+
+    base_frame: Annotated[
+        str | None, "The robot's frame in tf, for the sensor's mount; if absent that of its odometry, or base_link."
+    ] = None
+
+    def sensors(self, topic: str) -> tuple[str, ...]:
+        """Return the names of the sensors that a topic of this name has readings of."""
+        return (getattr(self, "sensor", None) or topic.strip("/").replace("/", "_"),)
+
+
 def _a_size(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e3
 
 
 @register("topic", "scan")
-class Scans(Topic):
+class Scans(Carried):
     """What a sensor saw: laser beams, points, ranges, detections, corners or poses of tags, markers."""
 
     wants: ClassVar[tuple[str, ...]] = ("seen",)
@@ -125,9 +138,6 @@ class Scans(Topic):
     size_m: Annotated[float | None, Within(gt=0), "Corners of tags: side of the black square."] = None
     sizes: Annotated[Any, "Corners of tags: sides by id, of tags with another one; all others have `size_m`."] = None
     max_hamming: Annotated[int, Within(ge=0), "Tags: the most corrected bits."] = 2
-    base_frame: Annotated[
-        str | None, "The robot's frame in tf, for the sensor's mount; if absent that of its odometry, or base_link."
-    ] = None
 
     def __post_init__(self) -> None:
         if self.take is not None:
@@ -143,6 +153,48 @@ class Scans(Topic):
         """Return the size (m) of a tag, None if it has none."""
         named = {landmark_id(str(name)): size for name, size in (self.sizes or {}).items()}
         return named.get(tag, self.size_m)
+
+
+@declared
+class Sparse(Carried):
+    """Readings of which only some are taken."""
+
+    every_s: Annotated[
+        float, Within(ge=0), "Take no heading, inclination or gravity sooner than this after the last: its errors last."
+    ] = 0.0
+
+
+@register("topic", "imu")
+class Imu(Sparse):
+    """Readings of sensors of the robot itself by an Imu: of a gyroscope, and those that are given a name."""
+
+    wants: ClassVar[tuple[str, ...]] = ("rates",)
+
+    gyro: Annotated[str | None, "Name of the sensor, a `gyro`, of its rates; null: they are not taken."] = "gyro"
+    heading: Annotated[str | None, "Name of the sensor, a `heading`, of its orientation."] = None
+    inclination: Annotated[str | None, "In space, name of the sensor, an `inclination`, of its orientation."] = None
+    gravity: Annotated[str | None, "In space, name of the sensor, a `gravity`, of its accelerations."] = None
+    at: Annotated[
+        Literal["messages", "controls"],
+        "Rates as they come, or their means from one control of the robot to the next: for increments.",
+    ] = "messages"
+
+    def __post_init__(self) -> None:
+        if not self.sensors(""):
+            raise refuse(self, "gyro", "a name, or one of heading, inclination, gravity")
+
+    def sensors(self, topic: str) -> tuple[str, ...]:
+        """Return the names of the sensors that this topic has readings of."""
+        return tuple(filter(None, (self.gyro, self.heading, self.inclination, self.gravity)))
+
+
+@register("topic", "compass")
+class Compass(Sparse):
+    """Headings by a MagneticField, of a robot of the plane: `heading`, counted from magnetic east to the left."""
+
+    wants: ClassVar[tuple[str, ...]] = ("field",)
+
+    sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
 
 
 @declared
