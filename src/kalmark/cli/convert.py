@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from kalmark.cli.shared import writable
@@ -14,27 +15,39 @@ if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.results.run import Run
 
-MCAP = ".mcap"
+MCAP, G2O, POSES = ".mcap", ".g2o", (".tum", ".kitti")
 
 
 def convert(
     source: Annotated[
         Path, typer.Argument(metavar="IN", help="A log that kalmark reads, a configuration that names one, or a run.")
     ],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The folder of the native log to write, or FILE.mcap.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help="The folder of the native log to write; or a file: .mcap; of a run .g2o; .tum or .kitti of a path.",
+        ),
+    ],
     log_format: Annotated[str | None, typer.Option("--format", help="Format of IN, if not recognised.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Of this robot's path: .tum, .kitti.")] = None,
 ) -> None:
-    """Write a log as a native one, a folder of CSV files, or as MCAP, of a run with its results."""
+    """Write a log as a native one, a folder of CSV files; with its results as MCAP or g2o; a path as TUM or KITTI."""
     from kalmark.logs import write_native
 
-    if out.suffix == MCAP:
+    if out.suffix in (MCAP, G2O, *POSES):
         if out.exists():
             raise KalmarkError(f"{out}: this file exists already, expected a new one")
         writable(out.parent)
     else:
         writable(out)
     log, run = _read(source, log_format)
-    if out.suffix == MCAP:
+    if out.suffix in POSES:
+        _write_path(out, log, run, robot)
+        return
+    if out.suffix == G2O:
+        _write_graph(out, source, log, run)
+    elif out.suffix == MCAP:
         from kalmark.results.mcap import export
 
         counts = export(out, log, run)
@@ -43,6 +56,37 @@ def convert(
         write_native(log, out)
     if log is not None:
         typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}, read as {log.format}")
+
+
+def _write_path(out: Path, log: Log | None, run: Run | None, robot: str | None) -> None:
+    """Write the path of a robot: of a run the estimated one, of a log the true one.  Raises KalmarkError."""
+    from kalmark.logs.log import Trajectory
+    from kalmark.logs.poses import write_path
+
+    paths: dict[str, Trajectory] = {} if log is None or run is not None else dict(log.truth)
+    if run is not None:
+        history = run.history
+        for name in history.robots:
+            t_ns, first = np.unique(history.t_ns[history.robot == name], return_index=True)
+            if len(t_ns):
+                paths[name] = Trajectory(t_ns, history.poses[history.robot == name][first])
+    names = [robot] if robot is not None else [*paths]
+    if len(names) != 1 or names[0] not in paths:
+        there = ", ".join(paths) or "none: only a run has an estimated path, and this log has no truth"
+        raise KalmarkError(f"{out}: paths of {there}; expected one, or --robot with one of them")
+    files = write_path(out, paths[names[0]].t_ns, paths[names[0]].poses)
+    typer.echo(f"{', '.join(map(str, files))}: {len(paths[names[0]])} poses of {names[0]}")
+
+
+def _write_graph(out: Path, source: Path, log: Log | None, run: Run | None) -> None:
+    """Write a run as a graph.  Raises KalmarkError."""
+    from kalmark.config import build_slam, open_run
+    from kalmark.results.graph import g2o_text
+
+    if log is None or run is None:
+        raise KalmarkError(f"{source}: not the folder of a run, expected one: a graph needs estimates and noise")
+    slam = build_slam(open_run(source / "config.yaml")[0], log)
+    out.write_text(g2o_text(run, log, slam.robots), encoding="utf-8")
 
 
 def _read(source: Path, log_format: str | None) -> tuple[Log | None, Run | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,10 @@ from kalmark.cli.shared import RunFolder, computing, print_summary
 
 def evaluate(
     run: RunFolder,
-    truth: Annotated[Path | None, typer.Option(metavar="LOG", help="Judge by the truth of this log.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="LOG", help="Judge by the truth of this log, or by a file of poses: TUM, KITTI."),
+    ] = None,
     batch: Annotated[
         bool, typer.Option("--batch", help="Compare with the batch solution, and keep that in the run.")
     ] = False,
@@ -27,7 +31,11 @@ def evaluate(
     with computing():
         loaded = Run.load(run)
         if truth is not None:
-            loaded = loaded.with_truth(open_log(truth))
+            log = open_log(truth)
+            robots = loaded.history.robots
+            if not log.events and len(robots) == 1:  # a file of poses does not name its robot
+                log = replace(log, truth=dict.fromkeys(robots, *log.truth.values()))
+            loaded = loaded.with_truth(log)
         summary = loaded.evaluate(batch=batch)
         if batch and truth is None:
             write(run / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.config.reading import config_of, did_you_mean, resolve_config, shipped_configs
-from kalmark.config.schema import TRUTH, Config
+from kalmark.config.schema import COMMON, TRUTH, Config
 from kalmark.config.tree import OVERRIDE, Tree, read_tree
 from kalmark.errors import ConfigError, LogError
 from kalmark.logs import FORMATS, find_data, open_log
@@ -57,7 +57,8 @@ def described(config: Config, log: Log) -> Config:
 
 def in_force(config: Config, log_path: str | Path | None = None) -> Config:
     """Return the configuration with its log's path found, or replaced by `log_path`.  Raises ConfigError, LogError."""
-    log = config.log.model_copy(update={"path": str(find_log(config, log_path))})
+    named: dict[str, Any] = {name: beside(config, getattr(config.log, name)) for name in ("truth", "fixes")}
+    log = config.log.model_copy(update=named | {"path": str(find_log(config, log_path))})
     return config.model_copy(update={"log": log})
 
 
@@ -65,8 +66,23 @@ def open_config_log(config: Config, log_path: str | Path | None = None) -> Log:
     """Return the log that a configuration names, or the one at `log_path` read in the same way."""
     log, path = config.log, find_log(config, log_path)
     check_format(config, path)
-    common = log.model_dump(include={"robots", "from_s", "to_s", "on_error", "ids"})
-    return open_log(path, log.format, **common, **log.options())
+    common = log.model_dump(include={*COMMON})
+    common |= {name: beside(config, common[name]) for name in ("truth", "fixes")}
+    found = open_log(path, log.format, **common, **log.options())
+    if not found.events:
+        raise LogError(f"{path}: true poses alone, expected a log with events; as `log.truth` it scores one")
+    return found
+
+
+def beside(config: Config, path: Any) -> Any:
+    """Return where the files are that a configuration names: beside it, or where logs are looked for.
+
+    Raises LogError.
+    """
+    if path is None or isinstance(path, dict):
+        return {robot: beside(config, each) for robot, each in path.items()} if path else None
+    own = config.file is not None and config.file not in shipped_configs().values()
+    return str(find_data(path, config.file.resolve().parent if config.file and own else None).resolve())
 
 
 def find_log(config: Config, log_path: str | Path | None = None) -> Path:

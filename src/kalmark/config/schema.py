@@ -256,6 +256,9 @@ def _three(sigma: float | tuple[float, ...]) -> Array:
     return np.broadcast_to(np.asarray(sigma, dtype=np.float64), 3)
 
 
+COMMON = ("robots", "from_s", "to_s", "on_error", "ids", "truth", "fixes", "sigma_fixes_m")  # of logs of any format
+
+
 class LogConfig(Section):
     """Which log, and how much of it."""
 
@@ -273,6 +276,14 @@ class LogConfig(Section):
     """What to do with bad input: refuse, or leave out."""
     ids: Literal["given", "hidden"] = "given"
     """`hidden`: the filter is not told which landmark is which; the summary says how often it was wrong."""
+    truth: str | dict[str, str] | None = None
+    """A file of true poses in the format of TUM or KITTI, to score against; by robot if there are several."""
+    fixes: str | dict[str, str] | None = None
+    """The same, of positions that the filter is given, as fixes."""
+    sigma_fixes_m: Positive | None = None
+    """Noise of each coordinate of `fixes`."""
+    vertices: Literal["none", "truth"] | None = None
+    """g2o: `truth` takes the vertices as true poses and landmarks (none if absent)."""
     r_max: Positive | None = None
     """lost_in_the_woods: drop observations beyond this range."""
     measured: Literal["range_bearing", "bearing"] | None = None
@@ -304,7 +315,7 @@ class LogConfig(Section):
 
     def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""
-        common = {"path", "format", "robots", "from_s", "to_s", "on_error", "ids"}
+        common = {"path", "format", *COMMON}
         return self.model_dump(exclude=common, exclude_none=True)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,14 +11,17 @@ from typing import Any, Literal
 import numpy as np
 
 from kalmark.errors import LogError
-from kalmark.events import Event, Scan
+from kalmark.events import Event, Fix, Scan, order, shown
 from kalmark.logs.bag.importer import BAG
+from kalmark.logs.carmen import CARMEN
 from kalmark.logs.download import find_data
+from kalmark.logs.graph import G2O
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
 from kalmark.logs.native import NATIVE
 from kalmark.logs.plaza import PLAZA
+from kalmark.logs.poses import KITTI, TUM, read_path
 from kalmark.logs.slamtb import SLAMTB
 from kalmark.logs.source import Format, Request, choice, nearest, quantity, raising
 from kalmark.logs.steps import DLR, FREIBURG
@@ -28,7 +31,7 @@ from kalmark.logs.victoria_park import VICTORIA_PARK
 
 FORMATS: dict[str, Format] = {entry.name: entry for entry in (
     NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB, TAGSLAM, KITTI_STEREO, PLAZA,
-    BAG,
+    BAG, G2O, CARMEN, TUM, KITTI,
 )}  # fmt: skip
 
 
@@ -41,6 +44,9 @@ def open_log(
     to_s: float | None = None,
     on_error: Literal["raise", "skip"] = "raise",
     ids: Literal["given", "hidden"] = "given",
+    truth: Path | str | Mapping[str, Path | str] | None = None,
+    fixes: Path | str | Mapping[str, Path | str] | None = None,
+    sigma_fixes_m: float | None = None,
     **options: Any,
 ) -> Log:
     """Read the log at `path`, a folder or file of any known format.
@@ -48,6 +54,8 @@ def open_log(
     `robots` keeps some robots (names, or MRCLAM's numbers), `from_s` and `to_s` the events between these seconds
     from the log's first event.  With `on_error="skip"` bad rows are left out and listed in `log.skipped`.  With
     `ids="hidden"` no scan says which landmark is which; `log.true_ids` does.
+    `truth` and `fixes` are files of poses in the formats of TUM or KITTI, by robot if there are several: true poses to
+    score against, and positions for the filter with the noise `sigma_fixes_m`.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
     Raises LogError, with ``file:line:`` for a bad row.
     """
@@ -60,8 +68,42 @@ def open_log(
             raise LogError(f"log option {name!r} is unknown to {entry.name}, expected {wanted}")
     request = Request(robot_names(robots, entry), refuse, skipped)
     log = entry.read(found, request, **options)
+    log = with_poses(log, request, truth, fixes, sigma_fixes_m)
     log = between(keep_robots(log, request), from_s, to_s)
     return hide_ids(log) if choice(ids, "ids", ("given", "hidden")) == "hidden" else log
+
+
+def with_poses(log: Log, request: Request, truth: Any, fixes: Any, sigma_m: float | None) -> Log:
+    """Return the log with true poses and fixes of other files.  Raises LogError."""
+    true = {robot: read_path(path, request) for robot, path in _by_robot(log, "truth", truth).items()}
+    places = {robot: read_path(path, request) for robot, path in _by_robot(log, "fixes", fixes).items()}
+    if (sigma_m is None) != (fixes is None):
+        both = f"fixes is {shown(fixes)} and sigma_fixes_m is {shown(sigma_m)}"
+        raise LogError(f"log option {both}, expected both: a file of positions and their noise")
+    events = [
+        Fix(t_ns=t_ns, robot=robot, y=pose[:d], cov=quantity(sigma_m, "sigma_fixes_m", 1e-9) ** 2 * np.eye(d))
+        for robot, path in places.items()
+        for d in (_dimensions(log, robot),)
+        for t_ns, pose in zip(path.t_ns.tolist(), path.poses, strict=True)
+    ]
+    found = sorted([*log.events, *events], key=order) if events else log.events
+    return replace(log, events=found, truth=log.truth | true) if true or events else log
+
+
+def _by_robot(log: Log, name: str, given: Any) -> dict[str, Path]:
+    """Return the files of an option by robot.  Raises LogError."""
+    files = given if isinstance(given, Mapping) else {} if given is None else dict.fromkeys(log.robots, given)
+    for robot in files:
+        if robot not in log.robots or (len(files) > 1 and not isinstance(given, Mapping)):
+            wanted = f"a file, or one for each of the robots {', '.join(log.robots)}: {{robot: file}}"
+            raise LogError(f"log option {name} is {shown(given)}, expected {wanted}")
+    return {robot: find_data(path) for robot, path in files.items()}
+
+
+def _dimensions(log: Log, robot: str) -> int:
+    """Return 2 for a robot with controls of the plane, 3 for another."""
+    columns = log.control_columns.get(robot, ("z",))
+    return 3 if any("z" in column for column in columns) else 2
 
 
 def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
@@ -139,6 +181,8 @@ def without(event: Event, others: set[str], left_out: Counter[str]) -> Event | N
 
 def between(log: Log, from_s: float | None, to_s: float | None) -> Log:
     """Return the log with the events from `from_s` to `to_s` (both included), s from its first event."""
+    if not log.events and log.format in (TUM.name, KITTI.name):
+        return log
     if not log.events:
         raise LogError(f"{log.path}: no event that can be used, expected controls and scans")
     if from_s is None and to_s is None:

@@ -13,12 +13,13 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import seconds as short
 from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.logs.source import seconds
 from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth
 from kalmark.report import Candidate
 from kalmark.results.history import Change, History, Ints
 from kalmark.results.landmarks import LINE
 from kalmark.results.readings import mount_now
-from kalmark.results.recording import Recording, seconds
+from kalmark.results.recording import Recording
 from kalmark.results.truth import as_rigid
 from kalmark.results.words import count, figure
 

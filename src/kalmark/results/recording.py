@@ -26,11 +26,12 @@ from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
-from kalmark.logs.source import LeftOut, records_of
+from kalmark.logs.poses import tum_text
+from kalmark.logs.source import LeftOut, records_of, seconds
 from kalmark.results.history import History
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.readings import plain
-from kalmark.results.truth import Truth, fitted
+from kalmark.results.truth import Truth
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
@@ -42,20 +43,10 @@ FAST, PAYS = 1, 0.75  # the level of compression of ``history.npz``, and what it
 NEEDED = ("summary.json", "config.yaml", "history.npz", "landmarks.csv")
 
 
-def seconds(t_ns: int) -> str:
-    """Return nanoseconds as seconds with nine decimals, exactly (a float would lose up to 256 ns)."""
-    whole, rest = divmod(abs(int(t_ns)), 1_000_000_000)
-    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
-
-
 def tum(history: History, robot: str) -> str:
     """Return a robot's path after each of its scans as TUM lines: t x y z qx qy qz qw."""
     mine = history.robot == robot
-    lines = ["# t_s x_m y_m z_m qx qy qz qw"]
-    poses = fitted(history.poses[mine], 7).tolist()
-    for t_ns, (x, y, z, *q) in zip(history.t_ns[mine].tolist(), poses, strict=True):
-        lines.append(f"{seconds(t_ns)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
-    return "\n".join(lines) + "\n"
+    return tum_text(history.t_ns[mine], history.poses[mine])
 
 
 def associations_csv(history: History) -> str:

@@ -1,0 +1,211 @@
+"""Read a graph of poses and landmarks as g2o writes it: the chain of its odometry, and the observations of landmarks.
+
+======================  =====================================================  =====================================
+line                    numbers                                                in the log
+======================  =====================================================  =====================================
+`VERTEX_SE2`            id x y theta                                           a pose; with `vertices: truth` true
+`VERTEX_SE3:QUAT`       id x y z qx qy qz qw                                   the same in space
+`VERTEX_XY`             id x y                                                 a landmark; the same
+`VERTEX_TRACKXYZ`       id x y z                                               the same in space
+`EDGE_SE2`              i j dx dy dtheta, 6 of information                     the increment from a pose to the next
+`EDGE_SE3:QUAT`         i j x y z qx qy qz qw, 21 of information               the same in space
+`EDGE_SE2_XY`           i l x y, 3 of information                              an observation, x and y in pose i
+`EDGE_SE3_TRACKXYZ`     i l p x y z, 6 of information                          the same in space, sensor offset p
+`PARAMS_SE3OFFSET`      p x y z qx qy qz qw                                    the mount of the sensor
+======================  =====================================================  =====================================
+
+Poses have no times: in the order of their ids they are one second apart.  An edge between poses that do not follow each
+other, a loop that something else has closed, is nothing that a filter of events can take; it is left out and counted.
+
+Information matrices are upper triangles.  g2o's errors of an edge are in the frame where it ends, and those of a turn
+in space the vector part of a quaternion, half an angle (`EdgeSE3::computeError`).  So the covariance of an increment u
+is J C J^T, J = [R(u) 0; 0 1] in the plane, [R(u) 0; 0 2 Jr(u)^-1] in space, with the right Jacobian Jr of its rotation.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import LogError
+from kalmark.events import Control, Event, Id, Scan
+from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix
+from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.source import (
+    STEP_NS,
+    Format,
+    Request,
+    choice,
+    landmark_id,
+    number,
+    one_robot,
+    placed,
+    rows,
+)
+
+ROBOT, SENSOR = "robot", "sensor"
+INCREMENT2, INCREMENT3 = ("dx_m", "dy_m", "dtheta_rad"), ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+POSITION = ("x_m", "y_m", "z_m")
+LENGTH = 1e-3
+POSES = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
+PLACES = {"VERTEX_XY": 2, "VERTEX_TRACKXYZ": 3}
+EDGES = {"EDGE_SE2": (3, 3), "EDGE_SE3:QUAT": (7, 6)}  # numbers, and the size of their information
+SIGHTS = {"EDGE_SE2_XY": 2, "EDGE_SE3_TRACKXYZ": 3}
+OFFSET = "PARAMS_SE3OFFSET"
+IGNORED = ("FIX",)
+TAGS = (*POSES, *PLACES, *EDGES, *SIGHTS, OFFSET, *IGNORED)
+
+
+@dataclass
+class Graph:
+    """What the lines of a file have: poses, places and edges, by ids."""
+
+    poses: dict[int, Array] = field(default_factory=dict)
+    places: dict[Id, Array] = field(default_factory=dict)
+    moves: dict[tuple[int, int], tuple[Array, Array]] = field(default_factory=dict)
+    sights: dict[int, list[tuple[Id, Array, Array]]] = field(default_factory=dict)
+    offset: Array | None = None
+    left_out: Counter[str] = field(default_factory=Counter)
+
+
+def information(cells: list[str], size: int) -> Array:
+    """Return the covariance (size, size) whose inverse has this upper triangle.  Raises ValueError."""
+    if len(cells) != size * (size + 1) // 2:
+        raise ValueError(f"{len(cells)} numbers of information, expected {size * (size + 1) // 2}")
+    H = np.zeros((size, size))
+    H[np.triu_indices(size)] = [number(cell) for cell in cells]
+    H = H + np.triu(H, 1).T
+    np.linalg.cholesky(H)  # its LinAlgError is a ValueError
+    C = np.linalg.inv(H)
+    return np.asarray((C + C.T) / 2)
+
+
+def pose(cells: list[str]) -> Array:
+    """Return a pose (3,) or (7,), its quaternion normalised.  Raises ValueError."""
+    values = np.array([number(cell) for cell in cells])
+    if len(values) == 7:
+        norm = float(np.linalg.norm(values[3:]))
+        if abs(norm - 1) > LENGTH:
+            raise ValueError(f"quaternion has length {norm:.6g}, expected 1")
+        values[3:] /= norm
+    return values
+
+
+def pose_id(text: str) -> int:
+    """Return the id of a pose, by which they are in order.  Raises ValueError."""
+    found = landmark_id(text)
+    if not isinstance(found, int):
+        raise ValueError(f"id {text!r} of a pose, expected a whole number")
+    return found
+
+
+def control(step: Array, C: Array) -> tuple[Array, Array]:
+    """Return the increment of an edge (3,) or (7,), and its covariance from that of the edge's errors."""
+    if len(step) == 3:
+        c, s = np.cos(step[2]), np.sin(step[2])
+        J = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return step, J @ C @ J.T
+    turn, J = log(step[3:].copy()), np.zeros((6, 6))
+    J[:3, :3], J[3:, 3:] = matrix(step[3:].copy()), 2 * left_jacobian_inverse(-turn)
+    return np.append(step[:3], turn), J @ C @ J.T
+
+
+def take(graph: Graph, tag: str, cells: list[str]) -> None:
+    """Take one line.  Raises ValueError."""
+    if tag in POSES or tag in PLACES:
+        size = POSES.get(tag) or PLACES[tag]
+        if len(cells) != size + 1:
+            raise ValueError(f"{len(cells)} cells, expected an id and {size} numbers")
+        if tag in POSES:
+            graph.poses[pose_id(cells[0])] = pose(cells[1:])
+        else:
+            graph.places[landmark_id(cells[0])] = np.array([number(cell) for cell in cells[1:]])
+    elif tag in EDGES:
+        size, errors = EDGES[tag]
+        a, b = map(pose_id, cells[:2])
+        step, C = control(pose(cells[2 : 2 + size]), information(cells[2 + size :], errors))
+        if (a, b) in graph.moves:
+            graph.left_out[f"{tag} lines of a pair of poses that has one already"] += 1
+        graph.moves.setdefault((a, b), (step, C))
+    elif tag in SIGHTS:
+        size, first = SIGHTS[tag], 2 if tag == "EDGE_SE2_XY" else 3
+        y = np.array([number(cell) for cell in cells[first : first + size]])
+        C = information(cells[first + size :], size)
+        if len(y) != size:
+            raise ValueError(f"{len(cells)} cells, expected {first} ids, a position and its information")
+        graph.sights.setdefault(pose_id(cells[0]), []).append((landmark_id(cells[1]), y, C))
+    elif tag == OFFSET:
+        if graph.offset is not None and not np.array_equal(graph.offset, pose(cells[1:])):
+            raise ValueError("a second offset, expected one sensor")
+        graph.offset = pose(cells[1:])
+    elif tag not in IGNORED:
+        graph.left_out[f"{tag} lines, which are not read"] += 1
+
+
+def read(path: Path, request: Request, vertices: Any = None) -> Log:
+    """Return the log; with `vertices` "truth" the vertices are the true poses and landmarks, else they are not used."""
+    graph = Graph()
+    for line, (tag, *cells) in rows(path):
+        try:
+            take(graph, tag, cells)
+        except (ValueError, IndexError) as error:
+            request.refuse(f"{path}:{line}: {tag}: {' '.join(str(error).split())}, expected {WHAT}")
+    ids = sorted({*graph.poses, *graph.sights, *(one for pair in graph.moves for one in pair)})
+    for reason, count in sorted(graph.left_out.items()):
+        request.leave_out(count, f"{path}: {count} {reason}")
+    return _log(path, request, graph, ids, choice(vertices or "none", "vertices", ("none", "truth")) == "truth")
+
+
+def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool) -> Log:
+    """Return the log of a graph whose poses have these ids, in order."""
+    space = any(len(u) == 6 for u, _ in graph.moves.values()) or any(len(p) == 7 for p in graph.poses.values())
+    size, d = (6, 3) if space else (3, 2)
+    t_ns = {one: k * STEP_NS for k, one in enumerate(ids)}
+    events: list[Event] = []
+    for a, b in pairwise(ids):
+        if (a, b) not in graph.moves:
+            raise LogError(f"{path}: no edge from pose {a} to pose {b}, expected one from each pose to the next")
+        u, C = graph.moves[a, b]
+        if len(u) != size:
+            raise LogError(f"{path}: edges of the plane and of space, expected one kind")
+        events.append(Control(t_ns=t_ns[b], robot=ROBOT, u=u, cov=C))
+    loops = len(graph.moves) - max(len(ids) - 1, 0)
+    if loops:
+        request.leave_out(loops, f"{path}: {loops} edges between poses that do not follow each other")
+    for at, seen in graph.sights.items():
+        first = {one: (y, C) for one, y, C in reversed(seen)}
+        if len(first) < len(seen):
+            twice = len(seen) - len(first)
+            request.leave_out(twice, f"{path}: {twice} observations of a landmark that pose {at} has already")
+        if any(len(y) != d for y, _ in first.values()):
+            raise LogError(f"{path}: pose {at} has observations of another world, expected positions of {d} numbers")
+        y, cov = [y for y, _ in first.values()], [C for _, C in first.values()]
+        events.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=SENSOR, y=y, ids=[*first], cov=cov))
+    sensor: dict[str, Any] = {"type": "position_3d" if space else "position"}
+    if graph.offset is not None:
+        sensor["mount"] = placed(graph.offset)
+    told: dict[str, Any] = {"motion": {"type": "odometry_3d" if space else "odometry_2d"}}
+    if graph.sights:
+        told["sensors"] = {SENSOR: sensor}
+    rest: dict[str, Any] = {"describes": {"robots": {ROBOT: told}}, "name": path.stem}
+    if true and graph.poses:
+        known = sorted(graph.poses)
+        path_ = Trajectory(np.array([t_ns[one] for one in known]), np.array([graph.poses[one] for one in known]))
+        rest |= {"truth": {ROBOT: path_}, "landmarks": graph.places}
+    columns = {SENSOR: POSITION[:d]} if graph.sights else {}
+    return one_robot("g2o", path, request, ROBOT, events, INCREMENT3 if space else INCREMENT2, columns, **rest)
+
+
+def find(path: Path) -> Path | None:
+    """Return the file if it is one of g2o: by its ending."""
+    return path if path.is_file() and path.suffix == ".g2o" else None
+
+
+WHAT = "a line of g2o with poses, landmarks or edges between them, information matrices positive definite"
+G2O = Format("g2o", "a graph of poses and landmarks, .g2o", find, read, options=("vertices",))

@@ -1,0 +1,156 @@
+"""Poses as TUM and KITTI have them: read as a path, written from one.
+
+TUM: rows ``t x y z qx qy qz qw`` (s, m).  KITTI: rows of twelve numbers, [R | t] row by row, without times, which are
+one a line in ``NAME_times.txt`` or ``times.txt`` beside the poses.  Poses of the plane are at z = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import LogError
+from kalmark.geometry.rotations import matrix
+from kalmark.logs.log import Log, Times, Trajectory
+from kalmark.logs.source import (
+    Format,
+    Request,
+    frame,
+    is_number,
+    nanoseconds,
+    number,
+    read_text,
+    rows,
+    seconds,
+    timed_rows,
+)
+
+ROBOT = "robot"
+TUM_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+TUM_CELLS, KITTI_CELLS = 8, 12
+ENDINGS = (".tum", ".kitti", ".txt")
+LENGTH = 1e-3  # a quaternion is of length 1, and a matrix a rotation, up to this: the files are rounded
+
+
+def find(path: Path, cells: int) -> Path | None:
+    """Return the file if its first row has so many numbers."""
+    if not path.is_file() or path.suffix not in ENDINGS:
+        return None
+    with path.open("rb") as stream:
+        begin = stream.read(8192).decode("utf-8", "replace").splitlines()
+    first = next((line.split() for line in begin if line.strip() and not line.lstrip().startswith("#")), [])
+    return path if len(first) == cells and all(map(is_number, first)) else None
+
+
+def read_path(path: Path, request: Request) -> Trajectory:
+    """Return the poses of a file of TUM or KITTI.  Raises LogError, with file and line."""
+    for entry, reader in ((TUM, tum_rows), (KITTI, kitti_rows)):
+        if entry.find(path) is not None:
+            found = dict(reader(path, request))
+            if not found:
+                raise LogError(f"{path}: no pose that can be used, expected {entry.what}")
+            return Trajectory(np.array([*found]), np.array([*found.values()]))
+    raise LogError(f"{path}: no file of poses, expected {TUM.what}, or {KITTI.what}")
+
+
+def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
+    """Yield times (ns), which increase, and poses (7,)."""
+    last_ns = None
+    for line, t_ns, values in timed_rows(path, TUM_COLUMNS, request.refuse):
+        norm = float(np.linalg.norm(values[3:]))
+        if abs(norm - 1) > LENGTH:
+            request.refuse(f"{path}:{line}: quaternion has length {norm:.6g}, expected 1")
+        elif t_ns == last_ns:
+            request.refuse(f"{path}:{line}: time {seconds(t_ns)} s twice, expected increasing times")
+        else:
+            last_ns = t_ns
+            yield t_ns, np.append(values[:3], np.array(values[3:]) / norm)
+
+
+def kitti_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
+    """Yield times (ns), which increase, and poses (7,)."""
+    lines = list(rows(path))
+    t_ns = kitti_times(path)
+    if len(t_ns) != len(lines):
+        raise LogError(f"{path}: {len(lines)} poses and {len(t_ns)} times, expected as many")
+    for k, (line, cells) in enumerate(lines):
+        try:
+            M = np.array([number(cell) for cell in cells]).reshape(3, 4)
+        except ValueError:
+            request.refuse(f"{path}:{line}: {len(cells)} cells, expected {KITTI_CELLS} finite numbers")
+            continue
+        R = M[:, :3]
+        off = float(np.abs(R @ R.T - np.eye(3)).max())
+        if off > LENGTH or np.linalg.det(R) < 0:
+            request.refuse(f"{path}:{line}: the first three columns are no rotation (off by {off:.2g}), expected one")
+        elif k and t_ns[k] <= t_ns[k - 1]:
+            request.refuse(f"{path}:{line}: its time is not after the one before, expected increasing times")
+        else:
+            yield int(t_ns[k]), frame(M[:, 3], R)
+
+
+def times_beside(path: Path) -> Path:
+    """Return the file of the times of a file of KITTI."""
+    return path.with_name(f"{path.stem}_times.txt")
+
+
+def kitti_times(path: Path) -> Times:
+    """Return the times (N,) ns of a file of KITTI.  Raises LogError."""
+    own, shared = times_beside(path), path.with_name("times.txt")
+    file = own if own.is_file() else shared
+    if not file.is_file():
+        raise LogError(f"{path}: KITTI's poses have no times, expected them in {own.name} or {shared.name} beside it")
+    out = []
+    for line, text in enumerate(read_text(file).split("\n"), 1):
+        try:
+            out += [nanoseconds(text.strip())] if text.strip() else []
+        except ValueError:
+            raise LogError(f"{file}:{line}: {text.strip()!r}, expected a time in s") from None
+    return np.array(out, dtype=np.int64)
+
+
+# ------------------------------------------------------------------ to text
+def in_space(poses: Array) -> Array:
+    """Return poses (N, 3) or (N, 7) as those of space (N, 7), at z = 0."""
+    if poses.shape[1] == len(TUM_COLUMNS):
+        return poses
+    flat, half = np.zeros(len(poses)), poses[:, 2] / 2
+    return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
+
+
+def tum_text(t_ns: Times, poses: Array) -> str:
+    """Return a path, poses (N, 3) or (N, 7), as TUM lines: t x y z qx qy qz qw."""
+    lines = ["# t_s x_m y_m z_m qx qy qz qw"]
+    for t, (x, y, z, *q) in zip(t_ns.tolist(), in_space(poses).tolist(), strict=True):
+        lines.append(f"{seconds(t)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
+    return "\n".join(lines) + "\n"
+
+
+def write_path(out: Path, t_ns: Times, poses: Array) -> list[Path]:
+    """Write a path as TUM, or as KITTI with its times beside it, by the file's ending; return the files."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".tum":
+        out.write_text(tum_text(t_ns, poses), encoding="utf-8")
+        return [out]
+    lines = []
+    for pose in in_space(poses):
+        M = np.column_stack([matrix(np.ascontiguousarray(pose[3:])), pose[:3]])
+        lines.append(" ".join(f"{value:.12g}" for value in M.ravel()))
+    out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    times_beside(out).write_text("".join(f"{seconds(int(t))}\n" for t in t_ns), encoding="utf-8")
+    return [out, times_beside(out)]
+
+
+# ------------------------------------------------------------------ as logs: truth alone
+def read(path: Path, request: Request) -> Log:
+    """Return a log that has true poses only."""
+    kind = "tum" if TUM.find(path) is not None else "kitti"
+    return Log(path.stem, (ROBOT,), [], kind, path, truth={ROBOT: read_path(path, request)}, skipped=request.skipped)
+
+
+TUM = Format("tum", "poses as TUM has them, rows t x y z qx qy qz qw", partial(find, cells=TUM_CELLS), read)
+KITTI = Format("kitti", "poses as KITTI has them, rows of 12 numbers", partial(find, cells=KITTI_CELLS), read)

@@ -1,0 +1,73 @@
+"""A run as poses of TUM and KITTI, and as a graph of g2o."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from command_line import Kalmark, write_log, write_log_of_space
+from kalmark.config import build_slam, open_run
+from kalmark.logs.poses import in_space, read_path
+from kalmark.logs.source import Request, raising
+from kalmark.results.record import record
+from kalmark.results.run import Run
+
+REQUEST = Request(None, raising, [])
+OWN = (
+    "log: {path: log}\nrobots: {each: {sensors: {lidar: {type: range_bearing, mount: {x_m: 0.1, theta_rad: 0.2}}}}}\n",
+    "log: {path: log}\nrobots: {each: {motion: {type: odometry_3d}, sensors: {lidar: {type: range_bearing_3d, "
+    "mount: {z_m: 0.5}}}}}\n",
+)
+
+
+def test_a_run_s_path_is_written_and_scored_by_files_of_poses(kalmark: Kalmark, tmp_path: Path) -> None:
+    write_log(tmp_path / "log")
+    text = (tmp_path / "config.yaml").write_text
+    assert kalmark("convert", "log", "truth.kitti").status == 0
+    text("log: {path: log, truth: truth.kitti}\nrobots: {each: {sensors: {lidar: {type: range_bearing}}}}\n")
+    done = kalmark("run", "config.yaml", "--out", "run")
+    assert done.status == 0, done.err
+    for name in ("path.tum", "path.kitti"):
+        assert kalmark("convert", "run", name).status == 0
+        found = read_path(tmp_path / name, REQUEST)
+        history = Run.load(tmp_path / "run").history
+        np.testing.assert_allclose(found.poses[:, :3], in_space(history.poses)[:, :3], atol=1e-8)
+    assert (tmp_path / "path.tum").read_text() == (tmp_path / "run" / "trajectory_rover.tum").read_text()
+    scored = kalmark("evaluate", "run", "--truth", "path.tum")
+    assert scored.status == 0 and "0.000" in scored.out
+    again = kalmark("convert", "run", "path.tum")
+    assert again.status == 2 and "exists already" in again.err
+    assert "expected one, or --robot" in kalmark("convert", "run", "b.tum", "--robot", "nobody").err
+    alone = kalmark("run", "native", "--log", "path.tum", "--set", "log.format=tum")
+    assert alone.status == 2 and "true poses alone, expected a log with events" in alone.err
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_a_run_comes_back_from_its_graph_with_the_same_map(space: bool, kalmark: Kalmark, tmp_path: Path) -> None:
+    """Fused again, increments and observations give nearly the same: steps are joined, polar noise linearised."""
+    (write_log_of_space if space else write_log)(tmp_path / "log")
+    (tmp_path / "own.yaml").write_text(OWN[space])
+    assert kalmark("run", "own.yaml", "--out", "run").status == 0
+    done = kalmark("convert", "run", "run.g2o")
+    assert done.status == 0, done.err
+    before = Run.load(tmp_path / "run")
+    (tmp_path / "config.yaml").write_text("log: {path: run.g2o, vertices: truth}\nestimator: {type: ekf}\n")
+    config, graph = open_run(tmp_path / "config.yaml")
+    run = record(build_slam(config, graph), graph, progress=False)
+    assert len(run.landmarks) == len(before.landmarks) == len(graph.landmarks) > 0
+    lines = [line.split() for line in (tmp_path / "run.g2o").read_text().splitlines() if line.startswith("# landmark")]
+    names = {int(cells[2]): cells[4] for cells in lines}
+    own = {
+        str(i): (mean, P)
+        for i, mean, P in zip(before.landmarks.ids, before.landmarks.means, before.landmarks.covariances, strict=True)
+    }
+    for number, mean, P in zip(run.landmarks.ids, run.landmarks.means, run.landmarks.covariances, strict=True):
+        true, spread = own[names[number]]
+        np.testing.assert_allclose(graph.landmarks[number], true)
+        sigma = np.sqrt(np.linalg.eigvalsh(spread)[-1])
+        np.testing.assert_allclose(mean, true, atol=0.5 * sigma + 1e-3)
+        np.testing.assert_allclose(np.linalg.eigvalsh(P)[-1], sigma**2, rtol=0.3)
+    refused = kalmark("convert", "log", "log.g2o")
+    assert refused.status == 2 and "not the folder of a run" in refused.err
