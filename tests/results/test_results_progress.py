@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from kalmark.results.progress import track
+from kalmark.logs.progress import track
 
 
 def test_quick_things_show_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,11 +29,11 @@ from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.spaces import SE2
 from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.progress import track
 from kalmark.models.observe import composed
 from kalmark.models.protocols import calibrating
 from kalmark.report import Report
 from kalmark.results.landmarks import MapLandmarks, refuse_other_than_points
-from kalmark.results.progress import track
 from kalmark.results.recording import config_yaml
 from kalmark.results.warnings import NO_ID
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start, told

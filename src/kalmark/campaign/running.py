@@ -30,7 +30,7 @@ from kalmark.config.reading import did_you_mean, validate
 from kalmark.config.schema import Config
 from kalmark.config.tree import Tree
 from kalmark.errors import ConfigError, KalmarkError
-from kalmark.results.progress import track
+from kalmark.logs.progress import track
 from kalmark.simulate.robots import simulation
 from kalmark.simulate.worlds import World
 

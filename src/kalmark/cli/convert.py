@@ -31,6 +31,7 @@ def convert(
     ],
     log_format: Annotated[str | None, typer.Option("--format", help="Format of IN, if not recognised.")] = None,
     robot: Annotated[str | None, typer.Option(help="Of this robot's path: .tum, .kitti.")] = None,
+    parquet: Annotated[bool, typer.Option("--parquet", help="Write a folder of Parquet files instead of CSV.")] = False,
 ) -> None:
     """Write a log as a native one, a folder of CSV files; with its results as MCAP or g2o; a path as TUM or KITTI."""
     from kalmark.logs import write_native
@@ -53,7 +54,7 @@ def convert(
         counts = export(out, log, run)
         typer.echo(f"{out}: {sum(counts.values())} messages on {', '.join(sorted(counts))}")
     elif log is not None:
-        write_native(log, out)
+        write_native(log, out, parquet=parquet)
     if log is not None:
         typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}, read as {log.format}")
 
@@ -101,5 +102,5 @@ def _read(source: Path, log_format: str | None) -> tuple[Log | None, Run | None]
     if source.suffix in (".yaml", ".yml"):
         from kalmark.config import open_run
 
-        return open_run(source)[1], None
-    return open_log(source, log_format), None
+        return open_run(source, progress=True)[1], None
+    return open_log(source, log_format, progress=True), None

@@ -38,7 +38,7 @@ def run_log(
     from kalmark.results.record import record
 
     override = [] if on_error is None else [f"log.on_error={on_error}"]
-    config, log = cfg.open_run(config_path, log_path, [*overrides, *override])
+    config, log = cfg.open_run(config_path, log_path, [*overrides, *override], progress=True)
     slam = cfg.build_slam(config, log)
     return record(slam, log, progress=progress, on_error=config.log.on_error, config=cfg.config_dict(config))
 

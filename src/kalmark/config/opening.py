@@ -19,7 +19,11 @@ EACH = "each"
 
 
 def open_run(
-    path_or_name: str | Path, log_path: str | Path | None = None, overrides: Sequence[str] = ()
+    path_or_name: str | Path,
+    log_path: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    progress: bool = False,
 ) -> tuple[Config, Log]:
     """Return a configuration as it is in force, and the log it names, or the one at `log_path` read in the same way.
 
@@ -30,7 +34,7 @@ def open_run(
     tree = read_tree(path, overrides)
     values = {key: value for key, value in tree.values.items() if key in ("log", "plugins")}
     alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
-    log = open_config_log(alone)
+    log = open_config_log(alone, progress=progress)
     refuse_idle(tree, log)
     config = config_of(laid_over(tree, log), path)
     found = {"known": str(known_path(config))} if config.map.known not in (None, TRUTH) else {}
@@ -62,13 +66,13 @@ def in_force(config: Config, log_path: str | Path | None = None) -> Config:
     return config.model_copy(update={"log": log})
 
 
-def open_config_log(config: Config, log_path: str | Path | None = None) -> Log:
+def open_config_log(config: Config, log_path: str | Path | None = None, *, progress: bool = False) -> Log:
     """Return the log that a configuration names, or the one at `log_path` read in the same way."""
     log, path = config.log, find_log(config, log_path)
     check_format(config, path)
     common = log.model_dump(include={*COMMON})
     common |= {name: beside(config, common[name]) for name in ("truth", "fixes")}
-    found = open_log(path, log.format, **common, **log.options())
+    found = open_log(path, log.format, **common, **log.options(), progress=progress)
     if not found.events:
         raise LogError(f"{path}: true poses alone, expected a log with events; as `log.truth` it scores one")
     return found

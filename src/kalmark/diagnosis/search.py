@@ -13,7 +13,7 @@ from kalmark.batch.state import LANDMARKS, looked
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import Finding, Where
 from kalmark.diagnosis.linear import Linear
-from kalmark.results.progress import track
+from kalmark.logs.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
 ROUNDS, MORE = 6, 14  # in which all that is sure is taken out, and further ones for what explains this

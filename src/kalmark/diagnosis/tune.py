@@ -34,9 +34,9 @@ from kalmark.diagnosis.search import LEAST_GAIN
 from kalmark.diagnosis.verdict import NEAR, calibrated, sensors_of
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
+from kalmark.logs.progress import track
 from kalmark.results.batch import given_by
 from kalmark.results.measures import nis
-from kalmark.results.progress import track
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.warnings import Window, nis_windows

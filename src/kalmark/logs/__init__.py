@@ -2,6 +2,7 @@
 
 from kalmark.logs.download import Dataset, cache_folder, fetch, find_data, list_data
 from kalmark.logs.formats import FORMATS, open_log
+from kalmark.logs.frames import log_from
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.write import write_native
 
@@ -15,6 +16,7 @@ __all__ = [
     "fetch",
     "find_data",
     "list_data",
+    "log_from",
     "open_log",
     "write_native",
 ]

@@ -47,6 +47,7 @@ def open_log(
     truth: Path | str | Mapping[str, Path | str] | None = None,
     fixes: Path | str | Mapping[str, Path | str] | None = None,
     sigma_fixes_m: float | None = None,
+    progress: bool = False,
     **options: Any,
 ) -> Log:
     """Read the log at `path`, a folder or file of any known format.
@@ -56,19 +57,30 @@ def open_log(
     `ids="hidden"` no scan says which landmark is which; `log.true_ids` does.
     `truth` and `fixes` are files of poses in the formats of TUM or KITTI, by robot if there are several: true poses to
     score against, and positions for the filter with the noise `sigma_fixes_m`.
+    With `progress` tables that take longer than two seconds show a bar on standard error.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
     Raises LogError, with ``file:line:`` for a bad row.
     """
-    skipped: list[str] = []
-    refuse = raising if choice(on_error, "on_error", ("raise", "skip")) == "raise" else skipped.append
     entry, found = recognise(find_data(path), format)
     for name in options:
         if name not in entry.options:
             wanted = f"{', '.join(entry.options) or 'none'}{nearest(name, entry.options)}"
             raise LogError(f"log option {name!r} is unknown to {entry.name}, expected {wanted}")
-    request = Request(robot_names(robots, entry), refuse, skipped)
+    request = requested(robot_names(robots, entry.robot_prefix), on_error, progress)
     log = entry.read(found, request, **options)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m)
+    return selected(log, request, from_s, to_s, ids)
+
+
+def requested(robots: tuple[str, ...] | None, on_error: str, progress: bool = False) -> Request:
+    """Return what the caller asked for.  Raises LogError."""
+    skipped: list[str] = []
+    refuse = raising if choice(on_error, "on_error", ("raise", "skip")) == "raise" else skipped.append
+    return Request(robots, refuse, skipped, progress)
+
+
+def selected(log: Log, request: Request, from_s: float | None, to_s: float | None, ids: str) -> Log:
+    """Return the robots, the time and the ids of a log that were asked for.  Raises LogError."""
     log = between(keep_robots(log, request), from_s, to_s)
     return hide_ids(log) if choice(ids, "ids", ("given", "hidden")) == "hidden" else log
 
@@ -126,13 +138,13 @@ def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
     raise LogError(f"{path}: no known log format, expected one of {known}{hint}")
 
 
-def robot_names(robots: Any, entry: Format) -> tuple[str, ...] | None:
+def robot_names(robots: Any, prefix: str = "") -> tuple[str, ...] | None:
     """Return the names of the robots asked for; a number is put behind the format's prefix."""
     if robots is None:
         return None
     if isinstance(robots, str | int):
         robots = [robots]
-    names = (f"{entry.robot_prefix}{robot}" if str(robot).isdecimal() else str(robot) for robot in robots)
+    names = (f"{prefix}{robot}" if str(robot).isdecimal() else str(robot) for robot in robots)
     return tuple(dict.fromkeys(names))
 
 
@@ -143,13 +155,13 @@ def keep_robots(log: Log, request: Request) -> Log:
     for robot in request.robots:
         if robot not in log.robots:
             hint = nearest(robot, log.robots)
-            raise LogError(f"{log.path}: no robot {robot!r}, expected one of {', '.join(log.robots)}{hint}")
+            raise LogError(f"{log.path or log.name}: no robot {robot!r}, expected one of {', '.join(log.robots)}{hint}")
     others = set(MRCLAM_ROBOTS if log.format == MRCLAM.name else log.robots) - set(request.robots)
     left_out: Counter[str] = Counter()
     kept = (without(event, others, left_out) for event in log if event.robot in request.robots)
     events = [event for event in kept if event is not None]
     for robot, count in sorted(left_out.items()):
-        request.leave_out(count, f"{log.path}: {count} sightings of {robot}, which was not asked for")
+        request.leave_out(count, f"{log.path or log.name}: {count} sightings of {robot}, which was not asked for")
     names, rig = request.robots, log.describes
     if "robots" in rig:
         rig = rig | {"robots": kept_of(rig["robots"], (*names, "each"))}
@@ -184,7 +196,7 @@ def between(log: Log, from_s: float | None, to_s: float | None) -> Log:
     if not log.events and log.format in (TUM.name, KITTI.name):
         return log
     if not log.events:
-        raise LogError(f"{log.path}: no event that can be used, expected controls and scans")
+        raise LogError(f"{log.path or log.name}: no event that can be used, expected controls and scans")
     if from_s is None and to_s is None:
         return log
     start = log.events[0].t_ns
@@ -193,7 +205,9 @@ def between(log: Log, from_s: float | None, to_s: float | None) -> Log:
     events = [event for event in log if low <= event.t_ns <= high]
     if not events:
         length = (log.events[-1].t_ns - start) * 1e-9
-        raise LogError(f"{log.path}: no event from {from_s} to {to_s} s, expected times within 0 to {length:.9g} s")
+        raise LogError(
+            f"{log.path or log.name}: no event from {from_s} to {to_s} s, expected times within 0 to {length:.9g} s"
+        )
     return replace(log, events=events)
 
 

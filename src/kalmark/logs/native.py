@@ -32,7 +32,7 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Id, Scan, order, shown
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
-from kalmark.logs.table import CONTROL, OBSERVATION, READING, Refused, Row, read_table
+from kalmark.logs.table import CONTROL, OBSERVATION, PARQUET, READING, Refused, Row, Sheet, read_table
 
 RIG = "rig.yaml"
 FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv")
@@ -51,27 +51,46 @@ NEAR = 0.65  # of difflib's ratio
 
 def read(path: Path, request: Request) -> Log:
     """Return the native log in a folder.  Raises LogError with file and line."""
-    if not any((path / name).is_file() for name in EVENTS):
+    there = tables(path)
+    if not {*EVENTS} & there.keys():
         raise LogError(
             f"{path}: no controls.csv, scans.csv, fixes.csv or measurements.csv, expected at least one of them"
         )
     others = [file.name for file in path.glob("*.csv") if file.name not in FILES]
     for name in FILES:
-        near = [] if (path / name).is_file() else get_close_matches(name, others, n=1, cutoff=0.85)
+        near = [] if name in there else get_close_matches(name, others, n=1, cutoff=0.85)
         if near:
             raise LogError(f"{path / near[0]}: a file of this name is not read, expected {name}")
+    return of_tables(there, request, path.name, path, read_rig(path / RIG) if (path / RIG).is_file() else {})
+
+
+def tables(path: Path) -> dict[str, Path]:
+    """Return the tables in a folder by the names of their CSV files.  Raises LogError if one is there twice."""
+    found: dict[str, Path] = {}
+    for name in FILES:
+        same = [file for file in (path / name, (path / name).with_suffix(PARQUET)) if file.is_file()]
+        if len(same) > 1:
+            raise LogError(f"{same[1]}: beside {name}, expected one of them")
+        if same:
+            found[name] = same[0]
+    return found
+
+
+def of_tables(
+    there: Mapping[str, Path | Sheet], request: Request, called: str, path: Path | None, describes: dict[str, Any]
+) -> Log:
+    """Return the log of tables, by the names of their CSV files.  Raises LogError with file and line."""
     reader = _Reader(request)
     for name, read_file in zip(FILES, reader.readers, strict=True):
-        if (path / name).is_file():
-            read_file(path / name)
-    describes = read_rig(path / RIG) if (path / RIG).is_file() else {}
+        if name in there:
+            read_file(there[name])
     seen = {name for event in reader.events if isinstance(event, Scan) for name in event.ids or ()}
     known = {*reader.truth, *describes.get("robots", ()), *map(str, seen)}
     strays = refuse_misspelt(reader.places, known, request)
     events = [event for event in reader.events if event.robot not in strays]
     columns = {key: names for key, names in reader.columns.items() if key[0] not in strays}
     return Log(
-        name=path.name, path=path, robots=tuple(dict.fromkeys(event.robot for event in events)),
+        name=called, path=path, robots=tuple(dict.fromkeys(event.robot for event in events)),
         events=sorted(events, key=order), truth=reader.truth, landmarks=reader.landmarks, gps=reader.gps,
         skipped=request.skipped, describes=describes,
         control_columns={robot: names for (robot, sensor), names in columns.items() if not sensor},
@@ -96,6 +115,7 @@ def read_rig(path: Path) -> dict[str, Any]:
 class _Rows:
     """Gather the observations of one scan; a bad row refuses the whole scan, an empty one says it saw nothing."""
 
+    t_ns: int
     y: list[list[float]] = field(default_factory=list)
     ids: list[Id | None] = field(default_factory=list)
     covs: list[Array | None] = field(default_factory=list)
@@ -127,7 +147,7 @@ class _Reader:
         """Note where the controls, fixes or scans of a row begin."""
         self.places.setdefault((row.table.path, *row.key), row.line)
 
-    def controls(self, path: Path) -> None:
+    def controls(self, path: Path | Sheet) -> None:
         """Read `controls.csv`."""
 
         def take(row: Row) -> None:
@@ -138,13 +158,16 @@ class _Reader:
 
         read_table(path, ("t_s", "robot"), known=CONTROL).each(self.request, take)
 
-    def scans(self, path: Path) -> None:
+    def scans(self, path: Path | Sheet) -> None:
         """Read `scans.csv`: one scan a robot, sensor and time."""
-        scans: dict[tuple[int, str, str], _Rows] = {}
+        scans: dict[tuple[str, str], _Rows] = {}  # those that may still get rows: of each sensor the last
 
         def take(row: Row) -> None:
             self.note(row)
-            rows = scans.setdefault((row.t_ns, *row.key), _Rows())
+            rows = scans.get(row.key)
+            if rows is None or rows.t_ns != row.t_ns:
+                self.close(path, row.key, rows)
+                rows = scans[row.key] = _Rows(row.t_ns)
             try:
                 self.add(rows, row)
             except Refused:
@@ -153,14 +176,21 @@ class _Reader:
 
         table = read_table(path, ("t_s", "robot", "sensor", "id"), known=(*CONTROL, *OBSERVATION, *READING))
         table.each(self.request, take, by_sensor=True)
-        for (t_ns, robot, sensor), rows in scans.items():
-            if rows.bad:
-                line = f"{path}: scan of {robot} by {sensor} at t={seconds(t_ns)} s, all of it"
-                self.request.leave_out(len(rows.lines), line)
-                continue
-            covs = [cov for cov in rows.covs if cov is not None]
-            cov = np.array(covs) if covs else None
-            self.events.append(Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov))
+        for key, rows in scans.items():
+            self.close(path, key, rows)
+
+    def close(self, path: Path | Sheet, key: tuple[str, str], rows: _Rows | None) -> None:
+        """Make an event of the rows of a scan, which has no more."""
+        if rows is None:
+            return
+        robot, sensor = key
+        if rows.bad:
+            line = f"{path}: scan of {robot} by {sensor} at t={seconds(rows.t_ns)} s, all of it"
+            self.request.leave_out(len(rows.lines), line)
+            return
+        covs = [cov for cov in rows.covs if cov is not None]
+        cov = np.array(covs) if covs else None
+        self.events.append(Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov))
 
     def add(self, rows: _Rows, row: Row) -> None:
         """Add one row of `scans.csv` to its scan.  Raises Refused."""
@@ -182,7 +212,7 @@ class _Reader:
         rows.covs.append(cov)
         rows.lines.append(row.line)
 
-    def measurements(self, path: Path) -> None:
+    def measurements(self, path: Path | Sheet) -> None:
         """Read `measurements.csv`: one reading a row."""
 
         def take(row: Row) -> None:
@@ -194,7 +224,7 @@ class _Reader:
         table = read_table(path, ("t_s", "robot", "sensor"), known=(*CONTROL, *OBSERVATION, *READING))
         table.each(self.request, take, by_sensor=True)
 
-    def fixes(self, path: Path) -> None:
+    def fixes(self, path: Path | Sheet) -> None:
         """Read `fixes.csv`: absolute positions."""
         table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",))
         if not table.noise_columns:
@@ -211,7 +241,7 @@ class _Reader:
 
         table.each(self.request, take)
 
-    def read_truth(self, path: Path) -> None:
+    def read_truth(self, path: Path | Sheet) -> None:
         """Read `truth.csv`: the true trajectory of each robot."""
         table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3))
         if set(table.value_columns) not in (set(POSE2), set(POSE3)):
@@ -232,7 +262,7 @@ class _Reader:
         table.each(self.request, take, strictly=True)
         self.truth = {robot: Trajectory(np.array([*p]), np.array([*p.values()])) for robot, p in paths.items()}
 
-    def read_landmarks(self, path: Path) -> None:
+    def read_landmarks(self, path: Path | Sheet) -> None:
         """Read `landmarks.csv`: true positions, both ends of lines (6,), poses of tags (7,)."""
 
         def take(row: Row) -> None:
@@ -248,7 +278,7 @@ class _Reader:
 
         read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:]).each(self.request, take, timed=False)
 
-    def read_gps(self, path: Path) -> None:
+    def read_gps(self, path: Path | Sheet) -> None:
         """Read `gps.csv`: position fixes that only score a run."""
         columns = ("x_m", "y_m", "antenna_x_m", "antenna_y_m")
         tracks: dict[str, tuple[list[int], list[list[float]]]] = {}
@@ -302,4 +332,5 @@ def _letters(name: str) -> str:
     return re.sub("[0-9]", "", name)
 
 
-NATIVE = Format("native", "a folder with controls.csv, scans.csv", lambda path: folder_of(path, FILES), read)
+ANY = (*FILES, *(Path(name).with_suffix(PARQUET).name for name in FILES))
+NATIVE = Format("native", "a folder with controls.csv, scans.csv", lambda path: folder_of(path, ANY), read)

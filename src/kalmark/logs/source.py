@@ -52,12 +52,14 @@ def records_of(line: str) -> int:
 class Request:
     """Hold what the caller of `open_log` asked for: the robots (None: all) and what to do with a bad row.
 
-    `refuse` takes a bad row; `skipped` collects what is left out, and is the log's list of that name.
+    `refuse` takes a bad row; `skipped` collects what is left out, and is the log's list of that name.  With `progress`
+    what takes longer than two seconds shows a bar on standard error.
     """
 
     robots: tuple[str, ...] | None
     refuse: Refuse
     skipped: list[str]
+    progress: bool = False
 
     def leave_out(self, records: int, line: str) -> None:
         """List that so many records were left out."""
@@ -139,11 +141,11 @@ def raising(line: str) -> None:
     raise LogError(line)
 
 
-def nanoseconds(text: str) -> int:
-    """Return the seconds in `text` as integer nanoseconds, exactly (nearest beyond nine decimals), or ValueError."""
+def nanoseconds(text: str, unit_ns: int = 1_000_000_000) -> int:
+    """Return the time in `text`, in units of `unit_ns`, as the nearest integer nanoseconds, exactly, or ValueError."""
     if len(text) > _LONGEST_TIME:
         raise ValueError(text)
-    plain = _PLAIN_TIME.fullmatch(text)
+    plain = _PLAIN_TIME.fullmatch(text) if unit_ns == 1_000_000_000 else None
     if plain:
         sign, whole, fraction = plain.groups()
         t_ns = int(whole) * 1_000_000_000 + int((fraction or "").ljust(9, "0"))
@@ -153,7 +155,7 @@ def nanoseconds(text: str) -> int:
             t_s = Decimal(text if "_" not in text else "")
             if not abs(t_s) < _T_MAX_NS:  # of 1e999990 an integer has a million digits
                 raise ValueError(text)
-            t_ns = int((t_s * 1_000_000_000).to_integral_value())
+            t_ns = int((t_s * unit_ns).to_integral_value())
         except (InvalidOperation, OverflowError, ValueError):
             raise ValueError(text) from None
     if abs(t_ns) > _T_MAX_NS:

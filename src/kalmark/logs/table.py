@@ -1,4 +1,8 @@
-"""CSV tables with a header, read row by row, every complaint with file and line."""
+"""Tables with a header, read row by row: of CSV and Parquet, or in memory; every complaint with file and line, or row.
+
+A file is never in memory as a whole.  Units other than kalmark's are told by the end of a column's name (`FACTORS`) and
+never guessed.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +10,18 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import MOST, Id, bound, most, shown
+from kalmark.logs.progress import track
 from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
 
 NAMES = ("t_s", "robot", "sensor", "id")
@@ -47,21 +53,65 @@ OTHER_UNITS = {
     "metre", "metres", "deg", "degree", "degrees", "rads", "radian", "radians", "mrad", "kmh", "kph", "mph", "dps",
     "degps", "degs", "rpm", "pixel", "pixels", "pix",
 }  # fmt: skip
-SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
+FACTORS = {
+    "mm": ("m", 1e-3), "cm": ("m", 1e-2), "km": ("m", 1e3), "deg": ("rad", math.pi / 180), "mrad": ("rad", 1e-3),
+    "mmps": ("mps", 1e-3), "cmps": ("mps", 1e-2), "kmh": ("mps", 1 / 3.6), "degps": ("radps", math.pi / 180),
+    "dps": ("radps", math.pi / 180),
+}  # fmt: skip
+"""Units of columns that are taken, too: each the unit that it becomes, and by what it is multiplied."""
+TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
+CSV, PARQUET = ".csv", ".parquet"
+BATCH = 65_536  # rows of Parquet at a time
+SEPARATORS = {"\t": "tabs", "|": "'|'", " ": "blanks"}
 
 _RANK = {name: rank for rank, name in enumerate(CANONICAL)}
 _COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
 
 
 @dataclass(frozen=True)
+class Sheet:
+    """A table in memory: values by column, None for an empty cell."""
+
+    name: str
+    columns: dict[str, list[Any]]
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class Content(NamedTuple):
+    """What a source has: its header with the place of it, rows with their numbers, and how much of it has been read.
+
+    `comma`: numbers may have a decimal comma.  `word` is what stands before the number of a row in messages.
+    """
+
+    header: list[str]
+    where: str
+    rows: Iterator[tuple[int, Sequence[Any]]]
+    word: str = ":"
+    comma: bool = False
+    size: int = 0
+    at: Callable[[], int] = lambda: 0
+
+
+@dataclass(frozen=True)
 class Table:
-    """Hold a CSV file: its header by name, the columns that are values, those of noise, and its rows."""
+    """Hold a table: its header by name, the columns that are values, those of noise, and its rows, to be read once.
+
+    `given` are the names of columns in other units, with their factors, and `unit_ns` that of times.
+    """
 
     path: Path
     index: dict[str, int]
     value_columns: tuple[str, ...]
     noise_columns: tuple[str, ...]
-    content: list[tuple[int, list[str]]]
+    content: Content
+    given: dict[str, tuple[str, float]]
+    unit_ns: int = TIMES["t_s"]
+
+    def name(self, column: str) -> str:
+        """Return a column's name as the source has it."""
+        return self.given[column][0] if column in self.given else column
 
     def each(
         self, request: Request, take: Callable[[Row], None], timed: bool = True, by_sensor: bool = False,
@@ -70,45 +120,138 @@ class Table:
         """Let `take` read every row; refuse those that it refuses, or with other cells than the header has.
 
         If `timed`, refuse those whose time runs backwards, or `strictly` stands still, within a robot (and sensor).
+        Raises LogError if there is no row.
         """
         last: dict[tuple[str, str], Row] = {}
-        for line, cells in self.content:
-            row = Row(self, line, cells)
+        content, row, count = self.content, None, 0
+        shown = request.progress and content.size > 0
+        for line, cells in track(content.rows, self.path.name, content.size, show=shown, at=content.at):
+            row, count = Row(self, line, cells), count + 1
             try:
                 if len(cells) != len(self.index):
-                    raise Refused(f"{len(cells)} cells, expected {len(self.index)}: {', '.join(self.index)}")
+                    names = ", ".join(map(self.name, self.index))
+                    raise Refused(f"{len(cells)} cells, expected {len(self.index)}: {names}")
                 if timed:
                     row.read_start(by_sensor)
                     before = last.get(row.key)
                     if before is not None and row.t_ns < before.t_ns + strictly:
                         wanted = "increasing times" if strictly else "times that never run backwards"
-                        at = f"time {row.text('t_s')} s after {before.text('t_s')} s of {row.robot}"
+                        at = f"time {row.time} after {before.time} of {row.robot}"
                         raise Refused(f"{at}, expected {wanted}")
                     last[row.key] = row
                 take(row)
             except Refused as refused:
-                request.refuse(f"{self.path}:{line}: {refused}")
+                request.refuse(f"{self.path}{content.word}{line}: {refused}")
+        if row is None:
+            raise LogError(f"{content.where}: no rows after the header, expected at least one")
+
+
+def opened(source: Path | Sheet) -> Content:
+    """Return what a source has.  Raises LogError if it is missing, empty or none of its kind."""
+    if isinstance(source, Sheet):
+        return _of_sheet(source)
+    return _of_parquet(source) if source.suffix == PARQUET else _of_csv(source)
+
+
+def _of_sheet(sheet: Sheet) -> Content:
+    if not sheet.columns:
+        raise LogError(f"{sheet}: no columns, expected some with names")
+    first, many = next((name, len(values)) for name, values in sheet.columns.items())
+    for name, values in sheet.columns.items():
+        if len(values) != many:
+            raise LogError(f"{sheet}: column {name!r} has {len(values)} values, expected {many} as {first!r} has")
+    rows = enumerate(zip(*sheet.columns.values(), strict=True), start=1)
+    return Content([*sheet.columns], str(sheet), rows, " row ")
+
+
+def _of_parquet(path: Path) -> Content:
+    import pyarrow
+    import pyarrow.parquet
+
+    def odd(error: Exception) -> LogError:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        return LogError(f"{path}: not a file of Parquet that can be read ({reason}), expected a whole one")
+
+    try:
+        file = pyarrow.parquet.ParquetFile(path)
+        names = [str(name) for name in file.schema_arrow.names]
+    except (pyarrow.ArrowException, OSError, ValueError, UnicodeError) as error:
+        raise odd(error) from None
+    done = 0
+
+    def rows() -> Iterator[tuple[int, Sequence[Any]]]:
+        nonlocal done
+        batches = file.iter_batches(BATCH)
+        while True:
+            try:
+                batch = next(batches, None)
+                if batch is None:
+                    return
+                columns = [column.to_pylist() for column in batch.columns]
+            except (pyarrow.ArrowException, OSError, ValueError, UnicodeError) as error:
+                raise odd(error) from None
+            for cells in zip(*columns, strict=True):
+                done += 1
+                yield done, cells
+
+    return Content(names, str(path), rows(), " row ", size=file.metadata.num_rows, at=lambda: done)
+
+
+def _of_csv(path: Path, separator: str = ",") -> Content:
+    """Return what a CSV file has; where its header has semicolons and no comma, they separate the cells."""
+    if path.suffix == CSV and not path.is_file():
+        read_text(path)  # says why
+    stream = path.open("rb")
+    encoding = "utf-16" if stream.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    stream.seek(0)
+    reader = csv.reader(io.TextIOWrapper(stream, encoding, newline=""), strict=True, delimiter=separator)
+
+    def rows() -> Generator[tuple[int, list[str]], None, None]:
+        try:
+            for cells in reader:
+                if cells:
+                    yield reader.line_num, cells
+        except csv.Error as error:
+            raise LogError(f"{path}:{reader.line_num}: {error}, expected comma separated values") from None
+        except UnicodeError:
+            read_text(path)  # says where
+            raise LogError(f"{path}: not text, expected a text file in UTF-8") from None
+        finally:
+            stream.close()
+
+    found: Generator[tuple[int, list[str]], None, None] = rows()
+    line, header = next(found, (0, []))
+    if not any(cell.strip() for cell in header):
+        read_text(path)
+        raise LogError(f"{path}:1: the file is empty, expected rows of data")
+    header = [cell.strip() for cell in header]
+    if len(header) == 1 and ";" in header[0]:
+        found.close()
+        return _of_csv(path, ";")
+    other = next((what for cut, what in SEPARATORS.items() if cut in header[0]), "")
+    if len(header) == 1 and other:
+        raise LogError(f"{path}:{line}: the cells seem to be separated by {other}, expected commas or semicolons")
+    size = path.stat().st_size
+
+    def at() -> int:
+        return size if stream.closed else min(stream.tell(), size)
+
+    return Content(header, f"{path}:{line}", found, comma=separator == ";", size=size, at=at)
 
 
 def read_table(
-    path: Path, required: tuple[str, ...], allowed: tuple[str, ...] | None = None, known: tuple[str, ...] = ()
-) -> Table:
-    """Return the table in a CSV file, which must have the columns `required`.
+    source: Path | Sheet, required: tuple[str, ...], allowed: tuple[str, ...] | None = None,
+    known: tuple[str, ...] = (),
+) -> Table:  # fmt: skip
+    """Return the table of a source, which must have the columns `required`.
 
     Other columns must be among `allowed` (None: any but those that are one of `known` in another unit or in none);
-    noise columns always may be there.  Raises LogError if the file is missing, empty, has no row after its header, or
-    a header that does not fit.
+    noise columns always may be there.  Columns in other units are renamed, and their numbers multiplied.  Raises
+    LogError if the source is missing or empty, or has a header that does not fit.
     """
-    reader = csv.reader(io.StringIO(read_text(path), newline=""), strict=True)
-    try:
-        content = [(reader.line_num, cells) for cells in reader if cells]
-    except csv.Error as error:
-        raise LogError(f"{path}:{reader.line_num}: {error}, expected comma separated values") from None
-    where, header = f"{path}:{content[0][0]}", [cell.strip() for cell in content[0][1]]
-    separator = next((what for cut, what in SEPARATORS.items() if cut in header[0]), "")
-    if len(header) == 1 and separator:
-        raise LogError(f"{where}: the cells seem to be separated by {separator}, expected commas")
-    known = (*required, *(allowed or ()), *known)
+    content = opened(source)
+    where, known = content.where, (*required, *(allowed or ()), *known)
+    header, given, unit_ns = in_units(content.header, known)
     for name in header:
         refuse_unit(where, name, known)
     for name in required:
@@ -127,10 +270,29 @@ def read_table(
         if allowed is not None and name not in required and name not in allowed:
             wanted = f"{', '.join((*required, *allowed))}{nearest(name, allowed)}"
             raise LogError(f"{where}: column {name!r} is unknown, expected {wanted}")
-    if len(content) == 1:
-        raise LogError(f"{where}: no rows after the header, expected at least one")
     values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
-    return Table(path, {name: i for i, name in enumerate(header)}, tuple(values), noise, content[1:])
+    index = {name: i for i, name in enumerate(header)}
+    return Table(Path(str(source)), index, tuple(values), noise, content, given, unit_ns)
+
+
+def in_units(header: list[str], known: tuple[str, ...]) -> tuple[list[str], dict[str, tuple[str, float]], int]:
+    """Return a header in kalmark's units, the names of columns that had others with their factors, and that of times.
+
+    Only names that are known, or their standard deviations, have units that are known.
+    """
+    out, given, unit_ns = [], {}, TIMES["t_s"]
+    for name in header:
+        stem, _, unit = name.rpartition("_")
+        meant = f"{stem}_{FACTORS[unit][0]}" if unit in FACTORS else ""
+        if name in TIMES and "t_s" in known and name not in known:
+            out.append("t_s")
+            given["t_s"], unit_ns = (name, 1.0), TIMES[name]
+        elif name not in known and meant.removeprefix("sigma_") in known:
+            out.append(meant)
+            given[meant] = (name, FACTORS[unit][1])
+        else:
+            out.append(name)
+    return out, given, unit_ns
 
 
 def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
@@ -145,6 +307,15 @@ def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
         raise LogError(f"{where}: column {name!r} is unknown, expected {closest}{f', in {measure}' if measure else ''}")
 
 
+def decimal(text: str) -> str:
+    """Return a number with a decimal comma with a point.  Raises ValueError if it has both, as of thousands."""
+    if "," not in text:
+        return text
+    if "." in text or text.count(",") > 1:
+        raise ValueError(text)
+    return text.replace(",", ".")
+
+
 class Refused(Exception):
     """What is wrong with a row."""
 
@@ -154,7 +325,7 @@ class Row:
 
     __slots__ = ("cells", "line", "robot", "sensor", "t_ns", "table")
 
-    def __init__(self, table: Table, line: int, cells: list[str]) -> None:
+    def __init__(self, table: Table, line: int, cells: Sequence[Any]) -> None:
         self.table, self.line, self.cells = table, line, cells
         self.t_ns, self.robot, self.sensor = 0, "", ""
 
@@ -163,41 +334,64 @@ class Row:
         """Its robot and sensor."""
         return self.robot, self.sensor
 
+    @property
+    def time(self) -> str:
+        """Its time as the source has it, with the unit."""
+        return f"{self.text('t_s')} {self.table.name('t_s').removeprefix('t_')}"
+
     def text(self, column: str) -> str:
-        """Return the text of a cell."""
-        return self.cells[self.table.index[column]].strip()
+        """Return the text of a cell, "" of an empty one."""
+        cell = self.cells[self.table.index[column]]
+        return cell.strip() if type(cell) is str else "" if cell is None else str(cell)
 
     def read_start(self, with_sensor: bool) -> None:
         """Read the column t_s exactly, the robot and, if asked, the sensor.  Raises Refused."""
+        text, table = self.text("t_s"), self.table
         try:
-            self.t_ns = nanoseconds(self.text("t_s"))
+            self.t_ns = nanoseconds(decimal(text) if table.content.comma else text, table.unit_ns)
         except ValueError:
             wanted = "a finite number of seconds, within 292 years of 0"
-            raise Refused(f"t_s is {shown(self.text('t_s'))}, expected {wanted}") from None
+            raise Refused(f"{table.name('t_s')} is {shown(text)}, expected {wanted}") from None
         self.robot, self.sensor = self.text("robot"), self.text("sensor") if with_sensor else ""
         if not self.robot or (with_sensor and not self.sensor):
             raise Refused(f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
 
     def id(self) -> Id | None:
         """Return the landmark's id, None for an empty cell.  Raises Refused."""
+        cell, text = self.cells[self.table.index["id"]], self.text("id")
+        if type(cell) is float and cell.is_integer():  # as tables in memory make numbers beside empty cells
+            text = str(int(cell))
         try:
-            return landmark_id(self.text("id")) if self.text("id") else None
+            return landmark_id(text) if text else None
         except ValueError as error:
             raise Refused(f"id: {error}") from None
 
+    def number(self, column: str) -> float:
+        """Return the finite number in a column, in kalmark's unit.  Raises ValueError."""
+        cell, table = self.cells[self.table.index[column]], self.table
+        if type(cell) is str:
+            value = number(decimal(cell) if table.content.comma else cell, math.inf)
+        elif isinstance(cell, int | float) and not isinstance(cell, bool):
+            value = number(repr(cell), math.inf) if type(cell) is int else cell
+            if not math.isfinite(value):
+                raise ValueError(cell)
+        else:
+            raise ValueError(cell)
+        return value * table.given[column][1] if column in table.given else value
+
     def numbers(self, columns: tuple[str, ...]) -> list[float]:
         """Return the finite numbers in these columns.  Raises Refused."""
-        values = []
+        values, name = [], self.table.name
         for column in columns:
             try:
-                values.append(number(self.cells[self.table.index[column]], math.inf))
-            except ValueError:
-                raise Refused(f"{column} is {shown(self.text(column))}, expected a finite number") from None
+                values.append(self.number(column))
+            except (ValueError, OverflowError):
+                raise Refused(f"{name(column)} is {shown(self.text(column))}, expected a finite number") from None
             if abs(values[-1]) > (MOST["m"] ** 2 if column.startswith("cov_") else most(column)[0]):
                 wanted = f"at most {MOST['m'] ** 2:.0e}" if column.startswith("cov_") else bound(column)
-                raise Refused(f"{column} is {shown(self.text(column))}, expected {wanted}")
+                raise Refused(f"{name(column)} is {shown(self.text(column))}, expected {wanted}")
             if values[-1] < 0 and column in NOT_NEGATIVE:
-                raise Refused(f"{column} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
+                raise Refused(f"{name(column)} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
         return values
 
     def values(self, columns: dict[tuple[str, str], tuple[str, ...]]) -> list[float]:
@@ -210,7 +404,8 @@ class Row:
         for name in self.table.value_columns:
             if name not in used and self.text(name):
                 who = " ".join(self.key).strip()
-                raise Refused(f"{name} is {self.text(name)}, expected an empty cell as in {who}'s first row")
+                told = f"{self.table.name(name)} is {self.text(name)}"
+                raise Refused(f"{told}, expected an empty cell as in {who}'s first row")
         columns.setdefault(self.key, used)
         return values
 

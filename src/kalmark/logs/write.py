@@ -15,16 +15,18 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
-from kalmark.logs.source import landmark_id, seconds
-from kalmark.logs.table import CANONICAL, cov_columns
+from kalmark.logs.source import landmark_id, nanoseconds, seconds
+from kalmark.logs.table import CANONICAL, PARQUET, cov_columns
 
 Table = tuple[list[str], list[dict[str, str]]]
 POSITION = ("x_m", "y_m", "z_m")
 EMPTY: Table = ([], [])  # measurements.csv: what has no id is written into scans.csv, too
 
 
-def write_native(log: Log, folder: Path | str) -> Path:
+def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path:
     """Write `log` as a native log and return its folder; files of an earlier native log there are replaced.
+
+    With `parquet` its tables are files of Parquet instead of CSV.
 
     Files without a row are not written.  Raises LogError if the log has something that the files cannot hold (an
     unnamed column, two scans of one sensor at one time, an id that would be read as another).
@@ -33,8 +35,13 @@ def write_native(log: Log, folder: Path | str) -> Path:
     tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log), EMPTY)
     folder.mkdir(parents=True, exist_ok=True)
     for file_name, (header, rows) in zip(FILES, tables, strict=True):
+        other = (folder / file_name).with_suffix(PARQUET)
+        for old in (folder / file_name, other):
+            old.unlink(missing_ok=True)
         if not rows:
-            (folder / file_name).unlink(missing_ok=True)
+            continue
+        if parquet:
+            write_parquet(other, header, rows)
             continue
         with (folder / file_name).open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, header, lineterminator="\n")
@@ -45,6 +52,22 @@ def write_native(log: Log, folder: Path | str) -> Path:
         with (folder / RIG).open("w", encoding="utf-8") as file:
             YAML(typ="safe", pure=True).dump(log.describes, file)
     return folder
+
+
+def write_parquet(path: Path, header: list[str], rows: list[dict[str, str]]) -> None:
+    """Write a table as Parquet: times in ns, texts, and numbers to the last bit; what is empty is null."""
+    import pyarrow
+    import pyarrow.parquet
+
+    columns: dict[str, Any] = {}
+    for name in header:
+        told = [row.get(name) or None for row in rows]
+        if name == "t_s":
+            columns["t_ns"] = [nanoseconds(text) if text else None for text in told]
+        else:
+            texts = name in ("robot", "sensor", "id")
+            columns[name] = told if texts else [None if text is None else float(text) for text in told]
+    pyarrow.parquet.write_table(pyarrow.table(columns), path)
 
 
 def controls(log: Log) -> Table:

@@ -22,6 +22,7 @@ from kalmark.errors import KalmarkError
 from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
+from kalmark.logs.progress import track
 from kalmark.models.landmarks import Point2D, Point3D, Tag
 from kalmark.models.protocols import Landmark
 from kalmark.models.sensors import TagCorners
@@ -29,7 +30,6 @@ from kalmark.models.tags import corners
 from kalmark.results.history import History, as_id
 from kalmark.results.landmarks import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
-from kalmark.results.progress import track
 
 STRETCHES = 10  # of a robot's path, each with its difference from the batch solution
 

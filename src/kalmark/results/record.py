@@ -15,12 +15,12 @@ from kalmark.declare import is_own, registered_name
 from kalmark.errors import DivergedError, EventError, LogError
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log, begins_at
+from kalmark.logs.progress import track
 from kalmark.logs.source import nearest
 from kalmark.results.foresight import Foresight
 from kalmark.results.gaps import joined
 from kalmark.results.history import Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
-from kalmark.results.progress import track
 from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
 from kalmark.results.recording import LogReference
 from kalmark.results.repeats import repeated

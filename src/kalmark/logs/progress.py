@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
 
 def track(
-    items: Iterable[T], what: str, total: int | None = None, *, show: bool = True, delay_s: float = 2.0
+    items: Iterable[T],
+    what: str,
+    total: int | None = None,
+    *,
+    show: bool = True,
+    delay_s: float = 2.0,
+    at: Callable[[], int] | None = None,
 ) -> Iterator[T]:
-    """Yield the items; after `delay_s` seconds show a bar named `what` on standard error, if `show`."""
+    """Yield the items; after `delay_s` seconds show a bar named `what` on standard error, if `show`.
+
+    `at` says how much of `total` is done, if that is not the number of items.
+    """
     if not show:
         yield from items
         return
@@ -23,7 +32,7 @@ def track(
             now = time.perf_counter()
             if now - start > delay_s and (bar is None or now - shown > 0.1):
                 bar, shown = bar or _bar(what, total), now
-                bar.update(bar.task_ids[0], completed=done, refresh=True)
+                bar.update(bar.task_ids[0], completed=done if at is None else at(), refresh=True)
             yield item
         if bar is not None:
             bar.update(bar.task_ids[0], completed=done + 1, refresh=True)
