@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench bench-peers bench-growth clean
+.PHONY: demo test lint bench bench-peers bench-growth fuzz clean
 
 demo: $(VENV)/base.stamp
 	$(BIN)/kalmark demo
@@ -26,6 +26,11 @@ bench-peers: $(VENV)/bench.stamp
 bench-growth: $(VENV)/base.stamp
 	$(BIN)/python benchmarks/map_growth.py
 
+# ten minutes each: every reader, the configuration, the saved map, process; SECONDS=60 for less
+SECONDS ?= 600
+fuzz: $(VENV)/fuzz.stamp
+	$(BIN)/python benchmarks/fuzz.py --seconds $(SECONDS)
+
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
@@ -39,6 +44,10 @@ $(VENV)/test.stamp: $(VENV)/base.stamp
 
 $(VENV)/bench.stamp: $(VENV)/base.stamp
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[peers]'
+	touch $@
+
+$(VENV)/fuzz.stamp: $(VENV)/base.stamp
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[fuzz]'
 	touch $@
 
 clean:

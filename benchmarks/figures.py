@@ -275,6 +275,14 @@ def storms() -> Iterator[Figure]:
     """Yield what becomes of a map in a storm of bad events."""
     yield Figure("Bad events", "1,000,000 events, 5 % bad, all estimators, maps and worlds: refused / not as they should be / storms that end as without them / growth of memory",
                  "all / 0 / all / flat", "python benchmarks/storm.py --events 1000000", row("total", "{1} / {2} / {3} of {4} / {5} MB"))  # fmt: skip
+    yield Figure("Bad events", "66,000 events, before 91 % of them a bad one: refused / not as they should be / storms that end as without them",
+                 "about 60,000 / 0 / all", "python benchmarks/storm.py --events 66000 --share 0.91", row("total", "{1} / {2} / {3} of {4}"))  # fmt: skip
+    yield Figure("Bad events", "Odd files, configurations, maps and streams of events, 100 of each target: inputs / taken / broken",
+                 "all / some / 0", "python benchmarks/fuzz.py --inputs 100", row("total", "{0} / {1} / {2}"))  # fmt: skip
+    yield Figure("Bad events", "Fuzzing guided by coverage, 10 minutes a target: inputs / crashes, hangs, tracebacks",
+                 "all / 0", "python benchmarks/fuzz.py --seconds 600", row("total", "{0} / {2}"))  # fmt: skip
+    yield Figure("Bad events", "A log of 1,000,000 rows of CSV: time / memory / bytes a row", "- / that of its events / -",
+                 "python benchmarks/tables.py --rows 1000000", row("1000000 rows,", "{6} s / {8} MB / {10}"))  # fmt: skip
 
 
 def gaps() -> Iterator[Figure]:

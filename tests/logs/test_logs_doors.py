@@ -193,6 +193,7 @@ def test_a_graph_of_space_has_a_mount_and_positions(tmp_path: Path) -> None:
         ("EDGE_SE2 7 8 1 0 nan 1 0 0 400 0 1", "a.g2o:13: EDGE_SE2: nan"),
         ("EDGE_SE2", "a.g2o:13: EDGE_SE2: "),
         ("VERTEX_SE2 a 1 2 3", "a.g2o:13: VERTEX_SE2: id 'a' of a pose, expected a whole number"),
+        ("PARAMS_SE3OFFSET 0 1", "a.g2o:13: PARAMS_SE3OFFSET: 1 numbers of a pose, expected 7"),
         ("VERTEX_SE2 8 1 2 3", "no edge from pose 7 to pose 8"),
         ("VERTEX_SE3:QUAT 8 1 2 3 0 0 0 2", "quaternion has length 2, expected 1"),
         (f"EDGE_SE2 7 {'9' * 5000} 1 0 0 1 0 0 1 0 1", "expected at most 200"),

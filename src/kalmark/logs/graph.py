@@ -86,8 +86,10 @@ def information(cells: list[str], size: int) -> Array:
     return np.asarray((C + C.T) / 2)
 
 
-def pose(cells: list[str]) -> Array:
+def pose(cells: list[str], size: int) -> Array:
     """Return a pose (3,) or (7,), its quaternion normalised.  Raises ValueError."""
+    if len(cells) != size:
+        raise ValueError(f"{len(cells)} numbers of a pose, expected {size}")
     values = np.array([number(cell) for cell in cells])
     if len(values) == 7:
         norm = float(np.linalg.norm(values[3:]))
@@ -123,13 +125,13 @@ def take(graph: Graph, tag: str, cells: list[str]) -> None:
         if len(cells) != size + 1:
             raise ValueError(f"{len(cells)} cells, expected an id and {size} numbers")
         if tag in POSES:
-            graph.poses[pose_id(cells[0])] = pose(cells[1:])
+            graph.poses[pose_id(cells[0])] = pose(cells[1:], size)
         else:
             graph.places[landmark_id(cells[0])] = np.array([number(cell) for cell in cells[1:]])
     elif tag in EDGES:
         size, errors = EDGES[tag]
         a, b = map(pose_id, cells[:2])
-        step, C = control(pose(cells[2 : 2 + size]), information(cells[2 + size :], errors))
+        step, C = control(pose(cells[2 : 2 + size], size), information(cells[2 + size :], errors))
         if (a, b) in graph.moves:
             graph.left_out[f"{tag} lines of a pair of poses that has one already"] += 1
         graph.moves.setdefault((a, b), (step, C))
@@ -141,9 +143,10 @@ def take(graph: Graph, tag: str, cells: list[str]) -> None:
             raise ValueError(f"{len(cells)} cells, expected {first} ids, a position and its information")
         graph.sights.setdefault(pose_id(cells[0]), []).append((landmark_id(cells[1]), y, C))
     elif tag == OFFSET:
-        if graph.offset is not None and not np.array_equal(graph.offset, pose(cells[1:])):
+        offset = pose(cells[1:], 7)
+        if graph.offset is not None and not np.array_equal(graph.offset, offset):
             raise ValueError("a second offset, expected one sensor")
-        graph.offset = pose(cells[1:])
+        graph.offset = offset
     elif tag not in IGNORED:
         graph.left_out[f"{tag} lines, which are not read"] += 1
 
