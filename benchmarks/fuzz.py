@@ -22,6 +22,7 @@ import types
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,25 @@ def parquet(data: bytes, folder: Path) -> None:
 def mcap(data: bytes, folder: Path) -> None:
     """Read a bag that kalmark wrote."""
     read(written(folder / "log", {"a.mcap": data}) / "a.mcap", False)
+
+
+def bag(name: str) -> Callable[[bytes, Path], None]:
+    """Return what reads a bag by topic, and what makes its first configuration."""
+
+    def take(data: bytes, folder: Path) -> None:
+        from kalmark.logs.bag.first_config import first_config
+        from kalmark.logs.bag.survey import survey
+
+        path = written(folder / "log", {name: data}) / name
+        first_config(survey(path))
+        read(path, True, topics={"/odom": {"type": "odometry_2d", "own_noise": True}, "/imu": {"type": "imu"}})
+
+    return take
+
+
+def matlab(data: bytes, folder: Path) -> None:
+    """Read a log in a file of MATLAB."""
+    read(written(folder / "log", {"dataset2.mat": data}), False)
 
 
 def config(data: bytes, folder: Path) -> None:
@@ -306,6 +326,41 @@ def a_log(parquet_: bool) -> bytes:
         return (folder / "a.mcap").read_bytes()
 
 
+def a_bag(ros1: bool) -> bytes:
+    """Return a small bag of ROS 1, or of ROS 2 in sqlite3."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    from kalmark.logs.bag.write import Types, header
+
+    types_ = Types(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE))
+    encode = types_.store.serialize_ros1 if ros1 else types_.store.serialize_cdr
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "a.bag"
+        with Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            for topic, kind in (("/odom", "nav_msgs/msg/Odometry"), ("/imu", "sensor_msgs/msg/Imu")):
+                connection = writer.add_connection(topic, kind, typestore=types_.store)
+                for k in range(3):
+                    turn = {"orientation": {"w": 1.0}, "position": {"x": float(k)}}
+                    fields = {"header": header(k * 10**9 + 1, "base_link"), "pose": {"pose": turn}} | turn
+                    writer.write(connection, k * 10**9 + 1, encode(types_.made(kind, fields), kind))
+        return (path if ros1 else next(path.glob("*.db3"))).read_bytes()
+
+
+def a_matlab_file() -> bytes:
+    """Return a small log in a file of MATLAB."""
+    import scipy.io
+
+    column, seen = np.arange(3.0)[:, None], np.tile([[0.0, 2.0]], (3, 1))
+    zero, out = 0 * column, BytesIO()
+    truth = {"x_true": column, "y_true": zero, "th_true": zero, "true_valid": np.ones((3, 1), dtype=np.uint8)}
+    told = {"t": column / 10, "v": zero, "om": zero, "r": seen, "b": seen / 10, "l": np.eye(2)}
+    scipy.io.savemat(out, told | truth)
+    return out.getvalue()
+
+
 def first(seeds: dict[str, Any]) -> tuple[bytes, ...]:
     """Return seeds whose first byte says which file they are."""
     files = [
@@ -329,6 +384,9 @@ def targets() -> dict[str, Target]:
         "process": Target((STREAM, STREAM * 3, bytes([3]) + STREAM, bytes(range(256))), process),
         "parquet": Target((b"\0" + a_log(True),), parquet),
         "mcap": Target((a_log(False),), mcap),
+        "ros1": Target((a_bag(True),), bag("a.bag")),
+        "sqlite": Target((a_bag(False),), bag("a.db3")),
+        "matlab": Target((a_matlab_file(),), matlab),
     }
     return found | {
         kind: Target(tuple(b"\0" + seed for seed in seeds), text(kind)) for kind, (_, seeds) in TEXTS.items()

@@ -39,9 +39,9 @@ def evaluate(run: Recording) -> dict[str, Any]:
         "estimator": run.estimator,
         "coordinates": run.coordinates,
         "frame": run.truth.frame if run.truth else None,
-        "events": controls + len(history.t_ns) + len(fixes),
+        "events": controls + history.scans + len(fixes),
         "controls": controls,
-        "scans": len(history.t_ns),
+        "scans": history.scans,
         "fixes": len(fixes),
         "fixes_rejected": sum(not fix.used for fix in fixes),
         "observations": len(history.step),
@@ -95,6 +95,8 @@ def headline(run: Recording) -> tuple[str, list[str]]:
     name = run.log.name or "run"
     title = f"{name} · {run.estimator}" if run.estimator else name
     parts = [count(summary["landmarks"], "landmark"), count(summary["scans"], "scan")]
+    if not summary["scans"]:
+        parts = [count(summary["fixes"], "fix", "fixes"), count(summary["controls"], "control")]
     errors = [figures for figures in summary["robots"].values() if figures.get("ate_m") is not None]
 
     def mean_of(key: str) -> float:
@@ -128,7 +130,7 @@ def robot_figures(run: Recording, name: str) -> dict[str, Any]:
     mine = run.history.robot == name
     mean, P = run.history.poses[mine], run.history.pose_covariances[mine]
     truth = run.truth.poses_in_map()[mine]
-    figures: dict[str, Any] = {"scans": int(mine.sum())}
+    figures: dict[str, Any] = {"scans": int(mine.sum()) if run.history.scans else 0}
     known = np.isfinite(truth).all(axis=1)
     if known.any():
         figures |= pose_figures(mean[known], P[known], truth[known], run.coordinates)

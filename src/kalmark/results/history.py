@@ -1,7 +1,8 @@
 """What a run leaves behind: one row a step, one row an observation, and the map at some sixty instants.
 
-A *step* is one scan and the controls before it.  Plain arrays, saved as ``history.npz`` without pickle; rows of few are
-named tuples, each field an array in the file, vectors and matrices of several sizes padded with NaN.
+A *step* is one scan and the controls before it; of a log without scans one fix, without fixes too one control.  Plain
+arrays, saved as ``history.npz`` without pickle; rows of few are named tuples, each field an array in the file, vectors
+and matrices of several sizes padded with NaN.
 """
 
 from __future__ import annotations
@@ -187,6 +188,8 @@ class History:
     `unmeasured_landmark`, their kinds, expectations `unmeasured_e` (U, m) before the scan and the covariances
     `unmeasured_Z` (U, p, p) that their innovations would have had.
 
+    `stepped` is what ends a step, "scan", or "fix" or "control" of a log without any scan.
+
     `changes` is what became of landmarks, `fixes` are those used, in the order they came, `controls` those of each
     robot that had any, `gaps` the times without, `repeats` pairs of landmarks that seem to be one.
     """
@@ -239,6 +242,12 @@ class History:
     biases: tuple[Biased, ...] = ()
     gaps: tuple[Gap, ...] = ()
     repeats: tuple[Repeated, ...] = ()
+    stepped: str = "scan"
+
+    @property
+    def scans(self) -> int:
+        """The number of scans."""
+        return len(self.t_ns) if self.stepped == "scan" else 0
 
     @property
     def fused(self) -> Flags:
@@ -296,6 +305,7 @@ class History:
             "map_mean": padded_all([mean for m in self.maps for mean in m.means]),
             "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
         }
+        named["stepped"] = np.array(self.stepped, dtype=np.str_)
         named["control_robot"] = texts(list(self.controls))
         named["control_span"] = np.array(list(self.controls.values()), dtype=np.int64).reshape(-1, 3)
         for name, (prefix, cls, joined) in ROWS.items():
@@ -317,11 +327,12 @@ class History:
             for step, t_ns, (means, covariances, names, kinds) in times
         )
         spans = zip(named["control_robot"].tolist(), named["control_span"].tolist(), strict=True)
+        given["stepped"] = str(named["stepped"])
         return cls(**given, controls={robot: Controlled(*span) for robot, span in spans})
 
 
 def _array_fields() -> list[str]:
-    return [f.name for f in fields(History) if f.name not in ("maps", "controls", *ROWS)]
+    return [f.name for f in fields(History) if f.name not in ("maps", "controls", "stepped", *ROWS)]
 
 
 def as_id(text: str) -> Id:

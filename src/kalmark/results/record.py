@@ -17,6 +17,7 @@ from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.progress import track
 from kalmark.logs.source import nearest
+from kalmark.report import Report
 from kalmark.results.foresight import Foresight
 from kalmark.results.gaps import joined
 from kalmark.results.history import Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
@@ -29,7 +30,7 @@ from kalmark.results.truth import Truth
 from kalmark.slam.motion import HeldInput
 
 if TYPE_CHECKING:
-    from kalmark.report import Gap, Report
+    from kalmark.report import Gap
     from kalmark.slam.robot import Robot
     from kalmark.slam.slam import Slam
 
@@ -112,7 +113,9 @@ class _Recorder:
 
     def __init__(self, slam: Slam, log: Log) -> None:
         self.slam, self.log = slam, log
-        scans = sum(type(e) is Scan for e in log.events)
+        kinds = {type(event) for event in log.events}
+        self.stepped: type[Event] = next((kind for kind in (Scan, Fix) if kind in kinds), Control)
+        scans = sum(type(e) is self.stepped for e in log.events)
         self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS)
         self.foresight = Foresight(slam, scans)
         self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
@@ -141,7 +144,10 @@ class _Recorder:
         self.spent_ns = 0
 
     def process(self, event: Event) -> None:
-        """Feed one event and, if it is a scan, keep the step that ends with it."""
+        """Feed one event and, if it is a scan, keep the step that ends with it; of a log without scans, if it is a fix.
+
+        Of one without either, if it is a control.
+        """
         start = time.perf_counter_ns()
         try:
             report = self.slam.process(event)
@@ -157,12 +163,15 @@ class _Recorder:
             self.fixes.append(
                 UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0], report.replaced)
             )
-        if type(event) is not Scan:
+        if type(event) is not self.stepped:
             return
+        scan = event if type(event) is Scan else Scan(t_ns=event.t_ns, robot=event.robot)
+        if scan is not event:
+            report = Report(scan)  # a step without observations
         self.step_ns.append(math.nan if self.compiler.was_busy else self.spent_ns)
         self.spent_ns, self.compiler.was_busy = 0, False
         self.dead.append(self.reckoned[event.robot].at(event.t_ns))
-        self.scans.append(event)
+        self.scans.append(scan)
         self.foresight.keep(len(self.reports), report)
         self.reports.append(report)
         self.states.append((self.slam.mean(event.robot), self.slam.covariance(event.robot)))
@@ -170,7 +179,8 @@ class _Recorder:
             o.landmark if o.landmark is None else self.slam.landmark_model(o.landmark) for o in report.observations
         ]
         self.kinds += ["" if model is None else model.kind for model in models]
-        self.left.append(left_px(self.slam, event, report))
+        if report.observations:
+            self.left.append(left_px(self.slam, scan, report))
         due = self.due < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[self.due]
         grown = self.kept < SMALL and any(o.outcome == "new" for o in report.observations)
         if due or grown:
@@ -250,6 +260,7 @@ class _Recorder:
             biases=biases(self.slam),
             gaps=joined(self.gaps),
             repeats=repeated(self.slam),
+            stepped=self.stepped.__name__.lower(),
             **decisions(reports, 3 if n > 3 else 2),
             **self.foresight.columns(m, p),
         )

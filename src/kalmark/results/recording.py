@@ -44,7 +44,7 @@ NEEDED = ("summary.json", "config.yaml", "history.npz", "landmarks.csv")
 
 
 def tum(history: History, robot: str) -> str:
-    """Return a robot's path after each of its scans as TUM lines: t x y z qx qy qz qw."""
+    """Return a robot's path after each of its steps as TUM lines: t x y z qx qy qz qw."""
     mine = history.robot == robot
     return tum_text(history.t_ns[mine], history.poses[mine])
 

@@ -222,9 +222,9 @@ def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
 def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history, total = run.history, int(summary["observations"])
     yield from _unused(run)
-    if not total:
+    if not total and history.scans:
         yield "no observation was made: there is nothing to map"
-    elif not summary["landmarks"]:
+    elif not summary["landmarks"] and history.scans:
         yield "no landmark was mapped"
     seen = list(zip(history.robot[history.step].tolist(), history.sensor.tolist(), strict=True))
     bearing = {pair for pair in set(seen) if run.section(*pair).get("type") in BEARINGS}
@@ -281,12 +281,14 @@ def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         scans, controls = history.t_ns[mine], history.controls.get(name)
         coasts = np.isfinite(history.mean[mine]).sum(axis=1).max(initial=0) not in (3, 7)  # its velocity is estimated
         if len(scans) and controls is None and not coasts:
-            yield f"robot {name} has {count(len(scans), 'scan')} but no controls: it is taken to stand still"
+            what = count(len(scans), "fix", "fixes") if history.stepped == "fix" else count(len(scans), "scan")
+            yield f"robot {name} has {what} but no controls: it is taken to stand still"
         elif len(scans) > 1 and controls is not None and controls.number > 1:
             shared = min(int(scans[-1]), controls.last_ns) - max(int(scans[0]), controls.first_ns)
             share = max(shared, 0) / max(int(scans[-1] - scans[0]), 1)
             if share < 0.5:
-                yield f"controls of robot {name} cover {share:.0%} of the time of its scans: are both in seconds?"
+                of = f"of the time of its {plural(history)}"
+                yield f"controls of robot {name} cover {share:.0%} {of}: are both in seconds?"
 
 
 def _sensors(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
@@ -323,7 +325,12 @@ def _truth(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         if true and name not in true:
             yield f"the log has no truth for robot {name}, but for {', '.join(sorted(true))}"
         elif name in true and "ate_m" not in summary["robots"].get(name, {}) and (run.history.robot == name).any():
-            yield f"the truth of robot {name} covers none of its scans: are both in seconds?"
+            yield f"the truth of robot {name} covers none of its {plural(run.history)}: are both in seconds?"
+
+
+def plural(history: History) -> str:
+    """Return what a run's steps end with."""
+    return {"fix": "fixes"}.get(history.stepped, f"{history.stepped}s")
 
 
 def _some(names: set[str]) -> str:

@@ -190,7 +190,7 @@ def errors(path: Path) -> Iterator[None]:
         said = error.strerror or error
         raise MapError(f"{path}: {said}, expected a map written by save()") from error
     except Exception as error:  # a damaged file fails in any way: in zlib, json, numpy or a model
-        said = " ".join(str(error).split())
+        said = " ".join(str(error).split())[:160]
         raise MapError(f"{path}: {type(error).__name__}: {said}, expected a map written by save()") from error
 
 
