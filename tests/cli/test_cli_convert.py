@@ -16,6 +16,7 @@ from kalmark.logs import Log, PositionTrack, Trajectory, open_log
 from kalmark.logs.bag.write import Types
 from kalmark.results.mcap import export
 from kalmark.results.record import record
+from kalmark.results.run import Run
 from ros_bags import same_logs
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be written")
@@ -132,6 +133,35 @@ def test_another_library_reads_the_messages_of_a_run(kalmark: Kalmark, tmp_path:
         np.testing.assert_allclose([marker.scale.x, marker.scale.y], np.maximum(axes, 0.02), rtol=1e-9)
     (_, frames) = decoded(tmp_path / "run.mcap", "/tf_static")[0]
     assert [(t.header.frame_id, t.child_frame_id) for t in frames.transforms] == [("rover", "rover/lidar")]
+
+
+def test_another_library_reads_frames_paths_and_diagnostics_of_a_run(kalmark: Kalmark, tmp_path: Path) -> None:
+    write_log(tmp_path / "native")
+    assert kalmark("run", "native", "--log", "native", "--out", "run").status == 0
+    assert kalmark("convert", "run", "run.mcap").status == 0
+    history = Run.load(tmp_path / "run").history
+    told = [message for _, message in decoded(tmp_path / "run.mcap", "/diagnostics")]
+    values = {pair.key: pair.value for pair in told[3].status[0].values}
+    assert told[3].status[0].name == "kalmark/rover" and values["associated"] == "3"
+    P = history.covariance[3]
+    sigmas = [float(values[f"{name} sigma ({unit})"]) for name, unit in (("position", "m"), ("heading", "rad"))]
+    np.testing.assert_allclose(sigmas, np.sqrt([np.linalg.eigvalsh(P[:2, :2])[-1], P[2, 2]]), rtol=1e-3)
+    assert told[-1].status[0].name == "kalmark/run" and "landmarks" in {p.key for p in told[-1].status[0].values}
+    frames = [message.transforms[0] for _, message in decoded(tmp_path / "run.mcap", "/tf")]
+    assert {(frame.header.frame_id, frame.child_frame_id) for frame in frames} == {("map", "rover")}
+    np.testing.assert_array_equal([frame.transform.translation.x for frame in frames], history.poses[:, 0])
+    _, path = decoded(tmp_path / "run.mcap", "/rover/path")[-1]
+    np.testing.assert_array_equal([each.pose.position.x for each in path.poses], history.poses[:, 0])
+
+
+def test_a_run_without_scans_is_written_too(kalmark: Kalmark, tmp_path: Path) -> None:
+    write_log(tmp_path / "native")
+    (tmp_path / "native" / "scans.csv").unlink()
+    assert kalmark("run", "native", "--log", "native", "--out", "run").status == 0
+    assert kalmark("convert", "run", "run.mcap").status == 0
+    counts = counted(tmp_path / "run.mcap")
+    assert counts["/rover/odometry"] == counts["/tf"] == counts["/kalmark/controls"] == 20
+    assert counts["/diagnostics"] == 21
 
 
 def _built(tmp_path: Path) -> Any:
