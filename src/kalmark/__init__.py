@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from kalmark.diagnosis.verdict import Verdict, diagnose
     from kalmark.events import Control, Fix, Scan
     from kalmark.filter import estimators
-    from kalmark.logs import Log, log_from, open_log
+    from kalmark.logs import Log, log_from, open_log, stream_log
     from kalmark.management import initialization
     from kalmark.management.attention import Attention
     from kalmark.management.delayed import Delayed
@@ -40,7 +40,7 @@ __all__ = [
     "Attention", "Control", "Delayed", "Expectations", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report",
     "Robot", "Run", "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators", "geometry",
     "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record", "register",
-    "sensors",
+    "sensors", "stream_log",
 ]  # fmt: skip
 
 _MODULES = {
@@ -58,7 +58,7 @@ _NAMES = {
     "kalmark.declare": ("register",),
     "kalmark.diagnosis.verdict": ("Verdict", "diagnose"),
     "kalmark.events": ("Control", "Fix", "Scan"),
-    "kalmark.logs": ("Log", "log_from", "open_log"),
+    "kalmark.logs": ("Log", "log_from", "open_log", "stream_log"),
     "kalmark.management.attention": ("Attention",),
     "kalmark.management.delayed": ("Delayed",),
     "kalmark.management.upkeep": ("Upkeep",),

@@ -13,7 +13,7 @@ import pytest
 import kalmark as km
 from kalmark.errors import KalmarkError, LogError
 from kalmark.events import Scan
-from kalmark.logs import Log, log_from, open_log, write_native
+from kalmark.logs import Log, log_from, open_log, stream_log, write_native
 from kalmark.logs.progress import track
 from native_logs import CONTROLS, SCANS, native
 
@@ -202,34 +202,60 @@ def test_tables_in_other_units_are_converted_too() -> None:
 
 # ------------------------------------------------------------------ large ones
 MANY = """
-import resource, sys
+import sys
 from pathlib import Path
-from kalmark.logs.table import read_table
-from kalmark.logs.source import Request, raising
+from kalmark.logs import stream_log
 
 def peak() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
-path = Path(sys.argv[1])
-rows = int(sys.argv[2])
-with path.open("w") as file:
+folder, rows = Path(sys.argv[1]), int(sys.argv[2])
+with (folder / "controls.csv").open("w") as file:
     file.write("t_s,robot,v_mps,w_radps\\n")
     file.writelines(f"{k},rover,0.123456789,0.987654321\\n" for k in range(rows))
-seen, before = [0], peak()
-def take(row) -> None:
-    seen[0] += 1
-read_table(path, ("t_s", "robot")).each(Request(None, raising, []), take)
-print(seen[0], peak() - before)
+with (folder / "scans.csv").open("w") as file:
+    file.write("t_s,robot,sensor,id,range_m,bearing_rad\\n")
+    file.writelines(f"{k // 2},rover,lidar,{k % 2},1,1\\n" for k in range(rows))
+events = stream_log(folder)
+next(events)
+before = peak()
+print(1 + sum(1 for _ in events), peak() - before)
 """
 
 
-def test_a_table_is_read_row_by_row_in_the_memory_of_one(tmp_path: Path) -> None:
-    pytest.importorskip("resource", reason="only Unix tells how much memory was used")
-    done = subprocess.run(
-        [sys.executable, "-c", MANY, tmp_path / "controls.csv", "300000"], capture_output=True, text=True, check=True
-    )
+def test_the_events_of_a_long_log_are_read_one_by_one_in_little_memory(tmp_path: Path) -> None:
+    if not Path("/proc/self/status").is_file():
+        pytest.skip("only Linux tells how much memory was used")
+    done = subprocess.run([sys.executable, "-c", MANY, tmp_path, "60000"], capture_output=True, text=True, check=True)
     count, grown_kb = map(int, done.stdout.split())
-    assert count == 300_000 and grown_kb < 8000  # the file has 12 MB
+    assert count == 90_000 and grown_kb < 4000  # kept, they would have 30 MB
+
+
+def test_events_read_one_by_one_are_those_of_the_log(tmp_path: Path) -> None:
+    controls = "t_s,robot,v_mps,w_radps\n" + "".join(f"{t},{r},1,0\n" for t in range(4) for r in ("b", "a"))
+    scans = "t_s,robot,sensor,id,range_m,bearing_rad\n" + "".join(
+        f"{t / 2},{r},{s},{i},4,0\n" for t in range(6) for i in (1, 2) for r in ("b", "a") for s in ("t", "s")
+    )
+    fixes = "t_s,robot,x_m,y_m,sigma_x_m,sigma_y_m\n2,a,1,2,1,1\n"
+    measurements = "t_s,robot,sensor,heading_rad\n1,a,compass,0.1\n1,b,compass,0.1\n"
+    native(tmp_path, controls=controls, scans=scans, fixes=fixes, measurements=measurements)
+    log, events = open_log(tmp_path), list(stream_log(tmp_path))
+    assert list(map(str, log.events)) == list(map(str, events)) and len(events) == 8 + 24 + 1 + 2
+    assert {event.robot for event in stream_log(tmp_path, robots="a")} == {"a"}
+    folder = write_native(log, tmp_path / "parquet", parquet=True)
+    assert list(map(str, stream_log(folder))) == list(map(str, open_log(folder)))
+
+
+def test_rows_that_are_not_in_the_order_of_time_cannot_be_read_one_by_one(tmp_path: Path) -> None:
+    controls = "t_s,robot,v_mps,w_radps\n1,a,1,0\n2,a,1,0\n1,b,1,0\n"
+    (tmp_path / "controls.csv").write_text(controls)
+    assert len(open_log(tmp_path)) == 3
+    with pytest.raises(LogError, match=r"controls.csv: an event at 1.0+ s after one at 2.0+ s, expected rows in the"):
+        list(stream_log(tmp_path))
+    (tmp_path / "a.txt").write_text("")
+    with pytest.raises(LogError, match="not a log of format native"):
+        stream_log(tmp_path / "a.txt")
 
 
 def test_the_bar_of_a_long_file_tells_how_much_of_it_is_read(capsys: pytest.CaptureFixture[str]) -> None:

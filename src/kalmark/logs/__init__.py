@@ -1,7 +1,7 @@
 """Logs of many formats as one stream of events, with the truth to score against."""
 
 from kalmark.logs.download import Dataset, cache_folder, fetch, find_data, list_data
-from kalmark.logs.formats import FORMATS, open_log
+from kalmark.logs.formats import FORMATS, open_log, stream_log
 from kalmark.logs.frames import log_from
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.write import write_native
@@ -18,5 +18,6 @@ __all__ = [
     "list_data",
     "log_from",
     "open_log",
+    "stream_log",
     "write_native",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from kalmark.logs.graph import G2O
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
-from kalmark.logs.native import NATIVE
+from kalmark.logs.native import NATIVE, stream
 from kalmark.logs.plaza import PLAZA
 from kalmark.logs.poses import KITTI, TUM, read_path
 from kalmark.logs.slamtb import SLAMTB
@@ -70,6 +70,20 @@ def open_log(
     log = entry.read(found, request, **options)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m)
     return selected(log, request, from_s, to_s, ids)
+
+
+def stream_log(
+    path: Path | str, *, robots: Sequence[str | int] | str | int | None = None,
+    on_error: Literal["raise", "skip"] = "raise",
+) -> Iterator[Event]:  # fmt: skip
+    """Yield the events of a native log one by one, in the order of `open_log`, in memory that does not grow with it.
+
+    The rows of each file must be in the order of time; the arguments are those of `open_log`.  Raises LogError, for a
+    bad row when it is reached.
+    """
+    _, found = recognise(find_data(path), NATIVE.name)
+    request = requested(robot_names(robots), on_error)
+    return (event for event in stream(found, request) if request.wants(event.robot))
 
 
 def requested(robots: tuple[str, ...] | None, on_error: str, progress: bool = False) -> Request:

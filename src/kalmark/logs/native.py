@@ -19,9 +19,11 @@ numbered in the order of the columns (`cov_xx, cov_xy, cov_yy, ...` where they a
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from heapq import merge
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +85,7 @@ def of_tables(
     reader = _Reader(request)
     for name, read_file in zip(FILES, reader.readers, strict=True):
         if name in there:
-            read_file(there[name])
+            reader.events += read_file(there[name]) or ()
     seen = {name for event in reader.events if isinstance(event, Scan) for name in event.ids or ()}
     known = {*reader.truth, *describes.get("robots", ()), *map(str, seen)}
     strays = refuse_misspelt(reader.places, known, request)
@@ -127,18 +129,19 @@ class _Rows:
 class _Reader:
     """Reads the files of a log, one method each, and gathers what is in them.
 
-    `columns` are those of each robot's controls (sensor "") and of each sensor, `places` where they begin.
+    `columns` are those of each robot's controls (sensor "") and of each sensor, `places` where they begin.  `in_order`:
+    the rows of a file are in the order of time, whichever robot and sensor they are of.
     """
 
-    def __init__(self, request: Request) -> None:
-        self.request = request
+    def __init__(self, request: Request, in_order: bool = False) -> None:
+        self.request, self.in_order = request, in_order
         self.events: list[Event] = []
         self.columns: dict[tuple[str, str], tuple[str, ...]] = {}
         self.places: Places = {}
         self.truth: dict[str, Trajectory] = {}
         self.landmarks: dict[Id, Array] = {}
         self.gps: dict[str, PositionTrack] = {}
-        self.readers = (
+        self.readers: tuple[Callable[[Path | Sheet], Iterator[Event] | None], ...] = (
             self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps,
             self.measurements,
         )  # fmt: skip
@@ -147,42 +150,43 @@ class _Reader:
         """Note where the controls, fixes or scans of a row begin."""
         self.places.setdefault((row.table.path, *row.key), row.line)
 
-    def controls(self, path: Path | Sheet) -> None:
-        """Read `controls.csv`."""
+    def controls(self, path: Path | Sheet) -> Iterator[Event]:
+        """Yield the controls of `controls.csv`."""
 
-        def take(row: Row) -> None:
+        def make(row: Row) -> Event:
             self.note(row)
             u = row.values(self.columns)
             cov = row.own_noise(self.columns[row.key], definite=False)
-            self.events.append(Control(t_ns=row.t_ns, robot=row.robot, u=u, cov=cov))
+            return Control(t_ns=row.t_ns, robot=row.robot, u=u, cov=cov)
 
-        read_table(path, ("t_s", "robot"), known=CONTROL).each(self.request, take)
+        return read_table(path, ("t_s", "robot"), known=CONTROL).made(self.request, make)
 
-    def scans(self, path: Path | Sheet) -> None:
-        """Read `scans.csv`: one scan a robot, sensor and time."""
+    def scans(self, path: Path | Sheet) -> Iterator[Event]:
+        """Yield the scans of `scans.csv`: one a robot, sensor and time."""
         scans: dict[tuple[str, str], _Rows] = {}  # those that may still get rows: of each sensor the last
 
-        def take(row: Row) -> None:
+        def make(row: Row) -> list[Event]:
             self.note(row)
-            rows = scans.get(row.key)
-            if rows is None or rows.t_ns != row.t_ns:
-                self.close(path, row.key, rows)
-                rows = scans[row.key] = _Rows(row.t_ns)
+            over = [row.key] if row.key in scans and scans[row.key].t_ns != row.t_ns else []
+            if self.in_order:
+                over = [key for key, rows in scans.items() if rows.t_ns < row.t_ns]
+            done = [event for key in over for event in self.closed(path, key, scans.pop(key))]
+            rows = scans.setdefault(row.key, _Rows(row.t_ns))
             try:
                 self.add(rows, row)
-            except Refused:
+            except Refused as refused:
                 rows.bad = True
-                raise
+                self.request.refuse(f"{path}{row.table.content.word}{row.line}: {refused}")
+            return done
 
         table = read_table(path, ("t_s", "robot", "sensor", "id"), known=(*CONTROL, *OBSERVATION, *READING))
-        table.each(self.request, take, by_sensor=True)
+        for done in table.made(self.request, make, by_sensor=True):
+            yield from done
         for key, rows in scans.items():
-            self.close(path, key, rows)
+            yield from self.closed(path, key, rows)
 
-    def close(self, path: Path | Sheet, key: tuple[str, str], rows: _Rows | None) -> None:
-        """Make an event of the rows of a scan, which has no more."""
-        if rows is None:
-            return
+    def closed(self, path: Path | Sheet, key: tuple[str, str], rows: _Rows) -> Iterator[Event]:
+        """Yield the event of the rows of a scan, which has no more; none if one of them is bad."""
         robot, sensor = key
         if rows.bad:
             line = f"{path}: scan of {robot} by {sensor} at t={seconds(rows.t_ns)} s, all of it"
@@ -190,7 +194,7 @@ class _Reader:
             return
         covs = [cov for cov in rows.covs if cov is not None]
         cov = np.array(covs) if covs else None
-        self.events.append(Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov))
+        yield Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov)
 
     def add(self, rows: _Rows, row: Row) -> None:
         """Add one row of `scans.csv` to its scan.  Raises Refused."""
@@ -212,34 +216,34 @@ class _Reader:
         rows.covs.append(cov)
         rows.lines.append(row.line)
 
-    def measurements(self, path: Path | Sheet) -> None:
-        """Read `measurements.csv`: one reading a row."""
+    def measurements(self, path: Path | Sheet) -> Iterator[Event]:
+        """Yield the readings of `measurements.csv`, one a row."""
 
-        def take(row: Row) -> None:
+        def make(row: Row) -> Event:
             self.note(row)
             y = row.values(self.columns)
             cov = row.own_noise(self.columns[row.key], definite=True)
-            self.events.append(Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov))
+            return Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov)
 
         table = read_table(path, ("t_s", "robot", "sensor"), known=(*CONTROL, *OBSERVATION, *READING))
-        table.each(self.request, take, by_sensor=True)
+        return table.made(self.request, make, by_sensor=True)
 
-    def fixes(self, path: Path | Sheet) -> None:
-        """Read `fixes.csv`: absolute positions."""
+    def fixes(self, path: Path | Sheet) -> Iterator[Event]:
+        """Yield the absolute positions of `fixes.csv`."""
         table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",))
         if not table.noise_columns:
             raise LogError(f"{path}:1: no column of noise, expected cov_xx, cov_xy, cov_yy or sigma_x_m, sigma_y_m")
         columns: dict[tuple[str, str], tuple[str, ...]] = {}
 
-        def take(row: Row) -> None:
+        def make(row: Row) -> Event:
             self.note(row)
             y = row.values(columns)
             cov = row.own_noise(columns[row.key], definite=True)
             if cov is None:
                 raise Refused("the fix has no noise, expected a covariance in m^2")
-            self.events.append(Fix(t_ns=row.t_ns, robot=row.robot, y=y, cov=cov))
+            return Fix(t_ns=row.t_ns, robot=row.robot, y=y, cov=cov)
 
-        table.each(self.request, take)
+        return table.made(self.request, make)
 
     def read_truth(self, path: Path | Sheet) -> None:
         """Read `truth.csv`: the true trajectory of each robot."""
@@ -295,6 +299,31 @@ class _Reader:
         for robot, (times, rows) in tracks.items():
             track = np.array(rows)
             self.gps[robot] = PositionTrack(np.array(times), track[:, :2], track[0, 2:])
+
+
+def stream(path: Path, request: Request) -> Iterator[Event]:
+    """Yield the events of the native log in a folder, in their order, without keeping them.
+
+    Raises LogError with file and line, for rows that are not in the order of time, too.
+    """
+    reader, there = _Reader(request, in_order=True), tables(path)
+    files = [
+        _by_time(there[name], read_file(there[name]) or iter(()))
+        for name, read_file in zip(FILES, reader.readers, strict=True)
+        if name in there and name in EVENTS
+    ]
+    return merge(*files, key=order)
+
+
+def _by_time(path: Path, events: Iterator[Event]) -> Iterator[Event]:
+    """Yield the events of a file, those of one time in their order.  Raises LogError if its times run backwards."""
+    last_ns = None
+    for t_ns, same in groupby(events, key=lambda event: event.t_ns):
+        if last_ns is not None and t_ns < last_ns:
+            told = f"an event at {seconds(t_ns)} s after one at {seconds(last_ns)} s"
+            raise LogError(f"{path}: {told}, expected rows in the order of time: only these can be read one by one")
+        last_ns = t_ns
+        yield from sorted(same, key=order)
 
 
 def refuse_misspelt(places: Places, known: Collection[str], request: Request) -> set[str]:

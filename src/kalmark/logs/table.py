@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from kalmark.events import MOST, Id, bound, most, shown
 from kalmark.logs.progress import track
 from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
 
+T = TypeVar("T")
 NAMES = ("t_s", "robot", "sensor", "id")
 CONTROL = (
     "v_mps", "vx_mps", "vy_mps", "vz_mps", "w_radps", "wx_radps", "wy_radps", "wz_radps", "steering_rad",
@@ -113,20 +114,25 @@ class Table:
         """Return a column's name as the source has it."""
         return self.given[column][0] if column in self.given else column
 
-    def each(
-        self, request: Request, take: Callable[[Row], None], timed: bool = True, by_sensor: bool = False,
+    def each(self, request: Request, take: Callable[[Row], None], timed: bool = True, strictly: bool = False) -> None:
+        """Let `take` read every row, as `made` does."""
+        for _ in self.made(request, take, timed, strictly=strictly):
+            pass
+
+    def made(
+        self, request: Request, make: Callable[[Row], T | None], timed: bool = True, by_sensor: bool = False,
         strictly: bool = False,
-    ) -> None:  # fmt: skip
-        """Let `take` read every row; refuse those that it refuses, or with other cells than the header has.
+    ) -> Iterator[T]:  # fmt: skip
+        """Yield what `make` makes of every row; refuse those that it refuses, or with other cells than the header has.
 
         If `timed`, refuse those whose time runs backwards, or `strictly` stands still, within a robot (and sensor).
         Raises LogError if there is no row.
         """
         last: dict[tuple[str, str], Row] = {}
-        content, row, count = self.content, None, 0
+        content, row = self.content, None
         shown = request.progress and content.size > 0
         for line, cells in track(content.rows, self.path.name, content.size, show=shown, at=content.at):
-            row, count = Row(self, line, cells), count + 1
+            row = Row(self, line, cells)
             try:
                 if len(cells) != len(self.index):
                     names = ", ".join(map(self.name, self.index))
@@ -139,9 +145,12 @@ class Table:
                         at = f"time {row.time} after {before.time} of {row.robot}"
                         raise Refused(f"{at}, expected {wanted}")
                     last[row.key] = row
-                take(row)
+                found = make(row)
             except Refused as refused:
                 request.refuse(f"{self.path}{content.word}{line}: {refused}")
+                continue
+            if found is not None:
+                yield found
         if row is None:
             raise LogError(f"{content.where}: no rows after the header, expected at least one")
 
