@@ -36,6 +36,7 @@ MOST_RHO = 0.999
 MOST_SCALE = 0.25  # beyond it the problem is not linear
 SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
 TIMES = "times"  # the unit of noise
+JUMPS = ("odometry_jump", "kidnapped")
 
 Where = tuple[str, str]
 
@@ -48,7 +49,7 @@ class Finding:
     `value` and `sigma` are its size in `unit`.  `cure` is what takes it out of the data: the systematic error itself as
     (Z, W), factors of the noise (N,) and of the motion's errors (r,).  `since_s` is when it begins, after the first
     scan, None for all the time.  `alike` are causes that explain the same.  `moved_m` is by how much a place in the map
-    is wrong for it while it was seen.
+    is wrong for it while it was seen.  `at` is where a surveyed landmark seems to be, or the step (q,) of a jump.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Finding:
     since_s: float | None = None
     alike: tuple[Finding, ...] = ()
     moved_m: float | None = None
+    at: Array | None = None
 
 
 class Column(NamedTuple):
@@ -357,7 +359,11 @@ def _seeming(linear: Linear, t_s: Array) -> Iterator[tuple[float, int, Ints, Arr
 
 
 def jumps(linear: Linear, t_s: Array) -> list[Finding]:
-    """Return the step of the motion whose error is largest."""
+    """Return the step of the motion that fits best if any motion may be there, and what jump that is.
+
+    Only the steps of the largest errors are looked at, and how each robot comes to its start.  A jump farther than
+    landmarks are apart is "kidnapped", else it is the odometry that jumps.
+    """
     e = linear.errors_of(linear.residuals)
     root = linear.problem.motions.root.tocoo()
     n = len(linear.problem.robots)
@@ -367,13 +373,23 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     kinds = np.array(linear.problem.motions.kinds)
     counts = ~np.isin(kinds, (START, UNKNOWN)) & (owner >= 0)
     squares = np.bincount(owner[counts], e[counts] ** 2, minlength=n)
-    numbers = np.bincount(owner[counts], minlength=n)
-    if not len(squares):
+    starts = [*{robot: k for k, robot in reversed([*enumerate(linear.problem.robots)])}.values()]
+    nodes = np.array([*np.argsort(-squares)[: min(LOOKED_AT, int((squares > 0).sum()))].tolist(), *starts])
+    if not len(nodes):
         return []
-    node = int(np.argmax(squares))
-    p = min(1.0, n * float(chdtrc(max(int(numbers[node]), 1), squares[node])))
-    errors = np.where((owner == node) & counts, OUT, 1.0)
-    return [
-        Finding("kidnapped", (linear.problem.robots[node],), 0.5 * float(squares[node]), p, math.sqrt(squares[node]),
-                1.0, "sigmas", errors=errors, rows=np.arange(n) == node, since_s=float(t_s[node]))
-    ]  # fmt: skip
+    rows = nodes[:, None] * q + np.arange(q)
+    W = np.zeros((len(linear.at.w), rows.size))
+    W[rows.ravel(), np.arange(rows.size)] = 1.0
+    left, m = linear.left(np.zeros((len(linear.at.z), rows.size)), W).m, linear.residuals.m
+    best = Finding("", (), 0.0, 1.0, 0.0)
+    for node, mine, columns in zip(nodes.tolist(), rows, np.arange(rows.size).reshape(-1, q), strict=True):
+        step = np.linalg.pinv(left[np.ix_(mine, columns)], rcond=1.0 / MOST_CONDITION, hermitian=True) @ m[mine]
+        chi2 = float(m[mine] @ step)
+        if 0.5 * chi2 > best.gain:
+            size, robot = math.sqrt(chi2), linear.problem.robots[node]
+            far = np.linalg.norm(step[: linear.state.d]) > linear.spacing
+            name = "start" if node in starts else "kidnapped" if far else "odometry_jump"
+            best = Finding(name, (robot, f"{t_s[node]:.9g}"), 0.5 * chi2, min(1.0, n * float(chdtrc(q, chi2))), size, 1.0,
+                           "sigmas", Z=np.zeros(len(linear.at.z)), W=W[:, columns] @ step / size,
+                           errors=np.where((owner == node) & counts, OUT, 1.0), since_s=float(t_s[node]), at=step)  # fmt: skip
+    return [best] if best.name else []

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.problem import Linearized, Problem
@@ -122,6 +123,12 @@ class Linear:
         """The number (N,) of the observation that each residual is a component of."""
         first = np.concatenate([[0], np.cumsum([len(f.R) for f in self.problem.factors])])
         return np.unique(self.rows.row + first[self.rows.factor], return_inverse=True)[1]
+
+    @cached_property
+    def spacing(self) -> float:
+        """The median distance, m, of a landmark to the next one; infinite of fewer than two."""
+        places = self.state.groups[LANDMARKS][:, : self.state.d]
+        return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) if len(places) > 1 else np.inf
 
     @property
     def kept(self) -> Flags:

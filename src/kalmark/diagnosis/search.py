@@ -35,11 +35,11 @@ def best(sure: list[Finding]) -> list[Finding]:
     as much, one in the sensors goes before one in the controls.
     """
     first = max(sure, key=lambda f: f.gain)
-    jump = [f for f in sure if f.name == "kidnapped" and f.gain > TAKEN_UP * first.gain]
+    jump = [f for f in sure if f.at is not None and f.gain > TAKEN_UP * first.gain]
     if jump and first.unit == causes.TIMES:
         return jump
-    steady = [f for f in sure if f.Z is not None and f.gain > TAKEN_UP * first.gain]
-    if not steady or (first.unit != causes.TIMES and first.Z is None):
+    steady = [f for f in sure if f.Z is not None and f.at is None and f.gain > TAKEN_UP * first.gain]
+    if not steady or first.at is not None or (first.unit != causes.TIMES and first.Z is None):
         return [first]
     most = max(f.gain for f in steady)
     alike = sorted((f for f in steady if f.gain > ALIKE * most), key=lambda f: -f.gain)
@@ -98,6 +98,8 @@ class Search:
         """Take a cause out of the data."""
         if finding.Z is not None and finding.W is not None:
             self.linear = self.linear.without(finding.Z * finding.value, finding.W * finding.value)
+            if finding.errors is not None:
+                self._scale(finding)
         elif finding.unit == causes.TIMES:
             finding = self._scaled(finding)
         else:

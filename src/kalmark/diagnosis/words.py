@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from kalmark.diagnosis.causes import TIMES, Finding
 from kalmark.results.words import figure
 
@@ -122,6 +124,8 @@ def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
 def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, *of = finding.of
     if finding.name == "start":
+        if finding.at is not None:
+            return f"{robot} does not start where it is said to: it is {_jump(finding)} from there", ""
         return f"the start is {figure(finding.value, 2)} times as uncertain as stated", ""
     if finding.name == "control_sigma":
         what, path = f"the noise of {robot}'s {of[0] or 'motion'}", ["motion", f"sigma_{of[0]}"]
@@ -162,8 +166,24 @@ def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, UNKNOWN_IDS
 
 
+def _jump(finding: Finding) -> str:
+    """Return how far a jump goes, and how sure that is."""
+    step = np.zeros(3) if finding.at is None else finding.at
+    d = 2 if len(step) == 3 else 3
+    by = f"{figure(float(np.linalg.norm(step[:d])))} m and {figure(math.degrees(float(np.linalg.norm(step[d:]))))} deg"
+    return f"{by} ({figure(finding.value, 2)} sigma)"
+
+
 def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
-    return f"{finding.of[0]} moves in a way that its controls do not show ({figure(finding.value, 2)} sigma)", ""
+    return f"{finding.of[0]} is moved by {_jump(finding)} at t={finding.of[1]} s, and its controls do not show it", ""
+
+
+def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
+    evidence = (
+        f"at t={finding.of[1]} s {finding.of[0]} moved by {_jump(finding)} more than its controls say: it was bumped, its wheels"
+        " slipped, or its odometry jumped"
+    )
+    return evidence, ""
 
 
 _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
@@ -180,4 +200,6 @@ _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "outliers": _outliers,
     "wrong_ids": _wrong_ids,
     "kidnapped": _kidnapped,
+    "odometry_jump": _odometry_jump,
+    "start": _noise,
 }
