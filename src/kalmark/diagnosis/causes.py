@@ -389,7 +389,9 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
             size, robot = math.sqrt(chi2), linear.problem.robots[node]
             far = np.linalg.norm(step[: linear.state.d]) > linear.spacing
             name = "start" if node in starts else "kidnapped" if far else "odometry_jump"
-            best = Finding(name, (robot, f"{t_s[node]:.9g}"), 0.5 * chi2, min(1.0, n * float(chdtrc(q, chi2))), size, 1.0,
-                           "sigmas", Z=np.zeros(len(linear.at.z)), W=W[:, columns] @ step / size,
-                           errors=np.where((owner == node) & counts, OUT, 1.0), since_s=float(t_s[node]), at=step)  # fmt: skip
+            errors, none = np.where((owner == node) & counts, OUT, 1.0), np.zeros(len(linear.at.z))
+            best = Finding(
+                name, (robot, f"{t_s[node]:.6g}"), 0.5 * chi2, min(1.0, n * float(chdtrc(q, chi2))), size, 1.0,
+                "sigmas", none, W[:, columns] @ step / size, errors=errors, since_s=float(t_s[node]), at=step,
+            )  # fmt: skip
     return [best] if best.name else []

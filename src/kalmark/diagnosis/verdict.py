@@ -12,16 +12,17 @@ from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS
-from kalmark.diagnosis.causes import TIMES, Finding, Where
+from kalmark.diagnosis.causes import JUMPS, TIMES, Finding, Where
 from kalmark.diagnosis.gross import gross
+from kalmark.diagnosis.jumps import OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.search import LEAST_GAIN, Search
-from kalmark.diagnosis.words import words
+from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.results.batch import given_by, log_of
-from kalmark.results.gaps import matters
+from kalmark.results.gaps import RULED_OUT, left_out, matters
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.warnings import window_warnings
@@ -113,7 +114,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         checked = f"innovations alone, no batch solution: {why}"
         return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
     effect = effect_of(run, found)
-    causes = causes_of(run, found.search, effect.accuracy_m or 0.0)
+    causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
     causes = sorted([*first, *causes], key=lambda c: c.harmless)
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
@@ -199,14 +200,24 @@ def thinned(run: Run, given: Given, most: int) -> Given:
 
 
 # ------------------------------------------------------------------ the causes
-def causes_of(run: Run, search: Search, accuracy_m: float = 0.0) -> list[Cause]:
+def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None = None) -> list[Cause]:
     """Return the causes that a search found; a landmark that moves by less than the map's accuracy does not matter."""
-    return [_cause(run, f) for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
+    matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
+    return [_cause(run, f, log) for f in joined(matter, begin_s(run))]
 
 
-def _cause(run: Run, finding: Finding) -> Cause:
+def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.unit == TIMES and finding.value < 1.0
-    return Cause(finding.name, since_s, finding.gain, *words(finding, run.config), harmless)
+    odd = _odd(run, log, finding, since_s) if finding.name in JUMPS and log is not None else None
+    name, told = finding.name, words(finding, run.config)
+    if odd is not None:
+        name, told = "odometry_jump", of_odd_control(finding, odd)
+    return Cause(name, since_s, finding.gain, *told, harmless)
+
+
+def _odd(run: Run, log: Log, finding: Finding, t_s: float) -> OddControl | None:
+    robot = finding.of[0]
+    return odd_control(log, tuple(run.final_slam().robots[robot].motion.columns), robot, t_s)
 
 
 def _structural(summary: dict[str, Any]) -> list[Cause]:
@@ -217,14 +228,15 @@ def _structural(summary: dict[str, Any]) -> list[Cause]:
 def gaps(summary: dict[str, Any]) -> list[Cause]:
     """Return the gaps in the controls; one that was bridged, and after which the pose was known, is harmless."""
     found = []
-    for gap in (gap for gap in summary.get("gaps", ()) if gap["action"] == "ignore" or matters(gap)):
+    stops = [gap for gap in summary.get("gaps", ()) if gap["kind"] != RULED_OUT]
+    for gap in (gap for gap in stops if gap["action"] == "ignore" or matters(gap)):
         lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
         cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
         evidence = (
             f"the control of {gap['robot']} stops for {figure(lasts)} s{', which was bridged' if bridged else ''}"
         )
         found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged))
-    return found
+    return found + [Cause("odometry_jump", begin_s, 0.0, line, "", True) for begin_s, line in left_out(summary)]
 
 
 def repeats(summary: dict[str, Any]) -> list[Cause]:

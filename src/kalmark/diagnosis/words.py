@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from kalmark.diagnosis.causes import TIMES, Finding
+from kalmark.diagnosis.jumps import LISTED, OddControl, size_of
 from kalmark.results.words import figure
+from kalmark.slam.gaps import MARGIN
 
 Words = tuple[str, str]  # evidence, cure
 MOST_SIGMAS = 1e4
@@ -27,6 +29,9 @@ CALIBRATIONS = {  # the keys that put an error of a column of the controls into 
     ("dtheta_rad", "offset"): "sigma_turn_bias_radps",
     ("dtheta_rad", "per_way"): "sigma_turn_rad_per_m",
 }
+
+
+LIMITS = {"v_mps": "max_speed_mps", "w_radps": "max_turn_radps"}
 
 
 def words(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -168,22 +173,41 @@ def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _jump(finding: Finding) -> str:
     """Return how far a jump goes, and how sure that is."""
-    step = np.zeros(3) if finding.at is None else finding.at
-    d = 2 if len(step) == 3 else 3
-    by = f"{figure(float(np.linalg.norm(step[:d])))} m and {figure(math.degrees(float(np.linalg.norm(step[d:]))))} deg"
-    return f"{by} ({figure(finding.value, 2)} sigma)"
+    far_m, turn_deg = size_of(np.zeros(3) if finding.at is None else finding.at)
+    return f"{figure(far_m)} m and {figure(turn_deg)} deg ({figure(finding.value, 2)} sigma)"
+
+
+def _others(finding: Finding) -> str:
+    """Return the times of the other jumps of a robot."""
+    times = finding.of[2:]
+    some = ", ".join(times[:LISTED])
+    return f"; {len(times)} more at t={some} s{', ...' if len(times) > LISTED else ''}" if times else ""
 
 
 def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
-    return f"{finding.of[0]} is moved by {_jump(finding)} at t={finding.of[1]} s, and its controls do not show it", ""
+    far = f"{finding.of[0]} is moved by about {_jump(finding)} at t={finding.of[1]} s"
+    return f"{far}, and its controls do not show it{_others(finding)}", ""
 
 
 def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
+    by = f"{finding.of[0]} moves by {_jump(finding)} more than its controls say at t={finding.of[1]} s"
+    return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding)}", ""
+
+
+def of_odd_control(finding: Finding, odd: OddControl) -> Words:
+    """Return what a control says that jumps itself, and the limit that leaves it out, where its column has one."""
+    robot = finding.of[0]
+    degrees = odd.column.endswith(("_rad", "_radps"))
+    value = f"{figure(math.degrees(odd.value) if degrees else odd.value)} {'deg' if degrees else ''}".rstrip()
     evidence = (
-        f"at t={finding.of[1]} s {finding.of[0]} moved by {_jump(finding)} more than its controls say: it was bumped, its wheels"
-        " slipped, or its odometry jumped"
+        f"{odd.column} of {robot} is {value} at t={odd.t_s:.6g} s, {figure(odd.times, 2)} times as large as is usual,"
+        f" and it does not move so: its odometry jumps{_others(finding)}"
     )
-    return evidence, ""
+    key = LIMITS.get(odd.column)
+    return (
+        evidence,
+        f"--set robots.{robot}.{key}={figure(odd.usual * MARGIN)}" if key else f"set max_speed_mps of {robot}",
+    )
 
 
 _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
