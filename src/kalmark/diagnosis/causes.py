@@ -34,6 +34,7 @@ SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the 
 SLOW_S = 1e-3
 MOST_RHO = 0.999
 MOST_SCALE = 0.25  # beyond it the problem is not linear
+ALIKE = 0.85  # of what another one explains: they are alike
 SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
 TIMES = "times"  # the unit of noise
 JUMPS = ("odometry_jump", "kidnapped")
@@ -293,6 +294,7 @@ def outliers(linear: Linear, t_s: Array) -> list[Finding]:
     d2, m = np.bincount(of, linear.residuals.r**2), np.bincount(of)
     if not len(d2):
         return []
+    d2[of[linear.surveys]] = 0.0  # a survey that is off is a cause of its own
     best = (0.0, 0.0)
     for spread in SPREADS:
         log_u, share = 0.5 * d2 * (1 - spread**-2) - m * math.log(spread), FIRST_SHARE
@@ -381,17 +383,75 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     W = np.zeros((len(linear.at.w), rows.size))
     W[rows.ravel(), np.arange(rows.size)] = 1.0
     left, m = linear.left(np.zeros((len(linear.at.z), rows.size)), W).m, linear.residuals.m
-    best = Finding("", (), 0.0, 1.0, 0.0)
+    found: list[Finding] = []
     for node, mine, columns in zip(nodes.tolist(), rows, np.arange(rows.size).reshape(-1, q), strict=True):
         step = np.linalg.pinv(left[np.ix_(mine, columns)], rcond=1.0 / MOST_CONDITION, hermitian=True) @ m[mine]
         chi2 = float(m[mine] @ step)
-        if 0.5 * chi2 > best.gain:
+        if chi2 > 0:
             size, robot = math.sqrt(chi2), linear.problem.robots[node]
             far = np.linalg.norm(step[: linear.state.d]) > linear.spacing
             name = "start" if node in starts else "kidnapped" if far else "odometry_jump"
             errors, none = np.where((owner == node) & counts, OUT, 1.0), np.zeros(len(linear.at.z))
-            best = Finding(
+            found.append(Finding(
                 name, (robot, f"{t_s[node]:.6g}"), 0.5 * chi2, min(1.0, n * float(chdtrc(q, chi2))), size, 1.0,
                 "sigmas", none, W[:, columns] @ step / size, errors=errors, since_s=float(t_s[node]), at=step,
-            )  # fmt: skip
-    return [best] if best.name else []
+            ))  # fmt: skip
+    most = max((f.gain for f in found), default=0.0)
+    begins = [f for f in found if f.name == "start" and f.gain > ALIKE * most]  # so is the first step in all but name
+    return sorted(begins or found, key=lambda f: -f.gain)[:1]
+
+
+def priors(linear: Linear, t_s: Array) -> list[Finding]:
+    """Return the surveyed landmarks that are elsewhere than the survey says, each as if it were the only one.
+
+    Their sightings determine where they are.  Only those are looked at whose surveys seem to be off most.
+    """
+    rows, d, found = linear.rows, linear.state.d, []
+    for _, l, place, sign, mine, part in sorted(_surveyed(linear), key=lambda seems: -seems[0])[:LOOKED_AT]:
+        Z = np.zeros((len(linear.at.z), d))
+        Z[mine] = part
+        left = linear.left(Z, np.zeros((len(linear.at.w), d))).r
+        I, g = part.T @ left[mine], part.T @ linear.residuals.r[mine]
+        if not 0 < np.linalg.cond(I) < MOST_CONDITION:
+            continue
+        off = np.linalg.solve(I, g)
+        far, chi2 = float(np.linalg.norm(off)), float(g @ off)
+        if far <= 0 or chi2 <= 0:
+            continue
+        parts = np.bincount(_blocks(linear)[0], (left @ off) * (linear.residuals.r - left @ off))
+        sigmas = chi2 / math.sqrt(max(chi2, float(parts @ parts)))
+        seen = (rows.landmark == l) & linear.kept
+        noise = np.ones(len(linear.at.z))
+        noise[mine] = OUT
+        since_s = float(t_s[rows.node[seen]].min()) if seen.any() else 0.0
+        name, p = str(linear.problem.ids[l]), float(chdtrc(d, sigmas**2))
+        found.append(Finding("landmark_prior", (name,), 0.5 * chi2, p, far, far / sigmas, "m", noise=noise,
+                             since_s=since_s, at=place + sign * off))  # fmt: skip
+    return found
+
+
+def _surveyed(linear: Linear) -> Iterator[tuple[float, int, Array, int, Ints, Array]]:
+    """Yield of each surveyed landmark how much it seems to be off, its number and place, a sign, rows and derivative.
+
+    A survey with a covariance is data: it is off by what was added to it, sign -1.  One that is exact is not: its
+    sightings are of a landmark that is elsewhere, sign +1.
+    """
+    d, problem, rows = linear.state.d, linear.problem, linear.rows
+    if linear.state.spaces[LANDMARKS].dof < d:
+        return
+    have, at = linear.residuals.r, linear.state.columns(LANDMARKS, np.arange(len(problem.ids)))
+    surveys: list[tuple[int, Array, int, Ints]] = []
+    for f, factor in enumerate(problem.factors):
+        block = factor.term.blocks[0]
+        if factor.sensor[1] == "" and block.group == LANDMARKS:
+            at_factor = np.flatnonzero((rows.factor == f) & linear.kept)
+            of = [at_factor[rows.row[at_factor] == k] for k in range(len(factor.y))]
+            surveys += [(l, *rest) for l, *rest in zip(block.rows.tolist(), factor.y, [-1] * len(of), of, strict=True)]
+    for l in np.flatnonzero(~problem.free[at]).tolist():
+        seen = np.flatnonzero((rows.landmark == l) & linear.kept)
+        surveys.append((l, linear.state.groups[LANDMARKS][l, :d], 1, seen))
+    for l, place, sign, mine in surveys:
+        if len(mine) >= d:
+            part = linear.at.H[mine][:, at[l] : at[l] + d].toarray()
+            g = part.T @ have[mine]
+            yield float(g @ np.linalg.pinv(part.T @ part) @ g), l, place, sign, mine, part

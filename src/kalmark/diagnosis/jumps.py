@@ -24,7 +24,10 @@ LISTED = 5  # times of further jumps
 
 
 class OddControl(NamedTuple):
-    """A control far larger than all others: its time, its column and value, and how many times the usual it is."""
+    """A control far larger than all others: its time, its column and value, and how many times the usual it is.
+
+    `usual` is that of a second.
+    """
 
     t_s: float
     column: str
@@ -42,11 +45,12 @@ def odd_control(log: Log, columns: Sequence[str], robot: str, t_s: float) -> Odd
         return None
     usual = np.quantile(u, USUAL, axis=0)
     times = u[near] / np.maximum(usual, 1e-300) * (usual > 0)
-    row, column = np.unravel_index(int(np.argmax(times)), times.shape)
+    row, column = divmod(int(np.argmax(times)), times.shape[1])
     if times[row, column] < TIMES:
         return None
     k = int(near[row])
-    value, most = float(mine[k].u[column]), float(usual[column])
+    lasts_s = 1.0 if columns[column].endswith("ps") else float(np.median(np.diff(t)))
+    value, most = float(mine[k].u[column]), float(usual[column]) / max(lasts_s, 1e-9)
     return OddControl(float(t[k]), columns[column], value, float(times[row, column]), most)
 
 

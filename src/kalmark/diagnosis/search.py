@@ -31,10 +31,15 @@ LOOKED_AT = 200  # outliers whose landmarks are looked for
 def best(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
+    Surveys that are off go before outliers and noise that would take them up, which are one for all of them.
     A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
     as much, one in the sensors goes before one in the controls.
     """
     first = max(sure, key=lambda f: f.gain)
+    surveys = [f for f in sure if f.name == "landmark_prior"]
+    spread = first.name == "outliers" or first.unit == causes.TIMES
+    if surveys and spread and sum(f.gain for f in surveys) > TAKEN_UP * first.gain:
+        return [max(surveys, key=lambda f: f.gain)]
     jump = [f for f in sure if f.at is not None and f.gain > TAKEN_UP * first.gain]
     if jump and first.unit == causes.TIMES:
         return jump
@@ -92,6 +97,7 @@ class Search:
             *causes.outliers(self.linear, self.t_s),
             *causes.landmarks(self.linear, self.t_s),
             *causes.jumps(self.linear, self.t_s),
+            *causes.priors(self.linear, self.t_s),
         ]
 
     def take(self, finding: Finding) -> None:

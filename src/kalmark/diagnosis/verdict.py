@@ -117,6 +117,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
     causes = sorted([*first, *causes], key=lambda c: c.harmless)
+    if effect.status == "ok" and any(misplaced(run, f) for f in found.search.found):
+        effect = replace(effect, status="doubtful")
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
     return Verdict(effect.status, tuple(causes), checked, *figures, found.search)
@@ -218,6 +220,16 @@ def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
 def _odd(run: Run, log: Log, finding: Finding, t_s: float) -> OddControl | None:
     robot = finding.of[0]
     return odd_control(log, tuple(run.final_slam().robots[robot].motion.columns), robot, t_s)
+
+
+def misplaced(run: Run, finding: Finding) -> bool:
+    """Return whether a finding is a surveyed landmark that the map has elsewhere than its sightings."""
+    names = [str(id_) for id_ in run.landmarks.ids]
+    if finding.name != "landmark_prior" or finding.at is None or finding.of[0] not in names:
+        return False
+    k, d = names.index(finding.of[0]), len(finding.at)
+    off, P = run.landmarks.means[k][:d] - finding.at, run.landmarks.covariances[k][:d, :d]
+    return bool(np.linalg.norm(off) > SIGMAS * np.hypot(finding.sigma, np.sqrt(np.trace(P))))
 
 
 def _structural(summary: dict[str, Any]) -> list[Cause]:

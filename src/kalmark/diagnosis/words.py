@@ -31,7 +31,12 @@ CALIBRATIONS = {  # the keys that put an error of a column of the controls into 
 }
 
 
-LIMITS = {"v_mps": "max_speed_mps", "w_radps": "max_turn_radps"}
+LIMITS = {
+    "v_mps": "max_speed_mps",
+    "dx_m": "max_speed_mps",
+    "w_radps": "max_turn_radps",
+    "dtheta_rad": "max_turn_radps",
+}
 
 
 def words(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -162,6 +167,16 @@ def _moving(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, f"leave out {finding.of[0]}"
 
 
+def _landmark_prior(finding: Finding, config: Mapping[str, Any]) -> Words:
+    name = finding.of[0]
+    at = ", ".join(figure(float(x)) for x in (np.zeros(0) if finding.at is None else finding.at))
+    evidence = (
+        f"landmark {name} is {figure(finding.value)} m from where its survey says ({_sure(finding)}):"
+        f" its sightings place it at ({at}) m"
+    )
+    return evidence, f"correct {name} in the file of the survey, or leave it out"
+
+
 def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
     return f"{finding.value:.1%} of the observations are far off where their landmark is", ""
 
@@ -221,6 +236,7 @@ _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "steering_offset": _odometry,
     "correlated_noise": _correlated,
     "moving_landmark": _moving,
+    "landmark_prior": _landmark_prior,
     "outliers": _outliers,
     "wrong_ids": _wrong_ids,
     "kidnapped": _kidnapped,

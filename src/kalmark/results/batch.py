@@ -152,7 +152,7 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
     rows = fused if rows is None else rows
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
     started = {name for row, name in names.items() if history.outcome[row] != "associated"}
-    beforehand = {ids.get(str(name), name): prior for name, prior in (known or {}).items()}
+    beforehand = {ids.get(str(name), name): prior for name, prior in {**_surveyed(history), **(known or {})}.items()}
     for name in dict.fromkeys(names.values()):
         if name not in started and name not in beforehand and name not in robots:
             mean, covariance = landmarks.get(name, (None, np.ones(1)))
@@ -178,6 +178,12 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
         starts={start.robot: (start.mean, start.covariance) for start in history.starts},
         fixes=len(run.history.fixes),
     )
+
+
+def _surveyed(history: History) -> Known:
+    """Return the points that were surveyed with a covariance."""
+    points = [prior for prior in history.priors if len(prior.mean) == len(prior.covariance) == history.d]
+    return {as_id(prior.landmark): (prior.mean, prior.covariance) for prior in points}
 
 
 def _in_the_end(history: History, rows: Index) -> list[str]:

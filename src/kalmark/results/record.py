@@ -18,7 +18,7 @@ from kalmark.logs.log import Log, begins_at
 from kalmark.logs.source import nearest
 from kalmark.results.foresight import Foresight
 from kalmark.results.gaps import joined
-from kalmark.results.history import Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
+from kalmark.results.history import Change, Controlled, History, MapSnapshot, Prior, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.progress import track
 from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
@@ -122,6 +122,14 @@ class _Recorder:
             for name, t_ns in begins.items()
             if t_ns is not None
         )
+        self.priors = (
+            ()
+            if slam.t_ns is not None
+            else tuple(
+                Prior(str(name), np.array(slam.mean(name)), np.array(slam.covariance(name)))
+                for name in slam.tracks.confirmed
+            )
+        )  # of a map that is resumed they are correlated
         self.controls: dict[str, Controlled] = {}
         self.reckoned = {name: DeadReckoning(robot) for name, robot in slam.robots.items()}
         self.dead: list[Array] = []
@@ -244,6 +252,7 @@ class _Recorder:
             controls=self.controls,
             fixes=tuple(self.fixes),
             starts=self.starts,
+            priors=self.priors,
             cameras=cameras(self.slam),
             sensors=sensors(self.slam),
             mounts=mounts(self.slam),

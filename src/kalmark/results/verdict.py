@@ -8,6 +8,7 @@ from typing import Any
 from kalmark.results.words import count, figure
 
 SHOWN = 3  # causes in a short verdict
+ROUNDING_M = 1e-9
 SEEN = 0.02  # by which a factor of the sigmas is worth a word
 
 
@@ -40,7 +41,7 @@ def _trust(verdict: Mapping[str, Any]) -> str:
     """Return to what accuracy a map can be trusted."""
     factor, accuracy, shift = (verdict[key] for key in ("sigma_factor", "accuracy_m", "shift_m"))
     if verdict["map"] != "ok":
-        return f": its shape is off by {figure(shift)} m" if shift else ""
+        return f": its shape is off by {figure(shift)} m" if shift and shift > ROUNDING_M else ""
     if factor is None:
         return ""
     said = f"{figure(factor, 2)} times what the filter states" if abs(factor - 1.0) > SEEN else "as the filter states"
