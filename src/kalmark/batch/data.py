@@ -25,6 +25,7 @@ from kalmark.geometry.spaces import mount_space
 from kalmark.models.observe import inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor
 from kalmark.slam.checks import measurements
+from kalmark.tracks.channel import huber_length
 
 if TYPE_CHECKING:
     from kalmark.slam.robot import Robot
@@ -263,7 +264,8 @@ class Replay:
             if (robot, sensor) in groups:
                 blocks.insert(1, Block(groups[robot, sensor], np.zeros_like(node), mount_space(size)))
             view = view_of(mount.sensor, given.landmark, mean)
-            factors.append(sightings(view, tuple(blocks), y, R, given.huber, (robot, sensor)))
+            huber = given.huber if mount.robust is None else min(given.huber, huber_length(R.shape[1]))
+            factors.append(sightings(view, tuple(blocks), y, R, huber, (robot, sensor)))
         return factors, [np.array(given.mounts[name], dtype=np.float64) for name in groups]
 
     def _positions(self, names: list[Id]) -> list[Factor]:
