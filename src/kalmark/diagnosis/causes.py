@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtr, chdtrc, expit, ndtr
+from scipy.special import chdtr, chdtrc, chdtri, expit, ndtr
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.course import START, UNKNOWN
@@ -32,6 +32,8 @@ LOOKED_AT = 20  # landmarks
 MOST_CONDITION = 1e12
 SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the end
 SLOW_S = 1e-3
+MOST_STEPS, FAR_STEPS = 0.9, 10.0  # share of steps without a jump; and times a long step is one that is no driving
+SELDOM = 1e-3
 MOST_RHO = 0.999
 MOST_SCALE = 0.25  # beyond it the problem is not linear
 ALIKE = 0.85  # of what another one explains: they are alike
@@ -364,7 +366,8 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     """Return the step of the motion that fits best if any motion may be there, and what jump that is.
 
     Only the steps of the largest errors are looked at, and how each robot comes to its start.  A jump farther than
-    landmarks are apart is "kidnapped", else it is the odometry that jumps.
+    landmarks are apart and than steps are long is "kidnapped", else it is the odometry that jumps.  `p` counts it in
+    the chi-square of steps all over the run, which is larger where errors of a sensor last, or where noise is.
     """
     e = linear.errors_of(linear.residuals)
     root = linear.problem.motions.root.tocoo()
@@ -376,29 +379,40 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     counts = ~np.isin(kinds, (START, UNKNOWN)) & (owner >= 0)
     squares = np.bincount(owner[counts], e[counts] ** 2, minlength=n)
     starts = [*{robot: k for k, robot in reversed([*enumerate(linear.problem.robots)])}.values()]
-    nodes = np.array([*np.argsort(-squares)[: min(LOOKED_AT, int((squares > 0).sum()))].tolist(), *starts])
-    if not len(nodes):
-        return []
-    rows = nodes[:, None] * q + np.arange(q)
+    nodes = [*np.argsort(-squares)[: min(LOOKED_AT, int((squares > 0).sum()))].tolist(), *starts]
+    found: list[Finding] = []
+    for node, (chi2, step, W) in zip(nodes, _free_steps(linear, nodes), strict=True):
+        if chi2 <= 0:
+            continue
+        size, robot = math.sqrt(chi2), linear.problem.robots[node]
+        far = np.linalg.norm(step[: linear.state.d]) > max(linear.spacing, FAR_STEPS * linear.step)
+        name = "start" if node in starts else "kidnapped" if far else "odometry_jump"
+        errors, none = np.where((owner == node) & counts, OUT, 1.0), np.zeros(len(linear.at.z))
+        found.append(Finding(
+            name, (robot, f"{t_s[node]:.6g}"), 0.5 * chi2, min(1.0, n * float(chdtrc(q, chi2))), size, 1.0,
+            "sigmas", none, W / size, errors=errors, since_s=float(t_s[node]), at=step,
+        ))  # fmt: skip
+    most = max((f.gain for f in found), default=0.0)
+    begins = [f for f in found if f.name == "start" and f.gain > ALIKE * most]  # so is the first step in all but name
+    best = sorted(begins or found, key=lambda f: -f.gain)[:1]
+    if not best or best[0].p > SELDOM:
+        return best
+    known = np.flatnonzero(squares > 0)
+    usual = [chi2 for chi2, *_ in _free_steps(linear, known[:: max(1, len(known) // SETS)].tolist())]
+    larger = max(1.0, float(np.quantile(usual, MOST_STEPS)) / float(chdtri(q, 1.0 - MOST_STEPS)))
+    return [replace(best[0], p=min(1.0, n * float(chdtrc(q, 2.0 * best[0].gain / larger))))]
+
+
+def _free_steps(linear: Linear, nodes: list[int]) -> Iterator[tuple[float, Array, Array]]:
+    """Yield of each node by how much chi-square falls if any step leads to it, the step (q,), what it adds (q n,)."""
+    q = len(linear.at.w) // max(len(linear.problem.robots), 1)
+    rows = np.array(nodes)[:, None] * q + np.arange(q)
     W = np.zeros((len(linear.at.w), rows.size))
     W[rows.ravel(), np.arange(rows.size)] = 1.0
     left, m = linear.left(np.zeros((len(linear.at.z), rows.size)), W).m, linear.residuals.m
-    found: list[Finding] = []
-    for node, mine, columns in zip(nodes.tolist(), rows, np.arange(rows.size).reshape(-1, q), strict=True):
+    for mine, columns in zip(rows, np.arange(rows.size).reshape(-1, q), strict=True):
         step = np.linalg.pinv(left[np.ix_(mine, columns)], rcond=1.0 / MOST_CONDITION, hermitian=True) @ m[mine]
-        chi2 = float(m[mine] @ step)
-        if chi2 > 0:
-            size, robot = math.sqrt(chi2), linear.problem.robots[node]
-            far = np.linalg.norm(step[: linear.state.d]) > linear.spacing
-            name = "start" if node in starts else "kidnapped" if far else "odometry_jump"
-            errors, none = np.where((owner == node) & counts, OUT, 1.0), np.zeros(len(linear.at.z))
-            found.append(Finding(
-                name, (robot, f"{t_s[node]:.6g}"), 0.5 * chi2, min(1.0, n * float(chdtrc(q, chi2))), size, 1.0,
-                "sigmas", none, W[:, columns] @ step / size, errors=errors, since_s=float(t_s[node]), at=step,
-            ))  # fmt: skip
-    most = max((f.gain for f in found), default=0.0)
-    begins = [f for f in found if f.name == "start" and f.gain > ALIKE * most]  # so is the first step in all but name
-    return sorted(begins or found, key=lambda f: -f.gain)[:1]
+        yield float(m[mine] @ step), step, W[:, columns] @ step
 
 
 def priors(linear: Linear, t_s: Array) -> list[Finding]:

@@ -45,7 +45,7 @@ class Mistake(NamedTuple):
     """What may have been done wrongly: its name, what it is, its cure, and the configuration and log without it.
 
     `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
-    `since_s` since when it counts, in s of the log.
+    `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Mistake(NamedTuple):
     change: Change | None = None
     gain: float = 0.0
     since_s: float = 0.0
+    share: float = 1.0
 
 
 class Fit(NamedTuple):
@@ -153,7 +154,7 @@ def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
     ids = "; ".join(f"what is called {a} is where {b} was" for a, b in others.items())
     gain = explained(now.of(slice(first, first + len(after.history.d2))), fit(after))
     evidence = f"ids mean other landmarks from t={t_ns * 1e-9:.1f} s on: {ids}"
-    return Mistake("wrong_ids", evidence, UNKNOWN_IDS, run.config, None, gain, t_ns * 1e-9)
+    return Mistake("wrong_ids", evidence, UNKNOWN_IDS, run.config, None, gain, t_ns * 1e-9, len(others) / len(old.ids))
 
 
 def _misfit_in_a_row(run: Run, now: Fit) -> int | None:

@@ -64,7 +64,7 @@ def joined(found: Sequence[Finding], begin_s: float) -> list[Finding]:
     for robot in dict.fromkeys(f.of[0] for f in jumps):
         first, *more = [f for f in jumps if f.of[0] == robot]
         times = [first.since_s or 0.0, *sorted(f.since_s or 0.0 for f in more)]
-        of = (robot, *(f"{begin_s + t:.6g}" for t in times))
+        of = (robot, *(f"{begin_s + t:.1f}" for t in times))
         rest.append(replace(first, of=of, gain=sum(f.gain for f in (first, *more))))
     return rest
 

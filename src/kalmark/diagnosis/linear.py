@@ -137,6 +137,18 @@ class Linear:
         places = self.state.groups[LANDMARKS][:, : self.state.d]
         return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) if len(places) > 1 else np.inf
 
+    @cached_property
+    def step(self) -> float:
+        """The length, m, of a long step of a robot from one pose to the next: 1 % are longer."""
+        poses, robots, lengths = (
+            self.state.groups[POSES][:, : self.state.d],
+            np.array(self.problem.robots),
+            [np.zeros(1)],
+        )
+        for robot in dict.fromkeys(self.problem.robots):
+            lengths.append(np.linalg.norm(np.diff(poses[robots == robot], axis=0), axis=1))
+        return float(np.quantile(np.concatenate(lengths), 0.99))
+
     @property
     def kept(self) -> Flags:
         """Which residuals (N,) still count."""

@@ -13,7 +13,7 @@ from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis.causes import JUMPS, TIMES, Finding, Where
-from kalmark.diagnosis.gross import gross
+from kalmark.diagnosis.gross import Mistake, gross
 from kalmark.diagnosis.jumps import OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.search import LEAST_GAIN, Search
@@ -36,6 +36,7 @@ EVENTS = 4  # times as many as observations are taken
 SEGMENT = 30  # successive scans that are taken together where not all are
 MORE = 4  # times as many are taken if the segments do not determine the map
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
+FEW = 0.01  # of the landmarks: a mistake about no more than these is weighed by what it does to the map
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
@@ -92,15 +93,22 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
         run.evaluate()
     summary = run.summary
     mistake = gross(run, log)
-    if mistake is not None:
-        cause = Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
-        verdict = Verdict("wrong", (cause, *_structural(summary)), "the log filtered again without the mistake")
+    if mistake is not None and mistake.share > FEW:
+        verdict = Verdict(
+            "wrong", (_of_mistake(mistake), *_structural(summary)), "the log filtered again without the mistake"
+        )
     else:
         verdict = _judged(run, log, most, progress)
+        if mistake is not None:
+            verdict = replace(verdict, causes=(_of_mistake(mistake), *verdict.causes))
         if run.stopped or summary.get("diverged") or repeats(summary):
             verdict = replace(verdict, map="wrong")
     summary["verdict"] = verdict.as_dict()
     return verdict
+
+
+def _of_mistake(mistake: Mistake) -> Cause:
+    return Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
 
 
 def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:

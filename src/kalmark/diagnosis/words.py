@@ -215,7 +215,7 @@ def of_odd_control(finding: Finding, odd: OddControl) -> Words:
     degrees = odd.column.endswith(("_rad", "_radps"))
     value = f"{figure(math.degrees(odd.value) if degrees else odd.value)} {'deg' if degrees else ''}".rstrip()
     evidence = (
-        f"{odd.column} of {robot} is {value} at t={odd.t_s:.6g} s, {figure(odd.times, 2)} times as large as is usual,"
+        f"{odd.column} of {robot} is {value} at t={odd.t_s:.1f} s, {figure(odd.times, 2)} times as large as is usual,"
         f" and it does not move so: its odometry jumps{_others(finding)}"
     )
     key = LIMITS.get(odd.column)
