@@ -29,6 +29,7 @@ from kalmark.results.warnings import window_warnings
 from kalmark.results.words import figure
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
+from kalmark.slam.surveyed import ELSEWHERE
 
 NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
@@ -95,7 +96,7 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     mistake = gross(run, log)
     if mistake is not None and mistake.share > FEW:
         verdict = Verdict(
-            "wrong", (_of_mistake(mistake), *_structural(summary)), "the log filtered again without the mistake"
+            "wrong", (_of_mistake(mistake), *_structural(run)), "the log filtered again without the mistake"
         )
     else:
         verdict = _judged(run, log, most, progress)
@@ -113,7 +114,7 @@ def _of_mistake(mistake: Mistake) -> Cause:
 
 def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first = _structural(run.summary)
+    first = _structural(run)
     try:
         found = _searched(run, log, most, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
@@ -240,9 +241,27 @@ def misplaced(run: Run, finding: Finding) -> bool:
     return bool(np.linalg.norm(off) > SIGMAS * np.hypot(finding.sigma, np.sqrt(np.trace(P))))
 
 
-def _structural(summary: dict[str, Any]) -> list[Cause]:
+def _structural(run: Run) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
-    return [*repeats(summary), *gaps(summary)]
+    return [*repeats(run.summary), *gaps(run.summary), *given_up(run)]
+
+
+def given_up(run: Run) -> list[Cause]:
+    """Return the surveyed landmarks that the filter found elsewhere and mapped anew, which does no harm."""
+    h, found, now = run.history, [], {str(id_): k for k, id_ in enumerate(run.landmarks.ids)}
+    surveys = {prior.landmark: prior for prior in h.priors}
+    for change in (c for c in h.changes if c.reason == ELSEWHERE and c.landmark in surveys and c.landmark in now):
+        prior, k, d = surveys[change.landmark], now[change.landmark], h.d
+        mean, P = run.landmarks.means[k][:d], run.landmarks.covariances[k][:d, :d] + prior.covariance[:d, :d]
+        off, at = mean - prior.mean[:d], ", ".join(figure(float(x)) for x in mean)
+        chi2 = float(off @ np.linalg.pinv(P) @ off)
+        evidence = (
+            f"landmark {change.landmark} is {figure(float(np.linalg.norm(off)))} m from where its survey says"
+            f" ({figure(float(np.sqrt(chi2)), 2)} sigma): the filter left its survey out and mapped it at ({at}) m"
+        )
+        cure = f"correct {change.landmark} in the file of the survey, or leave it out"
+        found.append(Cause("landmark_prior", float(h.t_ns[change.step]) * 1e-9, 0.5 * chi2, evidence, cure, True))
+    return found
 
 
 def gaps(summary: dict[str, Any]) -> list[Cause]:

@@ -30,6 +30,7 @@ from kalmark.results.history import History, as_id
 from kalmark.results.landmarks import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
 from kalmark.results.progress import track
+from kalmark.slam.surveyed import ELSEWHERE
 
 MOST_REJECTED = 0.2  # of the fixes
 STRETCHES = 10  # of a robot's path, each with its difference from the batch solution
@@ -185,8 +186,15 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
 
 
 def _surveyed(history: History) -> Known:
-    """Return the points that were surveyed with a covariance."""
-    points = [prior for prior in history.priors if len(prior.mean) == len(prior.covariance) == history.d]
+    """Return the points that were surveyed with a covariance, and were not found to be elsewhere."""
+    gone = {change.landmark for change in history.changes if change.reason == ELSEWHERE}
+    points = [
+        prior
+        for prior in history.priors
+        if len(prior.mean) == len(prior.covariance) == history.d
+        and prior.covariance.any()
+        and prior.landmark not in gone
+    ]
     return {as_id(prior.landmark): (prior.mean, prior.covariance) for prior in points}
 
 

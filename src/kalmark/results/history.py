@@ -73,7 +73,7 @@ class Start(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """A landmark of a survey: its name, and its mean and covariance before the first event."""
+    """A landmark of a survey: its name, and its mean and covariance (0: known exactly) before the first event."""
 
     landmark: str
     mean: Vector
@@ -198,7 +198,7 @@ class History:
 
     `changes` is what became of landmarks, `fixes` are those used, in the order they came, `controls` those of each
     robot that had any, `gaps` the times without, `repeats` pairs of landmarks that seem to be one.  `priors` are the
-    landmarks that were surveyed with a covariance.
+    landmarks that were surveyed.
     """
 
     t_ns: Ints

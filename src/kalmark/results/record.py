@@ -122,14 +122,8 @@ class _Recorder:
             for name, t_ns in begins.items()
             if t_ns is not None
         )
-        self.priors = (
-            ()
-            if slam.t_ns is not None
-            else tuple(
-                Prior(str(name), np.array(slam.mean(name)), np.array(slam.covariance(name)))
-                for name in slam.tracks.confirmed
-            )
-        )  # of a map that is resumed they are correlated
+        surveyed = slam.landmarks() if slam.t_ns is None else ()  # in a map that is resumed they are correlated
+        self.priors = tuple(Prior(str(l.id), np.array(l.mean), np.array(l.covariance)) for l in surveyed)
         self.controls: dict[str, Controlled] = {}
         self.reckoned = {name: DeadReckoning(robot) for name, robot in slam.robots.items()}
         self.dead: list[Array] = []

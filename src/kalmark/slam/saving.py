@@ -126,6 +126,11 @@ def _state(state: State) -> Description:
             for name, m in state.moving.items()
         },
         "readers": [[*key, reader.t_ns] for key, reader in state.readers.items()],
+        "surveys": {
+            "trial": [[_id(name), count] for name, count in state.surveys.trial.items()],
+            "misfits": [[_id(name), *counts] for name, counts in state.surveys.misfits.items()],
+            "strangers": [[robot, [*map(_id, names)]] for robot, names in state.surveys.strangers.items()],
+        },
     }
 
 
@@ -232,6 +237,10 @@ class Saved:
         clones.latest = {robot: _count(number, "number of a clone") for robot, number in s["latest"].items()}
         clones.numbered = _count(s["numbered"], "number of clones")
         self._fill_moving(state)
+        judged = s.get("surveys", {"trial": (), "misfits": (), "strangers": ()})
+        state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
+        state.surveys.misfits = {name: (int(out), int(fit)) for name, out, fit in judged["misfits"]}
+        state.surveys.strangers = {str(robot): set(names) for robot, names in judged["strangers"]}
         for robot, sensor, t_ns in s["readers"]:
             state.readers[robot, sensor].t_ns = _time(t_ns)
         carried: dict[ChannelKey, Channel | Reader] = {**state.channels, **state.readers}

@@ -1,0 +1,63 @@
+"""Corrections by surveyed landmarks, which are gated, so that one that stands elsewhere does not pull the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from kalmark.association.protocol import Decision
+from kalmark.filter.estimators import Correction, Estimator, Update
+from kalmark.geometry.gaussian import gate
+from kalmark.slam.policy import Policy
+from kalmark.slam.state import State
+from kalmark.tracks.channel import ObservationModel
+from kalmark.tracks.scan import ScanContext
+
+SURVEYED = 0.9999  # of right sightings are within the gate
+ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped anew"
+SURE_RAD = 0.3  # a sigma of the heading above which nothing can be expected
+
+
+def apart(
+    state: State, groups: Sequence[tuple[ObservationModel, list[int]]], decisions: Sequence[Decision]
+) -> Iterator[tuple[ObservationModel, list[int], bool]]:
+    """Yield the groups, of each those apart, and last, whose surveys are on trial."""
+    trial = state.surveys.trial
+    for model, rows in groups:
+        tried = [k for k in rows if decisions[k][0] in trial] if trial else []
+        yield model, [k for k in rows if k not in tried] if tried else rows, False
+        if tried:
+            yield model, tried, True
+
+
+def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
+    """Return the gate of sightings of surveyed landmarks; infinite while the heading of their robot is not known."""
+    turns = slice(2, 3) if scan.dimensions == 2 else slice(3, 6)
+    if state.map.covariance([scan.robot]).diagonal()[turns].max() > SURE_RAD**2:
+        return math.inf
+    return policy.association.threshold(scan.channel.dof, gate(SURVEYED, scan.channel.dof))
+
+
+def corrected(
+    state: State,
+    scan: ScanContext,
+    names: Sequence[Any],
+    update: Update,
+    least: float,
+    estimator: Estimator | None = None,
+) -> Correction:
+    """Correct by sightings of surveyed landmarks; those beyond the gate `least` are left out, unless the robot is."""
+    done = state.corrected(update._replace(gate=min(update.gate, least)), scan.event, estimator)
+    if least == math.inf:
+        return done
+    out = np.flatnonzero(~done.fused & (done.d2 <= update.gate))
+    fitting, others = ([names[k] for k in rows.tolist()] for rows in (np.flatnonzero(done.fused), out))
+    if not state.surveys.judge(scan.event.robot, fitting, others):
+        return done
+    rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
+    again, fused = state.corrected(rest, scan.event, estimator), done.fused.copy()
+    fused[out] = again.fused
+    return done._replace(fused=fused)
