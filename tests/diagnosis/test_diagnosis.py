@@ -216,20 +216,27 @@ def surveyed(folder: Path, log: Log, sigma_m: float, wrong: dict[int, tuple[floa
     return f"filter.map.known={folder / 'survey.csv'}"
 
 
-@pytest.mark.parametrize("sigma_m", [0.0, 0.02])
-def test_surveyed_landmarks_that_are_elsewhere_are_named_with_their_place(tmp_path: Path, sigma_m: float) -> None:
+@pytest.mark.parametrize(("sigma_m", "gate"), [(0.0, "default"), (0.02, "default"), (0.0, "off"), (0.02, "off")])
+def test_surveyed_landmarks_that_are_elsewhere_are_named_with_their_place(
+    tmp_path: Path, sigma_m: float, gate: str
+) -> None:
     log = simulate(world_of(), 3)
     ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
     often = sorted({*ids}, key=lambda i: (-ids.count(i), i))
-    verdict = km.diagnose(recorded(log, surveyed(tmp_path, log, sigma_m, {0: (0.6, 0.3), 2: (-0.4, 0.5)})))
+    association = f"filter.association={{type: identity, gate: {gate}}}"
+    survey = surveyed(tmp_path, log, sigma_m, {0: (0.9, 0.3), 2: (-0.6, 0.8)})
+    verdict = km.diagnose(recorded(log, survey, association))
     named = [cause for cause in verdict.causes if cause.name == "landmark_prior"]
     assert {cause.evidence.split()[1] for cause in named} == {str(often[0]), str(often[2])}
     assert verdict.causes[0].name == "landmark_prior"
-    assert verdict.search is not None
-    for finding in (f for f in verdict.search.found if f.name == "landmark_prior"):
-        true = log.landmarks[next(i for i in often if str(i) == finding.of[0])]
-        assert finding.at is not None and np.linalg.norm(finding.at - true) < 0.2
-        assert finding.value == pytest.approx(0.66, abs=0.2)
+    assert verdict.map == ("ok" if gate == "default" else "doubtful")
+    for cause in named:
+        true = log.landmarks[next(i for i in often if str(i) == cause.evidence.split()[1])]
+        at = [
+            float(x) for x in cause.evidence[cause.evidence.index("at (") + 4 : cause.evidence.index(") m")].split(",")
+        ]
+        assert np.linalg.norm(at - true) < 0.25
+        assert cause.harmless == (gate == "default") == ("mapped it" in cause.evidence)  # or is the map pulled?
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.02, 0.5])
