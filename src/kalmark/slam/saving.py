@@ -128,8 +128,12 @@ def _state(state: State) -> Description:
         "readers": [[*key, reader.t_ns] for key, reader in state.readers.items()],
         "surveys": {
             "trial": [[_id(name), count] for name, count in state.surveys.trial.items()],
-            "misfits": [[_id(name), *counts] for name, counts in state.surveys.misfits.items()],
-            "strangers": [[robot, [*map(_id, names)]] for robot, names in state.surveys.strangers.items()],
+            "misfits": [
+                [_id(name), out, sorted(map(_id, fit), key=str)] for name, (out, fit) in state.surveys.misfits.items()
+            ],
+            "strangers": [
+                [robot, sorted(map(_id, names), key=str)] for robot, names in state.surveys.strangers.items()
+            ],
         },
     }
 
@@ -239,7 +243,7 @@ class Saved:
         self._fill_moving(state)
         judged = s.get("surveys", {"trial": (), "misfits": (), "strangers": ()})
         state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
-        state.surveys.misfits = {name: (int(out), int(fit)) for name, out, fit in judged["misfits"]}
+        state.surveys.misfits = {name: (int(out), frozenset(fit)) for name, out, fit in judged["misfits"]}
         state.surveys.strangers = {str(robot): set(names) for robot, names in judged["strangers"]}
         for robot, sensor, t_ns in s["readers"]:
             state.readers[robot, sensor].t_ns = _time(t_ns)

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.association.protocol import Decision
 from kalmark.filter.estimators import Correction, Estimator, Update
+from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
@@ -18,6 +20,7 @@ from kalmark.tracks.scan import ScanContext
 
 SURVEYED = 0.9999  # of right sightings are within the gate
 ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped anew"
+WIDER = 2.0  # times what a robot that was elsewhere has moved by
 SURE_RAD = 0.3  # a sigma of the heading above which nothing can be expected
 
 
@@ -57,7 +60,21 @@ def corrected(
     fitting, others = ([names[k] for k in rows.tolist()] for rows in (np.flatnonzero(done.fused), out))
     if not state.surveys.judge(scan.event.robot, fitting, others):
         return done
+    pose = state.map.mean(scan.robot)[: len(scan.channel.at)]
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
     again, fused = state.corrected(rest, scan.event, estimator), done.fused.copy()
     fused[out] = again.fused
+    _widen(state, scan, pose)
     return done._replace(fused=fused)
+
+
+def _widen(state: State, scan: ScanContext, before: Array) -> None:
+    """Let the pose of a robot that was elsewhere be as uncertain as it has moved now: it was believed too much.
+
+    What its covariance lets it move by is too little at first, but doubles from scan to scan.
+    """
+    after, d, dof = state.map.mean(scan.robot)[: len(before)], scan.dimensions, scan.channel.pose_dof
+    turn = after[2] - before[2] if d == 2 else 2.0 * math.acos(min(1.0, abs(float(after[3:] @ before[3:]))))
+    sigmas = np.repeat([np.linalg.norm(after[:d] - before[:d]), abs(wrap(float(turn)))], [d, dof - d])
+    index = state.map.index(scan.robot)[:dof]
+    state.map.predict(index, np.eye(dof), np.diag((WIDER * sigmas) ** 2))

@@ -2,7 +2,7 @@
 
 A sighting outside its gate is left out, as a fix is.  Sightings of two such landmarks with none between that fits say
 that the robot is elsewhere, not they: those are taken.  A landmark of which five sightings in a row do not fit, while
-as many of others do, stands elsewhere: it is removed, and its next sighting maps it anew.
+those of twice as many landmarks do as do not, stands elsewhere: it is removed, and its next sighting maps it anew.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from collections.abc import Collection
 
 from kalmark.events import Id
 
-MISFITS = 5  # sightings in a row that do not fit, and of others that do: the survey is wrong
+MISFITS, TWICE = 5, 2  # sightings in a row that do not fit, and landmarks that do: the survey is wrong
 TRUSTED = 5  # sightings that fit, after which it is right
 
 
 class Surveys:
     """What sightings say of surveys.  `trial`: of landmarks in the map, how many sightings have fitted so far.
 
-    `misfits`: how many sightings in a row did not fit, and how many of others did meanwhile.  `strangers`: by robot,
+    `misfits`: how many sightings in a row did not fit, and which landmarks did meanwhile.  `strangers`: by robot,
     the landmarks that did not fit since one did.
     """
 
     def __init__(self) -> None:
         self.trial: dict[Id, int] = {}
-        self.misfits: dict[Id, tuple[int, int]] = {}
+        self.misfits: dict[Id, tuple[int, frozenset[Id]]] = {}
         self.strangers: dict[str, set[Id]] = {}
 
     def forget(self, name: Id) -> None:
@@ -43,11 +43,11 @@ class Surveys:
                 if self.trial[name] >= TRUSTED:
                     del self.trial[name]
         if fitting:
-            self.misfits = {name: (out, fit + len(fitting)) for name, (out, fit) in self.misfits.items()}
+            self.misfits = {name: (out, fit.union(fitting)) for name, (out, fit) in self.misfits.items()}
             self.strangers.pop(robot, None)
         for name in others:
-            out, fit = self.misfits.get(name, (0, 0))
-            self.misfits[name] = out + 1, fit
+            out, fit = self.misfits.get(name, (0, frozenset[Id]()))
+            self.misfits[name] = out + 1, fit.union(fitting)
         strangers = self.strangers.setdefault(robot, set())
         strangers.update(others if not fitting else ())
         if len(strangers) < 2:
@@ -59,4 +59,5 @@ class Surveys:
 
     def wrong(self) -> list[Id]:
         """Return the landmarks that stand elsewhere."""
-        return [name for name, (out, fit) in self.misfits.items() if out >= MISFITS and fit >= MISFITS]
+        least = TWICE * len(self.misfits)
+        return [name for name, (out, fit) in self.misfits.items() if out >= MISFITS and len(fit) >= least]
