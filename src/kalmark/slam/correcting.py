@@ -33,13 +33,13 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         found += [Observation(k, scan.ids[k], "ignored", decisions[k][0], None, why) for k in out]  # type: ignore[arg-type]
     if policy.attention.sequential:
         groups = [(model, [k]) for model, rows in groups for k in rows]
-    parts = [*surveyed.apart(state, groups, decisions)]
-    if not len(report.e) and (len(parts) != 1 or len(parts[0][1]) < len(scan.y)):
+    if not len(report.e) and (len(groups) != 1 or len(groups[0][1]) < len(scan.y)):
         report.blank(scan.channel.dof)
-    for model, rows, on_trial in parts:
+    for model, rows in groups:
         if not rows:
             continue
         names: list[Any] = [decisions[k][0] for k in rows]
+        on_trial = bool(state.surveys.trial) and not state.surveys.trial.keys().isdisjoint(names)
         least = surveyed.gate_of(state, scan, policy) if on_trial else math.inf
         slots = state.tracks.slots_of(names)
         if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:

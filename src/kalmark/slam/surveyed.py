@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.association.protocol import Decision
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
-from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 
 SURVEYED = 0.9999  # of right sightings are within the gate
 ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped anew"
 WIDER = 2.0  # times what a robot that was elsewhere has moved by
 SURE_RAD = 0.3  # a sigma of the heading above which nothing can be expected
-
-
-def apart(
-    state: State, groups: Sequence[tuple[ObservationModel, list[int]]], decisions: Sequence[Decision]
-) -> Iterator[tuple[ObservationModel, list[int], bool]]:
-    """Yield the groups, of each those apart, and last, whose surveys are on trial."""
-    trial = state.surveys.trial
-    for model, rows in groups:
-        tried = [k for k in rows if decisions[k][0] in trial] if trial else []
-        yield model, [k for k in rows if k not in tried] if tried else rows, False
-        if tried:
-            yield model, tried, True
 
 
 def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
@@ -45,26 +31,30 @@ def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
 
 
 def corrected(
-    state: State,
-    scan: ScanContext,
-    names: Sequence[Any],
-    update: Update,
-    least: float,
+    state: State, scan: ScanContext, names: Sequence[Any], update: Update, least: float,
     estimator: Estimator | None = None,
-) -> Correction:
-    """Correct by sightings of surveyed landmarks; those beyond the gate `least` are left out, unless the robot is."""
+) -> Correction:  # fmt: skip
+    """Correct by sightings of which some are of surveys; of these the ones beyond `least` are left out.
+
+    They are taken all the same if it is the robot that is elsewhere.
+    """
     done = state.corrected(update._replace(gate=min(update.gate, least)), scan.event, estimator)
     if least == math.inf:
         return done
-    out = np.flatnonzero(~done.fused & (done.d2 <= update.gate))
-    fitting, others = ([names[k] for k in rows.tolist()] for rows in (np.flatnonzero(done.fused), out))
-    if not state.surveys.judge(scan.event.robot, fitting, others):
+    trial, known = state.surveys.trial, state.tracks.known
+    beyond = np.flatnonzero(~done.fused & (done.d2 <= update.gate)).tolist()
+    tried = [name in trial or name in known for name in names]
+    fitting = [names[k] for k in np.flatnonzero(done.fused).tolist() if tried[k]]
+    lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
+    out = np.array([k for k in beyond if lost or not tried[k]], dtype=np.int64)
+    if not len(out):
         return done
     pose = state.map.mean(scan.robot)[: len(scan.channel.at)]
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
     again, fused = state.corrected(rest, scan.event, estimator), done.fused.copy()
     fused[out] = again.fused
-    _widen(state, scan, pose)
+    if lost:
+        _widen(state, scan, pose)
     return done._replace(fused=fused)
 
 
