@@ -200,6 +200,7 @@ def thinned(run: Run, given: Given, most: int) -> Given:
     number = max(len(t_ns) // SEGMENT, 2)
     first = np.unique(np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)) * SEGMENT
     segments = np.stack([t_ns[first], t_ns[np.minimum(first + SEGMENT, len(t_ns)) - 1]], axis=1)
+    segments[0, 0] = np.iinfo(np.int64).min  # the motion before the first scan leads from the start to it
     within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
     kept = (within >= 0) & (t_ns <= segments[within, 1])
     renumbered, rows = np.cumsum(kept) - 1, np.flatnonzero(kept[used.scan])
