@@ -19,9 +19,9 @@ import numpy as np
 from kalmark.cli.run import run_log
 from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import diagnose
-from kalmark.events import Control, Scan, order
+from kalmark.events import Control, Fix, Scan, order
 from kalmark.geometry import observe
-from kalmark.geometry.frames import compose
+from kalmark.geometry.frames import compose, inverse
 from kalmark.logs.log import Log
 from kalmark.results.record import record
 from kalmark.results.run import Run
@@ -155,6 +155,50 @@ def kidnapped(log: Log, rng: np.random.Generator) -> Log:
     return replace(log, events=events)
 
 
+def bumped(log: Log, rng: np.random.Generator) -> Log:
+    """Move the robot by .3 m and turn it by 15 deg, at once, in the middle of the log: it sees all from there on."""
+    t_ns, truth = log.events[len(log.events) // 2].t_ns, log.truth["rover"]
+    before, angle = truth.poses[np.searchsorted(truth.t_ns, t_ns)], rng.uniform(-np.pi, np.pi)
+    by = np.array([0.3 * np.cos(angle), 0.3 * np.sin(angle), np.radians(15.0) * rng.choice([-1, 1])])
+    moved = compose(compose(before, by)[0], inverse(before)[0])[0]
+    names, places = [*log.landmarks], np.array([*log.landmarks.values()])
+    events = []
+    for e in log.events:
+        event = e
+        if isinstance(event, Scan) and event.t_ns > t_ns:
+            pose = compose(moved, truth.poses[np.searchsorted(truth.t_ns, event.t_ns)])[0]
+            y = observe(compose(pose, MOUNT)[0], places)[0]
+            near = np.flatnonzero((y[:, 0] > 0.5) & (y[:, 0] < 12.0) & (np.abs(y[:, 1]) < np.pi / 2))
+            event = seen(event, y=y[near] + rng.normal(size=(len(near), 2)) * (0.1, 0.02), ids=[names[k] for k in near])
+        events.append(event)
+    return replace(log, events=events, truth={})
+
+
+def spiked(log: Log, rng: np.random.Generator) -> Log:
+    """Let one control in the middle of the log be 20 m/s."""
+    t_ns = [e.t_ns for e in log.events if isinstance(e, Control)][len(log.events) // 4]
+    spike = Control(t_ns=t_ns, robot="rover", u=np.array([20.0, 0.0]))
+    return replace(log, events=[spike if isinstance(e, Control) and e.t_ns == t_ns else e for e in log.events])
+
+
+def misplaced(log: Log, rng: np.random.Generator) -> Log:
+    """Survey the landmark that is seen most 1 m from where it is."""
+    ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
+    name, angle = max(set(ids), key=ids.count), rng.uniform(-np.pi, np.pi)
+    off = np.array([np.cos(angle), np.sin(angle)])
+    return replace(log, landmarks=log.landmarks | {name: np.array(log.landmarks[name]) + off})
+
+
+def fixed(log: Log, rng: np.random.Generator) -> Log:
+    """Add a fix of .3 m every two seconds."""
+    truth = log.truth["rover"]
+    fixes = [
+        Fix(t_ns=int(t), robot="rover", y=pose[:2] + rng.normal(size=2) * 0.3, cov=0.09 * np.eye(2))
+        for t, pose in [*zip(truth.t_ns, truth.poses, strict=True)][::10]
+    ]
+    return replace(log, events=sorted([*log.events, *fixes], key=order))
+
+
 def stopped(log: Log, rng: np.random.Generator) -> Log:
     """Leave out 4 s of controls and scans in the middle, as a recorder that stops does."""
     begin = log.events[len(log.events) // 2].t_ns
@@ -187,6 +231,21 @@ FAULTS: dict[str, tuple[tuple[str, ...], Plant, tuple[str, ...], tuple[str, ...]
     "steering bias 1 deg": (("steering_offset",), controlled(lambda u: np.add(u, [0.0, np.radians(1.0)])), CAR, ()),
     "recorder gap 4 s": (("gap",), stopped, (), ()),
     "kidnapped": (("kidnapped",), kidnapped, (), ()),
+    "bumped": (("odometry_jump",), bumped, (), ()),
+    "speed of 20 m/s once": (("odometry_jump",), spiked, (), ()),
+    "survey 1 m off": (("landmark_prior",), misplaced, (), ("filter.map.known=truth",)),
+    "survey 1 m off, no gate": (
+        ("landmark_prior",),
+        misplaced,
+        (),
+        ("filter.map.known=truth", "filter.association={type: identity, gate: off}"),
+    ),
+    "first heading 1 rad off": (
+        ("start",),
+        fixed,
+        (),
+        ("robots.rover.start={x_m: 12, y_m: 12, theta_rad: 1}",),
+    ),
     "bearing clockwise": (("bearing_sign",), measured(lambda y: y * [1.0, -1.0]), (), ()),
     "bearing in degrees": (("units",), measured(lambda y: y * [1.0, 180 / np.pi]), (), ()),
     "turn rate in degrees": (("units",), controlled(lambda u: u * [1.0, 180 / np.pi]), (), ()),
@@ -205,13 +264,14 @@ FAULTS: dict[str, tuple[tuple[str, ...], Plant, tuple[str, ...], tuple[str, ...]
 REAL: dict[str, tuple[tuple[str, ...], set[str]]] = {
     "lost_in_the_woods": (("lost_in_the_woods",), {"correlated_noise", "bearing_offset"}),
     "lost_in_the_woods_bearing": (("lost_in_the_woods_bearing",), set()),
-    "plaza": (("plaza",), set()),  # it estimates the scale of its ranges
+    "plaza": (("plaza",), {"odometry_jump"}),  # it estimates the scale of its ranges
     "plaza_uncalibrated": (("plaza", "robots.each.sensors.radio.sigma_scale=0"), {"range_scale"}),
     **{f"mrclam_{k}": (("mrclam", f"log.robots=[{k}]"), set()) for k in (1, 5)},
     "mrclam_3": (("mrclam", "log.robots=[3]"), {"time_offset"}),
     "mrclam_all": (("mrclam", "log.robots=[1, 2, 3, 4, 5]"), set()),
     "victoria_park_known": (("victoria_park_known",), {"control_sigma"}),
-    **{name: ((name,), set()) for name in ("victoria_park", "dlr", "dlr_unknown", "freiburg_course", "starry_night")},
+    "dlr": (("dlr",), {"wrong_ids"}),  # two of 576 landmarks at the end
+    **{name: ((name,), set()) for name in ("victoria_park", "dlr_unknown", "freiburg_course", "starry_night")},
 }
 
 

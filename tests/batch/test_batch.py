@@ -256,12 +256,16 @@ def test_landmarks_known_beforehand_are_kept_or_weighed_by_their_covariance() ->
     slam = slam_for(log)
     slam.add_landmark(two, surveyed, np.eye(2) * 1e-6)
     run = record(slam, log, progress=False)
-    with pytest.raises(KalmarkError, match=f"landmark '{two}' was in the map beforehand"):
-        solve_batch(run, log)
-    batch = solve_batch(run, log, known={two: (surveyed, np.eye(2) * 1e-6)})
+    batch, given = solve_batch(run, log), solve_batch(run, log, known={two: (surveyed, np.eye(2) * 1e-6)})
+    assert np.array_equal(batch.means, given.means)  # the run has kept the survey
     at = batch.ids.index(two)
     assert np.linalg.norm(batch.means[at] - surveyed) < 0.01
     assert np.trace(batch.covariances[at]) < 2e-6
+    half = len(log.events) // 2
+    record(slam := slam_for(log), log.events[:half], progress=False)
+    rest = record(slam, log.events[half:], progress=False)
+    with pytest.raises(KalmarkError, match="was in the map beforehand"):  # with covariances between landmarks
+        solve_batch(rest, log.events[half:])
 
 
 def test_a_range_only_beacon_known_roughly_is_solved_too() -> None:

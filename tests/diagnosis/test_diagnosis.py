@@ -22,7 +22,8 @@ from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.gross import elsewhere, fit
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.verdict import Verdict, causes_of
-from kalmark.events import Control, Event, Scan
+from kalmark.events import Control, Event, Scan, order
+from kalmark.geometry.frames import compose, inverse
 from kalmark.logs.log import Log
 from kalmark.results.batch import given_by
 from kalmark.results.run import Run
@@ -129,6 +130,155 @@ def test_a_robot_that_was_carried_away_is_noticed_at_that_time() -> None:
     assert verdict.causes[0].name == "kidnapped"
     assert (verdict.sigma_factor or 0.0) > 2
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=5.0)
+
+
+def bumped(seed: int, by: tuple[float, float, float], when: float = 0.5) -> tuple[Log, float]:
+    """Return a log in which the robot is moved `by` a step, in its frame, and the time of that."""
+    log, rng = simulate(world_of(), seed), np.random.default_rng(seed)
+    t_ns, truth = log.events[int(when * len(log.events))].t_ns, log.truth["rover"]
+    before = truth.poses[np.searchsorted(truth.t_ns, t_ns)]
+    to = compose(compose(before, np.array(by))[0], inverse(before)[0])[0]
+    names, places = [*log.landmarks], np.array([*log.landmarks.values()])
+
+    def moved(e: Event) -> Event:
+        if not isinstance(e, Scan) or e.t_ns <= t_ns:
+            return e
+        pose = truth.poses[np.searchsorted(truth.t_ns, e.t_ns)]
+        y = km.geometry.observe(compose(compose(to, pose)[0], np.array([0.3, 0.0, 0.0]))[0], places)[0]
+        near = (y[:, 0] > 0.5) & (y[:, 0] < 12.0) & (np.abs(y[:, 1]) < np.pi / 2)
+        y = y[near] + rng.normal(size=(near.sum(), 2)) * (0.1, 0.02)
+        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=y, ids=[n for n, i in zip(names, near) if i])  # noqa: B905
+
+    return replace(log, events=[*map(moved, log.events)], truth={}), t_ns * 1e-9
+
+
+def recorded(log: Log, *settings: str) -> Run:
+    config = world_of(*settings).config()
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_bump_is_a_jump_of_its_size_at_its_time(seed: int) -> None:
+    log, t_s = bumped(seed, (0.2, 0.2, 0.25))
+    verdict = km.diagnose(recorded(log))
+    assert [cause.name for cause in verdict.causes] == ["odometry_jump"]
+    assert verdict.causes[0].since_s == pytest.approx(t_s + 0.2, abs=0.21)
+    assert verdict.search is not None
+    (jump,) = verdict.search.found
+    assert jump.at is not None
+    np.testing.assert_allclose(jump.at, (0.2, 0.2, 0.25), atol=0.12)
+
+
+def test_a_robot_that_is_carried_far_is_kidnapped_and_no_odometry_jumps() -> None:
+    verdict = km.diagnose(recorded(bumped(3, (-4.0, 3.0, 0.3))[0]))
+    assert verdict.causes[0].name == "kidnapped"
+    assert "odometry_jump" not in [cause.name for cause in verdict.causes]
+
+
+def test_a_control_that_jumps_is_named_and_its_cure_leaves_it_out() -> None:
+    log = simulate(world_of(), 3)
+    t_ns = next(e.t_ns for e in log.events[len(log.events) // 2 :] if isinstance(e, Control))
+    jumps = [
+        Control(t_ns=e.t_ns, robot=e.robot, u=np.array([25.0, 0.0])) if isinstance(e, Control) and e.t_ns == t_ns else e
+        for e in log.events
+    ]
+    log = replace(log, events=jumps)
+    cause = km.diagnose(recorded(log)).causes[0]
+    assert cause.name == "odometry_jump" and "v_mps of rover is 25 " in cause.evidence
+    assert cause.since_s == pytest.approx(t_ns * 1e-9, abs=0.3)
+    cured = recorded(log, cause.cure.removeprefix("--set "))
+    (gap,) = cured.evaluate()["gaps"]
+    assert (gap["kind"], gap["start_s"]) == ("ruled_out", pytest.approx(t_ns * 1e-9))
+    verdict = km.diagnose(cured)
+    assert [(c.name, c.harmless) for c in verdict.causes] == [("odometry_jump", True)]
+    assert "left out" in verdict.causes[0].evidence
+
+
+def test_control_noise_and_gaps_are_no_jumps() -> None:
+    noisy = run_of(None, tuple(f"robots.rover.motion.sigma_{c}=0.0167" for c in ("v_mps", "w_radps")))
+    assert {cause.name for cause in km.diagnose(noisy).causes} == {"control_sigma"}
+    log = simulate(world_of(), 3)
+    begin = log.events[len(log.events) // 2].t_ns
+    log = replace(log, events=[e for e in log.events if not begin <= e.t_ns < begin + 4_000_000_000])
+    for gaps in ("widen", "ignore"):
+        assert [cause.name for cause in km.diagnose(recorded(log, f"robots.rover.gaps={gaps}")).causes] == ["gap"]
+
+
+def surveyed(folder: Path, log: Log, sigma_m: float, wrong: dict[int, tuple[float, float]]) -> str:
+    """Return the setting of a known map with landmarks at wrong places; `wrong` counts the ones seen most from 0."""
+    ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
+    often, rng = sorted({*ids}, key=lambda i: (-ids.count(i), i)), np.random.default_rng(0)
+    lines = ["id,x_m,y_m" + (",cov_xx,cov_xy,cov_yy" if sigma_m else "")]
+    for name, place in log.landmarks.items():
+        x, y = place + rng.normal(size=2) * sigma_m + wrong.get(often.index(name), (0.0, 0.0))
+        lines.append(f"{name},{x},{y}" + (f",{sigma_m**2},0,{sigma_m**2}" if sigma_m else ""))
+    (folder / "survey.csv").write_text("\n".join(lines) + "\n")
+    return f"filter.map.known={folder / 'survey.csv'}"
+
+
+@pytest.mark.parametrize(("sigma_m", "gate"), [(0.0, "default"), (0.02, "default"), (0.0, "off"), (0.02, "off")])
+def test_surveyed_landmarks_that_are_elsewhere_are_named_with_their_place(
+    tmp_path: Path, sigma_m: float, gate: str
+) -> None:
+    log = simulate(world_of(), 3)
+    ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
+    often = sorted({*ids}, key=lambda i: (-ids.count(i), i))
+    association = f"filter.association={{type: identity, gate: {gate}}}"
+    survey = surveyed(tmp_path, log, sigma_m, {0: (0.9, 0.3), 2: (-0.6, 0.8)})
+    verdict = km.diagnose(recorded(log, survey, association))
+    named = [cause for cause in verdict.causes if cause.name == "landmark_prior"]
+    assert {cause.evidence.split()[1] for cause in named} == {str(often[0]), str(often[2])}
+    assert verdict.causes[0].name == "landmark_prior"
+    assert verdict.map == ("ok" if gate == "default" else "doubtful")
+    for cause in named:
+        true = log.landmarks[next(i for i in often if str(i) == cause.evidence.split()[1])]
+        at = [
+            float(x) for x in cause.evidence[cause.evidence.index("at (") + 4 : cause.evidence.index(") m")].split(",")
+        ]
+        assert np.linalg.norm(at - true) < 0.25
+        assert cause.harmless == (gate == "default") == ("mapped it" in cause.evidence)  # or is the map pulled?
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, 0.02, 0.5])
+def test_a_survey_that_is_right_is_not_accused(tmp_path: Path, sigma_m: float) -> None:
+    log = simulate(world_of(), 3)
+    run = recorded(log, surveyed(tmp_path, log, sigma_m, {}))
+    for most in (20_000, 2000):
+        verdict = km.diagnose(run, most)
+        assert (verdict.map, verdict.causes) == ("ok", ())
+
+
+def with_fixes(log: Log) -> Log:
+    """Return a log with a fix of .3 m every two seconds."""
+    rng, truth = np.random.default_rng(0), log.truth["rover"]
+    fixes = [
+        km.Fix(t_ns=int(t), robot="rover", y=pose[:2] + rng.normal(size=2) * 0.3, cov=0.09 * np.eye(2))
+        for t, pose in [*zip(truth.t_ns, truth.poses, strict=True)][::10]
+    ]
+    return replace(log, events=sorted([*log.events, *fixes], key=order))
+
+
+@pytest.mark.parametrize("heading", [0.5, 1.0, -2.5])
+def test_a_wrong_first_heading_is_named_where_fixes_tell(heading: float) -> None:
+    log = with_fixes(simulate(world_of(), 3))
+    start = f"robots.rover.start={{x_m: 12, y_m: 12, theta_rad: {heading}}}"
+    verdict = km.diagnose(recorded(log, start))
+    assert (verdict.map, verdict.causes[0].name) == ("wrong", "start")
+    cured = km.diagnose(recorded(log, verdict.causes[0].cure.removeprefix("--set ").strip("'")))
+    assert (cured.map, cured.causes) == ("ok", ())
+
+
+def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:
+    log = simulate(world_of(), 3)
+    start = "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0.6}"
+    for sigma_m in (0.0, 0.05):
+        verdict = km.diagnose(recorded(log, start, surveyed(tmp_path, log, sigma_m, {})))
+        assert verdict.causes[0].name == "start" and " 3" in verdict.causes[0].evidence  # some 34 deg
+
+
+def test_the_first_line_of_a_verdict_names_the_cause() -> None:
+    verdict = km.diagnose(run_of(*MISTAKES["bearing_sign"])).as_dict()
+    assert next(verdict_lines(verdict)) == "the map is wrong because of bearing_sign"
 
 
 def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidnapped() -> None:

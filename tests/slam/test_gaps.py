@@ -140,3 +140,58 @@ def test_a_gap_that_is_ignored_doubles_the_map_and_is_warned_of() -> None:
     run = mapped(log, gaps="ignore")
     assert len(run.landmarks) > 40
     assert alarmed(run)
+
+
+def jump_of(slam: km.Slam, u: tuple[float, ...], t_s: float = 4.1) -> km.Report:
+    return slam.process(km.Control(t_s, "r", u))
+
+
+def test_an_increment_beyond_the_limits_of_the_robot_is_left_out_and_bridged() -> None:
+    slam = odometer(max_speed_mps=1.0, max_turn_radps=1.0)
+    mean, before = slam.mean("r"), slam.covariance("r")
+    (gap,) = jump_of(slam, (-7.0, 2.0, 1.0)).gaps
+    assert (gap.kind, gap.start_ns, gap.end_ns) == ("ruled_out", 4_000_000_000, 4_100_000_000)
+    np.testing.assert_array_equal(slam.mean("r"), mean)
+    grown = np.diag(slam.covariance("r") - before)
+    np.testing.assert_allclose(grown, [(0.1 / 2) ** 2] * 2 + [0.1**2 / 3], rtol=1e-6)  # what it may have done
+    assert slam.process(km.Control(4.2, "r", STEP)).gaps == ()
+    assert slam.mean("r")[0] != mean[0]
+
+
+def test_a_velocity_beyond_the_limits_is_left_out_until_the_next_control() -> None:
+    limits, scan = {"max_speed_mps": 1.0, "max_turn_radps": 1.0}, km.Scan(4.5, "r", "laser", [], None)
+    slam, held = (driven(km.motion.Unicycle(0.01, 0.01), (0.8, 0.2), **limits) for _ in range(2))
+    assert jump_of(slam, (30.0, 0.0)).gaps == ()  # nothing has asked for its pose yet
+    (gap,) = slam.process(scan).gaps
+    assert (gap.kind, gap.start_ns, gap.end_ns) == ("ruled_out", 4_100_000_000, 4_500_000_000)
+    assert gap.sigma_m == pytest.approx(0.4 / 2)
+    held.process(scan)
+    np.testing.assert_allclose(slam.mean("r"), held.mean("r"), atol=1e-9)  # the control before is held
+    assert slam.process(km.Control(4.6, "r", (0.8, 0.2))).gaps[0].end_ns == 4_600_000_000
+    assert slam.process(km.Scan(4.7, "r", "laser", [], None)).gaps == ()
+
+
+def test_no_control_is_beyond_limits_that_are_not_given_or_nearly_kept() -> None:
+    assert jump_of(odometer(), (-7.0, 2.0, 1.0)).gaps == ()
+    limits = {"max_speed_mps": 1.0, "max_turn_radps": 1.0}
+    assert jump_of(odometer(**limits), (0.14, 0.0, 0.0)).gaps == ()  # 1.4 m/s
+    assert jump_of(odometer(**limits, gaps="ignore"), (-7.0, 2.0, 1.0)).gaps == ()
+
+
+def test_a_control_beyond_the_limits_is_refused_where_that_is_asked_for() -> None:
+    slam = odometer(max_speed_mps=1.0, gaps="refuse")
+    mean = slam.mean("r")
+    with pytest.raises(EventError, match=r"expected at most 1\.0 m/s"):
+        jump_of(slam, (-7.0, 2.0, 1.0))
+    np.testing.assert_array_equal(slam.mean("r"), mean)
+    assert jump_of(slam, STEP).gaps == ()
+
+
+def test_a_control_that_was_left_out_is_kept_in_a_file(tmp_path: Path) -> None:
+    slam = driven(km.motion.Unicycle(0.01, 0.01), (0.8, 0.2), max_speed_mps=1.0)
+    jump_of(slam, (30.0, 0.0))
+    slam.save(tmp_path / "map.kmk")
+    again = km.Slam.load(tmp_path / "map.kmk")
+    scan = km.Scan(4.5, "r", "laser", [], None)
+    assert again.process(scan).gaps == slam.process(scan).gaps
+    np.testing.assert_array_equal(again.covariance("r"), slam.covariance("r"))

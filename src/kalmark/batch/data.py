@@ -25,6 +25,7 @@ from kalmark.geometry.spaces import mount_space
 from kalmark.models.observe import inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor
 from kalmark.slam.checks import measurements
+from kalmark.tracks.channel import huber_length
 
 if TYPE_CHECKING:
     from kalmark.slam.robot import Robot
@@ -64,7 +65,8 @@ class Given:
 
     The S scans have the times `t_ns` (S,) and are of the `robot` (S,), `poses` (S, 3) or (S, 7) are the initial poses
     there.  `landmarks` has the initial means, of the type `landmark`, and covariances of those in the map.  Of the
-    fixes the first `fixes` count.  `known` has what was in the map beforehand: (mean, covariance or None for exactly).
+    fixes the first `fixes` count, but for those `left_out`, by number.  `known` has what was in the map beforehand:
+    (mean, covariance or None for exactly).
 
     Without `motion` each pose is on its own, but for those that share landmarks: of each such part without a landmark
     that is known exactly the first pose is held.  `mounts`, by robot and sensor, are the means of those that are not
@@ -87,6 +89,7 @@ class Given:
     known: Known = field(default_factory=dict)
     starts: Starts = field(default_factory=dict)
     fixes: int = 0
+    left_out: frozenset[int] = frozenset()
     motion: bool = True
     mounts: Mapping[tuple[str, str], Array] = field(default_factory=dict)
     huber: float = np.inf
@@ -111,6 +114,7 @@ class Replay:
         self.apart: dict[tuple[str, int], int] = {}  # nodes without motion, by robot and time
         self.sighted: dict[tuple[str, str, int], list[Seen]] = {}  # by robot, sensor and group
         self.fixes: list[tuple[int, Array, Array]] = []
+        self.fixed = 0  # fixes so far, with those that do not count
         self.nodes: list[int] = []
         self.segment: dict[str, int] = {}  # that a robot is in
         self.varies: dict[tuple[str, str], bool] = {}  # whether the noise of a sensor does
@@ -150,7 +154,8 @@ class Replay:
         if isinstance(event, Control):
             self.chain.take(event)
         elif isinstance(event, Fix):
-            if len(self.fixes) < given.fixes:
+            self.fixed += 1
+            if self.fixed <= given.fixes and self.fixed - 1 not in given.left_out:
                 self.fixes.append((self._node(event.robot, event.t_ns), event.y, event.cov))
         elif step < len(given.t_ns) and (event.t_ns, event.robot) == (given.t_ns[step], given.robot[step]):
             self.nodes.append(self._node(event.robot, event.t_ns))
@@ -263,7 +268,8 @@ class Replay:
             if (robot, sensor) in groups:
                 blocks.insert(1, Block(groups[robot, sensor], np.zeros_like(node), mount_space(size)))
             view = view_of(mount.sensor, given.landmark, mean)
-            factors.append(sightings(view, tuple(blocks), y, R, given.huber, (robot, sensor)))
+            huber = given.huber if mount.robust is None else min(given.huber, huber_length(R.shape[1]))
+            factors.append(sightings(view, tuple(blocks), y, R, huber, (robot, sensor)))
         return factors, [np.array(given.mounts[name], dtype=np.float64) for name in groups]
 
     def _positions(self, names: list[Id]) -> list[Factor]:

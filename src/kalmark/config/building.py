@@ -132,6 +132,7 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
         "landmark": _made(config, (*path, "landmark"), model_of, sensor.landmark, world),
         "association": _made(config, (*path, "association"), model_of, sensor.association),
         "cov": covariance_of(sensor.mount, 3 if world == "plane" else 6),
+        "robust": sensor.robust,
     }
     if sensor.detector is not None:
         found, chooses = sensor.detector, "signature" in type(sensor.detector).model_fields

@@ -169,6 +169,8 @@ class Mounted(ModelSection):
     """What makes a landmark; the configuration's `upkeep` if absent."""
     detector: Detector | None = None
     """How landmarks are found in raw scans: one that finds what the sensor measures."""
+    robust: Literal["huber", "student"] | None = None
+    """How outliers count less: bounded, or hardly at all.  All observations count in full if absent."""
 
 
 class PlaneMounted(Mounted):

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtr, chdtrc, expit, ndtr
+from scipy.special import chdtr, chdtrc, chdtri, expit, ndtr
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.course import START, UNKNOWN
@@ -32,10 +32,14 @@ LOOKED_AT = 20  # landmarks
 MOST_CONDITION = 1e12
 SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the end
 SLOW_S = 1e-3
+MOST_STEPS, FAR_STEPS = 0.9, 3.0  # share of steps without a jump; and times a long step is one that is no driving
+SELDOM = 1e-3
 MOST_RHO = 0.999
 MOST_SCALE = 0.25  # beyond it the problem is not linear
+ALIKE = 0.85  # of what another one explains: they are alike
 SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
 TIMES = "times"  # the unit of noise
+JUMPS = ("odometry_jump", "kidnapped")
 
 Where = tuple[str, str]
 
@@ -48,7 +52,7 @@ class Finding:
     `value` and `sigma` are its size in `unit`.  `cure` is what takes it out of the data: the systematic error itself as
     (Z, W), factors of the noise (N,) and of the motion's errors (r,).  `since_s` is when it begins, after the first
     scan, None for all the time.  `alike` are causes that explain the same.  `moved_m` is by how much a place in the map
-    is wrong for it while it was seen.
+    is wrong for it while it was seen.  `at` is where a surveyed landmark seems to be, or the step (q,) of a jump.
     """
 
     name: str
@@ -66,6 +70,7 @@ class Finding:
     since_s: float | None = None
     alike: tuple[Finding, ...] = ()
     moved_m: float | None = None
+    at: Array | None = None
 
 
 class Column(NamedTuple):
@@ -291,6 +296,7 @@ def outliers(linear: Linear, t_s: Array) -> list[Finding]:
     d2, m = np.bincount(of, linear.residuals.r**2), np.bincount(of)
     if not len(d2):
         return []
+    d2[of[linear.surveys]] = 0.0  # a survey that is off is a cause of its own
     best = (0.0, 0.0)
     for spread in SPREADS:
         log_u, share = 0.5 * d2 * (1 - spread**-2) - m * math.log(spread), FIRST_SHARE
@@ -357,7 +363,12 @@ def _seeming(linear: Linear, t_s: Array) -> Iterator[tuple[float, int, Ints, Arr
 
 
 def jumps(linear: Linear, t_s: Array) -> list[Finding]:
-    """Return the step of the motion whose error is largest."""
+    """Return the step of the motion that fits best if any motion may be there, and what jump that is.
+
+    Only the steps of the largest errors are looked at, and how each robot comes to its start.  A jump farther than
+    landmarks are apart and than steps are long is "kidnapped", else it is the odometry that jumps.  `p` counts it in
+    the chi-square of steps all over the run, which is larger where errors of a sensor last, or where noise is.
+    """
     e = linear.errors_of(linear.residuals)
     root = linear.problem.motions.root.tocoo()
     n = len(linear.problem.robots)
@@ -367,13 +378,94 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     kinds = np.array(linear.problem.motions.kinds)
     counts = ~np.isin(kinds, (START, UNKNOWN)) & (owner >= 0)
     squares = np.bincount(owner[counts], e[counts] ** 2, minlength=n)
-    numbers = np.bincount(owner[counts], minlength=n)
-    if not len(squares):
-        return []
-    node = int(np.argmax(squares))
-    p = min(1.0, n * float(chdtrc(max(int(numbers[node]), 1), squares[node])))
-    errors = np.where((owner == node) & counts, OUT, 1.0)
-    return [
-        Finding("kidnapped", (linear.problem.robots[node],), 0.5 * float(squares[node]), p, math.sqrt(squares[node]),
-                1.0, "sigmas", errors=errors, rows=np.arange(n) == node, since_s=float(t_s[node]))
-    ]  # fmt: skip
+    starts = [*{robot: k for k, robot in reversed([*enumerate(linear.problem.robots)])}.values()]
+    nodes = [*np.argsort(-squares)[: min(LOOKED_AT, int((squares > 0).sum()))].tolist(), *starts]
+    found: list[Finding] = []
+    for node, (chi2, step, W) in zip(nodes, _free_steps(linear, nodes), strict=True):
+        if chi2 <= 0:
+            continue
+        size, robot = math.sqrt(chi2), linear.problem.robots[node]
+        far = np.linalg.norm(step[: linear.state.d]) > max(linear.spacing, FAR_STEPS * linear.step)
+        name = "start" if node in starts else "kidnapped" if far else "odometry_jump"
+        errors, none = np.where((owner == node) & counts, OUT, 1.0), np.zeros(len(linear.at.z))
+        found.append(Finding(
+            name, (robot, f"{t_s[node]:.6g}"), 0.5 * chi2, min(1.0, n * float(chdtrc(q, chi2))), size, 1.0,
+            "sigmas", none, W / size, errors=errors, since_s=float(t_s[node]), at=step,
+        ))  # fmt: skip
+    most = max((f.gain for f in found), default=0.0)
+    begins = [f for f in found if f.name == "start" and f.gain > ALIKE * most]  # so is the first step in all but name
+    best = sorted(begins or found, key=lambda f: -f.gain)[:1]
+    if not best or best[0].p > SELDOM:
+        return best
+    known = np.flatnonzero(squares > 0)
+    usual = [chi2 for chi2, *_ in _free_steps(linear, known[:: max(1, len(known) // SETS)].tolist())]
+    larger = max(1.0, float(np.quantile(usual, MOST_STEPS)) / float(chdtri(q, 1.0 - MOST_STEPS)))
+    return [replace(best[0], p=min(1.0, n * float(chdtrc(q, 2.0 * best[0].gain / larger))))]
+
+
+def _free_steps(linear: Linear, nodes: list[int]) -> Iterator[tuple[float, Array, Array]]:
+    """Yield of each node by how much chi-square falls if any step leads to it, the step (q,), what it adds (q n,)."""
+    q = len(linear.at.w) // max(len(linear.problem.robots), 1)
+    rows = np.array(nodes)[:, None] * q + np.arange(q)
+    W = np.zeros((len(linear.at.w), rows.size))
+    W[rows.ravel(), np.arange(rows.size)] = 1.0
+    left, m = linear.left(np.zeros((len(linear.at.z), rows.size)), W).m, linear.residuals.m
+    for mine, columns in zip(rows, np.arange(rows.size).reshape(-1, q), strict=True):
+        step = np.linalg.pinv(left[np.ix_(mine, columns)], rcond=1.0 / MOST_CONDITION, hermitian=True) @ m[mine]
+        yield float(m[mine] @ step), step, W[:, columns] @ step
+
+
+def priors(linear: Linear, t_s: Array) -> list[Finding]:
+    """Return the surveyed landmarks that are elsewhere than the survey says, each as if it were the only one.
+
+    Their sightings determine where they are.  Only those are looked at whose surveys seem to be off most.
+    """
+    rows, d, found = linear.rows, linear.state.d, []
+    for _, l, place, sign, mine, part in sorted(_surveyed(linear), key=lambda seems: -seems[0])[:LOOKED_AT]:
+        Z = np.zeros((len(linear.at.z), d))
+        Z[mine] = part
+        left = linear.left(Z, np.zeros((len(linear.at.w), d))).r
+        I, g = part.T @ left[mine], part.T @ linear.residuals.r[mine]
+        if not 0 < np.linalg.cond(I) < MOST_CONDITION:
+            continue
+        off = np.linalg.solve(I, g)
+        far, chi2 = float(np.linalg.norm(off)), float(g @ off)
+        if far <= 0 or chi2 <= 0:
+            continue
+        parts = np.bincount(_blocks(linear)[0], (left @ off) * (linear.residuals.r - left @ off))
+        sigmas = chi2 / math.sqrt(max(chi2, float(parts @ parts)))
+        seen = (rows.landmark == l) & linear.kept
+        noise = np.ones(len(linear.at.z))
+        noise[mine] = OUT
+        since_s = float(t_s[rows.node[seen]].min()) if seen.any() else 0.0
+        name, p = str(linear.problem.ids[l]), float(chdtrc(d, sigmas**2))
+        found.append(Finding("landmark_prior", (name,), 0.5 * chi2, p, far, far / sigmas, "m", noise=noise,
+                             since_s=since_s, at=place + sign * off))  # fmt: skip
+    return found
+
+
+def _surveyed(linear: Linear) -> Iterator[tuple[float, int, Array, int, Ints, Array]]:
+    """Yield of each surveyed landmark how much it seems to be off, its number and place, a sign, rows and derivative.
+
+    A survey with a covariance is data: it is off by what was added to it, sign -1.  One that is exact is not: its
+    sightings are of a landmark that is elsewhere, sign +1.
+    """
+    d, problem, rows = linear.state.d, linear.problem, linear.rows
+    if linear.state.spaces[LANDMARKS].dof < d:
+        return
+    have, at = linear.residuals.r, linear.state.columns(LANDMARKS, np.arange(len(problem.ids)))
+    surveys: list[tuple[int, Array, int, Ints]] = []
+    for f, factor in enumerate(problem.factors):
+        block = factor.term.blocks[0]
+        if factor.sensor[1] == "" and block.group == LANDMARKS:
+            at_factor = np.flatnonzero((rows.factor == f) & linear.kept)
+            of = [at_factor[rows.row[at_factor] == k] for k in range(len(factor.y))]
+            surveys += [(l, *rest) for l, *rest in zip(block.rows.tolist(), factor.y, [-1] * len(of), of, strict=True)]
+    for l in np.flatnonzero(~problem.free[at]).tolist():
+        seen = np.flatnonzero((rows.landmark == l) & linear.kept)
+        surveys.append((l, linear.state.groups[LANDMARKS][l, :d], 1, seen))
+    for l, place, sign, mine in surveys:
+        if len(mine) >= d:
+            part = linear.at.H[mine][:, at[l] : at[l] + d].toarray()
+            g = part.T @ have[mine]
+            yield float(g @ np.linalg.pinv(part.T @ part) @ g), l, place, sign, mine, part

@@ -20,11 +20,13 @@ from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
 from kalmark.diagnosis.words import UNKNOWN_IDS
 from kalmark.errors import KalmarkError
-from kalmark.events import Control, Event, Scan
+from kalmark.events import Control, Event, Fix, Scan
 from kalmark.logs.log import Log
-from kalmark.results.measures import rigid, rigid_robust
+from kalmark.results.history import Start
+from kalmark.results.measures import Rigid, rigid, rigid_robust
 from kalmark.results.record import record
 from kalmark.results.run import Run
+from kalmark.results.words import figure
 
 SCANS, OBSERVATIONS = 400, 3000  # of the log are filtered again
 MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
@@ -32,7 +34,8 @@ FITS = 2.0  # below which a log fits
 MUCH = 3.0  # times better is the log without the mistake
 MOST = 25.0  # that one observation counts, and what counts one that was left out
 TURNS_DEG = (180, 90, -90)
-HEADINGS_DEG = tuple(range(30, 360, 30))
+REJECTED = 0.5  # of the fixes, from which on their robot is not where it should be
+LEAST_FIXES = 5
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
 IN_A_ROW = 8  # sightings of a landmark that do not fit: its id may mean another one from there on
 SAME = 0.25  # of the distance to the next landmark, within which two places are one
@@ -45,7 +48,7 @@ class Mistake(NamedTuple):
     """What may have been done wrongly: its name, what it is, its cure, and the configuration and log without it.
 
     `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
-    `since_s` since when it counts, in s of the log.
+    `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.
     """
 
     name: str
@@ -55,6 +58,7 @@ class Mistake(NamedTuple):
     change: Change | None = None
     gain: float = 0.0
     since_s: float = 0.0
+    share: float = 1.0
 
 
 class Fit(NamedTuple):
@@ -99,17 +103,72 @@ def gross(run: Run, log: Log) -> Mistake | None:
     """Return the mistake that explains why a run does not fit, None if it does fit or if none explains it."""
     if not run.config.get("robots"):
         return None
+    found = elsewhere_from_the_start(run, log)
+    if found is not None:
+        return found
     now = fit(run)
     if now.mean < MISFIT and not run.stopped:
         return exchanged(run, log, now)
     events = beginning(log)
     as_it_is = fit_of(run.config, log, events)
-    found = []
+    made = []
     for mistake in mistakes(run.config, log) if as_it_is.mean >= MISFIT else ():
         after = fit_of(mistake.config, log, [*map(mistake.change, events)] if mistake.change else events)
         if after.mean < FITS and MUCH * after.mean < as_it_is.mean:
-            found.append(mistake._replace(gain=explained(as_it_is, after), since_s=events[0].t_s))
-    return max(found, key=lambda f: f.gain, default=None) or exchanged(run, log, now) or kidnapped(run, log, now)
+            made.append(mistake._replace(gain=explained(as_it_is, after), since_s=events[0].t_s))
+    return max(made, key=lambda f: f.gain, default=None) or exchanged(run, log, now) or kidnapped(run, log, now)
+
+
+def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
+    """Return that a robot of the plane starts elsewhere, or turned, if most of its fixes were rejected and then fit.
+
+    Its path without fixes, moved rigidly onto them, says from where.
+    """
+    fixes = run.history.fixes
+    if len(fixes) < LEAST_FIXES or run.history.in_space or np.mean([fix.used for fix in fixes]) > 1.0 - REJECTED:
+        return None
+    events = beginning(log)
+    path = _filtered(run.config, log, [e for e in events if not isinstance(e, Fix)])
+    found = []
+    if path is None:
+        return None
+    for start in run.history.starts:
+        mine = path.history.robot == start.robot
+        t_ns, p = path.history.t_ns[mine], path.history.poses[mine, :2]
+        seen = [e for e in events if isinstance(e, Fix) and e.robot == start.robot and t_ns[0] <= e.t_ns <= t_ns[-1]]
+        if len(seen) < LEAST_FIXES:
+            continue
+        at = np.column_stack([np.interp([e.t_ns for e in seen], t_ns, x) for x in p.T])
+        onto = rigid(at, np.array([e.y for e in seen]))
+        changed, evidence, cure = _started_at(run.config, start, onto)
+        after = _filtered(changed, log, events)
+        if after is not None and fit(after).mean < FITS and np.mean([f.used for f in after.history.fixes]) > REJECTED:
+            gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
+            found.append(Mistake("start", evidence, cure, changed, None, gain, start.t_ns * 1e-9))
+    return max(found, key=lambda f: f.gain, default=None)
+
+
+def _started_at(config: Mapping[str, Any], start: Start, onto: Rigid) -> tuple[dict[str, Any], str, str]:
+    """Return a configuration with a start that is moved, and that in words and as a line that makes it."""
+    x, y = onto(start.mean[None, :2])[0].tolist()
+    theta = math.remainder(start.mean[2] + math.atan2(onto.rotation[1, 0], onto.rotation[0, 0]), 2 * math.pi)
+    key = start.robot if start.robot in config["robots"] else "each"
+    moved = {"x_m": x, "y_m": y, "theta_rad": theta}
+    changed = _with(config, ("robots", key, "start"), {**(config["robots"][key].get("start") or {}), **moved})
+    was, now = (
+        f"at ({figure(float(a))}, {figure(float(b))}) m with a heading of {math.degrees(c):.0f} deg"
+        for a, b, c in (start.mean[:3], (x, y, theta))
+    )
+    evidence = f"{start.robot} starts {now}, not {was}: then its path fits its fixes"
+    said = ", ".join(f"{name}: {figure(value)}" for name, value in moved.items())
+    return changed, evidence, f"--set 'robots.{key}.start={{{said}}}'"
+
+
+def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:
+    """Return how the first fixes of a run fit."""
+    fixes = run.history.fixes[:number]
+    d2 = [float(f.z @ np.linalg.solve(f.Z, f.z)) / len(f.z) for f in fixes]
+    return Fit(np.minimum(d2, MOST), np.array([len(f.z) for f in fixes]))
 
 
 def kidnapped(run: Run, log: Log, now: Fit) -> Mistake | None:
@@ -153,7 +212,7 @@ def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
     ids = "; ".join(f"what is called {a} is where {b} was" for a, b in others.items())
     gain = explained(now.of(slice(first, first + len(after.history.d2))), fit(after))
     evidence = f"ids mean other landmarks from t={t_ns * 1e-9:.1f} s on: {ids}"
-    return Mistake("wrong_ids", evidence, UNKNOWN_IDS, run.config, None, gain, t_ns * 1e-9)
+    return Mistake("wrong_ids", evidence, UNKNOWN_IDS, run.config, None, gain, t_ns * 1e-9, len(others) / len(old.ids))
 
 
 def _misfit_in_a_row(run: Run, now: Fit) -> int | None:
@@ -259,16 +318,6 @@ def mistakes(config: Mapping[str, Any], log: Log) -> Iterator[Mistake]:
             key = f"robots.{robot}.sensors.{sensor}.mount.theta_rad"
             changed = _with(config, ("robots", robot, "sensors", sensor, "mount", "theta_rad"), angle)
             yield Mistake("mount", evidence, f"--set {key}={angle:.4f}", changed)
-    if any(not isinstance(event, Control | Scan) for event in log.events):
-        for name, robot in config["robots"].items():
-            theta = float((robot.get("start") or {}).get("theta_rad", 0.0))
-            for turn in HEADINGS_DEG:
-                angle = math.remainder(theta + math.radians(turn), 2 * math.pi)
-                evidence = (
-                    f"{name} starts with a heading of {math.degrees(angle):.0f} deg, not {math.degrees(theta):.0f}"
-                )
-                changed = _with(config, ("robots", name, "start", "theta_rad"), angle)
-                yield Mistake("start", evidence, f"--set robots.{name}.start.theta_rad={angle:.2f}", changed)
 
 
 def _with(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> dict[str, Any]:

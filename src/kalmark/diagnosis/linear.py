@@ -15,11 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.problem import Linearized, Problem
 from kalmark.batch.solver import Reduced, followers
-from kalmark.batch.state import LANDMARKS, Ints, State
+from kalmark.batch.state import LANDMARKS, POSES, Ints, State
 
 NONE = -1
 OUT = 1e3  # times its noise: what is so uncertain does not count
@@ -106,7 +107,8 @@ class Linear:
             k, p, _ = factor.R.shape
             first, last = factor.term.blocks[0], factor.term.blocks[-1]
             on_map = last.group == LANDMARKS and bool(factor.sensor[1])
-            of = (np.full(k, f), np.arange(k), last.rows if on_map else np.full(k, NONE), first.rows)
+            node_ = first.rows if first.group == POSES else np.zeros(k, dtype=np.int64)
+            of = (np.full(k, f), np.arange(k), last.rows if on_map else np.full(k, NONE), node_)
             factor_, row, landmark, node = (np.repeat(a, p) for a in of)
             parts.append((factor_, row, np.tile(np.arange(p), k), landmark, node))
         factor_, row, column, landmark, node = (np.concatenate(a) for a in zip(*parts, strict=True))
@@ -122,6 +124,30 @@ class Linear:
         """The number (N,) of the observation that each residual is a component of."""
         first = np.concatenate([[0], np.cumsum([len(f.R) for f in self.problem.factors])])
         return np.unique(self.rows.row + first[self.rows.factor], return_inverse=True)[1]
+
+    @property
+    def surveys(self) -> Flags:
+        """Which residuals (N,) are of surveyed landmarks, not of sightings."""
+        of = [f.sensor[1] == "" and f.term.blocks[0].group == LANDMARKS for f in self.problem.factors]
+        return np.array(of, dtype=np.bool_)[self.rows.factor]
+
+    @cached_property
+    def spacing(self) -> float:
+        """The median distance, m, of a landmark to the next one; infinite of fewer than two."""
+        places = self.state.groups[LANDMARKS][:, : self.state.d]
+        return float(np.median(cKDTree(places).query(places, k=2)[0][:, 1])) if len(places) > 1 else np.inf
+
+    @cached_property
+    def step(self) -> float:
+        """The length, m, of a long step of a robot from one pose to the next: 1 % are longer."""
+        poses, robots, lengths = (
+            self.state.groups[POSES][:, : self.state.d],
+            np.array(self.problem.robots),
+            [np.zeros(1)],
+        )
+        for robot in dict.fromkeys(self.problem.robots):
+            lengths.append(np.linalg.norm(np.diff(poses[robots == robot], axis=0), axis=1))
+        return float(np.quantile(np.concatenate(lengths), 0.99))
 
     @property
     def kept(self) -> Flags:

@@ -31,15 +31,20 @@ LOOKED_AT = 200  # outliers whose landmarks are looked for
 def best(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
+    Surveys that are off go before outliers and noise that would take them up, which are one for all of them.
     A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
     as much, one in the sensors goes before one in the controls.
     """
     first = max(sure, key=lambda f: f.gain)
-    jump = [f for f in sure if f.name == "kidnapped" and f.gain > TAKEN_UP * first.gain]
+    surveys = [f for f in sure if f.name == "landmark_prior"]
+    spread = first.name == "outliers" or first.unit == causes.TIMES
+    if surveys and spread and sum(f.gain for f in surveys) > TAKEN_UP * first.gain:
+        return [max(surveys, key=lambda f: f.gain)]
+    jump = [f for f in sure if f.at is not None and f.gain > TAKEN_UP * first.gain]
     if jump and first.unit == causes.TIMES:
         return jump
-    steady = [f for f in sure if f.Z is not None and f.gain > TAKEN_UP * first.gain]
-    if not steady or (first.unit != causes.TIMES and first.Z is None):
+    steady = [f for f in sure if f.Z is not None and f.at is None and f.gain > TAKEN_UP * first.gain]
+    if not steady or first.at is not None or (first.unit != causes.TIMES and first.Z is None):
         return [first]
     most = max(f.gain for f in steady)
     alike = sorted((f for f in steady if f.gain > ALIKE * most), key=lambda f: -f.gain)
@@ -92,12 +97,15 @@ class Search:
             *causes.outliers(self.linear, self.t_s),
             *causes.landmarks(self.linear, self.t_s),
             *causes.jumps(self.linear, self.t_s),
+            *causes.priors(self.linear, self.t_s),
         ]
 
     def take(self, finding: Finding) -> None:
         """Take a cause out of the data."""
         if finding.Z is not None and finding.W is not None:
             self.linear = self.linear.without(finding.Z * finding.value, finding.W * finding.value)
+            if finding.errors is not None:
+                self._scale(finding)
         elif finding.unit == causes.TIMES:
             finding = self._scaled(finding)
         else:

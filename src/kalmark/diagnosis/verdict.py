@@ -12,22 +12,24 @@ from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS
-from kalmark.diagnosis.causes import TIMES, Finding, Where
-from kalmark.diagnosis.gross import gross
+from kalmark.diagnosis.causes import JUMPS, TIMES, Finding, Where
+from kalmark.diagnosis.gross import Mistake, gross
+from kalmark.diagnosis.jumps import OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.search import LEAST_GAIN, Search
-from kalmark.diagnosis.words import words
+from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.results.batch import given_by, log_of
-from kalmark.results.gaps import matters
+from kalmark.results.gaps import RULED_OUT, left_out, matters
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.warnings import window_warnings
 from kalmark.results.words import figure
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
+from kalmark.slam.surveyed import ELSEWHERE
 
 NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
@@ -35,6 +37,7 @@ EVENTS = 4  # times as many as observations are taken
 SEGMENT = 30  # successive scans that are taken together where not all are
 MORE = 4  # times as many are taken if the segments do not determine the map
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
+FEW = 0.01  # of the landmarks: a mistake about no more than these is weighed by what it does to the map
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
@@ -91,20 +94,27 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
         run.evaluate()
     summary = run.summary
     mistake = gross(run, log)
-    if mistake is not None:
-        cause = Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
-        verdict = Verdict("wrong", (cause, *_structural(summary)), "the log filtered again without the mistake")
+    if mistake is not None and mistake.share > FEW:
+        verdict = Verdict(
+            "wrong", (_of_mistake(mistake), *_structural(run)), "the log filtered again without the mistake"
+        )
     else:
         verdict = _judged(run, log, most, progress)
+        if mistake is not None:
+            verdict = replace(verdict, causes=(_of_mistake(mistake), *verdict.causes))
         if run.stopped or summary.get("diverged") or repeats(summary):
             verdict = replace(verdict, map="wrong")
     summary["verdict"] = verdict.as_dict()
     return verdict
 
 
+def _of_mistake(mistake: Mistake) -> Cause:
+    return Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
+
+
 def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first = _structural(run.summary)
+    first = _structural(run)
     try:
         found = _searched(run, log, most, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
@@ -113,9 +123,11 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         checked = f"innovations alone, no batch solution: {why}"
         return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
     effect = effect_of(run, found)
-    causes = causes_of(run, found.search, effect.accuracy_m or 0.0)
+    causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
     causes = sorted([*first, *causes], key=lambda c: c.harmless)
+    if effect.status == "ok" and any(misplaced(run, f) for f in found.search.found):
+        effect = replace(effect, status="doubtful")
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
     return Verdict(effect.status, tuple(causes), checked, *figures, found.search)
@@ -188,6 +200,7 @@ def thinned(run: Run, given: Given, most: int) -> Given:
     number = max(len(t_ns) // SEGMENT, 2)
     first = np.unique(np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)) * SEGMENT
     segments = np.stack([t_ns[first], t_ns[np.minimum(first + SEGMENT, len(t_ns)) - 1]], axis=1)
+    segments[0, 0] = np.iinfo(np.int64).min  # the motion before the first scan leads from the start to it
     within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
     kept = (within >= 0) & (t_ns <= segments[within, 1])
     renumbered, rows = np.cumsum(kept) - 1, np.flatnonzero(kept[used.scan])
@@ -199,32 +212,71 @@ def thinned(run: Run, given: Given, most: int) -> Given:
 
 
 # ------------------------------------------------------------------ the causes
-def causes_of(run: Run, search: Search, accuracy_m: float = 0.0) -> list[Cause]:
+def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None = None) -> list[Cause]:
     """Return the causes that a search found; a landmark that moves by less than the map's accuracy does not matter."""
-    return [_cause(run, f) for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
+    matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
+    return [_cause(run, f, log) for f in joined(matter, begin_s(run))]
 
 
-def _cause(run: Run, finding: Finding) -> Cause:
+def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.unit == TIMES and finding.value < 1.0
-    return Cause(finding.name, since_s, finding.gain, *words(finding, run.config), harmless)
+    odd = _odd(run, log, finding, since_s) if finding.name in JUMPS and log is not None else None
+    name, told = finding.name, words(finding, run.config)
+    if odd is not None:
+        name, told = "odometry_jump", of_odd_control(finding, odd)
+    return Cause(name, since_s, finding.gain, *told, harmless)
 
 
-def _structural(summary: dict[str, Any]) -> list[Cause]:
+def _odd(run: Run, log: Log, finding: Finding, t_s: float) -> OddControl | None:
+    robot = finding.of[0]
+    return odd_control(log, tuple(run.final_slam().robots[robot].motion.columns), robot, t_s)
+
+
+def misplaced(run: Run, finding: Finding) -> bool:
+    """Return whether a finding is a surveyed landmark that the map has elsewhere than its sightings."""
+    names = [str(id_) for id_ in run.landmarks.ids]
+    if finding.name != "landmark_prior" or finding.at is None or finding.of[0] not in names:
+        return False
+    k, d = names.index(finding.of[0]), len(finding.at)
+    off, P = run.landmarks.means[k][:d] - finding.at, run.landmarks.covariances[k][:d, :d]
+    return bool(np.linalg.norm(off) > SIGMAS * np.hypot(finding.sigma, np.sqrt(np.trace(P))))
+
+
+def _structural(run: Run) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
-    return [*repeats(summary), *gaps(summary)]
+    return [*repeats(run.summary), *gaps(run.summary), *given_up(run)]
+
+
+def given_up(run: Run) -> list[Cause]:
+    """Return the surveyed landmarks that the filter found elsewhere and mapped anew, which does no harm."""
+    h, found, now = run.history, [], {str(id_): k for k, id_ in enumerate(run.landmarks.ids)}
+    surveys = {prior.landmark: prior for prior in h.priors}
+    for change in (c for c in h.changes if c.reason == ELSEWHERE and c.landmark in surveys and c.landmark in now):
+        prior, k, d = surveys[change.landmark], now[change.landmark], h.d
+        mean, P = run.landmarks.means[k][:d], run.landmarks.covariances[k][:d, :d] + prior.covariance[:d, :d]
+        off, at = mean - prior.mean[:d], ", ".join(figure(float(x)) for x in mean)
+        chi2 = float(off @ np.linalg.pinv(P) @ off)
+        evidence = (
+            f"landmark {change.landmark} is {figure(float(np.linalg.norm(off)))} m from where its survey says"
+            f" ({figure(float(np.sqrt(chi2)), 2)} sigma): the filter left its survey out and mapped it at ({at}) m"
+        )
+        cure = f"correct {change.landmark} in the file of the survey, or leave it out"
+        found.append(Cause("landmark_prior", float(h.t_ns[change.step]) * 1e-9, 0.5 * chi2, evidence, cure, True))
+    return found
 
 
 def gaps(summary: dict[str, Any]) -> list[Cause]:
     """Return the gaps in the controls; one that was bridged, and after which the pose was known, is harmless."""
     found = []
-    for gap in (gap for gap in summary.get("gaps", ()) if gap["action"] == "ignore" or matters(gap)):
+    stops = [gap for gap in summary.get("gaps", ()) if gap["kind"] != RULED_OUT]
+    for gap in (gap for gap in stops if gap["action"] == "ignore" or matters(gap)):
         lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
         cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
         evidence = (
             f"the control of {gap['robot']} stops for {figure(lasts)} s{', which was bridged' if bridged else ''}"
         )
         found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged))
-    return found
+    return found + [Cause("odometry_jump", begin_s, 0.0, line, "", True) for begin_s, line in left_out(summary)]
 
 
 def repeats(summary: dict[str, Any]) -> list[Cause]:

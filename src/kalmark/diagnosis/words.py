@@ -6,8 +6,12 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from kalmark.diagnosis.causes import TIMES, Finding
+from kalmark.diagnosis.jumps import LISTED, OddControl, size_of
 from kalmark.results.words import figure
+from kalmark.slam.gaps import MARGIN
 
 Words = tuple[str, str]  # evidence, cure
 MOST_SIGMAS = 1e4
@@ -24,6 +28,14 @@ CALIBRATIONS = {  # the keys that put an error of a column of the controls into 
     ("dtheta_rad", "scale"): "sigma_turn_scale",
     ("dtheta_rad", "offset"): "sigma_turn_bias_radps",
     ("dtheta_rad", "per_way"): "sigma_turn_rad_per_m",
+}
+
+
+LIMITS = {
+    "v_mps": "max_speed_mps",
+    "dx_m": "max_speed_mps",
+    "w_radps": "max_turn_radps",
+    "dtheta_rad": "max_turn_radps",
 }
 
 
@@ -122,6 +134,8 @@ def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
 def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, *of = finding.of
     if finding.name == "start":
+        if finding.at is not None:
+            return f"{robot} does not start where it is said to: it is {_jump(finding)} from there", ""
         return f"the start is {figure(finding.value, 2)} times as uncertain as stated", ""
     if finding.name == "control_sigma":
         what, path = f"the noise of {robot}'s {of[0] or 'motion'}", ["motion", f"sigma_{of[0]}"]
@@ -153,6 +167,16 @@ def _moving(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, f"leave out {finding.of[0]}"
 
 
+def _landmark_prior(finding: Finding, config: Mapping[str, Any]) -> Words:
+    name = finding.of[0]
+    at = ", ".join(figure(float(x)) for x in (np.zeros(0) if finding.at is None else finding.at))
+    evidence = (
+        f"landmark {name} is {figure(finding.value)} m from where its survey says ({_sure(finding)}):"
+        f" its sightings place it at ({at}) m"
+    )
+    return evidence, f"correct {name} in the file of the survey, or leave it out"
+
+
 def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
     return f"{finding.value:.1%} of the observations are far off where their landmark is", ""
 
@@ -162,8 +186,43 @@ def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, UNKNOWN_IDS
 
 
+def _jump(finding: Finding) -> str:
+    """Return how far a jump goes, and how sure that is."""
+    far_m, turn_deg = size_of(np.zeros(3) if finding.at is None else finding.at)
+    return f"{figure(far_m)} m and {figure(turn_deg)} deg ({figure(finding.value, 2)} sigma)"
+
+
+def _others(finding: Finding) -> str:
+    """Return the times of the other jumps of a robot."""
+    times = finding.of[2:]
+    some = ", ".join(times[:LISTED])
+    return f"; {len(times)} more at t={some} s{', ...' if len(times) > LISTED else ''}" if times else ""
+
+
 def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
-    return f"{finding.of[0]} moves in a way that its controls do not show ({figure(finding.value, 2)} sigma)", ""
+    far = f"{finding.of[0]} is moved by about {_jump(finding)} at t={finding.of[1]} s"
+    return f"{far}, and its controls do not show it{_others(finding)}", ""
+
+
+def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
+    by = f"{finding.of[0]} moves by {_jump(finding)} more than its controls say at t={finding.of[1]} s"
+    return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding)}", ""
+
+
+def of_odd_control(finding: Finding, odd: OddControl) -> Words:
+    """Return what a control says that jumps itself, and the limit that leaves it out, where its column has one."""
+    robot = finding.of[0]
+    degrees = odd.column.endswith(("_rad", "_radps"))
+    value = f"{figure(math.degrees(odd.value) if degrees else odd.value)} {'deg' if degrees else ''}".rstrip()
+    evidence = (
+        f"{odd.column} of {robot} is {value} at t={odd.t_s:.1f} s, {figure(odd.times, 2)} times as large as is usual,"
+        f" and it does not move so: its odometry jumps{_others(finding)}"
+    )
+    key = LIMITS.get(odd.column)
+    return (
+        evidence,
+        f"--set robots.{robot}.{key}={figure(odd.usual * MARGIN)}" if key else f"set max_speed_mps of {robot}",
+    )
 
 
 _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
@@ -177,7 +236,10 @@ _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "steering_offset": _odometry,
     "correlated_noise": _correlated,
     "moving_landmark": _moving,
+    "landmark_prior": _landmark_prior,
     "outliers": _outliers,
     "wrong_ids": _wrong_ids,
     "kidnapped": _kidnapped,
+    "odometry_jump": _odometry_jump,
+    "start": _noise,
 }

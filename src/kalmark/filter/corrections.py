@@ -70,6 +70,7 @@ TO_CORRECT = (  # all but the last argument
     f"{VIEW}, Tuple((f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8, UniTuple(i8, 8))), "
     "Tuple((i8, i8, i8[::1], i8, f8[:, ::1], f8[:, :, ::1], f8))"
 )
+ROUNDS, SETTLED = 20, 0.01  # of Huber's weights, and by how much these may still change
 call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
 _RETRACT, _GENERATOR, _ITERATE, _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8)
 
@@ -276,6 +277,45 @@ def compared(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
     return Z, d2
 
 
+def weighed(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
+    """Return R (K, p, p) divided by robust weights of what a scan leaves of each whitened innovation r.
+
+    Huber's min(1, k / |r|), or Student's min(1, (k + p) / (k + |r|^2)) of k degrees of freedom; k is in the place of
+    the gate.  Huber 1964, Annals of Mathematical Statistics 35; Lange, Little, Taylor 1989, Journal of the American
+    Statistical Association 84.  Iterated least squares on the scan as it is linearised at the prediction, with the
+    covariance of the prior.
+    """
+    x, P, _n, blocks, atoms, _axes, _ways = map_
+    robot, mount, slots, d, y, R, k = scan
+    index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    head, p = head_sizes(blocks, atoms, robot, mount)[1], R.shape[1]
+    _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
+    P_ss, H, v, inflated = submatrix(P, index), stacked(E_r, E_l), raveled(z), R.copy()
+    r = np.empty((len(y), p))
+    for _ in range(ROUNDS):
+        HP, Z = joint_innovation(H, P_ss, inflated, E_r.shape[2])
+        M, positive = cholesky_inverse(Z)
+        if not positive:
+            return R
+        step, changed = least_squares(HP, M, v), 0.0
+        for i in range(len(y)):
+            for a in range(p):
+                r[i, a] = v[i * p + a]
+                for c in range(len(step)):
+                    r[i, a] -= H[i * p + a, c] * step[c]
+        d2, _valid = squared_distances(R, r)
+        for i in range(len(y)):
+            times = (k + d2[i]) / (k + p) if student else np.sqrt(d2[i]) / k
+            times = max(1.0, times) if times < np.inf else 1.0
+            changed = max(changed, abs(inflated[i, 0, 0] / R[i, 0, 0] / times - 1.0))
+            for a in range(p):
+                for b in range(p):
+                    inflated[i, a, b] = R[i, a, b] * times
+        if changed < SETTLED:
+            break
+    return inflated
+
+
 def fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
     """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if not valid."""
     x, P, _n, blocks, atoms, axes, ways = map_
@@ -393,6 +433,7 @@ def first_estimates(
 
 compiled_invariant = compiled(invariant)
 compiled_compared = compiled(compared)
+compiled_weighed = compiled(weighed)
 compiled_fit = compiled(fit)
 compiled_averaged = compiled(averaged)
 compiled_textbook = compiled(textbook)

@@ -30,7 +30,9 @@ from kalmark.models.tags import corners
 from kalmark.results.history import History, as_id
 from kalmark.results.landmarks import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
+from kalmark.slam.surveyed import ELSEWHERE
 
+MOST_REJECTED = 0.2  # of the fixes
 STRETCHES = 10  # of a robot's path, each with its difference from the batch solution
 
 if TYPE_CHECKING:
@@ -125,7 +127,8 @@ def solve_batch(
     """Find the maximum-likelihood path and map of a run's data: O(steps) and O(landmarks^3) an iteration.
 
     `log` is what the run was made from.  Starts from the filter's solution, or from `initial`.  `known` gives the
-    landmarks that were in the map before the log, id: (mean, covariance or None for exactly).  Fixes are all used.
+    landmarks that were in the map before the log, id: (mean, covariance or None for exactly).  Fixes that the
+    filter rejected are left out.
     Raises KalmarkError if something is not determined, or if it does not converge within `iterations`.
     """
     problem = replayed(given_by(run, known), log)
@@ -138,9 +141,10 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
 
     With `rows` of the history these are read; those that the filter did not use are of no landmark.
     """
-    rejected = sum(not fix.used for fix in run.history.fixes)
-    if rejected:
-        raise KalmarkError(f"batch solution: the filter rejected {rejected} fixes, expected a run that used all")
+    rejected = frozenset(k for k, fix in enumerate(run.history.fixes) if not fix.used)
+    if len(rejected) > MOST_REJECTED * len(run.history.fixes):
+        what = f"the filter rejected {len(rejected)} of {len(run.history.fixes)} fixes"
+        raise KalmarkError(f"batch solution: {what}, expected a run that used most")
     history, slam = run.history, run.final_slam()
     refuse_other_than_points(slam, "batch solution")
     robots = slam.robots
@@ -152,7 +156,7 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
     rows = fused if rows is None else rows
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
     started = {name for row, name in names.items() if history.outcome[row] != "associated"}
-    beforehand = {ids.get(str(name), name): prior for name, prior in (known or {}).items()}
+    beforehand = {ids.get(str(name), name): prior for name, prior in {**_surveyed(history), **(known or {})}.items()}
     for name in dict.fromkeys(names.values()):
         if name not in started and name not in beforehand and name not in robots:
             mean, covariance = landmarks.get(name, (None, np.ones(1)))
@@ -177,7 +181,21 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
         known=beforehand,
         starts={start.robot: (start.mean, start.covariance) for start in history.starts},
         fixes=len(run.history.fixes),
+        left_out=rejected,
     )
+
+
+def _surveyed(history: History) -> Known:
+    """Return the points that were surveyed with a covariance, and were not found to be elsewhere."""
+    gone = {change.landmark for change in history.changes if change.reason == ELSEWHERE}
+    points = [
+        prior
+        for prior in history.priors
+        if len(prior.mean) == len(prior.covariance) == history.d
+        and prior.covariance.any()
+        and prior.landmark not in gone
+    ]
+    return {as_id(prior.landmark): (prior.mean, prior.covariance) for prior in points}
 
 
 def _in_the_end(history: History, rows: Index) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from kalmark.results.recording import Recording
 from kalmark.results.words import count, figure
 
 KNOWN = 0.5  # of the sigma that a gap gave it, below which the position is known again
+RULED_OUT = "ruled_out"  # the kind of a gap that is made: of controls beyond the limits of their robot
 NOTED, NOTED_S = 0.2, 0.5  # of a metre or a radian, sigmas above which a longer gap is worth a line
 
 
@@ -68,9 +69,22 @@ def matters(gap: dict[str, Any]) -> bool:
     return max(gap["sigma_m"], gap["sigma_rad"]) > NOTED and gap["end_s"] - gap["start_s"] > NOTED_S
 
 
+def left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
+    """Yield of each robot the time, s of the log, and a line of the controls that were beyond its limits."""
+    odd = [gap for gap in summary.get("gaps", ()) if gap["kind"] == RULED_OUT]
+    for robot in dict.fromkeys(gap["robot"] for gap in odd):
+        mine = [gap for gap in odd if gap["robot"] == robot]
+        begin_s, often = mine[0]["start_s"], count(len(mine), "time")
+        yield (
+            begin_s,
+            f"controls of {robot} are beyond its limits {often}, first at t={begin_s:.1f} s: they were left out",
+        )
+
+
 def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
-    """Tell of the gaps that were bridged, a line a robot."""
-    noted = [gap for gap in gaps if matters(gap)]
+    """Tell of the gaps that were bridged, and of controls that were left out, a line a robot."""
+    yield from (line for _, line in left_out({"gaps": gaps}))
+    noted = [gap for gap in gaps if matters(gap) and gap["kind"] != RULED_OUT]
     for robot in dict.fromkeys(gap["robot"] for gap in noted):
         mine = [gap for gap in noted if gap["robot"] == robot]
         longest = max(mine, key=lambda gap: gap["end_s"] - gap["start_s"])

@@ -73,6 +73,14 @@ class Start(NamedTuple):
     t_ns: int
 
 
+class Prior(NamedTuple):
+    """A landmark of a survey: its name, and its mean and covariance (0: known exactly) before the first event."""
+
+    landmark: str
+    mean: Vector
+    covariance: Matrix
+
+
 class MapSnapshot(NamedTuple):
     """The landmarks of the map after step `step`: ids, places (K, n) and their covariances (K, q, q), kinds.
 
@@ -155,6 +163,7 @@ ROWS: dict[
     "changes": ("change", Change, False),
     "fixes": ("used_fix", UsedFix, False),
     "starts": ("start", Start, False),
+    "priors": ("prior", Prior, False),
     "cameras": ("camera", Camera, True),
     "sensors": ("measuring", Measuring, True),
     "mounts": ("mount", Mounted, True),
@@ -191,7 +200,8 @@ class History:
     `stepped` is what ends a step, "scan", or "fix" or "control" of a log without any scan.
 
     `changes` is what became of landmarks, `fixes` are those used, in the order they came, `controls` those of each
-    robot that had any, `gaps` the times without, `repeats` pairs of landmarks that seem to be one.
+    robot that had any, `gaps` the times without, `repeats` pairs of landmarks that seem to be one.  `priors` are the
+    landmarks that were surveyed.
     """
 
     t_ns: Ints
@@ -236,6 +246,7 @@ class History:
     changes: tuple[Change, ...] = ()
     fixes: tuple[UsedFix, ...] = ()
     starts: tuple[Start, ...] = ()
+    priors: tuple[Prior, ...] = ()
     cameras: tuple[Camera, ...] = ()
     sensors: tuple[Measuring, ...] = ()
     mounts: tuple[Mounted, ...] = ()

@@ -97,6 +97,8 @@ def _sensor(mount: Any) -> dict[str, Any]:
             out[part] = model(vars(mount)[part])
     if mount.attention != type(mount.attention)():
         out["attention"] = _keys(mount.attention)
+    if mount.robust is not None:
+        out["robust"] = mount.robust
     if mount.upkeep is not None:
         out["upkeep"] = _keys(mount.upkeep)
     if mount.cov is not None:

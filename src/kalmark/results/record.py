@@ -20,7 +20,7 @@ from kalmark.logs.source import nearest
 from kalmark.report import Report
 from kalmark.results.foresight import Foresight
 from kalmark.results.gaps import joined
-from kalmark.results.history import Change, Controlled, History, MapSnapshot, Start, UsedFix, padded, texts
+from kalmark.results.history import Change, Controlled, History, MapSnapshot, Prior, Start, UsedFix, padded, texts
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
 from kalmark.results.recording import LogReference
@@ -125,6 +125,8 @@ class _Recorder:
             for name, t_ns in begins.items()
             if t_ns is not None
         )
+        surveyed = slam.landmarks() if slam.t_ns is None else ()  # in a map that is resumed they are correlated
+        self.priors = tuple(Prior(str(l.id), np.array(l.mean), np.array(l.covariance)) for l in surveyed)
         self.controls: dict[str, Controlled] = {}
         self.reckoned = {name: DeadReckoning(robot) for name, robot in slam.robots.items()}
         self.dead: list[Array] = []
@@ -254,6 +256,7 @@ class _Recorder:
             controls=self.controls,
             fixes=tuple(self.fixes),
             starts=self.starts,
+            priors=self.priors,
             cameras=cameras(self.slam),
             sensors=sensors(self.slam),
             mounts=mounts(self.slam),

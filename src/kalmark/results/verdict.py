@@ -8,13 +8,14 @@ from typing import Any
 from kalmark.results.words import count, figure
 
 SHOWN = 3  # causes in a short verdict
+ROUNDING_M = 1e-9
 SEEN = 0.02  # by which a factor of the sigmas is worth a word
 
 
 def verdict_lines(verdict: Mapping[str, Any], shown: int | None = SHOWN) -> Iterator[str]:
     """Yield a verdict of ``summary.json`` in words: the map, then so many causes (None: all), each with its cure."""
-    yield f"the map is {verdict['map']}{_trust(verdict)}"
     causes = verdict["causes"]
+    yield _first(verdict)
     some = causes if shown is None else causes[:shown]
     for cause in some:
         yield f"{cause['name']}: {cause['evidence']}{'; ' + cause['cure'] if cause['cure'] else ''}"
@@ -26,14 +27,21 @@ def alarm(verdict: Mapping[str, Any] | None) -> list[str]:
     """Return the lines for the picture of a map that is not ok: the first cause."""
     if verdict is None or verdict["map"] == "ok":
         return []
-    return [f"the map is {verdict['map']}{_trust(verdict)}", *(cause["evidence"] for cause in verdict["causes"][:1])]
+    return [_first(verdict), *(cause["evidence"] for cause in verdict["causes"][:1])]
+
+
+def _first(verdict: Mapping[str, Any]) -> str:
+    """Return the line that says it all: what the map is, by which cause if it is not ok, and to what accuracy."""
+    harmful = [cause["name"] for cause in verdict["causes"] if not cause["harmless"]]
+    why = f" because of {harmful[0]}" if harmful and verdict["map"] != "ok" else ""
+    return f"the map is {verdict['map']}{why}{_trust(verdict)}"
 
 
 def _trust(verdict: Mapping[str, Any]) -> str:
     """Return to what accuracy a map can be trusted."""
     factor, accuracy, shift = (verdict[key] for key in ("sigma_factor", "accuracy_m", "shift_m"))
     if verdict["map"] != "ok":
-        return f": its shape is off by {figure(shift)} m" if shift else ""
+        return f": its shape is off by {figure(shift)} m" if shift and shift > ROUNDING_M else ""
     if factor is None:
         return ""
     said = f"{figure(factor, 2)} times what the filter states" if abs(factor - 1.0) > SEEN else "as the filter states"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from kalmark.filter.estimators import Averaging
 from kalmark.management import depths, tags
 from kalmark.management.attention import chosen
 from kalmark.report import INDEFINITE, Judged, Observation
+from kalmark.slam import surveyed
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import ObservationModel
@@ -37,15 +39,20 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         if not rows:
             continue
         names: list[Any] = [decisions[k][0] for k in rows]
+        on_trial = bool(state.surveys.trial) and not state.surveys.trial.keys().isdisjoint(names)
+        least = surveyed.gate_of(state, scan, policy) if on_trial else math.inf
         slots = state.tracks.slots_of(names)
         if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:
-            state.estimator.correct(state.map, near)
+            state.estimator.correct(state.map, near._replace(gate=min(near.gate, least)))
         if scan.channel.depths and (near := depths.approach(scan, model, slots, rows)) is not None:
-            state.estimator.correct(state.map, near)
-        done = state.corrected(scan.update(model, slots, rows), scan.event)
+            state.estimator.correct(state.map, near._replace(gate=min(near.gate, least)))
+        update = scan.update(model, slots, rows)
+        done = (
+            surveyed.corrected(state, scan, names, update, least) if on_trial else state.corrected(update, scan.event)
+        )
         report.fill(rows, done)
         state.tracks.count(names, done.fused.tolist())
-        judged.append(Judged(rows, scan.ids, names, done, scan.channel.gate))
+        judged.append(Judged(rows, scan.ids, names, done, min(scan.channel.gate, least)))
     return judged, found + _average(state, scan, decisions) if policy.averages else found
 
 
@@ -58,6 +65,7 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
         groups = [(model, [k]) for model, rows in groups for k in rows]
     if groups and len(groups[0][1]) < len(scan.y):
         report.blank(scan.channel.dof)
+    least = surveyed.gate_of(state, scan, policy) if groups else math.inf
     judged = []
     for model, rows in groups:
         names: list[Any] = [decisions[k][0] for k in rows]
@@ -65,12 +73,12 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
         if scan.channel.far is not None:
             slots = np.full(len(rows), scan.robot)
             if (near := tags.approach(scan, model.exactly, slots, rows, l)) is not None:
-                estimator.correct(state.map, near)
-        done = state.corrected(scan.known_update(model, l, rows), scan.event, estimator)
+                estimator.correct(state.map, near._replace(gate=min(near.gate, least)))
+        done = surveyed.corrected(state, scan, names, scan.known_update(model, l, rows), least, estimator)
         done = done._replace(e=done.e[:, :m])
         report.fill(rows, done)
         known.count(names, done.fused.tolist())
-        judged.append(Judged(rows, scan.ids, names, done, scan.channel.gate))
+        judged.append(Judged(rows, scan.ids, names, done, min(scan.channel.gate, least)))
     return judged
 
 

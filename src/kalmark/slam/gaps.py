@@ -4,6 +4,8 @@ A control is late if it comes after more than `TIMES` the longest interval that 
 robot is unknown: its position is anywhere within the distance that its greatest speed allows, its heading turned by
 anything that its greatest turn rate allows, both uniformly, and the covariance of the pose grows by theirs.  The
 estimate of an increment's robot stays where it is, a held control stays held.
+
+A control of a motion that the limits of the robot rule out is left out, as if it had been lost.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ LEARNED = 20  # controls from one look at them to the next, and before the first
 MARGIN = 1.2  # greatest speed over the greatest one in the log so far
 NEVER_NS = 2**62
 KEPT = (
-    "last_ns", "since_ns", "until_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest", "adrift",
+    "last_ns", "since_ns", "until_ns", "left_out_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest",
+    "adrift",
 )  # fmt: skip
 WHOLE = 1.5  # an increment so much larger than any before is of the whole gap: its odometry went on
+RULED_OUT = 1.5  # times the limits of the robot: no such motion, but a jump of its odometry
 
 
 class Gaps:
@@ -54,6 +58,7 @@ class Gaps:
         self.pending: tuple[tuple[int, Array], ...] = ()
         self.largest: Array = np.zeros(len(motion.columns))  # of an increment: per second
         self.adrift = False  # whether the pose may be anywhere since a gap
+        self.left_out_ns: int | None = None  # since when controls are left out
         self.noticed: Gap | None = None
 
     def state(self) -> dict[str, Any]:
@@ -64,6 +69,8 @@ class Gaps:
         """Take back what `state` gave."""
         vars(self).update(state)
         self._expect_next()
+        if self.since_ns is not None:
+            self.late_ns = min(self.late_ns, self.since_ns)
 
     def take(self, control: Control) -> None:
         """Learn from a control, which ends a gap."""
@@ -71,8 +78,38 @@ class Gaps:
             self.pending = (*self.pending, (control.t_ns - self.last_ns, control.u))
             if len(self.pending) == LEARNED:
                 self._learn()
-        self.last_ns, self.since_ns = control.t_ns, None
+        self._go_on(control.t_ns)
+
+    def _go_on(self, t_ns: int) -> None:
+        self.last_ns, self.since_ns, self.left_out_ns = t_ns, None, None
         self._expect_next()
+
+    def rules_out(self, control: Control) -> bool:
+        """Return whether a control is of a motion far beyond the limits that the robot was given."""
+        limits = self.max_speed_mps, self.max_turn_radps
+        if limits == (None, None) or self.action == "ignore" or (self.usual_ns == 0 and not self.motion.held):
+            return False
+        rates = self._rates(control.u, self.usual_ns if self.last_ns is None else control.t_ns - self.last_ns)
+        return any(limit is not None and rate > RULED_OUT * limit for rate, limit in zip(rates, limits, strict=True))
+
+    def leave_out(self, control: Control) -> Array | None:
+        """Take a control that is ruled out for lost; return the covariance of what has been moved, of an increment.
+
+        A held control stays held, and the motion is unknown from then on.  Raises EventError where that is refused.
+        """
+        if self.action == "refuse":
+            what = f"{self.robot!r}: u is {control.u.tolist()} at t={seconds(control.t_ns)} s"
+            raise EventError(f"{what}, expected at most {self.max_speed_mps} m/s and {self.max_turn_radps} rad/s")
+        begin = control.t_ns if self.motion.held or self.last_ns is None else self.last_ns
+        if self.since_ns is None:
+            self.since_ns = self.until_ns = begin
+        self.left_out_ns = begin if self.left_out_ns is None else self.left_out_ns
+        self.late_ns = min(self.late_ns, begin)
+        if self.motion.held:
+            return None
+        D = self.unknown(control.t_ns)
+        self._go_on(control.t_ns)
+        return D
 
     def _expect_next(self) -> None:
         if self.last_ns is not None and self.bound_ns is not None:
@@ -102,7 +139,7 @@ class Gaps:
         """
         if t_ns <= self.late_ns or self.last_ns is None or self._is_of_all(t_ns, u):
             return None
-        if self.action == "refuse":
+        if self.action == "refuse" and self.left_out_ns is None:
             gap_s, usual_s = (t_ns - self.last_ns) * 1e-9, self.usual_ns * 1e-9
             what = f"{self.robot!r} had no control for {gap_s:.3g} s from t={seconds(self.last_ns)} s on"
             raise EventError(f"{what}, expected one every {usual_s:.3g} s; gaps: widen bridges that")
@@ -113,9 +150,11 @@ class Gaps:
         if self.action == "ignore":
             D[:] = 0.0
         self.adrift = self.adrift or bool(D.any())
-        kind = "held" if self.motion.held else "increments"
+        kind, start_ns = "held" if self.motion.held else "increments", self.last_ns
+        if self.left_out_ns is not None:
+            kind, start_ns = "ruled_out", self.left_out_ns
         sigmas = np.sqrt(D.diagonal()[[0, 2 if self.motion.space.axes == 1 else 5]]).tolist()
-        self.noticed = Gap(self.robot, kind, self.last_ns, t_ns, *sigmas)
+        self.noticed = Gap(self.robot, kind, start_ns, t_ns, *sigmas)
         return D if D.any() else None
 
     def _is_of_all(self, t_ns: int, u: Array | None) -> bool:
@@ -130,7 +169,8 @@ class Gaps:
         """Return the covariance of what it may have moved by since its motion is unknown."""
         assert self.since_ns is not None
         after_s, space = (t_ns - self.since_ns) * 1e-9, self.motion.space
-        speed, turn = self._rates(self.largest if self.motion.held else self.largest * self.usual_ns * 1e-9)
+        u = self.largest if self.motion.held else self.largest * self.usual_ns * 1e-9
+        speed, turn = self._rates(u, self.usual_ns)
         speed, turn = self.max_speed_mps or MARGIN * speed, self.max_turn_radps or MARGIN * turn
         d = 2 if space.axes == 1 else 3
         D = np.zeros((space.dof, space.dof))
@@ -139,9 +179,9 @@ class Gaps:
         D[angles, angles] = min(turn * after_s, math.pi) ** 2 / (space.axes + 2)
         return D
 
-    def _rates(self, u: Array) -> tuple[float, float]:
-        """Return the speed and the turn rate of a control that lasts the usual time."""
-        space, dt_s = self.motion.space, max(self.usual_ns, 1) * 1e-9
+    def _rates(self, u: Array, dt_ns: int) -> tuple[float, float]:
+        """Return the speed and the turn rate of a control that lasts so long, and at least the usual time."""
+        space, dt_s = self.motion.space, max(dt_ns, self.usual_ns, 1) * 1e-9
         origin = np.zeros(space.size)
         if space.axes > 1:
             origin[6] = 1.0

@@ -13,7 +13,7 @@ from kalmark.management import existence, reparametrize, walls
 from kalmark.management import repeats as of_map
 from kalmark.models.protocols import Segmented
 from kalmark.report import Observation
-from kalmark.slam import merging, tentative
+from kalmark.slam import merging, surveyed, tentative
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.scan import ScanContext
@@ -67,6 +67,9 @@ def _give_up(state: State, scan: ScanContext, policy: Policy, found: dict[Id | N
 def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
     """Map management after a scan: landmarks that are gone, that are one, tentative ones without hope."""
     report, ids = scan.report, scan.event.ids
+    for name in state.surveys.wrong() if state.surveys.misfits else ():
+        state.remove(name)
+        report.removed += ((name, surveyed.ELSEWHERE),)
     for judgement in existence.judged(scan, policy.upkeep) if policy.upkeep.p_detect is not None else ():
         track = state.tracks.confirmed[judgement.name]
         track.log_odds, track.missed = judgement.log_odds, judgement.missed

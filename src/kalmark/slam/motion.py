@@ -143,6 +143,8 @@ class HeldInput:
 
     def accept(self, control: Control) -> list[Part]:
         """Take a new control; return the parts of motion it closes."""
+        if self.gaps is not None and self.gaps.rules_out(control):
+            return self._left_out(control, self.gaps)
         N = self.motion.control_noise(control.u) if control.cov is None else control.cov
         if not self.motion.held:
             dt_s = 0.0 if self.t_ns is None else (control.t_ns - self.t_ns) * 1e-9
@@ -154,6 +156,17 @@ class HeldInput:
         if self.gaps is not None:
             self.gaps.take(control)
         return closing if part is None else [part, *closing]
+
+    def _left_out(self, control: Control, gaps: Gaps) -> list[Part]:
+        """Leave out a control that is ruled out; return the motion up to then."""
+        if self.motion.held:
+            part = self.advance(control.t_ns, last=True)
+            gaps.leave_out(control)
+            self.fresh = True
+            return [] if part is None else [part]
+        k, unknown = len(self.motion.columns), gaps.leave_out(control)
+        self.t_ns = control.t_ns
+        return [] if unknown is None else [Part(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)]
 
 
 @dataclass

@@ -122,7 +122,7 @@ def channel_of(
     def threshold(dof: int) -> float:
         return association.threshold(dof, estimator.default_gate)
 
-    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others)
+    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, mount.robust)
 
 
 def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:

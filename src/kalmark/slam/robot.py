@@ -19,9 +19,10 @@ from kalmark.management.delayed import Delayed
 from kalmark.management.hypotheses import Hypotheses
 from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.protocols import Landmark, Motion, Sensor, parameter_covariance, refuse_misspelt
+from kalmark.models.protocols import Landmark, Motion, OfState, Sensor, parameter_covariance, refuse_misspelt
 from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
 from kalmark.slam.gaps import ACTIONS, Gaps
+from kalmark.tracks.channel import ROBUST
 
 INFINITE = math.inf
 IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
@@ -55,7 +56,8 @@ class Mount:
     turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
     and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
     by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
-    called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas.
+    called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas.  `robust`
+    makes outliers count less, "huber" or "student" (docs/association.md; None: all count in full).
     """
 
     sensor: Sensor
@@ -67,6 +69,7 @@ class Mount:
     cov: Any = None
     upkeep: Upkeep | None = None
     initialization: Delayed | Trilateration | Hypotheses | None = None
+    robust: str | None = None
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
@@ -85,6 +88,12 @@ class Mount:
             ways = "a Delayed, a Trilateration or Hypotheses"
             one_of: Any = (Delayed, Trilateration, Hypotheses)
             instance(self.initialization, one_of, "Mount: initialization", ways)
+        if self.robust is not None:
+            what = f"Mount: robust is {shown(self.robust)}"
+            if self.robust not in ROBUST:
+                raise ModelError(f"{what}, expected {' or '.join(ROBUST)}, or None")
+            if isinstance(self.sensor, OfState):
+                raise ModelError(f"{what}, but a {type(self.sensor).__name__} measures its robot, expected None")
         object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
 
     def covariance(self, dof: int, what: str) -> Array | None:

@@ -126,6 +126,15 @@ def _state(state: State) -> Description:
             for name, m in state.moving.items()
         },
         "readers": [[*key, reader.t_ns] for key, reader in state.readers.items()],
+        "surveys": {
+            "trial": [[_id(name), count] for name, count in state.surveys.trial.items()],
+            "misfits": [
+                [_id(name), out, sorted(map(_id, fit), key=str)] for name, (out, fit) in state.surveys.misfits.items()
+            ],
+            "strangers": [
+                [robot, sorted(map(_id, names), key=str)] for robot, names in state.surveys.strangers.items()
+            ],
+        },
     }
 
 
@@ -232,6 +241,10 @@ class Saved:
         clones.latest = {robot: _count(number, "number of a clone") for robot, number in s["latest"].items()}
         clones.numbered = _count(s["numbered"], "number of clones")
         self._fill_moving(state)
+        judged = s.get("surveys", {"trial": (), "misfits": (), "strangers": ()})
+        state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
+        state.surveys.misfits = {name: (int(out), frozenset(fit)) for name, out, fit in judged["misfits"]}
+        state.surveys.strangers = {str(robot): set(names) for robot, names in judged["strangers"]}
         for robot, sensor, t_ns in s["readers"]:
             state.readers[robot, sensor].t_ns = _time(t_ns)
         carried: dict[ChannelKey, Channel | Reader] = {**state.channels, **state.readers}
@@ -399,6 +412,7 @@ def _watching(record: Description, k: int) -> Description:
 
     times = {key: _time(record[key]) for key in ("last_ns", "since_ns", "until_ns", "usual_ns", "bound_ns")}
     return times | {
+        "left_out_ns": _time(record.get("left_out_ns")),
         "intervals": tuple(_count(dt, "interval of controls") for dt in record["intervals"]),
         "pending": tuple((_count(dt, "interval of controls"), control(u)) for dt, u in record["pending"]),
         "largest": control(record["largest"]),
@@ -520,7 +534,7 @@ def same(landmark: Any, description: Description | None) -> bool:
 def robot_described(robot: Robot) -> Description:
     """Return a robot with its motion, its start and its mounted sensors."""
     mounts = [
-        [name, {"at": list(mount.at), "cov": _listed(mount.cov), **_parts(mount)}]
+        [name, {"at": list(mount.at), "cov": _listed(mount.cov), "robust": mount.robust, **_parts(mount)}]
         for name, mount in robot.sensors.items()
     ]
     moved = {"motion": described(robot.motion), "columns": list(robot.motion.columns)}
@@ -543,7 +557,7 @@ def _robot_restored(d: Description) -> Robot:
         what = f"{who}: sensor {name!r}"
         said = {"sensor": what} | {role: f"{what}: {role}" for role in PARTS[1:]}
         parts = {role: restored(role, m[role], said[role], "robots") for role in PARTS if m.get(role) is not None}
-        mounts[name] = Mount(at=m["at"], cov=m["cov"], **parts)
+        mounts[name] = Mount(at=m["at"], cov=m["cov"], robust=m.get("robust"), **parts)
     motion = restored("motion", d["motion"], f"{who}: motion", "robots")
     return Robot(d["name"], motion, d["start"], mounts, d["cov"], **{key: d[key] for key in OF_GAPS})
 

@@ -266,6 +266,7 @@ class Slam(Estimate):
             state.tracks.known.add(name, model, mean)
             return
         state.tracks.enter(Track(name, model, state.map.add(model.space, mean, cov)))
+        state.surveys.trial[name] = 0
         state.let_grow()
 
     def remove(self, name: Id) -> None:

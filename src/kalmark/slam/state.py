@@ -25,6 +25,7 @@ from kalmark.slam.robot import Robot, mount_name
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.scan import Start
+from kalmark.tracks.surveys import Surveys
 from kalmark.tracks.track import ChannelKey, Tracks
 
 CURE = "start anew from a pose that is less certain, or with larger sigmas of controls and sensors"
@@ -54,7 +55,7 @@ class State:
         self.settings, self.robots = settings, robots
         self.t_ns: int | None = None
         self.map: Map = new_map(settings.map, settings.numbers)
-        self.tracks, self.clones = Tracks(robots), Clones()
+        self.tracks, self.clones, self.surveys = Tracks(robots), Clones(), Surveys()
         self.moving: dict[str, Moving] = {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
@@ -143,6 +144,7 @@ class State:
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
+        self.surveys.forget(name)
         if name in self.tracks.known:
             self.tracks.known.remove(name)
             return

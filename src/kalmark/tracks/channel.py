@@ -15,6 +15,7 @@ from kalmark.errors import ModelError
 from kalmark.filter import corrections, kernels
 from kalmark.filter.map import AT_ONCE, Map, StochasticMap
 from kalmark.filter.neighbours import has_place
+from kalmark.geometry.gaussian import gate
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
 from kalmark.models.known import known_view
@@ -29,6 +30,8 @@ ROBOT = "robot"
 ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one model applies to
 EUCLIDEAN = ("point", "point3")
 TINY_RHO = 1e-9  # 1 / m: as good as infinitely far
+HUBER, STUDENT = ROBUST = ("huber", "student")
+FULL, DEGREES = 0.95, 4.0  # of right observations count in full for Huber; degrees of freedom of Student's weights
 BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
 
 
@@ -68,6 +71,15 @@ class ObservationModel:
         scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), math.inf
         return run(self.model, m.whole, scan)
 
+    def weighed(
+        self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array, how: str
+    ) -> Array:  # fmt: skip
+        """Return the noise (K, p, p) with which outliers count less, `how` one of `ROBUST`."""
+        run = corrections.compiled_weighed if isinstance(self.model, tuple) else corrections.weighed
+        k = DEGREES if how == STUDENT else huber_length(R.shape[1])
+        scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), k
+        return np.asarray(run(self.model, m.whole, scan, how == STUDENT))
+
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled model, whose addresses mean nothing to another process."""
         return {name: value for name, value in self.__dict__.items() if name not in ("model", "exactly")}
@@ -87,15 +99,21 @@ class KnownModel(ObservationModel):
         return 0
 
 
+def huber_length(dof: int) -> float:
+    """Return the length of a whitened residual of `dof` numbers up to which it counts in full for Huber."""
+    return math.sqrt(gate(FULL, dof))
+
+
 class Channel:
     """A sensor of a robot on its mount `at`, whose slot is `mount` (-1: not in the map), starting `landmark`s.
 
     `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
+    `robust`: how outliers count less, one of `ROBUST` (None: all count in full).
     """
 
     def __init__(
         self, sensor: Sensor, at: Array, mount: int, landmark: Landmark, threshold: Callable[[int], float],
-        others: Sequence[Landmark],
+        others: Sequence[Landmark], robust: str | None = None,
     ) -> None:  # fmt: skip
         self.sensor: Any = sensor
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
@@ -108,6 +126,7 @@ class Channel:
         self._refuse_misfit()
         self.dof = self._dof()
         self.gate = threshold(self.dof)
+        self.robust = robust
         full, self.finds_depth = isinstance(sensor, protocols.FullSensor), finds_depth(sensor)
         any_depth = self.finds_depth or isinstance(landmark, protocols.UnknownDepth) or landmark.kind not in EUCLIDEAN
         self.starts_landmarks = full and any_depth

@@ -1,0 +1,75 @@
+"""Jumps of a robot against its controls: those of one robot are one cause, and controls that jump themselves are named.
+
+A robot that is bumped, whose wheels slip or that is carried moves without its controls.  A control that is far larger
+than all others, at the time of a jump, is the opposite: the odometry jumps, and the robot does not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.diagnosis.causes import JUMPS, Finding
+from kalmark.events import Control
+from kalmark.logs.log import Log
+
+USUAL, TIMES = 0.99, 2.0  # share of the controls that are usual, and how many times as large is one that jumps
+NEAR_S = 0.5  # before and after a jump, within which a control may be the reason
+LISTED = 5  # times of further jumps
+
+
+class OddControl(NamedTuple):
+    """A control far larger than all others: its time, its column and value, and how many times the usual it is.
+
+    `usual` is that of a second.
+    """
+
+    t_s: float
+    column: str
+    value: float
+    times: float
+    usual: float
+
+
+def odd_control(log: Log, columns: Sequence[str], robot: str, t_s: float) -> OddControl | None:
+    """Return the control near a time of the log that is far larger than the others of its robot, None if none is."""
+    mine = [e for e in log.events if isinstance(e, Control) and e.robot == robot]
+    u, t = np.abs([e.u for e in mine]), np.array([e.t_s for e in mine])
+    near = np.flatnonzero(np.abs(t - t_s) <= NEAR_S)
+    if not len(near):
+        return None
+    usual = np.quantile(u, USUAL, axis=0)
+    times = u[near] / np.maximum(usual, 1e-300) * (usual > 0)
+    row, column = divmod(int(np.argmax(times)), times.shape[1])
+    if times[row, column] < TIMES:
+        return None
+    k = int(near[row])
+    lasts_s = 1.0 if columns[column].endswith("ps") else float(np.median(np.diff(t)))
+    value, most = float(mine[k].u[column]), float(usual[column]) / max(lasts_s, 1e-9)
+    return OddControl(float(t[k]), columns[column], value, float(times[row, column]), most)
+
+
+def joined(found: Sequence[Finding], begin_s: float) -> list[Finding]:
+    """Return findings with the jumps of each robot as one: the largest, and the times of all in s of the log.
+
+    The first scan is at `begin_s`.
+    """
+    rest = [f for f in found if f.name not in JUMPS]
+    jumps = sorted((f for f in found if f.name in JUMPS), key=lambda f: -f.gain)
+    for robot in dict.fromkeys(f.of[0] for f in jumps):
+        first, *more = [f for f in jumps if f.of[0] == robot]
+        times = [first.since_s or 0.0, *sorted(f.since_s or 0.0 for f in more)]
+        of = (robot, *(f"{begin_s + t:.1f}" for t in times))
+        rest.append(replace(first, of=of, gain=sum(f.gain for f in (first, *more))))
+    return rest
+
+
+def size_of(step: Array) -> tuple[float, float]:
+    """Return how far a step (3,) or (6,) goes, m, and turns, deg."""
+    d = 2 if len(step) == 3 else 3
+    return float(np.linalg.norm(step[:d])), math.degrees(float(np.linalg.norm(step[d:])))

@@ -1,0 +1,70 @@
+"""Corrections by surveyed landmarks, which are gated, so that one that stands elsewhere does not pull the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.filter.estimators import Correction, Estimator, Update
+from kalmark.geometry.angles import wrap
+from kalmark.geometry.gaussian import gate
+from kalmark.slam.policy import Policy
+from kalmark.slam.state import State
+from kalmark.tracks.scan import ScanContext
+
+SURVEYED = 0.9999  # of right sightings are within the gate
+ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped anew"
+WIDER = 2.0  # times what a robot that was elsewhere has moved by
+SURE_RAD = 0.3  # a sigma of the heading above which nothing can be expected
+
+
+def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
+    """Return the gate of sightings of surveyed landmarks; infinite while the heading of their robot is not known."""
+    turns = slice(2, 3) if scan.dimensions == 2 else slice(3, 6)
+    if state.map.covariance([scan.robot]).diagonal()[turns].max() > SURE_RAD**2:
+        return math.inf
+    return policy.association.threshold(scan.channel.dof, gate(SURVEYED, scan.channel.dof))
+
+
+def corrected(
+    state: State, scan: ScanContext, names: Sequence[Any], update: Update, least: float,
+    estimator: Estimator | None = None,
+) -> Correction:  # fmt: skip
+    """Correct by sightings of which some are of surveys; of these the ones beyond `least` are left out.
+
+    They are taken all the same if it is the robot that is elsewhere.
+    """
+    done = state.corrected(update._replace(gate=min(update.gate, least)), scan.event, estimator)
+    if least == math.inf:
+        return done
+    trial, known = state.surveys.trial, state.tracks.known
+    beyond = np.flatnonzero(~done.fused & (done.d2 <= update.gate)).tolist()
+    tried = [name in trial or name in known for name in names]
+    fitting = [names[k] for k in np.flatnonzero(done.fused).tolist() if tried[k]]
+    lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
+    out = np.array([k for k in beyond if lost or not tried[k]], dtype=np.int64)
+    if not len(out):
+        return done
+    pose = state.map.mean(scan.robot)[: len(scan.channel.at)]
+    rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
+    again, fused = state.corrected(rest, scan.event, estimator), done.fused.copy()
+    fused[out] = again.fused
+    if lost:
+        _widen(state, scan, pose)
+    return done._replace(fused=fused)
+
+
+def _widen(state: State, scan: ScanContext, before: Array) -> None:
+    """Let the pose of a robot that was elsewhere be as uncertain as it has moved now: it was believed too much.
+
+    What its covariance lets it move by is too little at first, but doubles from scan to scan.
+    """
+    after, d, dof = state.map.mean(scan.robot)[: len(before)], scan.dimensions, scan.channel.pose_dof
+    turn = after[2] - before[2] if d == 2 else 2.0 * math.acos(min(1.0, abs(float(after[3:] @ before[3:]))))
+    sigmas = np.repeat([np.linalg.norm(after[:d] - before[:d]), abs(wrap(float(turn)))], [d, dof - d])
+    index = state.map.index(scan.robot)[:dof]
+    state.map.predict(index, np.eye(dof), np.diag((WIDER * sigmas) ** 2))

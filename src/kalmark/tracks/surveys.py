@@ -1,0 +1,63 @@
+"""Surveyed landmarks whose sightings do not fit: whether they stand elsewhere, or their robot.
+
+A sighting outside its gate is left out, as a fix is.  Sightings of two such landmarks with none between that fits say
+that the robot is elsewhere, not they: those are taken.  A landmark of which five sightings in a row do not fit, while
+those of twice as many landmarks do as do not, stands elsewhere: it is removed, and its next sighting maps it anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from kalmark.events import Id
+
+MISFITS, TWICE = 5, 2  # sightings in a row that do not fit, and landmarks that do: the survey is wrong
+TRUSTED = 5  # sightings that fit, after which it is right
+
+
+class Surveys:
+    """What sightings say of surveys.  `trial`: of landmarks in the map, how many sightings have fitted so far.
+
+    `misfits`: how many sightings in a row did not fit, and which landmarks did meanwhile.  `strangers`: by robot,
+    the landmarks that did not fit since one did.
+    """
+
+    def __init__(self) -> None:
+        self.trial: dict[Id, int] = {}
+        self.misfits: dict[Id, tuple[int, frozenset[Id]]] = {}
+        self.strangers: dict[str, set[Id]] = {}
+
+    def forget(self, name: Id) -> None:
+        """Forget a landmark."""
+        self.trial.pop(name, None)
+        self.misfits.pop(name, None)
+        for names in self.strangers.values():
+            names.discard(name)
+
+    def judge(self, robot: str, fitting: Collection[Id], others: Collection[Id]) -> bool:
+        """Take sightings that fit and such that do not; return whether it is the robot that is elsewhere."""
+        for name in fitting:
+            self.misfits.pop(name, None)
+            if name in self.trial:
+                self.trial[name] += 1
+                if self.trial[name] >= TRUSTED:
+                    del self.trial[name]
+        if fitting:
+            self.misfits = {name: (out, fit.union(fitting)) for name, (out, fit) in self.misfits.items()}
+            self.strangers.pop(robot, None)
+        for name in others:
+            out, fit = self.misfits.get(name, (0, frozenset[Id]()))
+            self.misfits[name] = out + 1, fit.union(fitting)
+        strangers = self.strangers.setdefault(robot, set())
+        strangers.update(others if not fitting else ())
+        if len(strangers) < 2:
+            return False
+        for name in [*strangers, *others]:
+            self.misfits.pop(name, None)
+        strangers.clear()
+        return True
+
+    def wrong(self) -> list[Id]:
+        """Return the landmarks that stand elsewhere."""
+        least = TWICE * len(self.misfits)
+        return [name for name, (out, fit) in self.misfits.items() if out >= MISFITS and len(fit) >= least]
