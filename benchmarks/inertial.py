@@ -103,6 +103,12 @@ def points(states: np.ndarray, rng: Generator) -> np.ndarray:
     return p
 
 
+def start_sigmas(lost: bool) -> np.ndarray:
+    """Return the sigmas (15,) of a start, one of which next to nothing is known or one with a known place and yaw."""
+    pose = [SIGMA_M * lost] * 3 + [SIGMA_TILT] * 2 + [SIGMA_YAW * lost]
+    return np.array(pose + [SIGMA_V] * 3 + [SIGMA_W] * 3 + [SIGMA_A] * 3)
+
+
 class Run:
     """One run: the filter, the truth, and what the camera sees."""
 
@@ -111,14 +117,15 @@ class Run:
         self.u, self.biases = read(flight, self.rng)
         self.points, (self.sensor, landmark) = points(flight.states, self.rng), SENSORS[sensor]
         self.at = CAMERA if sensor != "spherical" else np.array([0.0, 0, 0, 0, 0, 0, 1])
-        sigmas = [SIGMA_M * lost] * 3 + [SIGMA_TILT] * 2 + [SIGMA_YAW * lost] + [SIGMA_V] * 3 + [SIGMA_W] * 3 + [SIGMA_A] * 3
-        truth = np.concatenate([flight.states[0, :10], self.biases[0]])
-        error = self.rng.normal(0.0, sigmas)
-        error[9:] = 0.0  # the biases are drawn already, around none
-        start = UNIT.space.plus(truth, error)
-        start[10:] = 0.0
+        truth, sigmas = flight.states[0], start_sigmas(lost)
+        error = self.rng.normal(0.0, sigmas[:9])
+        start = UNIT.space.rotated(truth, error[3:6])  # the velocity is known in the frame of the robot, turned with it
+        start[:3], start[7:10] = truth[:3] + error[:3], start[7:10] + error[6:]
+        A = np.eye(UNIT.space.dof)
+        A[6:9, 3:6] = UNIT.space.generator(start)[6:9]
+        self.prior = A @ np.diag(np.square(sigmas)) @ A.T
         mount = km.Mount(self.sensor, at=self.at)
-        robot = km.Robot("unit", UNIT, start, {"camera": mount}, cov=np.diag(np.square(sigmas)))
+        robot = km.Robot("unit", UNIT, start, {"camera": mount}, cov=self.prior)
         self.slam = km.Slam([robot], estimator=ESTIMATORS[estimator], landmarks=landmark)
 
     def scans(self) -> Any:
@@ -200,8 +207,8 @@ def gauged(flight: Flight, estimator: str, seed: SeedSequence, every: int) -> np
     """
     pin()
     run, values = Run(flight, "spherical", estimator, seed, lost=True), []
-    N, sigmas = run.directions(["unit"]), [SIGMA_M] * 3 + [SIGMA_TILT] * 2 + [SIGMA_YAW] + [SIGMA_V] * 3
-    first = N[:9].T @ (N[:9] / np.square(sigmas)[:, None])
+    N = run.directions(["unit"])
+    first = N.T @ np.linalg.solve(run.prior, N)
     root = np.linalg.inv(np.linalg.cholesky(first))
     for i, _ in enumerate(run.scans()):
         if i % every == 0:
