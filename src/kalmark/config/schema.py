@@ -55,7 +55,7 @@ STATES = {
     ),
 }  # fmt: skip
 """What a state may have behind its pose, as keys of a start."""
-_AXIS = re.compile(r"_?[xyz](?=_)")  # of a key
+_AXIS = re.compile(r"(?:_|(?<=[vwa]))[xyz](?=_)")  # of a key: vx_mps, gravity_x_mps2
 POSE_OF_PLANE = ("theta_rad", "sigma_xy_m", "sigma_theta_rad")
 POSE_OF_SPACE = ("z_m", "roll_deg", "pitch_deg", "yaw_deg", "sigma_position_m", "sigma_rotation_deg")
 
