@@ -47,7 +47,11 @@ SENSORS: dict[str, tuple[Any, Any]] = {  # and the landmarks that each starts
     "pinhole": (km.sensors.PinHole(fx_px=458.0, fy_px=457.0, cx_px=367.0, cy_px=248.0, width_px=752, height_px=480), km.landmarks.AnchoredHomogeneous()),
     "spherical": (km.sensors.RangeBearing3D(0.05, 0.003, 0.003, range_max_m=4.0), km.landmarks.Point3D()),
 }  # fmt: skip
-ESTIMATORS: dict[str, Any] = {"invariant": km.estimators.Invariant(), "ekf": km.estimators.Ekf(), "fej": km.estimators.Fej()}
+ESTIMATORS: dict[str, Any] = {
+    "invariant": km.estimators.Invariant(),
+    "ekf": km.estimators.Ekf(),
+    "fej": km.estimators.Fej(),
+}
 
 
 class Flight:
@@ -156,7 +160,9 @@ class Run:
             return UNIT.space.minus(truth, mean)
         turn = log(multiply(truth[3:7], mean[3:7] * [-1, -1, -1, 1]))
         back = np.linalg.inv(left_jacobian(turn))
-        return np.concatenate([back @ (truth[:3] - mean[:3]), turn, back @ (truth[7:10] - mean[7:10]), truth[10:] - mean[10:]])
+        return np.concatenate(
+            [back @ (truth[:3] - mean[:3]), turn, back @ (truth[7:10] - mean[7:10]), truth[10:] - mean[10:]]
+        )
 
     def gauge(self) -> np.ndarray:
         """Return the information (4, 4) about shifts and turns about the gravity, of the robot and the map."""
@@ -224,7 +230,9 @@ def gauges(given: argparse.Namespace) -> None:
     runs = np.array(Parallel(n_jobs=2)(jobs))
     worst, end = runs[:, :, 0].max(axis=1) - 1.0, runs[:, -1, 0]
     words = f"largest information of {given.runs} runs {runs.max():.9f} of that of the start"
-    print(f"gauge {given.estimator}: {words}, more by 1e-6 in {np.sum(worst > 1e-6)}; at the end {end.mean():.6f} on average")
+    print(
+        f"gauge {given.estimator}: {words}, more by 1e-6 in {np.sum(worst > 1e-6)}; at the end {end.mean():.6f} on average"
+    )
 
 
 def still(given: argparse.Namespace) -> None:

@@ -170,3 +170,78 @@ def test_what_is_unobservable_before_a_step_is_unobservable_after_it(motion: Any
         axes = slice(None) if motion.space.dof == 18 else slice(2, 3)
         turns = R_r @ motion.space.generator(r)[:, axes]
         np.testing.assert_allclose(turns, motion.space.generator(moved)[:, axes], atol=1e-12)
+
+
+# ---------------------------------------------------------------------- at rest
+SHEET = (1.7e-4, 2.0e-5, 2.0e-3, 3.0e-4)
+
+
+def readings(motion: Any, truth: Array, seconds: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return times (N,) and readings (N, 6) at 200 Hz of a unit at rest whose biases end at those of the truth."""
+    n, dt = round(seconds * 200), 1 / 200
+    white, walk = motion.densities[:6] / np.sqrt(dt), motion.densities[6:] * np.sqrt(dt)
+    steps = rng.normal(size=(n, 6)) * walk
+    biases = truth[10:16] - np.cumsum(steps[::-1], axis=0)[::-1] + steps
+    g = truth[16:] if len(truth) > 16 else np.array([0.0, 0.0, -9.81])
+    f = -matrix(truth[3:7].copy()).T @ g
+    return np.arange(n) * dt, np.concatenate([np.zeros(3), f]) + biases + rng.normal(size=(n, 6)) * white
+
+
+@pytest.mark.parametrize("kind", [km.motion.Inertial, km.motion.InertialGravity])
+@pytest.mark.parametrize("seconds", [1.0, 6.0])
+def test_a_start_at_rest_is_as_far_from_the_truth_as_it_says(kind: Any, seconds: float) -> None:
+    motion, rng, values = kind(*SHEET), np.random.default_rng(9), []
+    dof = motion.space.dof
+    known = np.zeros(dof)
+    known[3 if dof == 18 else 5 : 6] = 0.002  # the attitude, or the heading alone
+    known[9:12], known[12:15] = 0.01, 0.05
+    free = np.array([*range(3, 6), *range(9, 15), *range(15, dof)][:11])  # the gravity's length is known
+    for _ in range(200):
+        start = np.zeros(motion.space.size)
+        start[3:7] = exp(np.array([0.0, 0.0, 0.5]))
+        if dof == 18:  # a vertical that nobody knows
+            start[3:7], g = exp(rng.normal(size=3)), matrix(exp(np.array([0.3, -0.4, 0.0]))) @ [0, 0, -9.81]
+            start[16:] = g
+        error = rng.normal(size=dof) * known
+        truth = motion.space.plus(start, error)
+        if dof == 15:  # tilted, a little or a lot
+            heading = exp(np.array([0.0, 0.0, 0.5 + error[5]]))
+            tilt = np.append(rng.normal(size=2) * 0.3, 0.0)
+            truth[3:7] = multiply(heading, exp(tilt))
+            start[3:7] = multiply(exp(np.array([0.0, 0.0, -error[5]])), truth[3:7])
+        found = km.motion.at_rest(motion, *readings(motion, truth, seconds, rng), start, np.diag(known**2))
+        assert found.until_s >= 0.8 * seconds - 0.2
+        d = motion.space.minus(truth, found.start)
+        P = found.cov[np.ix_(free, free)]
+        values.append(float(d[free] @ np.linalg.solve(P, d[free])))
+    assert abs(np.mean(values) - len(free)) < 5 * np.sqrt(2 * len(free) / len(values))
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda u: u + np.array([0.1, 0, 0, 0, 0, 0]), "the unit begins with [0.0997"),
+        (lambda u: u + np.array([0, 0, 0, 0, 0, 0.6]), "expected it at rest for 0.5 s"),
+        (lambda u: u + np.linspace(0, 5, len(u))[:, None] * [0, 0, 0, 1, 0, 0], "expected it at rest for 0.5 s"),
+        (lambda u: u[:60], "there are 60 readings"),
+    ],
+)
+def test_a_unit_that_does_not_begin_at_rest_is_refused(change: Any, what: str) -> None:
+    motion, start = km.motion.Inertial(*SHEET), np.zeros(16)
+    start[6] = 1.0
+    cov = np.diag(np.repeat([0, 0, 0, 1e-4, 0.0025], 3))
+    t, u = readings(motion, start, 2.0, np.random.default_rng(10))
+    u = change(u)
+    with pytest.raises(km.KalmarkError) as refused:
+        km.motion.at_rest(motion, t[: len(u)], u, start, cov)
+    assert what in str(refused.value)
+
+
+def test_the_rest_ends_before_the_motion_begins() -> None:
+    motion, start = km.motion.Inertial(*SHEET), np.zeros(16)
+    start[6] = 1.0
+    cov = np.diag(np.repeat([0, 0, 0, 1e-4, 0.0025], 3))
+    t, u = readings(motion, start, 5.0, np.random.default_rng(11))
+    u[600:, 3] += 0.5 * (t[600:] - 3.0)  # from 3 s on it accelerates
+    found = km.motion.at_rest(motion, t, u, start, cov)
+    assert 2.5 < found.until_s < 3.0

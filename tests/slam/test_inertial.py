@@ -84,7 +84,11 @@ def information(slam: km.Slam) -> np.ndarray:
 
 @pytest.mark.parametrize("route", ["flies", "stands"])
 def test_shifts_and_turns_about_the_gravity_stay_as_uncertain_as_they_were(route: str) -> None:
-    lost = (f"{DRONE}start.sigma_position_m=1.0", f"{DRONE}start.sigma_rotation_deg=[1, 1, 20]", f"{DRONE}start.sigma_v_mps=0.01")
+    lost = (
+        f"{DRONE}start.sigma_position_m=1.0",
+        f"{DRONE}start.sigma_rotation_deg=[1, 1, 20]",
+        f"{DRONE}start.sigma_v_mps=0.01",
+    )
     stands = f"{DRONE}route={{type: constant, u: [0, 0, 0, 0, 0, 9.81]}}"
     biases = (f"{DRONE}start.sigma_bias_w_radps=1e-4", f"{DRONE}start.sigma_bias_a_mps2=0.01")
     scene = world(RADAR, *lost, *((stands, *biases) if route == "stands" else ()), steps=600)

@@ -135,6 +135,8 @@ class StartConfig(PlanePose):
 class SpaceStartConfig(SpacePose):
     """Where a robot of space starts, and how surely; turned by roll, then pitch, then yaw about the world's axes."""
 
+    at_rest: bool = False
+    """inertial: roll, pitch (or the gravity) and the bias of the rate are found from the log, which begins at rest."""
     vx_mps: Number = 0.0
     """constant_velocity_3d, inertial: velocity in the world."""
     vy_mps: Number = 0.0
@@ -282,6 +284,11 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
     """Refuse what a start says of a state that its motion does not have.  Raises ValueError."""
     has = _known(start, state_columns(model_of(motion)))
     allowed = {*has, *(sigma_of(name)[0] for name in has)}
+    if isinstance(start, SpaceStartConfig) and start.at_rest:
+        if "bias_ax_mps2" not in has:
+            raise expected(f"false: {motion.type} has no inertial unit", "start", "at_rest")
+        if not np.all(_three(start.sigma_bias_a_mps2)):
+            raise expected("a number > 0: at rest a bias looks like a tilt", "start", "sigma_bias_a_mps2")
     states = *STATES["plane"], *STATES["space"]
     for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):

@@ -9,18 +9,32 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.declare import NotNegative, Positive, register
-from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
+from kalmark.errors import ModelError
+from kalmark.geometry.rotations import (
+    exp,
+    from_euler,
+    left_jacobian,
+    left_jacobian_rate,
+    matrix,
+    multiply,
+    skew,
+    to_euler,
+)
 from kalmark.geometry.spaces import ROTATION, SCALAR, VECTOR3, Space
 from kalmark.models.kinematics import NODES, WEIGHTS, MotionModel
 
 GRAVITY = 16  # where the gravity begins in a state that has it
+INERTIAL_DOF = 15  # of one that has none
+WINDOW_S, WINDOWS = 0.1, 5  # of readings that are compared, and how many of them at least are at rest
+SIGMAS = 5.0  # by which a window at rest may differ from the mean of those before it
+SHAKEN = 10.0  # times the noise of the data sheet that readings at rest may scatter by
 
 
 @compiled
@@ -134,13 +148,11 @@ class Inertial(MotionModel):
     white, so a held reading that a scan divides has none in common with itself.
     """
 
-    gyroscope_noise_density_rad_per_sqrt_s: Annotated[
-        NotNegative, "White noise of the rate, rad/s/sqrt(Hz)."
-    ] = 1.7e-4
+    gyroscope_noise_density_rad_per_sqrt_s: Annotated[NotNegative, "White noise of the rate, rad/s/sqrt(Hz)."] = 1.7e-4
     gyroscope_random_walk_radps_per_sqrt_s: Annotated[NotNegative, "Random walk of the rate's bias."] = 2.0e-5
-    accelerometer_noise_density_mps_per_sqrt_s: Annotated[
-        NotNegative, "White noise of the force, m/s^2/sqrt(Hz)."
-    ] = 2.0e-3
+    accelerometer_noise_density_mps_per_sqrt_s: Annotated[NotNegative, "White noise of the force, m/s^2/sqrt(Hz)."] = (
+        2.0e-3
+    )
     accelerometer_random_walk_mps2_per_sqrt_s: Annotated[NotNegative, "Random walk of the force's bias."] = 3.0e-3
     gravity_mps2: Annotated[Positive, "What an accelerometer at rest reads."] = 9.81
 
@@ -175,11 +187,16 @@ class Inertial(MotionModel):
 
     @cached_property
     def _variances(self) -> Array:
+        return np.square(self.densities)
+
+    @cached_property
+    def densities(self) -> Array:
+        """The densities (12,) of the noise of rate and force, and of the walks of their biases."""
         sigmas = (
             self.gyroscope_noise_density_rad_per_sqrt_s, self.accelerometer_noise_density_mps_per_sqrt_s,
             self.gyroscope_random_walk_radps_per_sqrt_s, self.accelerometer_random_walk_mps2_per_sqrt_s,
         )  # fmt: skip
-        return np.repeat(np.square(sigmas), 3)
+        return np.repeat(sigmas, 3)
 
 
 @register("motion", "inertial_gravity")
@@ -193,3 +210,96 @@ class InertialGravity(Inertial):
     state_columns: ClassVar[tuple[str, ...]] = (
         *Inertial.state_columns, "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
     )  # fmt: skip
+
+
+# ------------------------------------------------------------------ at rest
+class Rest(NamedTuple):
+    """What readings at rest tell: until when it lasted, the state (size,) there and its covariance (dof, dof)."""
+
+    until_s: float
+    start: Array
+    cov: Array
+
+
+def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) -> Rest:
+    """Return the start of a unit of which the first readings u (N, 6), at `t_s` (N,), are made at rest.
+
+    `start` (size,) and `cov` (dof, dof) are what is known without them: position, heading and the prior of the biases
+    are taken from there.  Roll, pitch and the bias of the rate come from the means; a bias of the force looks like a
+    tilt, so they are as uncertain as the prior of it says, and correlated with it.  With the gravity in the state the
+    attitude is the start's and the gravity is found instead.  Raises ModelError if the unit does not begin at rest.
+    """
+    count = _resting(motion, t_s, u, np.sqrt(np.diag(cov)))
+    until_s, dt_s = float(t_s[count - 1]), float(np.median(np.diff(t_s)))
+    (w, w_var), (f, f_var) = (_mean_at_rest(motion, u[:count, 3 * k : 3 * k + 3], dt_s, 3 * k) for k in (0, 1))
+    state, P = start.copy(), cov.copy()
+    state[7:10], state[10:13] = 0.0, w
+    P[6:, :], P[:, 6:] = 0.0, 0.0
+    P[9:12, 9:12] = w_var * np.eye(3)
+    up, prior = f / np.linalg.norm(f), float(cov[12, 12])
+    if motion.space.dof == INERTIAL_DOF:
+        level = from_euler(np.array([math.atan2(up[1], up[2]), math.atan2(-up[0], math.hypot(up[1], up[2])), 0.0]))[0]
+        yaw = to_euler(start[3:7])[0][2]
+        state[3:7] = multiply(exp(np.array([0.0, 0.0, yaw])), level)
+    share = prior / (prior + f_var)  # of what the length of f has too much, that is the bias's
+    excess = float(np.linalg.norm(f)) - motion.gravity_mps2
+    state[13:16] = share * excess * up
+    Q = matrix(state[3:7])
+    above = Q @ up
+    along = np.outer(above, above)
+    B = prior * (np.eye(3) - along) + (1.0 - share) * prior * along  # of the bias of the force, in the world
+    if motion.space.dof == INERTIAL_DOF:
+        M, rows = skew(above) / motion.gravity_mps2, slice(3, 6)
+        P[3:6, :], P[:, 3:6] = 0.0, 0.0
+        P[3:6, 3:6] = cov[5, 5] * along
+    else:
+        M, rows = np.eye(3) - along, slice(15, 18)
+        state[GRAVITY:] = -motion.gravity_mps2 * above
+        J = -skew(state[GRAVITY:])  # it turns with the attitude of the start
+        P[rows, 3:6], P[rows, rows] = J @ P[3:6, 3:6], J @ P[3:6, 3:6] @ J.T
+        P[3:6, rows] = P[rows, 3:6].T
+    P[rows, rows] += M @ (B + f_var * np.eye(3)) @ M.T
+    P[rows, 12:15] = M @ B @ Q
+    P[12:15, rows], P[12:15, 12:15] = P[rows, 12:15].T, Q.T @ B @ Q
+    return Rest(until_s, state, P)
+
+
+def _resting(motion: Inertial, t_s: Array, u: Array, sigmas: Array) -> int:
+    """Return how many of the readings u (N, 6) are made at rest before the first that may not be.
+
+    `sigmas` (dof,) are those of the start.  A window of readings is compared with the mean of all before it.
+    """
+    dt_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    n = max(2, round(WINDOW_S / dt_s)) if dt_s > 0 else 2
+    count = len(u) // n
+    if dt_s <= 0 or count < WINDOWS:
+        raise ModelError(
+            f"there are {len(u)} readings, expected some at rest for {WINDOWS * WINDOW_S:g} s to start from"
+        )
+    windows, variances = u[: count * n].reshape(count, n, 6), motion.densities**2
+    means, white = windows.mean(axis=1), variances[:6] / dt_s
+    scatter = windows[:WINDOWS].var(axis=1, ddof=1).mean(axis=0)
+    first, k = means[:WINDOWS].mean(axis=0), np.arange(1, count)[:, None]
+    off = np.append(np.abs(first[:3]), abs(float(np.linalg.norm(first[3:])) - motion.gravity_mps2))
+    known = np.append(sigmas[9:12], sigmas[12]) + np.sqrt(scatter[:4] / (n * WINDOWS))
+    spread = np.maximum(scatter, white) * (1.0 + 1.0 / k) / n + variances[6:] * (k * n * dt_s)
+    still = (np.abs(means[1:] - np.cumsum(means, axis=0)[:-1] / k) <= SIGMAS * np.sqrt(spread)).all(axis=1)
+    resting = count if still.all() else int(np.argmin(still))  # less the window in which it may begin to move
+    if resting < WINDOWS or (scatter > SHAKEN**2 * white).any() or (off > SIGMAS * known).any():
+        w, f = np.round(first[:3], 4).tolist(), np.round(first[3:], 3).tolist()
+        what = f"the unit begins with {w} rad/s and {f} m/s^2"
+        raise ModelError(f"{what}, expected it at rest for {WINDOWS * WINDOW_S:g} s to start from")
+    return resting * n
+
+
+def _mean_at_rest(motion: Inertial, u: Array, dt_s: float, at: int) -> tuple[Array, float]:
+    """Return the mean of the last readings u (N, 3) at rest, and its variance as the bias of now.
+
+    So many that white noise and the walk of the bias weigh most favourably; `at` is 0 for rates, 3 for forces.
+    """
+    white, walk = float(motion.densities[at] ** 2), float(motion.densities[6 + at] ** 2)
+    best = math.sqrt(3.0 * white / walk) if walk > 0 else math.inf
+    n = min(len(u), max(round(WINDOWS * WINDOW_S / dt_s), math.ceil(min(best / dt_s, len(u)))))
+    last = u[-n:]
+    variance = max(white / dt_s, float(last.var(axis=0, ddof=1).mean())) / n + walk * n * dt_s / 3.0
+    return last.mean(axis=0), variance
