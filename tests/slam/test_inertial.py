@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from scipy.stats import chi2
 import kalmark as km
 from kalmark.campaign.scoring import score
 from kalmark.config.building import build_slam
+from kalmark.config.sections import model_of
+from kalmark.errors import KalmarkError
 from kalmark.events import Control, Scan
 from kalmark.geometry.rotations import exp, matrix
 from kalmark.logs import open_log, write_native
@@ -24,7 +27,9 @@ GRAVITY = (
     f"{DRONE}motion={{type: inertial_gravity}}", f"{DRONE}start.gravity_z_mps2=-9.81",
     f"{DRONE}start.sigma_gravity_mps2=0.1", f"{DRONE}start.sigma_rotation_deg=1.0",
 )  # fmt: skip
-RADAR = f"{DRONE}sensors.stereo={{type: range_bearing_3d, sigma_range_m: 0.05, sigma_azimuth_rad: 0.005, sigma_elevation_rad: 0.005}}"
+ANGLES = "sigma_azimuth_rad: 0.005, sigma_elevation_rad: 0.005"
+RADAR = f"{DRONE}sensors.stereo={{type: range_bearing_3d, sigma_range_m: 0.05, {ANGLES}}}"
+CAMERA = f"{DRONE}sensors.stereo={{type: pinhole, mount: {{roll_deg: -90, yaw_deg: -90}}}}"
 
 
 def world(*keys: str, steps: int = 200) -> Any:
@@ -111,7 +116,7 @@ def test_shifts_and_turns_about_the_gravity_stay_as_uncertain_as_they_were(route
         ((), 15),
         ((RADAR,), 15),
         ((RADAR, "filter.map.type=postponed"), 15),
-        ((f"{DRONE}sensors.stereo={{type: pinhole, mount: {{roll_deg: -90, yaw_deg: -90}}}}", "filter.landmarks.type=anchored_homogeneous"), 15),
+        ((CAMERA, "filter.landmarks.type=anchored_homogeneous"), 15),
         (GRAVITY, 18),
     ],
     ids=str,
@@ -128,3 +133,122 @@ def test_the_estimate_is_as_far_from_the_truth_as_it_says(keys: tuple[str, ...],
         assert (after[:3] < 0.2 * before[:3]).all(), "the biases of the rate are found"
     low, high = chi2.ppf([0.0005, 0.9995], dof * len(values))
     assert low < sum(values) < high
+
+
+STATE_SENSORS = {
+    "gps": "{type: gps, sigma_m: 0.05, mount: {x_m: 0.3}}",
+    "mocap": "{type: absolute_pose, sigma_m: 0.02, sigma_rotation_rad: 0.01}",
+    "barometer": "{type: height, sigma_z_m: 0.05, sigma_bias_m: 0.1}",
+    "compass": "{type: heading, sigma_heading_rad: 0.05}",
+    "flow": "{type: body_velocity, sigma_mps: 0.02}",
+    "wheels": "{type: odometer, sigma_m: 0.01, sigma_rad: 0.01}",
+}
+
+
+@pytest.mark.parametrize("name", STATE_SENSORS)
+def test_sensors_of_the_state_work_with_it(name: str) -> None:
+    sensors = f"{DRONE}sensors.{name}={STATE_SENSORS[name]}", f"{DRONE}sensing.{name}={{every: 10}}"
+    scene, values = world(RADAR, *sensors, f"{DRONE}start.sigma_position_m=0.1", steps=400), []
+    for seed in range(3):
+        simulated = simulation(scene, seed)
+        slam = build_slam(scene.config(), simulated.log)
+        found = score(slam, simulated, scene.times(), map_every=scene.steps)
+        values.append(found.series["state"][0][-1])
+    low, high = chi2.ppf([0.0005, 0.9995], 15 * len(values))
+    assert low < sum(values) < high
+
+
+def test_a_scan_of_nothing_between_two_readings_changes_nothing() -> None:
+    """The noise of a reading is white: its parts have none in common."""
+    scene = world(steps=40)
+    log = simulate(scene, 3)
+    whole, parted = build_slam(scene.config(), log), build_slam(scene.config(), log)
+    for event in log:
+        whole.process(event)
+        parted.process(event)
+        if isinstance(event, Control) and event.t_ns % 50_000_000:
+            parted.process(Scan(t_ns=event.t_ns + 2_000_000, robot="drone", sensor="stereo"))
+    np.testing.assert_allclose(parted.mean("drone"), whole.mean("drone"), atol=1e-10)
+    P = whole.covariance("drone")
+    scale = np.sqrt(np.outer(np.diag(P), np.diag(P))) + 1e-30
+    np.testing.assert_allclose(parted.covariance("drone") / scale, P / scale, atol=1e-7)
+
+
+def test_a_log_of_it_is_written_read_and_resumed(tmp_path: Path) -> None:
+    scene = world(steps=60)
+    log = simulate(scene, 4)
+    write_native(log, tmp_path / "log")
+    again = open_log(tmp_path / "log")
+    assert again.control_columns["drone"] == ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
+    one, other = build_slam(scene.config(), log), build_slam(scene.config(), again)
+    for k, (event, same) in enumerate(zip(log, again, strict=True)):
+        one.process(event)
+        other.process(same)
+        if k == 40:
+            other.save(tmp_path / "map.kmk")
+            other = km.Slam.load(tmp_path / "map.kmk")
+    np.testing.assert_array_equal(one.mean("drone"), other.mean("drone"))
+    np.testing.assert_array_equal(one.covariance("drone"), other.covariance("drone"))
+
+
+# ---------------------------------------------------------------------- at rest
+REST_NS = 2_000_000_000
+
+
+def rested(log: km.Log, state: np.ndarray, motion: Any, rng: np.random.Generator) -> km.Log:
+    """Return a log, from a true state (16,) without velocity on, with a rest before it: readings and empty scans."""
+    white = motion.densities[:6] / np.sqrt(0.005)
+    still = np.concatenate([state[10:13], state[13:16] + matrix(state[3:7].copy()).T @ [0, 0, 9.81]])
+    begin: list[Any] = [
+        Control(t_ns=t, robot="drone", u=still + rng.normal(size=6) * white) for t in range(0, REST_NS, 5_000_000)
+    ]
+    later: list[Any] = []
+    for event in log:
+        key = {"t_ns": event.t_ns + REST_NS, "robot": "drone"}
+        is_scan = isinstance(event, Scan)
+        later.append(Scan(**key, sensor="stereo", y=event.y, ids=event.ids) if is_scan else Control(**key, u=event.u))
+    return replace(log, events=begin + later, truth={})
+
+
+def test_a_start_at_rest_is_found_in_the_log_and_is_consistent() -> None:
+    """Tilted by some degrees, with biases of which nothing is known: the filter starts from its first readings."""
+    tilted = f"{DRONE}start.sigma_rotation_deg=[5, 5, 0]"
+    found = "filter.robots.drone.start={at_rest: true, sigma_rotation_deg: [0, 0, 0.5]}"
+    scene, values = world(RADAR, tilted, found, steps=600), []
+    motion = model_of(scene.config().robots["drone"].motion)
+    for seed in range(4):
+        simulated = simulation(scene, seed)
+        states, rng = simulated.states["drone"], np.random.default_rng(seed)
+        log = rested(simulated.log, states[0], motion, rng)
+        slam = build_slam(scene.config(), log)
+        robot = slam.robots["drone"]
+        assert 0.8 * REST_NS < robot.rests_until_ns < REST_NS + 5e7
+        for event in log:
+            slam.process(event)
+        d = robot.motion.space.minus(states[-1], slam.mean("drone"))
+        values.append(float(d @ np.linalg.solve(slam.covariance("drone"), d)))
+    low, high = chi2.ppf([0.0005, 0.9995], 15 * len(values))
+    assert low < sum(values) < high
+
+
+@pytest.mark.parametrize(
+    ("start", "what"),
+    [
+        ("{at_rest: true, sigma_bias_a_mps2: 0.0}", "sigma_bias_a_mps2: got 0.0, expected a number > 0"),
+        ("{at_rest: 1}", "at_rest: got 1, expected true or false"),
+    ],
+)
+def test_a_start_at_rest_that_cannot_be_found_is_refused(start: str, what: str) -> None:
+    with pytest.raises(KalmarkError) as refused:
+        world(f"filter.robots.drone.start={start}")
+    assert what in str(refused.value)
+
+
+def test_a_start_at_rest_is_refused_of_a_log_that_begins_with_a_motion() -> None:
+    scene = world(RADAR, "filter.robots.drone.start={at_rest: true}")
+    with pytest.raises(KalmarkError) as refused:
+        build_slam(scene.config(), simulate(scene, 1))
+    assert "robots.drone.start: the unit begins with" in str(refused.value)
+    with pytest.raises(KalmarkError) as refused:
+        build_slam(scene.config())
+    assert "expected a log that begins at rest" in str(refused.value)
