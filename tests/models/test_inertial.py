@@ -184,7 +184,8 @@ def readings(motion: Any, truth: Array, seconds: float, rng: np.random.Generator
     biases = truth[10:16] - np.cumsum(steps[::-1], axis=0)[::-1] + steps
     g = truth[16:] if len(truth) > 16 else np.array([0.0, 0.0, -9.81])
     f = -matrix(truth[3:7].copy()).T @ g
-    return np.arange(n) * dt, np.concatenate([np.zeros(3), f]) + biases + rng.normal(size=(n, 6)) * white
+    u: Array = np.concatenate([np.zeros(3), f]) + biases + rng.normal(size=(n, 6)) * white
+    return np.arange(n) * dt, u
 
 
 @pytest.mark.parametrize("kind", [km.motion.Inertial, km.motion.InertialGravity])
