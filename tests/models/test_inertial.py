@@ -185,7 +185,8 @@ def readings(motion: Any, truth: Array, seconds: float, rng: np.random.Generator
     g = truth[16:] if len(truth) > 16 else np.array([0.0, 0.0, -9.81])
     f = -matrix(truth[3:7].copy()).T @ g
     u: Array = np.concatenate([np.zeros(3), f]) + biases + rng.normal(size=(n, 6)) * white
-    return np.arange(n) * dt, u
+    t: Array = np.arange(n) * dt
+    return t, u
 
 
 @pytest.mark.parametrize("kind", [km.motion.Inertial, km.motion.InertialGravity])
