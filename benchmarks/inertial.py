@@ -34,7 +34,8 @@ from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
 from kalmark.results.measures import anees_interval, path_m
 
 TRUTH = "visual/euroc_v101_micro/gt_V1_01_easy.csv"
-RATE_HZ, EVERY, POINTS, ROOM_M = 200, 10, 150, 1.5
+RATE_HZ, EVERY, ROOM_M = 200, 10, 1.5
+POINTS, FEW = 150, 30  # of a room: of the trajectory as a whole, and where the information is asked for
 UNIT = km.motion.Inertial(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3)
 G = np.array([0.0, 0.0, -UNIT.gravity_mps2])
 SIGMA_W, SIGMA_A, SIGMA_TILT = 0.01, 0.05, math.radians(1.0)  # of biases and of roll and pitch at the start
@@ -99,11 +100,11 @@ def read(flight: Flight, rng: Generator) -> tuple[np.ndarray, np.ndarray]:
     return flight.readings + biases[:-1] + rng.normal(0.0, noise / math.sqrt(dt), (n, 6)), biases
 
 
-def points(states: np.ndarray, rng: Generator) -> np.ndarray:
-    """Return points (POINTS, 3) on the walls of a room around a flight."""
+def points(states: np.ndarray, count: int, rng: Generator) -> np.ndarray:
+    """Return points (count, 3) on the walls of a room around a flight."""
     low, high = states[:, :3].min(axis=0) - ROOM_M, states[:, :3].max(axis=0) + ROOM_M
-    p, rows, axis = rng.uniform(low, high, (POINTS, 3)), np.arange(POINTS), rng.integers(3, size=POINTS)
-    p[rows, axis] = np.where(rng.uniform(size=POINTS) < 0.5, low[axis], high[axis])
+    p, rows, axis = rng.uniform(low, high, (count, 3)), np.arange(count), rng.integers(3, size=count)
+    p[rows, axis] = np.where(rng.uniform(size=count) < 0.5, low[axis], high[axis])
     return p
 
 
@@ -119,7 +120,8 @@ class Run:
     def __init__(self, flight: Flight, sensor: str, estimator: str, seed: SeedSequence, lost: bool = False) -> None:
         self.rng, self.flight = np.random.default_rng(seed), flight
         self.u, self.biases = read(flight, self.rng)
-        self.points, (self.sensor, landmark) = points(flight.states, self.rng), SENSORS[sensor]
+        self.points = points(flight.states, FEW if lost else POINTS, self.rng)
+        self.sensor, landmark = SENSORS[sensor]
         self.at = CAMERA if sensor != "spherical" else np.array([0.0, 0, 0, 0, 0, 0, 1])
         truth, sigmas = flight.states[0], start_sigmas(lost)
         error = self.rng.normal(0.0, sigmas[:9])

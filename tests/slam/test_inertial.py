@@ -135,6 +135,43 @@ def test_the_estimate_is_as_far_from_the_truth_as_it_says(keys: tuple[str, ...],
     assert low < sum(values) < high
 
 
+AHEAD = "mount: {roll_deg: -90, yaw_deg: -90}"
+HOUSE = (
+    "world={type: house, x_m: -2.5, y_m: -2.5}", f"{DRONE}start.x_m=6.0",
+    f"{DRONE}route.points_m=[[6, 2, 2.5], [4, 6, 1], [0, 7, 2], [-6, 4, 2]]",
+    f"{DRONE}sensors.stereo={{type: segments, min_length_px: 10, mount: {{roll_deg: -90}}}}",
+    "filter.landmarks={type: anchored_homogeneous_line, prior_rho_per_m: 0.25, sigma_rho_per_m: 0.125}",
+    "filter.estimator.iterations=1", f"{DRONE}start.sigma_bias_a_mps2=0.005", f"{DRONE}start.sigma_bias_w_radps=0.001",
+    f"{DRONE}start.sigma_rotation_deg=0.1",
+)  # fmt: skip
+TAGS = (
+    "world={type: tag_room, length_m: 10, width_m: 10, size_m: 0.5}",
+    f"{DRONE}sensors.stereo={{type: tag_corners, fx_px: 500, fy_px: 500, {AHEAD}}}", "filter.landmarks.type=tag",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        *((CAMERA, f"filter.landmarks.type={kind}") for kind in ("inverse_depth", "homogeneous")),
+        (f"{DRONE}sensors.stereo={{type: omnidirectional, {AHEAD}}}", "filter.landmarks.type=anchored_homogeneous"),
+        (f"{DRONE}sensors.stereo={{type: position_3d}}",),
+        HOUSE,
+        TAGS,
+    ],
+    ids=str,
+)
+def test_landmarks_and_cameras_of_any_kind_work_with_it(keys: tuple[str, ...]) -> None:
+    scene = world(*keys, steps=300)
+    simulated = simulation(scene, 5)
+    slam = build_slam(scene.config(), simulated.log)
+    found = score(slam, simulated, scene.times(), map_every=scene.steps)
+    assert len(slam.landmarks().ids) > 3
+    assert not found.diverged
+    values = found.series["state"][0]
+    assert values[np.isfinite(values)][-1] < chi2.ppf(0.99999, 15)
+
+
 STATE_SENSORS = {
     "gps": "{type: gps, sigma_m: 0.05, mount: {x_m: 0.3}}",
     "mocap": "{type: absolute_pose, sigma_m: 0.02, sigma_rotation_rad: 0.01}",
