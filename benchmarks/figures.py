@@ -183,6 +183,24 @@ def motions() -> Iterator[Figure]:
                      f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip
 
 
+def inertial() -> Iterator[Figure]:
+    """Yield the consistency of an inertial unit along EuRoC's trajectory, and what it learns of nothing."""
+    for sensor, estimator in (("stereo", "invariant"), ("spherical", "invariant"), ("stereo", "ekf")):
+        wanted = ".3 % / 85 % in the band" if estimator == "invariant" else ""
+        name = f"V1_01, {sensor} points, `{estimator}`: position / attitude ANEES (3) / in band / state ANEES (15)"
+        yield Figure("Inertial", name, wanted, f"python benchmarks/inertial.py path --sensor {sensor} --estimator {estimator}",
+                     row(f"path {sensor} {estimator}:", "{3} % / {14} / {18} / {30}"))  # fmt: skip
+    for estimator in ("invariant", "ekf"):
+        wanted = "0 of 100" if estimator == "invariant" else ""
+        yield Figure("Inertial", f"information about position and yaw, `{estimator}`: most, start 1 / runs that gain any", wanted,
+                     f"python benchmarks/inertial.py gauge --runs 100 --estimator {estimator}",
+                     row(f"gauge {estimator}:", "{2} / {12} of {14}"))  # fmt: skip
+        wanted = "1 within 1e-6" if estimator == "invariant" else ""
+        yield Figure("Inertial", f"5 min at rest, `{estimator}`: least and most information about position and yaw", wanted,
+                     f"python benchmarks/inertial.py still --estimator {estimator}",
+                     row(f"still {estimator}:", "{2} / {4}"))  # fmt: skip
+
+
 TOOLBOX = {
     "a_idpPnt_odo": ".0365 / 6.5", "a_idpPnt_odo_small": ".0405 / 7.8", "a3_hmgPnt_odo": ".0217 / 25.7",
     "b2_idpPnt_constVel_small": ".095 / 5.3", "c_idpLin_small": ".0113 / 7.6", "c_plkLin_small": ".0117 / 7.6",
@@ -527,6 +545,7 @@ def figures() -> list[Figure]:
         exactness,
         campaigns,
         motions,
+        inertial,
         real_logs,
         unknown_ids,
         gaps,

@@ -93,7 +93,6 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
             "robots.each.motion.type=unicicle",
             "got 'unicicle', expected one of unicycle, odometry_2d, ackermann, differential_drive",
         ),
-        ("robots.each.motion.type=inertial", "got 'inertial', which is not available yet, expected one of unic"),
         ("robots.each.motion=3", "robots.each.motion: got 3, expected a mapping with a type: one of unicycle, od"),
         ("robots.each.start.x_m=.inf", "robots.each.start.x_m: got inf, expected a finite number"),
         (
@@ -102,10 +101,6 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ),
         ("robots.each.sensors.camera.type=sonar", "robots.each.sensors.camera.type: got 'sonar', expected one of "),
         ("robots.each.sensors=[1]", "robots.each.sensors: got [1], expected a mapping of keys"),
-        (
-            "robots.each.motion.type=inertial",
-            "robots.each.motion.type: got 'inertial', which is not available yet, expected one of ",
-        ),
         ("association.gate=2", "association.gate: got 2, expected a probability between 0 and 1, off or default"),
         ("map.type=sparse", "map.type: got 'sparse', expected one of auto, dense, postponed"),
         ("estimator.iterations=2.5", "estimator.iterations: got 2.5, expected a whole number"),

@@ -33,6 +33,7 @@ from kalmark.geometry.spaces import Space
 Class = TypeVar("Class", bound=type)
 
 UNITS = {
+    "_mps2_per_sqrt_s": "m/s^2/sqrt(s)",
     "_mps_per_sqrt_s": "m/s/sqrt(s)",
     "_radps_per_sqrt_s": "rad/s/sqrt(s)",
     "_m_per_sqrt_s": "m/sqrt(s)",

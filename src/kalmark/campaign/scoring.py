@@ -55,16 +55,19 @@ class Judged(NamedTuple):
 
 
 def state_error(mean: Array, truth: Array, turn: Any, coordinates: str) -> Array:
-    """Return the error of a robot's state: pose (3,) or (7,), or pose, velocity and body rate (13,).
+    """Return the error of a robot's state: a pose (3,) or (7,), and what is behind it.
 
-    In the plane numbers behind the pose, up to (6,), are in the robot's frame.
+    In space that is a velocity in the world and numbers of the robot's frame, (13,) or (16,), or a gravity in the world
+    behind them, (19,).  In the plane all of it, up to (6,), is in the robot's frame.
     """
     if len(mean) < 7:
         place, angle = point_error(mean[:2], truth[:2], turn, coordinates), wrap(truth[2] - mean[2])
         return np.concatenate([place, [angle], truth[3:] - mean[3:]])
     parts = [point_error(mean[:3], truth[:3], turn, coordinates), orientation_error(mean, truth, turn, coordinates)]
-    if len(mean) == 13:
-        parts += [point_error(mean[7:10], truth[7:10], turn, coordinates), truth[10:] - mean[10:]]
+    if len(mean) > 7:
+        parts += [point_error(mean[7:10], truth[7:10], turn, coordinates), truth[10:16] - mean[10:16]]
+    if len(mean) > 16:
+        parts.append(point_error(mean[16:], truth[16:], turn, coordinates))
     return np.concatenate(parts)
 
 

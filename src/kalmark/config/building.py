@@ -7,18 +7,21 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel
 
+from kalmark.arrays import Array
 from kalmark.config.opening import described, known_path, open_run
 from kalmark.config.reading import did_you_mean, load_config
-from kalmark.config.schema import TRUTH, Config, covariance_of, pose_of, state_of
+from kalmark.config.schema import TRUTH, Config, SpaceStartConfig, covariance_of, pose_of, state_of
 from kalmark.config.sections import model_of
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
-from kalmark.events import Scan
+from kalmark.events import Control, Scan
 from kalmark.logs.known_map import KnownLandmark, read_known
 from kalmark.logs.log import Log, true_start
+from kalmark.models.inertial import Inertial, at_rest
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import coasts, state_columns
 from kalmark.slam.robot import Mount, Robot
@@ -96,6 +99,9 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     robot, path = config.robots[key], ("robots", key)
     moves = _made(config, (*path, "motion"), model_of, robot.motion)
     start, cov = _start(robot.start, name, log, moves)
+    rests: dict[str, Any] = {}
+    if isinstance(robot.start, SpaceStartConfig) and robot.start.at_rest:
+        start, cov, rests["rests_until_ns"] = _made(config, (*path, "start"), _at_rest, moves, name, log, start, cov)
     world = moves.space.world
     if log is not None:
         refuse_controls(config, key, name, moves.columns, log)
@@ -103,7 +109,7 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     if log is not None:
         refuse_scans(config, key, name, mounts, log)
     watched = {key: getattr(robot, key) for key in ("gaps", "max_speed_mps", "max_turn_radps")}
-    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov, **watched)
+    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov, **watched, **rests)
 
 
 def _names(config: Config, log: Log | None) -> list[str]:
@@ -125,6 +131,20 @@ def _start(section: Any, name: str, log: Log | None, moves: MotionModel) -> tupl
         return [*pose_of(section), *state_of(section, behind)], covariance_of(section, space.dof, behind)
     true = None if log is None else true_start(log, name, moves.held or coasts(moves))
     return (true if true is not None and (len(true) == 3) == (space.world == "plane") else None), None
+
+
+def _at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any) -> tuple[Array, Array, int]:
+    """Return the start of a robot whose log begins at rest, its covariance, and until when (ns) it does.
+
+    Raises ModelError.
+    """
+    readings = [event for event in log or () if isinstance(event, Control) and event.robot == name]
+    if not readings:
+        raise ModelError(f"{name} has no readings of its inertial unit yet, expected a log that begins at rest")
+    t_ns = np.array([event.t_ns for event in readings])
+    seconds, u = (t_ns - t_ns[0]) * 1e-9, np.array([event.u for event in readings])
+    found = at_rest(motion, seconds, u, np.array(start, dtype=np.float64), np.asarray(cov, dtype=np.float64))
+    return found.start, found.cov, int(t_ns[0]) + round(found.until_s * 1e9)
 
 
 def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mount:

@@ -16,7 +16,7 @@ from pydantic_core import PydanticUndefined
 
 from kalmark.config import schema
 from kalmark.config.reading import shipped_configs
-from kalmark.config.sections import BASES, LATER, Section, section_of
+from kalmark.config.sections import BASES, Section, section_of
 from kalmark.declare import classes, is_own, unit_of
 
 HEAD = """\
@@ -100,8 +100,7 @@ def _choice(title: str, role: str, world: str = "") -> str:
             model = section_of(role, name, world)
             table = _table(model, BASES.get((role, world), Section))
             parts.append(f"**`type: {name}`**  {inspect.getdoc(model)}\n" + (f"\n{table}\n" if table else ""))
-    later = ", ".join(f"`{name}`" for name in LATER.get(role, ()) if world != "plane")
-    return "\n".join(parts) + (f"\nNot available yet: {later}.\n" if later else "")
+    return "\n".join(parts)
 
 
 def _table(model: type[BaseModel], common: type[BaseModel] = Section) -> str:

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from kalmark.config.data_sheets import take_data_sheets
 from kalmark.config.schema import Config
-from kalmark.config.sections import LATER
 from kalmark.config.tree import OVERRIDE, Tree, read_tree, show
 from kalmark.declare import classes, load_plugin
 from kalmark.errors import ConfigError, KalmarkError
@@ -48,6 +48,7 @@ def load_config(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Conf
 def config_of(tree: Tree, path: Path | None) -> Config:
     """Return the configuration that a tree read from the file `path` is.  Raises ConfigError."""
     run_plugins(tree, path)
+    take_data_sheets(tree, path)
     config = validate(tree, Config)
     config._file = path
     config._where.update(tree.places)
@@ -173,8 +174,6 @@ def _expected(kind: str, context: dict[str, Any], message: str) -> str:
 
 def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
     kind = _kind(path[:-1])
-    if path[-1] == "type" and got in LATER.get(kind, ()):
-        return f"got {show(got)}, which is not available yet, expected {_one_of(words)}"
     for here, there, world in (("space", "the plane", "plane"), ("the plane", "space", "space")):
         if kind == "sensor" and path[-1] == "type" and got in classes("sensor", world):
             return f"got {show(got)}, a sensor of {there} on a robot of {here}, expected {_one_of(words)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -47,10 +48,14 @@ _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
 _PLANE_FOR_SPACE = "a key of the plane for a robot of space"
 STATES = {
     "plane": ("vx_mps", "vy_mps", "w_radps", "slip"),
-    "space": ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps"),
-}
+    "space": (
+        "vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps",
+        "bias_wx_radps", "bias_wy_radps", "bias_wz_radps", "bias_ax_mps2", "bias_ay_mps2", "bias_az_mps2",
+        "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
+    ),
+}  # fmt: skip
 """What a state may have behind its pose, as keys of a start."""
-SIGMAS = {"v": "sigma_v_mps", "w": "sigma_w_radps", "s": "sigma_slip"}  # by how these begin
+_AXIS = re.compile(r"(?:_|(?<=[vwa]))[xyz](?=_)")  # of a key: vx_mps, gravity_x_mps2
 POSE_OF_PLANE = ("theta_rad", "sigma_xy_m", "sigma_theta_rad")
 POSE_OF_SPACE = ("z_m", "roll_deg", "pitch_deg", "yaw_deg", "sigma_position_m", "sigma_rotation_deg")
 
@@ -130,12 +135,14 @@ class StartConfig(PlanePose):
 class SpaceStartConfig(SpacePose):
     """Where a robot of space starts, and how surely; turned by roll, then pitch, then yaw about the world's axes."""
 
+    at_rest: bool = False
+    """inertial: roll, pitch (or the gravity) and the bias of the rate are found from the log, which begins at rest."""
     vx_mps: Number = 0.0
-    """constant_velocity_3d: velocity in the world."""
+    """constant_velocity_3d, inertial: velocity in the world."""
     vy_mps: Number = 0.0
-    """constant_velocity_3d: velocity in the world."""
+    """constant_velocity_3d, inertial: velocity in the world."""
     vz_mps: Number = 0.0
-    """constant_velocity_3d: velocity in the world."""
+    """constant_velocity_3d, inertial: velocity in the world."""
     wx_radps: Number = 0.0
     """constant_velocity_3d: rate about the robot's own x."""
     wy_radps: Number = 0.0
@@ -143,9 +150,33 @@ class SpaceStartConfig(SpacePose):
     wz_radps: Number = 0.0
     """constant_velocity_3d: rate about the robot's own z."""
     sigma_v_mps: Sigmas = 0.0
-    """constant_velocity_3d: standard deviation of each velocity; or a list of three."""
+    """constant_velocity_3d, inertial: standard deviation of each velocity; or a list of three."""
     sigma_w_radps: Sigmas = 0.0
     """constant_velocity_3d: standard deviation of each rate; or a list of three."""
+    bias_wx_radps: Number = 0.0
+    """inertial: bias of the rate about x."""
+    bias_wy_radps: Number = 0.0
+    """inertial: bias of the rate about y."""
+    bias_wz_radps: Number = 0.0
+    """inertial: bias of the rate about z."""
+    bias_ax_mps2: Number = 0.0
+    """inertial: bias of the specific force along x."""
+    bias_ay_mps2: Number = 0.0
+    """inertial: bias of the specific force along y."""
+    bias_az_mps2: Number = 0.0
+    """inertial: bias of the specific force along z."""
+    gravity_x_mps2: Number = 0.0
+    """inertial_gravity: gravity in the map's frame."""
+    gravity_y_mps2: Number = 0.0
+    """inertial_gravity: gravity in the map's frame."""
+    gravity_z_mps2: Number = 0.0
+    """inertial_gravity: gravity in the map's frame."""
+    sigma_bias_w_radps: Sigmas = 0.0
+    """inertial: standard deviation of each bias of the rate; or a list of three."""
+    sigma_bias_a_mps2: Sigmas = 0.0
+    """inertial: standard deviation of each bias of the specific force; or a list of three."""
+    sigma_gravity_mps2: Sigmas = 0.0
+    """inertial_gravity: standard deviation of each coordinate of the gravity; or a list of three."""
 
 
 @register("initialization", "immediate")
@@ -228,10 +259,17 @@ def covariance_of(section: PlanePose | SpacePose, dof: int, behind: tuple[str, .
     else:
         sigmas = [*_three(section.sigma_position_m), *np.radians(_three(section.sigma_rotation_deg))]
     for name in _known(section, behind):
-        sigma = getattr(section, SIGMAS[name[0]])
-        sigmas.append(_three(sigma)["xyz".index(name[1])] if isinstance(section, SpaceStartConfig) else sigma)
+        key, axis = sigma_of(name)
+        sigma = getattr(section, key)
+        sigmas.append(_three(sigma)[axis] if isinstance(section, SpaceStartConfig) else sigma)
     sigmas += [0.0] * (dof - len(sigmas))
     return np.diag(np.square(sigmas[:dof])) if any(sigmas[:dof]) else None
+
+
+def sigma_of(name: str) -> tuple[str, int]:
+    """Return the key of a start with the sigma of what a state has behind its pose, and its axis, 0 of no axis."""
+    found = _AXIS.search(name)
+    return f"sigma_{_AXIS.sub('', name, count=1)}", "xyz".index(found[0][-1]) if found else 0
 
 
 def state_of(section: PlanePose | SpacePose, behind: tuple[str, ...]) -> list[float]:
@@ -247,10 +285,16 @@ def _known(section: PlanePose | SpacePose, behind: tuple[str, ...]) -> tuple[str
 def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None:
     """Refuse what a start says of a state that its motion does not have.  Raises ValueError."""
     has = _known(start, state_columns(model_of(motion)))
-    allowed = {*has, *(SIGMAS[name[0]] for name in has)}
-    for key in dict.fromkeys((*STATES["plane"], *STATES["space"], *SIGMAS.values())):
+    allowed = {*has, *(sigma_of(name)[0] for name in has)}
+    if isinstance(start, SpaceStartConfig) and start.at_rest:
+        if "bias_ax_mps2" not in has:
+            raise expected(f"false: {motion.type} has no inertial unit", "start", "at_rest")
+        if not np.all(_three(start.sigma_bias_a_mps2)):
+            raise expected("a number > 0: at rest a bias looks like a tilt", "start", "sigma_bias_a_mps2")
+    states = *STATES["plane"], *STATES["space"]
+    for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
-            what = "slip" if "slip" in key else "velocity like this"
+            what = next((word for word in ("slip", "bias", "gravity") if word in key), "velocity like this")
             raise expected(f"0: {motion.type} has no {what} in its state", "start", key)
 
 

@@ -43,9 +43,6 @@ Number = Annotated[float, Field(ge=-FAR, le=FAR, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=FAR, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, le=FAR, allow_inf_nan=False)]
 
-# What the contract names and later versions bring: refused by name, not as a spelling mistake.
-LATER = {"motion": ("inertial",)}
-
 
 class Section(BaseModel):
     """A frozen mapping of keys, each with its default; unknown keys and loosely typed values are refused.

@@ -27,7 +27,8 @@ from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, numb
 T = TypeVar("T")
 NAMES = ("t_s", "robot", "sensor", "id")
 CONTROL = (
-    "v_mps", "vx_mps", "vy_mps", "vz_mps", "w_radps", "wx_radps", "wy_radps", "wz_radps", "steering_rad",
+    "v_mps", "vx_mps", "vy_mps", "vz_mps", "w_radps", "wx_radps", "wy_radps", "wz_radps",
+    "ax_mps2", "ay_mps2", "az_mps2", "steering_rad",
     "dv_mps", "dvx_mps", "dvy_mps", "dvz_mps", "dw_radps", "dwx_radps", "dwy_radps", "dwz_radps",
     "dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad", "dtheta_rad", "left_rad", "right_rad",
     "front_left_radps", "front_right_radps", "rear_left_radps", "rear_right_radps",
@@ -40,7 +41,7 @@ OBSERVATION = (
 )  # fmt: skip
 READING = (  # of a robot itself by its own sensors, and of senders
     "heading_rad", "theta_rad", "rssi_dbm", "difference_m", "roll_rad", "pitch_rad",
-    "ax_mps2", "ay_mps2", "az_mps2", "speed_mps",
+    "speed_mps",
 )  # fmt: skip
 CANONICAL = (*CONTROL, *OBSERVATION, *READING)
 """The order in which known columns make a control or an observation, whatever their order in the file."""

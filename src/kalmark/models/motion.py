@@ -1,7 +1,7 @@
 """Motion models: odometry increments ([S] A.3), held velocities on exact arcs ([F]), Ackermann, constant velocity.
 
-Wheels of other kinds are in `wheels`, velocities in the state of a robot of the plane in `coasting`, what all share in
-`kinematics`; all have their names here.
+Wheels of other kinds are in `wheels`, velocities in the state of a robot of the plane in `coasting`, inertial units in
+`inertial`, what all share in `kinematics`; all have their names here.
 
 Three kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
 displacement is sigma times the duration.  What *all controls lack*, a constant or a share of them (`sigma_v_bias_mps`,
@@ -29,8 +29,9 @@ from kalmark.models.kinematics import MotionModel, PlanarMotion, Scale, SpeedAnd
 from kalmark.models.observe import CompiledVelocity
 
 __all__ = [
-    "Ackermann", "ConstantTurnRate", "ConstantVelocity", "ConstantVelocity3D", "DifferentialDrive", "Mecanum",
-    "Odometry2D", "Odometry3D", "Omnidirectional", "SlippingUnicycle", "Tricycle", "Unicycle", "Velocity3D",
+    "Ackermann", "ConstantTurnRate", "ConstantVelocity", "ConstantVelocity3D", "DifferentialDrive", "Inertial",
+    "InertialGravity", "Mecanum", "Odometry2D", "Odometry3D", "Omnidirectional", "SlippingUnicycle", "Tricycle",
+    "Unicycle", "Velocity3D", "at_rest",
 ]  # fmt: skip
 
 
@@ -313,3 +314,4 @@ class ConstantVelocity3D(MotionModel, CompiledVelocity):
 # after those above, which messages and the page of the configuration name first
 from kalmark.models.wheels import DifferentialDrive, Mecanum, Omnidirectional, SlippingUnicycle, Tricycle  # noqa: E402, I001
 from kalmark.models.coasting import ConstantTurnRate, ConstantVelocity  # noqa: E402
+from kalmark.models.inertial import Inertial, InertialGravity, at_rest  # noqa: E402

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.config.schema import STATES, sigma_of
 from kalmark.declare import own_name, parameters, plugin_of, registered_name
 from kalmark.errors import MapError
 from kalmark.events import Scan
@@ -121,11 +122,11 @@ def _sigmas(cov: Any, behind: tuple[str, ...] = ()) -> dict[str, float]:
     `behind` are the names of what a state has behind its pose.
     """
     sigma = np.sqrt(np.diagonal(np.asarray(cov, dtype=np.float64))).tolist()
-    names = {"v": "sigma_v_mps", "w": "sigma_w_radps", "s": "sigma_slip"}
+    known = {*STATES["plane"], *STATES["space"]}
     more = {
-        names[name[0]]: sigma[i]
+        sigma_of(name)[0]: sigma[i]
         for i, name in reversed([*enumerate(behind, len(sigma) - len(behind))])
-        if name[0] in names
+        if name in known
     }
     if len(sigma) - len(behind) == 3:
         return {"sigma_xy_m": sigma[0], "sigma_theta_rad": sigma[2]} | more

@@ -18,6 +18,8 @@ from kalmark.geometry.rotations import left_jacobian, matrix
 from kalmark.models.motion import (
     Ackermann,
     DifferentialDrive,
+    Inertial,
+    InertialGravity,
     Mecanum,
     Odometry2D,
     Odometry3D,
@@ -30,6 +32,7 @@ from kalmark.models.protocols import HasVelocity
 from kalmark.simulate.layouts import Points
 
 SLOW_S = 1.0  # in which a robot steered by impulses turns to its target
+REACHED_S = 0.2  # in which a robot of space turns to its target, and one that accelerates has its speed
 
 Driver = Callable[[Array], Array]  # true state -> control of the next step
 
@@ -158,7 +161,7 @@ def steer_in_space(motion: Any, state: Array, target: Array, drive: Drive, dt_s:
     up = Q[2]  # the world's, in the robot's frame
     pitch, yaw = math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1])), math.atan2(ahead[1], ahead[0])
     error = np.array([-math.atan2(up[1], up[2]), pitch, yaw])
-    w = error / max(dt_s, 0.2)
+    w = error / max(dt_s, REACHED_S)
     limit = drive.speed_mps / drive.turn_radius_m
     w *= min(1.0, limit / max(float(np.linalg.norm(w)), 1e-12))
     return control_in_space(motion, state, np.array([drive.speed_mps, 0.0, 0.0]), w, dt_s)
@@ -168,6 +171,11 @@ def control_in_space(motion: Any, state: Array, v: Array, w: Array, dt_s: float)
     """Return the control (m,) of `motion` for v (3,) m/s and w (3,) rad/s in the robot's frame, for `dt_s`."""
     if motion.columns == Odometry3D.columns:  # the exact screw
         return np.concatenate([left_jacobian(w * dt_s) @ v * dt_s, w * dt_s])
+    if isinstance(motion, Inertial):
+        g = state[16:] if isinstance(motion, InertialGravity) else np.array([0.0, 0.0, -motion.gravity_mps2])
+        Q = matrix(state[3:7].copy())
+        a = (Q @ v - state[7:10]) / max(dt_s, REACHED_S)
+        return np.concatenate([w + state[10:13], Q.T @ (a - g) + state[13:16]])
     if len(state) == 7:
         return np.concatenate([v, w])
     return np.concatenate([matrix(state[3:7].copy()) @ v - state[7:10], w - state[10:13]])  # impulses

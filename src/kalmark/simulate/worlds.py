@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 from ruamel.yaml import YAML
 
+from kalmark.config.data_sheets import take_data_sheets
 from kalmark.config.opening import merged
 from kalmark.config.reading import resolve_name, run_plugins, shipped_configs, validate
 from kalmark.config.schema import (
@@ -196,6 +197,7 @@ def load_world(path_or_name: str | Path, overrides: Sequence[str] = ()) -> World
     path = resolve_name(path_or_name, shipped_worlds(), "world")
     tree = read_tree(path, _of_each(path, overrides))
     run_plugins(tree, path)
+    take_data_sheets(tree, path)
     world = validate(tree, World)
     world._file, world._tree = path, tree
     world.config()  # a mistake in `filter` shows now, not after the simulation

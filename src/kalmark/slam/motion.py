@@ -11,6 +11,7 @@ the scans correct them like all else.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -61,16 +62,17 @@ class HeldInput:
     """The control in force of one robot and how far it has been acted upon.
 
     As a context manager it puts the clock back if a control turns out to be impossible.  `gaps` watches for controls
-    that stop.
+    that stop.  Controls up to `rests_until_ns` are those of a robot that stands: its start was found from them.
     """
 
-    def __init__(self, motion: Motion, gaps: Gaps | None = None) -> None:
+    def __init__(self, motion: Motion, gaps: Gaps | None = None, rests_until_ns: int | None = None) -> None:
         self.motion, self.coasts = motion, coasts(motion)
         self.t_ns: int | None = None
         self.u: Array | None = None
         self.N: Array | None = None
         self.fresh = True
         self.gaps = None if self.coasts else gaps
+        self.rests_until_ns = -math.inf if rests_until_ns is None else rests_until_ns
         self._before: tuple[Any, ...] = ()
 
     def __enter__(self) -> Self:
@@ -143,6 +145,8 @@ class HeldInput:
 
     def accept(self, control: Control) -> list[Part]:
         """Take a new control; return the parts of motion it closes."""
+        if control.t_ns <= self.rests_until_ns:
+            return []
         if self.gaps is not None and self.gaps.rules_out(control):
             return self._left_out(control, self.gaps)
         N = self.motion.control_noise(control.u) if control.cov is None else control.cov

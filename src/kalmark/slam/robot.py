@@ -121,7 +121,8 @@ class Robot:
 
     `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.  `gaps` says
     what to do about controls that stop: "widen" the covariance by what the robot may have moved meanwhile, at most by
-    these speeds (None: by the largest so far), "refuse" to go on, or "ignore" it.
+    these speeds (None: by the largest so far), "refuse" to go on, or "ignore" it.  Controls up to `rests_until_ns` do
+    not move it: those at rest, from which its start was found.
     """
 
     name: str
@@ -132,6 +133,7 @@ class Robot:
     gaps: str = "widen"
     max_speed_mps: float | None = None
     max_turn_radps: float | None = None
+    rests_until_ns: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -143,6 +145,8 @@ class Robot:
             limit = vars(self)[key]
             if limit is not None and not (isinstance(limit, int | float) and 0 < limit < math.inf):
                 raise ModelError(f"{what}: {key} is {shown(limit)}, expected a number > 0, or None")
+        if self.rests_until_ns is not None:
+            instance(self.rests_until_ns, int, f"{what}: rests_until_ns", "a whole number, or None")
         instance(self.motion, Motion, f"{what}: motion", "a motion model")
         refuse_misspelt(self.motion, f"{what}: motion")
         space = self.motion.space

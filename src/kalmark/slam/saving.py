@@ -65,7 +65,7 @@ PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep",
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 MODELS = ("association", "estimator", "landmarks", "upkeep")  # among the settings
 OF_MOVING = ("t_ns", "fresh")
-OF_GAPS = ("gaps", "max_speed_mps", "max_turn_radps")  # of a robot
+OF_ROBOT = ("gaps", "max_speed_mps", "max_turn_radps", "rests_until_ns")
 
 
 def _settings(state: State) -> Description:
@@ -538,7 +538,7 @@ def robot_described(robot: Robot) -> Description:
         for name, mount in robot.sensors.items()
     ]
     moved = {"motion": described(robot.motion), "columns": list(robot.motion.columns)}
-    watched = {key: vars(robot)[key] for key in OF_GAPS}
+    watched = {key: vars(robot)[key] for key in OF_ROBOT}
     start = {"start": list(robot.start), "cov": _listed(robot.cov)}
     return {"name": robot.name, **moved, **start, **watched, "sensors": mounts}
 
@@ -559,7 +559,7 @@ def _robot_restored(d: Description) -> Robot:
         parts = {role: restored(role, m[role], said[role], "robots") for role in PARTS if m.get(role) is not None}
         mounts[name] = Mount(at=m["at"], cov=m["cov"], robust=m.get("robust"), **parts)
     motion = restored("motion", d["motion"], f"{who}: motion", "robots")
-    return Robot(d["name"], motion, d["start"], mounts, d["cov"], **{key: d[key] for key in OF_GAPS})
+    return Robot(d["name"], motion, d["start"], mounts, d["cov"], **{key: d[key] for key in OF_ROBOT if key in d})
 
 
 def robots_restored(saved: list[Description], given: list[Robot] | None) -> list[Robot]:

@@ -83,7 +83,8 @@ class State:
         bias_slot = None if bias is None else self.map.add(*bias)
         if bias_slot is not None:
             self.tracks.enter_block(bias_name(robot.name), bias_slot)
-        self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, HeldInput(robot.motion, robot.watch()))
+        held = HeldInput(robot.motion, robot.watch(), robot.rests_until_ns)
+        self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, held)
         for name, mount in robot.sensors.items():
             mount_slot, block = -1, mount.block(name)
             if block is not None:  # the mount calibrates itself

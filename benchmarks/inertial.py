@@ -1,0 +1,259 @@
+"""An inertial unit and a camera along EuRoC's trajectory V1_01, with simulated readings and points; and at rest.
+
+    python benchmarks/inertial.py path [--runs 20] [--sensor stereo] [--estimator invariant]
+    python benchmarks/inertial.py gauge [--runs 100] [--estimator invariant]
+    python benchmarks/inertial.py still [--minutes 5] [--estimator invariant]
+
+`path`: the unit reads at 200 Hz, the camera sees at 20 Hz.  Noise and biases are those of EuRoC's data sheet, the start
+is known to 1 deg of roll and pitch, 0.01 rad/s and 0.05 m/s^2.  Printed: the position error as a share of the
+path, RMS over the runs, and the ANEES of attitude, position and state, with the share of scans in the 95 % band.
+
+`gauge`: 10 s of it, from 20 s on, with an unknown start, 20 deg and 1 m.  `still`: one run at rest.  Both print how the
+information about the directions that nothing observes, shifts and turns about the gravity, compares with that of the
+start: the eigenvalues of N' P^-1 N relative to those of the start, N the directions, P the covariance of robot and map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.random import Generator, SeedSequence
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+from ways import pin
+
+import kalmark as km
+from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
+from kalmark.results.measures import anees_interval, path_m
+
+TRUTH = "visual/euroc_v101_micro/gt_V1_01_easy.csv"
+RATE_HZ, EVERY, ROOM_M = 200, 10, 1.5
+POINTS, FEW = 150, 30  # of a room: of the trajectory as a whole, and where the information is asked for
+UNIT = km.motion.Inertial(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3)
+G = np.array([0.0, 0.0, -UNIT.gravity_mps2])
+SIGMA_W, SIGMA_A, SIGMA_TILT = 0.01, 0.05, math.radians(1.0)  # of biases and of roll and pitch at the start
+SIGMA_YAW, SIGMA_M, SIGMA_V = math.radians(20.0), 1.0, 1e-3  # of a start of which nothing is known
+CAMERA = np.array([-0.0216, -0.0647, 0.0098, *Rotation.from_matrix(
+    [[0.0148655, -0.9998809, 0.0041403], [0.9995572, 0.0149672, 0.0257155], [-0.0257744, 0.0037562, 0.9996607]]
+).as_quat()])  # fmt: skip
+IMAGE = {"fx_px": 458.0, "fy_px": 457.0, "cx_px": 367.0, "cy_px": 248.0, "width_px": 752, "height_px": 480}
+SENSORS: dict[str, tuple[Any, Any]] = {  # and the landmarks that each starts
+    "stereo": (km.sensors.Stereo(baseline_m=0.11, **IMAGE), km.landmarks.Point3D()),
+    "pinhole": (km.sensors.PinHole(**IMAGE), km.landmarks.AnchoredHomogeneous()),
+    "spherical": (km.sensors.RangeBearing3D(0.05, 0.003, 0.003, range_max_m=4.0), km.landmarks.Point3D()),
+}
+ESTIMATORS: dict[str, Any] = {
+    "invariant": km.estimators.Invariant(),
+    "ekf": km.estimators.Ekf(),
+    "fej": km.estimators.Fej(),
+}
+
+
+class Flight:
+    """True states (N + 1, 16) at the times of the readings, and the exact readings (N, 6) that lead along them."""
+
+    def __init__(self, states: np.ndarray, readings: np.ndarray) -> None:
+        self.states, self.readings = states, readings
+
+
+def euroc(seconds: float | None = None) -> Flight:
+    """Return the flight whose velocity and orientation are those of EuRoC's truth, by splines."""
+    folder = Path(os.environ.get("KALMARK_DATA", "../shared/data"))
+    with (folder / TRUTH).open() as file:
+        rows = np.array([[float(cell) for cell in row] for row in list(csv.reader(file))[1:]])
+    t = (rows[:, 0] - rows[0, 0]) * 1e-9
+    way, turn = CubicSpline(t, rows[:, 1:4]), RotationSpline(t, Rotation.from_quat(rows[:, [5, 6, 7, 4]]))
+    at = np.arange(0.0, min(t[-1], seconds or math.inf), 1.0 / RATE_HZ)
+    return flown(np.concatenate([way(at[0]), turn(at[0]).as_quat()]), way(at, 1), turn(at).as_quat())
+
+
+def flown(start: np.ndarray, v: np.ndarray, q: np.ndarray) -> Flight:
+    """Return the flight from a pose (7,) with the velocities v (N, 3) and the orientations q (N, 4), held readings."""
+    dt, readings, states = 1.0 / RATE_HZ, [], [np.concatenate([start, v[0], np.zeros(6)])]
+    for k in range(len(v) - 1):
+        w = log(multiply(q[k] * [-1, -1, -1, 1], q[k + 1]))
+        f = np.linalg.solve(matrix(q[k]) @ left_jacobian(w), (v[k + 1] - v[k]) / dt - G)
+        readings.append(np.concatenate([w / dt, f]))
+        states.append(UNIT.move(states[-1], readings[-1], dt)[0])
+    return Flight(np.array(states), np.array(readings))
+
+
+def standing(seconds: float) -> Flight:
+    """Return the flight of a unit that stands tilted."""
+    q = np.tile(exp(np.array([0.1, -0.2, 0.3])), (round(seconds * RATE_HZ), 1))
+    return flown(np.concatenate([[0.0, 0.0, 1.0], q[0]]), np.zeros((len(q), 3)), q)
+
+
+def read(flight: Flight, rng: Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the unit reads (N, 6), and its true biases (N + 1, 6)."""
+    dt, n = 1.0 / RATE_HZ, len(flight.readings)
+    noise, walk = UNIT.densities[:6], UNIT.densities[6:]
+    first = rng.normal(0.0, np.repeat([SIGMA_W, SIGMA_A], 3))
+    biases = first + np.vstack([np.zeros(6), np.cumsum(rng.normal(0.0, walk * math.sqrt(dt), (n, 6)), axis=0)])
+    return flight.readings + biases[:-1] + rng.normal(0.0, noise / math.sqrt(dt), (n, 6)), biases
+
+
+def points(states: np.ndarray, count: int, rng: Generator) -> np.ndarray:
+    """Return points (count, 3) on the walls of a room around a flight."""
+    low, high = states[:, :3].min(axis=0) - ROOM_M, states[:, :3].max(axis=0) + ROOM_M
+    p, rows, axis = rng.uniform(low, high, (count, 3)), np.arange(count), rng.integers(3, size=count)
+    p[rows, axis] = np.where(rng.uniform(size=count) < 0.5, low[axis], high[axis])
+    return p
+
+
+def start_sigmas(lost: bool) -> np.ndarray:
+    """Return the sigmas (15,) of a start, one of which next to nothing is known or one with a known place and yaw."""
+    pose = [SIGMA_M * lost] * 3 + [SIGMA_TILT] * 2 + [SIGMA_YAW * lost]
+    return np.array(pose + [SIGMA_V] * 3 + [SIGMA_W] * 3 + [SIGMA_A] * 3)
+
+
+class Run:
+    """One run: the filter, the truth, and what the camera sees."""
+
+    def __init__(self, flight: Flight, sensor: str, estimator: str, seed: SeedSequence, lost: bool = False) -> None:
+        self.rng, self.flight = np.random.default_rng(seed), flight
+        self.u, self.biases = read(flight, self.rng)
+        self.points = points(flight.states, FEW if lost else POINTS, self.rng)
+        self.sensor, landmark = SENSORS[sensor]
+        self.at = CAMERA if sensor != "spherical" else np.array([0.0, 0, 0, 0, 0, 0, 1])
+        truth, sigmas = flight.states[0], start_sigmas(lost)
+        error = self.rng.normal(0.0, sigmas[:9])
+        start = UNIT.space.rotated(truth, error[3:6])  # the velocity is known in the frame of the robot, turned with it
+        start[:3], start[7:10] = truth[:3] + error[:3], start[7:10] + error[6:]
+        A = np.eye(UNIT.space.dof)
+        A[6:9, 3:6] = UNIT.space.generator(start)[6:9]
+        self.prior = A @ np.diag(np.square(sigmas)) @ A.T
+        mount = km.Mount(self.sensor, at=self.at)
+        robot = km.Robot("unit", UNIT, start, {"camera": mount}, cov=self.prior)
+        self.slam = km.Slam([robot], estimator=ESTIMATORS[estimator], landmarks=landmark)
+
+    def scans(self) -> Any:
+        """Yield the number of each reading that a scan follows, after the filter has taken both."""
+        dt_ns = 1_000_000_000 // RATE_HZ
+        for k, u in enumerate(self.u):
+            self.slam.process(km.Control(t_ns=k * dt_ns, robot="unit", u=u))
+            if (k + 1) % EVERY == 0 or k == 0:
+                n = k + 1 if k else 0
+                y, ids = self.seen(self.flight.states[n, :7])
+                self.slam.process(km.Scan(t_ns=n * dt_ns, robot="unit", sensor="camera", y=y, ids=ids))
+                yield n
+
+    def seen(self, pose: np.ndarray) -> tuple[np.ndarray, list[int]]:
+        """Return noisy measurements (K, m) of the points in view, and their numbers."""
+        T = km.geometry.frames3d.compose(pose, self.at)[0]
+        v = km.landmarks.Point3D().seen_from(T, self.points)[0]
+        inside = np.flatnonzero(self.sensor.sees(v))
+        e = self.sensor.expect(v[inside])[0] if len(inside) else np.zeros((0, len(self.sensor.columns)))
+        noise = self.sensor.noise(e) if len(e) else np.zeros((0, e.shape[1], e.shape[1]))
+        y = e + np.array([self.rng.multivariate_normal(np.zeros(len(N)), N) for N in noise]).reshape(e.shape)
+        return y, inside.tolist()
+
+    def error(self, n: int) -> np.ndarray:
+        """Return the invariant error (15,) of the estimate after reading n, in the coordinates of its covariance."""
+        mean, truth = self.slam.mean("unit"), np.concatenate([self.flight.states[n, :10], self.biases[n]])
+        if self.slam.estimator.coordinates == "world":
+            return UNIT.space.minus(truth, mean)
+        turn = log(multiply(truth[3:7], mean[3:7] * [-1, -1, -1, 1]))
+        back = np.linalg.inv(left_jacobian(turn))
+        return np.concatenate(
+            [back @ (truth[:3] - mean[:3]), turn, back @ (truth[7:10] - mean[7:10]), truth[10:] - mean[10:]]
+        )
+
+    def gauge(self) -> np.ndarray:
+        """Return the information (4, 4) about shifts and turns about the gravity, of the robot and the map."""
+        names = ["unit", *self.slam.landmarks().ids]
+        N = self.directions(names)
+        return N.T @ np.linalg.solve(self.slam.covariance(*names), N)
+
+    def directions(self, names: list[Any]) -> np.ndarray:
+        """Return how the errors (n, 4) of these blocks move in a shift of the world and a turn about its vertical."""
+        parts = []
+        for name in names:
+            space = UNIT.space if name == "unit" else km.landmarks.Point3D().space
+            parts.append(np.column_stack([np.eye(space.dof, 3), space.generator(self.slam.mean(name))[:, 2]]))
+        return np.concatenate(parts)
+
+
+def path(seed: SeedSequence, sensor: str, estimator: str, seconds: float | None) -> tuple[np.ndarray, float]:
+    """Return of each scan the position error and the NEES of attitude, position and state (scans, 4), and the path."""
+    pin()
+    flight = euroc(seconds)
+    run, found = Run(flight, sensor, estimator, seed), []
+    for n in run.scans():
+        d, P = run.error(n), run.slam.covariance("unit")
+        parts = [slice(3, 6), slice(0, 3), slice(0, 15)]
+        nees = [d[p] @ np.linalg.pinv(P[p, p]) @ d[p] for p in parts]
+        found.append([np.linalg.norm(run.slam.mean("unit")[:3] - flight.states[n, :3]), *nees])
+    return np.array(found), path_m(flight.states[:, :3])
+
+
+def paths(given: argparse.Namespace) -> None:
+    """Print the errors and the ANEES of the runs along EuRoC's trajectory."""
+    jobs = [delayed(path)(s, given.sensor, given.estimator, given.seconds) for s in SeedSequence(0).spawn(given.runs)]
+    runs = Parallel(n_jobs=2)(jobs)
+    each, length = np.array([found for found, _ in runs])[:, 1:], runs[0][1]
+    error = np.sqrt(np.mean(each[:, :, 0] ** 2, axis=1))
+    rms, worst = np.sqrt(np.mean(error**2)), error.max()
+    words = [f"RMS {rms:.4f} m, {100 * rms / length:.3f} % of {length:.1f} m, worst {100 * worst / length:.3f} %"]
+    for i, (name, dof) in enumerate((("attitude", 3), ("position", 3), ("state", 15)), 1):
+        mean, (low, high) = each[:, :, i].mean(axis=0), anees_interval(dof, given.runs)
+        inside = np.mean((mean > low) & (mean < high))
+        words.append(f"{name} ANEES ({dof}) {mean.mean():.2f}, in the band {inside:.1%}")
+    print(f"path {given.sensor} {given.estimator}: " + "; ".join(words))
+
+
+def gauged(flight: Flight, estimator: str, seed: SeedSequence, every: int) -> np.ndarray:
+    """Return the largest and smallest eigenvalues (scans, 2) of the information about shifts and turns.
+
+    Relative to that of the start; of every so manieth scan, the first one included.
+    """
+    pin()
+    run, values = Run(flight, "spherical", estimator, seed, lost=True), []
+    N = run.directions(["unit"])
+    first = N.T @ np.linalg.solve(run.prior, N)
+    root = np.linalg.inv(np.linalg.cholesky(first))
+    for i, _ in enumerate(run.scans()):
+        if i % every == 0:
+            values.append(np.linalg.eigvalsh(root @ run.gauge() @ root.T)[[-1, 0]])
+    return np.array(values)
+
+
+def gauges(given: argparse.Namespace) -> None:
+    """Print the information of short runs about what is unobservable."""
+    flight = euroc(given.seconds or 30.0)
+    flight = Flight(flight.states[4000:], flight.readings[4000:])  # under way
+    jobs = [delayed(gauged)(flight, given.estimator, s, 20) for s in SeedSequence(1).spawn(given.runs)]
+    runs = np.array(Parallel(n_jobs=2)(jobs))
+    grown = np.sum(runs[:, :, 0].max(axis=1) > 1.0 + 1e-6)
+    most = f"most information {runs.max():.9f}"
+    print(f"gauge {given.estimator}: {most}, more than that of the start by 1e-6 in {grown} of {given.runs} runs")
+
+
+def still(given: argparse.Namespace) -> None:
+    """Print the information of a run at rest about what is unobservable."""
+    values = gauged(standing(60.0 * given.minutes), given.estimator, SeedSequence(2), 100)
+    print(f"still {given.estimator}: least information {values.min():.9f}, most {values.max():.9f}")
+
+
+def main() -> None:
+    """Print the row of one question."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["path", "gauge", "still"])
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--sensor", choices=[*SENSORS], default="stereo")
+    parser.add_argument("--estimator", choices=[*ESTIMATORS], default="invariant")
+    parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--seconds", type=float, help="not the whole trajectory, but its beginning")
+    given = parser.parse_args()
+    {"path": paths, "gauge": gauges, "still": still}[given.what](given)
+
+
+if __name__ == "__main__":
+    main()
