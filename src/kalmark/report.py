@@ -139,8 +139,8 @@ class Expectations:
     those in view).  e (L, m) is the expectation h(x), Z (L, p, p) the covariance that an innovation would have, with
     the noise of the sensor.  E_r (L, p, 3 or 6), E_s and E_p are the Jacobians in the robot's pose, in the mount,
     whether it is in the map or not, and in the parameters of the sensor that are in the map (none: 0 columns).  E_l
-    (L, p, n) is the Jacobian in the landmark.  All are padded with NaN where landmarks differ in size, and NaN of what
-    cannot be expected.
+    (L, p, n) is the Jacobian in the landmark.  Of a sensor that sees its velocity E_s is NaN.  All are padded with NaN
+    where landmarks differ in size, and NaN of what cannot be expected.
     """
 
     robot: str

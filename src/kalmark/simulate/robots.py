@@ -30,6 +30,7 @@ from kalmark.models.protocols import (
     Drifting,
     OfState,
     Ranging,
+    SeesVelocity,
     TimedNoise,
     calibrating,
     coasts,
@@ -39,6 +40,7 @@ from kalmark.models.protocols import (
     true_control,
 )
 from kalmark.models.state_view import sees_state, view_of_state
+from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
@@ -275,7 +277,10 @@ def scans(
             continue
         sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
-        sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight)
+        t = np.zeros(0)
+        if isinstance(sensor, SeesVelocity):  # of what stands still
+            t, others = velocity_of(robot.motion, carried.at, robot.state)[0], {}
+        sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight, t)
         sighted, real = sights.faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
         y = sights.noisy(sensor, sighted.e, chance.sight)
         kept = sights.possible(sensor, y)
@@ -308,10 +313,16 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
     return SE3.plus(e[0], error)[None]  # a pose of space has more numbers than errors
 
 
-def seen_by(sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator) -> Sighted:
-    """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last."""
+def seen_by(
+    sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator, velocity: Array
+) -> Sighted:  # fmt: skip
+    """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last.
+
+    `velocity` is that of a sensor that sees it, in its frame, of others empty.
+    """
     near = things.near(T[: world.dimensions], range_limit(sensor))
     v = in_frame(things.sort, T, things.values[near])
+    v = np.column_stack([v, np.tile(velocity, (len(v), 1))])
     inside, e = sights.exact(sensor, v, things.sizes[near])
     near, v, e = near[inside], v[inside], e[inside]
     distance = np.linalg.norm(sights.centre(things.sort, v, world.dimensions), axis=1)

@@ -73,7 +73,7 @@ def policy_of(
         association, upkeep, mount.attention, mount.detector, _deferred(mount), delayed, _starts(association, upkeep),
         averages(association), upkeep.hold_back and not weighs(association), reviews,
         0.0 if channel.joins else linear or 0.0,
-        upkeep.keep_poses if delayed is None else 0,
+        upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
     )  # fmt: skip
 
 
@@ -122,7 +122,8 @@ def channel_of(
     def threshold(dof: int) -> float:
         return association.threshold(dof, estimator.default_gate)
 
-    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others)
+    motion = next((r.motion for r in robots.values() if mount in r.sensors.values()), None)
+    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, motion)
 
 
 def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:

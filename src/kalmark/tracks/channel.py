@@ -22,6 +22,7 @@ from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, 
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
+from kalmark.models.velocity_view import moving_view_of
 
 Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
 
@@ -39,16 +40,23 @@ class ObservationModel:
     landmark: Landmark
     sensor: Any
     at: Array
+    motion: Any = None
 
     @cached_property
     def model(self) -> Any:
         """What `linearize` takes.  Made when it is first needed: models that are built in are compiled then."""
+        return self.view()
+
+    def view(self) -> Any:
+        """Return what `linearize` takes of landmarks in the map."""
+        if isinstance(self.sensor, protocols.SeesVelocity):
+            return moving_view_of(self.sensor, self.landmark, self.motion, self.at)
         return view_of(self.sensor, self.landmark, self.at)
 
     @cached_property
     def exactly(self) -> KnownModel:
         """The same for landmarks known exactly, which are not in the map."""
-        return KnownModel(self.landmark, self.sensor, self.at)
+        return KnownModel(self.landmark, self.sensor, self.at, self.motion)
 
     @cached_property
     def built_in(self) -> bool:
@@ -79,7 +87,7 @@ class KnownModel(ObservationModel):
     @cached_property
     def model(self) -> Any:
         """What `linearize` takes."""
-        return known_view(view_of(self.sensor, self.landmark, self.at))
+        return known_view(self.view())
 
     @cached_property
     def d(self) -> int:
@@ -91,13 +99,15 @@ class Channel:
     """A sensor of a robot on its mount `at`, whose slot is `mount` (-1: not in the map), starting `landmark`s.
 
     `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
+    `motion` is that of its robot: a sensor that sees its velocity needs one that has it in its state.
     """
 
     def __init__(
         self, sensor: Sensor, at: Array, mount: int, landmark: Landmark, threshold: Callable[[int], float],
-        others: Sequence[Landmark],
+        others: Sequence[Landmark], motion: Any = None,
     ) -> None:  # fmt: skip
         self.sensor: Any = sensor
+        self.motion, self.sees_velocity = motion, isinstance(sensor, protocols.SeesVelocity)
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
@@ -134,8 +144,10 @@ class Channel:
             types += [AsPoint(ray) for ray in others if self._has_point(ray) and ray.kind not in seen]
         models: dict[str, ObservationModel] = {}
         for landmark in (*types, self.landmark):
-            model = ObservationModel(landmark, self.sensor, self.at)
+            model = ObservationModel(landmark, self.sensor, self.at, self.motion)
             models |= {kind: model for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
+        if self.sees_velocity:
+            models.pop(ROBOT, None)  # which does not stand still
         return models
 
     def _has_point(self, other: Landmark) -> bool:
@@ -146,6 +158,11 @@ class Channel:
     def _refuse_misfit(self) -> None:
         """Refuse a kind of landmark that one of kalmark's own sensors does not observe."""
         sensor, kind = type(self.sensor).__name__, self.landmark.kind
+        if self.sees_velocity and not isinstance(self.motion, protocols.HasVelocity):
+            robot = f"a {sensor} is on a robot with the motion {type(self.motion).__name__}"
+            raise ModelError(f"{robot}, expected one with the velocity in its state, such as constant_turn_rate")
+        if self.sees_velocity and self.mount >= 0:
+            raise ModelError(f"the mount of a {sensor} has sigmas, expected one that is known")
         if isinstance(self.landmark, InverseDepth2D) and finds_depth(self.sensor):
             raise ModelError(f"a {sensor} does not see the rays to landmarks of unknown depth, {kind}, expected point")
         if not self.models[kind].built_in:
@@ -168,6 +185,15 @@ class Channel:
         return len(self.sensor.angular)
 
     # ------------------------------------------------------------------ where it is
+    def second(self, robot: int) -> int:
+        """Return the slot of what the head has behind the robot's pose: the state, the mount, or -1 for nothing."""
+        return robot if self.sees_velocity else self.mount
+
+    def head(self, map_: Map, robot: int) -> Array:
+        """Return the head (h,) of what is observed: the robot's pose and what comes `second`."""
+        second, pose = self.second(robot), map_.mean(robot)[: len(self.at)]
+        return pose if second < 0 else np.concatenate([pose, map_.mean(second)])
+
     def observer(self, map_: Map, robot: int) -> Array:
         """Return the observer block (size,): the robot's pose, then mount and parameters if they are in the map."""
         pose = map_.mean(robot)[: len(self.at)]
@@ -231,7 +257,7 @@ class Channel:
 
     def innovations(self, map_: Map, robot: int, model: ObservationModel, slots: Index, y: Array) -> Array:
         """Return the innovations z (K, p) of y (K, m) from the blocks `slots`."""
-        return linearize(model.model, self.observer(map_, robot), map_.means(slots, model.d), y)[1]
+        return linearize(model.model, self.head(map_, robot), map_.means(slots, model.d), y)[1]
 
     def predict(
         self, map_: Map, robot: int, model: ObservationModel, slots: Index, y: Array, R: Array
@@ -241,7 +267,7 @@ class Channel:
             cuts = [slice(i, i + AT_ONCE) for i in range(0, len(slots), AT_ONCE)]
             parts = [self.predict(map_, robot, model, slots[cut], y[cut], R[cut]) for cut in cuts]
             return np.concatenate([Z for Z, _ in parts]), np.concatenate([d2 for _, d2 in parts])
-        return model.predict(*map_.marginal(robot, self.mount, slots), y, R)
+        return model.predict(*map_.marginal(robot, self.second(robot), slots), y, R)
 
     def landmark_of(
         self, map_: Map, robot: int, y: Array, R: Array, own_noise: bool, which: int = 0
