@@ -178,6 +178,14 @@ def motions() -> Iterator[Figure]:
         yield Figure("Sensors of the state", name, "" if estimator == "ekf" else "90 % in the band / 97 of 100",
                      f"python benchmarks/motions.py {world} --estimator {estimator}",
                      row(world, "{1} / {5} / {7} / {9} of {11}"))  # fmt: skip
+    for world, dof in (("radar", 3), ("radar_in_space", 6)):
+        yield Figure("Sensors of the state", f"`{world}`: pose ANEES ({dof}) / in band / ANEES of the whole state (1)",
+                     "90 % in the band", f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip
+    for motion in ("slipping_unicycle", "constant_velocity"):
+        for of in ("without", "with"):
+            yield Figure("Sensors of the state", f"`stop_and_go`, `{motion}`, {of} zero-velocity updates: pose ANEES (3) / sigma / error at "
+                         "the end of stops / windows of stops noticed / false", "" if of == "without" else "smaller sigmas, ANEES not worse",
+                         "python benchmarks/standing.py", row(f"{motion}, {of}:", "{1} / {7} m / {12} m / {20} / {22}"))  # fmt: skip
     for world in ("slipping_unicycle", "constant_velocity", "constant_turn_rate"):
         yield Figure("Motions", f"`{world}`: pose ANEES (3) / in band / ANEES of the whole state (1)", "90 % in the band",
                      f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip

@@ -189,6 +189,7 @@ class Report:
     come from.  `gaps` are times without controls, up to now, for which the pose was widened.
     `repeats` were found in the map after the scan, and not merged.
     `replaced` is how far, in m, a robot was moved to where the last fixes place it that it did not believe.
+    `standing` is the reading of zero velocity that was added to the event, of a robot that was noticed to stand.
     """
 
     __slots__ = (
@@ -205,6 +206,7 @@ class Report:
         "repeats",
         "replaced",
         "seen_at",
+        "standing",
         "y",
         "z",
     )
@@ -219,6 +221,7 @@ class Report:
         self.gaps: tuple[Gap, ...] = ()
         self.repeats: tuple[Repeat, ...] = ()
         self.replaced = 0.0
+        self.standing: Observation | None = None
         self.compared: Compared | None = None
         self.seen_at: Array = NOTHING
         self.y = y

@@ -41,6 +41,8 @@ from kalmark.models.state_sensors import (
     Odometer2D,
     Odometer3D,
     Speed,
+    ZeroVelocity2D,
+    ZeroVelocity3D,
 )
 
 __all__ = [
@@ -49,6 +51,7 @@ __all__ = [
     "Omnidirectional", "PinHole", "Position2D", "Position3D", "Radar2D", "Radar3D", "Range", "RangeBearing",
     "RangeBearing3D", "RangeBearingSignature", "RangeDifference2D", "RangeDifference3D", "RangeRate2D", "RangeRate3D",
     "Segments", "SignalStrength2D", "SignalStrength3D", "Speed", "Stereo", "TagCorners", "TagPose", "Wall",
+    "ZeroVelocity2D", "ZeroVelocity3D",
 ]  # fmt: skip
 
 TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed

@@ -25,7 +25,8 @@ from kalmark.models.seen import residual
 
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
-    "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D", "Speed",
+    "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D", "Speed", "ZeroVelocity2D",
+    "ZeroVelocity3D",
 ]  # fmt: skip
 
 STILL_MPS = 1e-6  # a ground speed below which its direction means nothing
@@ -534,6 +535,44 @@ class GroundSpeed(StateSensor):
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",)
     views: ClassVar[str] = TWIST
     expected: ClassVar[Any] = ground_speed
+
+
+@declared
+class _ZeroVelocity(StateSensor):
+    window_s: Annotated[Positive, "Time over which a robot must stand to be noticed."] = 1.0
+    _: KW_ONLY
+    slowest_mps: Annotated[Positive, "The slowest motion that is not to be taken for standing."] = 0.05
+    slowest_radps: Annotated[Positive, "The slowest turn that is not to be taken for standing."] = 0.05
+    false_alarm: Annotated[Probability, "Share of windows in which so slow a motion is taken for standing."] = 0.001
+    sigma_mps: Annotated[Positive, "Velocity of a robot that stands, on each axis."] = 0.005
+    sigma_radps: Annotated[Positive, "Turn rate of a robot that stands, about each axis."] = 0.005
+
+    views: ClassVar[str] = TWIST
+    expected: ClassVar[Any] = place
+
+
+@register("sensor", "zero_velocity")
+class ZeroVelocity2D(_ZeroVelocity):
+    """No sensor but what is noticed of the others: that the robot stands, which is a reading of zero velocity.
+
+    It has no rows in a log; rows that it has are readings, of a brake for example.  docs/state_sensors.md.
+    """
+
+    world: ClassVar[str] = "plane"
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "w_radps")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps", "sigma_mps", "sigma_radps")
+
+
+@register("sensor", "zero_velocity")
+class ZeroVelocity3D(_ZeroVelocity):
+    """No sensor but what is noticed of the others: that the robot stands, which is a reading of zero velocity.
+
+    It has no rows in a log; rows that it has are readings, of a brake for example.  docs/state_sensors.md.
+    """
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    sigmas: ClassVar[tuple[str, ...]] = (*("sigma_mps",) * 3, *("sigma_radps",) * 3)
 
 
 # ------------------------------------------------------------------ of the way since the last reading

@@ -39,6 +39,7 @@ from kalmark.models.protocols import (
     range_limit,
     true_control,
 )
+from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
@@ -262,7 +263,7 @@ def scans(
     """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
     found: list[tuple[Scan, tuple[Id | None, ...]]] = []
     for name, carried in robot.sensors.items():
-        if not carried.sensing.scans_at(k):
+        if not carried.sensing.scans_at(k) or isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
             continue
         if carried.laser is not None:
             y = laser.beams(carried.laser, carried.sensing, composed(robot.pose, carried.at)[0], things, chance.sight)

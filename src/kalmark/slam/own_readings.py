@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.events import Fix, Scan
+from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Update
 from kalmark.models.observe import fix_view
 from kalmark.report import Judged, Observation, Report
@@ -45,6 +45,21 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         for slot in state.clones.refer(key, set(state.clones.of(key)) - set(held)):
             state.map.remove(slot)
     return report
+
+
+def stood(state: State, event: Event) -> Observation | None:
+    """Correct by a velocity of zero where a robot is noticed to stand at the end of an event."""
+    key = event.robot, state.standing[event.robot]
+    reader = state.readers[key]
+    assert reader.standing is not None
+    stands = reader.standing.take(event, lambda *sensor: state.readers[sensor].constants(state.map))
+    if stands and reader.t_ns != event.t_ns:
+        zero = Scan(t_ns=event.t_ns, robot=key[0], sensor=key[1], y=np.zeros((1, len(reader.sensor.columns))))
+        return read(state, zero, reader).observations[0]
+    if stands is False:
+        for slot in state.clones.refer(key, ()):  # from where a robot that moves now was
+            state.map.remove(slot)
+    return None
 
 
 def fix(state: State, event: Fix) -> Report:

@@ -101,10 +101,10 @@ def _starts(association: Association, upkeep: Upkeep) -> tuple[Answer, ...]:
 
 
 def channel_of(
-    robots: Mapping[str, Robot], mount: Mount, slot: int, landmarks: Landmark | None, association: Association,
-    estimator: Estimator,
+    robots: Mapping[str, Robot], robot: Robot, mount: Mount, slot: int, landmarks: Landmark | None,
+    association: Association, estimator: Estimator,
 ) -> Channel:  # fmt: skip
-    """Return the channel of a mount whose block is on a slot (-1: none).
+    """Return the channel of a robot's mount whose block is on a slot (-1: none).
 
     Raises ModelError if sensor or landmark are of another world than the robots, or do not fit each other.
     """
@@ -122,8 +122,7 @@ def channel_of(
     def threshold(dof: int) -> float:
         return association.threshold(dof, estimator.default_gate)
 
-    motion = next((r.motion for r in robots.values() if mount in r.sensors.values()), None)
-    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, motion)
+    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, robot.motion)
 
 
 def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:

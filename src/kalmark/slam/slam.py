@@ -110,7 +110,10 @@ class Slam(Estimate):
             names = sorted(state.robots)
             raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
         try:
-            return take(event)
+            report: Report = take(event)
+            if event.robot in state.standing:
+                report.standing = own_readings.stood(state, event)
+            return report
         except EventError:
             state.t_ns = before
             raise

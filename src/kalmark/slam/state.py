@@ -22,6 +22,7 @@ from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
 from kalmark.slam.reader import Reader
 from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.standing import standing_of
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.scan import Start
@@ -46,7 +47,8 @@ class Settings:
 class State:
     """The map, the tracks and the clones of some robots, with the channels and readers of their sensors.
 
-    `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed.
+    `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
+    `standing` are, of robots that are noticed to stand, the names of the sensors that do.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
@@ -59,6 +61,7 @@ class State:
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
         self.readers: dict[ChannelKey, Reader] = {}
+        self.standing: dict[str, str] = {}
         self.inner = {bias_name(name) for name in robots}
         self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}
         for robot in robots.values():
@@ -90,10 +93,15 @@ class State:
                 self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
             if isinstance(mount.sensor, OfState):
                 refuse_other_world(self.robots, type(mount.sensor).__name__, world_of(mount.sensor))
-                self.readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot)
+                standing = standing_of(mount.sensor, robot)
+                if standing is not None:
+                    self.standing[robot.name] = name
+                self.readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot, standing)
                 continue
             association = mount.association or settings.association
-            channel = channel_of(self.robots, mount, mount_slot, settings.landmarks, association, self.estimator)
+            channel = channel_of(
+                self.robots, robot, mount, mount_slot, settings.landmarks, association, self.estimator
+            )  # fmt: skip
             self.channels[robot.name, name] = channel
             upkeep = mount.upkeep or settings.upkeep
             self.policies[robot.name, name] = policy_of(mount, channel, association, upkeep, settings.reparametrize)
