@@ -59,6 +59,15 @@ def place(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Ar
 
 
 @compiled
+def antenna(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the position of a pose v (1, 3) or (1, 7), with the bias `par` (d,)."""
+    e, _z, E_v = place(code, par, angular, v, y)
+    for i in range(e.shape[1]):
+        e[0, i] += par[i]
+    return e, y - e, E_v
+
+
+@compiled
 def pose_in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Expect a pose v (1, 3) itself."""
     E_v = np.zeros((1, 3, 3))
@@ -287,27 +296,50 @@ class Heading(StateSensor):
 @declared
 class _Gps(StateSensor):
     sigma_m: Annotated[Positive, "Noise of each coordinate."] = 1.0
+    _: KW_ONLY
+    sigma_bias_m: Annotated[
+        NotNegative, "Standard deviation of an error that lasts, at first; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_bias_m_per_sqrt_s: Annotated[
+        NotNegative, "Random walk of an error that lasts; above 0 it is in the map and is estimated."
+    ] = 0.0
 
     views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = place
+    expected: ClassVar[Any] = antenna
+    varied: ClassVar[Any] = plus
 
 
 @register("sensor", "gps")
 class Gps2D(_Gps):
     """The position of an antenna, at its mount, in the map's frame: GPS, a total station, a beacon system."""
 
+    _: KW_ONLY
+    bias_x_m: Bias = 0.0
+    bias_y_m: Bias = 0.0
+
     world: ClassVar[str] = "plane"
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 2
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
+        (f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xy"
+    )
 
 
 @register("sensor", "gps")
 class Gps3D(_Gps):
     """The position of an antenna, at its mount, in the map's frame."""
 
+    _: KW_ONLY
+    bias_x_m: Bias = 0.0
+    bias_y_m: Bias = 0.0
+    bias_z_m: Bias = 0.0
+
     world: ClassVar[str] = "space"
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 3
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
+        (f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xyz"
+    )
 
 
 @register("sensor", "absolute_pose")

@@ -23,7 +23,7 @@ from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.models.landmarks import Point2D, Point3D, Tag
-from kalmark.models.protocols import Landmark, SeesVelocity
+from kalmark.models.protocols import Landmark, OfState, SeesVelocity
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.history import History, as_id
@@ -182,13 +182,16 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
 
 
 def _of_places(history: History, slam: Slam, rows: Index) -> Index:
-    """Return those rows of the history that are of sensors which see no velocity: poses have none."""
+    """Return those rows of the history that say where landmarks or other robots are, seen from a pose alone.
+
+    Readings of the state do not, nor do range rates.
+    """
     mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
-    moving = {key for key, mount in mounted.items() if isinstance(mount.sensor, SeesVelocity)}
-    if not moving:
+    others = {key for key, mount in mounted.items() if isinstance(mount.sensor, SeesVelocity | OfState)}
+    if not others:
         return rows
     keys = zip(history.robot[history.step[rows]].tolist(), history.sensor[rows].tolist(), strict=True)
-    return rows[np.array([key not in moving for key in keys], dtype=np.bool_)]
+    return rows[np.array([key not in others for key in keys], dtype=np.bool_)]
 
 
 def _in_the_end(history: History, rows: Index) -> list[str]:
