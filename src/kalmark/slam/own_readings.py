@@ -39,6 +39,9 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         done = done._replace(e=done.e[:, : event.width])
         report.e, report.z, report.Z = done.e, done.z, done.Z
         report.judged = (Judged([0], [None], [event.robot], done, reader.gate),)
+        if reader.is_position:
+            position = replacing.LeftOut(event.y[0], R[0], done.e[0])
+            report.replaced = _believed(state, event.robot, position, done.fused[0])
     if reader.counts:
         with suppress(MapError):  # it is full: the next reading is the first again
             state.clone(key, event.t_ns)
@@ -75,14 +78,19 @@ def fix(state: State, event: Fix) -> Report:
     done = state.corrected(update, event, state.estimator.for_fixes())
     report.e, report.z, report.Z = done.e, done.z, done.Z
     report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)
-    left_out = state.moving[event.robot].left_out
-    if done.fused[0]:
-        left_out.clear()
-    else:
-        del left_out[: len(left_out) + 1 - replacing.KEPT]
-        left_out.append(replacing.LeftOut(event.y, event.cov, done.e[0]))
-        report.replaced = _replace(state, event.robot)
+    report.replaced = _believed(state, event.robot, replacing.LeftOut(event.y, event.cov, done.e[0]), done.fused[0])
     return report
+
+
+def _believed(state: State, name: str, position: replacing.LeftOut, fused: bool) -> float:
+    """Keep a measured position that was left out; return how far, m, the robot is moved if these agree, 0 if not."""
+    left_out = state.moving[name].left_out
+    if fused:
+        left_out.clear()
+        return 0.0
+    del left_out[: len(left_out) + 1 - replacing.KEPT]
+    left_out.append(position)
+    return _replace(state, name)
 
 
 def _replace(state: State, name: str) -> float:

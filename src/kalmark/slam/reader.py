@@ -17,6 +17,7 @@ from kalmark.models.state_view import sees_state, state_view_of
 from kalmark.slam.checks import measurements
 from kalmark.slam.standing import Standing
 
+POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures where an antenna is
 LEAST_S = 1e-6  # between two readings that tell how the robot moved
 
 
@@ -24,7 +25,7 @@ class Reader:
     """A sensor of the state of a robot that moves by `motion`; `mount` is the slot of its mount, -1 for none.
 
     `counts`: what it measures counts from its last reading, where a clone of the robot's pose was left.  `standing`
-    notices of a `zero_velocity` that its robot stands.
+    notices of a `zero_velocity` that its robot stands.  `is_position`: as a fix it says where a lost robot is.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class Reader:
         self.mount, self.motion, self.standing = mount, motion, standing
         self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
+        self.is_position = tuple(sensor.columns) in POSITIONS
         if self.of_state and not np.diagonal(sensor.noise(np.zeros((1, len(sensor.columns))))[0]).all():
             name, wanted = type(sensor).__name__, "a positive number for each component"
             raise ModelError(f"{name}: the noise of one reading is 0, expected {wanted}: the state has the velocity")
