@@ -96,7 +96,7 @@ class _Doppler:
 class RangeRate2D(_Doppler):
     """Rate of the range of a landmark that stands still.
 
-    It starts no landmark; the robot's motion has its velocity in its state.
+    It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
     """
 
     world: ClassVar[str] = "plane"
@@ -107,7 +107,7 @@ class RangeRate2D(_Doppler):
 class RangeRate3D(_Doppler):
     """Rate of the range of a landmark that stands still.
 
-    It starts no landmark; the robot's motion has its velocity in its state.
+    It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
     """
 
     world: ClassVar[str] = "space"
@@ -116,7 +116,10 @@ class RangeRate3D(_Doppler):
 
 @register("sensor", "radar")
 class Radar2D(_Doppler):
-    """A radar: range, bearing and range rate of a landmark that stands still."""
+    """A radar: range, bearing and range rate of a landmark that stands still.
+
+    Where the robot has no velocity in its state it is the mean since the last scan.
+    """
 
     sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
     sigma_bearing_rad: Annotated[Positive, "Noise of the bearing."] = 0.02
@@ -138,7 +141,10 @@ class Radar2D(_Doppler):
 
 @register("sensor", "radar")
 class Radar3D(_Doppler):
-    """A radar: range, azimuth, elevation and range rate of a landmark that stands still."""
+    """A radar: range, azimuth, elevation and range rate of a landmark that stands still.
+
+    Where the robot has no velocity in its state it is the mean since the last scan.
+    """
 
     sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
     sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02

@@ -28,6 +28,7 @@ from kalmark.models.observe import composed
 from kalmark.models.protocols import (
     POSE,
     Drifting,
+    HasVelocity,
     OfState,
     Ranging,
     SeesVelocity,
@@ -61,7 +62,7 @@ class SimSensor:
     at: Array
     sensing: Sensing
     laser: Laser | None = None
-    last: tuple[int, Array] | None = None  # step and robot's pose of the last reading of a sensor of the state
+    last: tuple[int, Array] | None = None  # step and robot's pose of the last reading or scan
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -280,7 +281,7 @@ def scans(
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
         t = np.zeros(0)
         if isinstance(sensor, SeesVelocity):  # of what stands still
-            t, others = velocity_of(robot.motion, carried.at, robot.state)[0], {}
+            t, others = moving_at(robot, carried, k, world.dt_s), {}
         sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight, t)
         sighted, real = sights.faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
         y = sights.noisy(sensor, sighted.e, chance.sight)
@@ -288,8 +289,16 @@ def scans(
         if len(kept):
             told = [sighted.ids[i] for i in kept] if world.ids else None
             scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=told)
+            carried.last = k, robot.pose.copy()
             found.append((scan, tuple(real[i] for i in kept)))
     return found
+
+
+def moving_at(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:
+    """Return the velocity (2 or 3,) of a sensor at step k in its frame, or the mean since its last scan."""
+    k_before, before = carried.last or (0, robot.states[0][: len(robot.pose)])
+    state = robot.state if isinstance(robot.motion, HasVelocity) else np.array(before)
+    return velocity_of(robot.motion, carried.at, robot.pose, state, (k - k_before) * dt_s)[0]
 
 
 def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Chance) -> Array | None:

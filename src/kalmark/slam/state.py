@@ -20,7 +20,7 @@ from kalmark.models.protocols import Landmark, OfState, world_of
 from kalmark.slam.checks import fault_of
 from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
-from kalmark.slam.reader import Reader
+from kalmark.slam.reader import LEAST_S, Reader
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.standing import standing_of
 from kalmark.tracks.channel import Channel, Parts
@@ -139,12 +139,21 @@ class State:
         self.clones.clones[number].users.add(key)
         return number
 
+    def look_back(self, key: ChannelKey) -> str:
+        """Let a channel that counts from its last scan do so; return what keeps it from that, "" for nothing."""
+        channel, held = self.channels[key], self.clones.of(key)
+        channel.clone = self.clones[held[-1]] if held else -1
+        if not held or self.t_ns is None:
+            return "the first scan: none to count the velocity from"
+        channel.since[0] = (self.t_ns - self.clones.clones[held[-1]].t_ns) * 1e-9
+        return "" if channel.since[0] >= LEAST_S else "at the time of the last scan: none to count the velocity from"
+
     def release(self, key: ChannelKey) -> None:
         """Remove the clones that no measurement of a channel needs any more; a delayed start needs the last one."""
         used = {m.clone for track in self.tracks.tentative.values() for m in track.measurements
                 if (m.robot, m.sensor) == key}  # fmt: skip
         used |= {m.clone for pending in self.tracks.waiting() if pending.channel == key for m in pending.measurements}
-        if key in self.readers or self.policies[key].delayed is not None:
+        if key in self.readers or self.channels[key].counts or self.policies[key].delayed is not None:
             used.update(self.clones.of(key)[-1:])
         for slot in self.clones.refer(key, used):
             self.map.remove(slot)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -41,6 +41,7 @@ class ObservationModel:
     sensor: Any
     at: Array
     motion: Any = None
+    since: Array = field(default_factory=lambda: np.zeros(1))
 
     @cached_property
     def model(self) -> Any:
@@ -50,13 +51,13 @@ class ObservationModel:
     def view(self) -> Any:
         """Return what `linearize` takes of landmarks in the map."""
         if isinstance(self.sensor, protocols.SeesVelocity):
-            return moving_view_of(self.sensor, self.landmark, self.motion, self.at)
+            return moving_view_of(self.sensor, self.landmark, self.motion, self.at, self.since)
         return view_of(self.sensor, self.landmark, self.at)
 
     @cached_property
     def exactly(self) -> KnownModel:
         """The same for landmarks known exactly, which are not in the map."""
-        return KnownModel(self.landmark, self.sensor, self.at, self.motion)
+        return KnownModel(self.landmark, self.sensor, self.at, self.motion, self.since)
 
     @cached_property
     def built_in(self) -> bool:
@@ -99,7 +100,8 @@ class Channel:
     """A sensor of a robot on its mount `at`, whose slot is `mount` (-1: not in the map), starting `landmark`s.
 
     `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
-    `motion` is that of its robot: a sensor that sees its velocity needs one that has it in its state.
+    `motion` is that of its robot: a sensor that sees its velocity has it from the state; else it `counts`, from a clone
+    of the robot's pose at its last scan, `since` (1,) seconds ago.
     """
 
     def __init__(
@@ -108,6 +110,8 @@ class Channel:
     ) -> None:  # fmt: skip
         self.sensor: Any = sensor
         self.motion, self.sees_velocity = motion, isinstance(sensor, protocols.SeesVelocity)
+        self.counts = self.sees_velocity and not isinstance(motion, protocols.HasVelocity)
+        self.clone, self.since = -1, np.zeros(1)
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
@@ -144,7 +148,7 @@ class Channel:
             types += [AsPoint(ray) for ray in others if self._has_point(ray) and ray.kind not in seen]
         models: dict[str, ObservationModel] = {}
         for landmark in (*types, self.landmark):
-            model = ObservationModel(landmark, self.sensor, self.at, self.motion)
+            model = ObservationModel(landmark, self.sensor, self.at, self.motion, self.since)
             models |= {kind: model for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
         if self.sees_velocity:
             models.pop(ROBOT, None)  # which does not stand still
@@ -158,9 +162,6 @@ class Channel:
     def _refuse_misfit(self) -> None:
         """Refuse a kind of landmark that one of kalmark's own sensors does not observe."""
         sensor, kind = type(self.sensor).__name__, self.landmark.kind
-        if self.sees_velocity and not isinstance(self.motion, protocols.HasVelocity):
-            robot = f"a {sensor} is on a robot with the motion {type(self.motion).__name__}"
-            raise ModelError(f"{robot}, expected one with the velocity in its state, such as constant_turn_rate")
         if self.sees_velocity and self.mount >= 0:
             raise ModelError(f"the mount of a {sensor} has sigmas, expected one that is known")
         if isinstance(self.landmark, InverseDepth2D) and finds_depth(self.sensor):
@@ -186,8 +187,8 @@ class Channel:
 
     # ------------------------------------------------------------------ where it is
     def second(self, robot: int) -> int:
-        """Return the slot of what the head has behind the robot's pose: the state, the mount, or -1 for nothing."""
-        return robot if self.sees_velocity else self.mount
+        """Return the slot of what the head has behind the robot's pose: state, clone, mount, or -1 for nothing."""
+        return self.clone if self.counts else robot if self.sees_velocity else self.mount
 
     def head(self, map_: Map, robot: int) -> Array:
         """Return the head (h,) of what is observed: the robot's pose and what comes `second`."""

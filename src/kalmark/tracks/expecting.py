@@ -75,8 +75,9 @@ def expectations(
         chosen = np.flatnonzero(seen.in_view) if only_in_view else np.arange(len(rows))
         if len(chosen):
             found.append((rows[chosen], linearised_known(map_, channel, slot, model, l[chosen], seen.y[chosen])))
-    if channel.sees_velocity:
-        found = [(rows, part._replace(E_h=_in_pose(part.E_h, channel.pose_dof))) for rows, part in found]
+    if channel.sees_velocity:  # of a state, the pose in it, too; a clone is not where the robot is
+        twice = 1 if channel.counts else 2
+        found = [(rows, part._replace(E_h=_in_pose(part.E_h, channel.pose_dof, twice))) for rows, part in found]
     h, n = (max((getattr(part, key).shape[2] for _, part in found), default=0) for key in ("E_h", "E_l"))
     h, dof = max(h, 2 * channel.pose_dof), channel.pose_dof
     whole = Linearised(*(np.full((count, *shape), np.nan) for shape in ((m,), (p, p), (p, h), (p, n))))
@@ -94,9 +95,9 @@ def expectations(
     return _of_rows(all_, np.flatnonzero(in_view)) if only_in_view else all_
 
 
-def _in_pose(E_h: Array, dof: int) -> Array:
-    """Return the Jacobian (K, p, dof) in a robot's pose, of that in its pose and in its state, which begins with it."""
-    E_r: Array = E_h[:, :, :dof] + E_h[:, :, dof : 2 * dof]
+def _in_pose(E_h: Array, dof: int, times: int) -> Array:
+    """Return the Jacobian (K, p, dof) in a robot's pose, with which so many blocks of the columns of E_h begin."""
+    E_r: Array = sum((E_h[:, :, k * dof : (k + 1) * dof] for k in range(times)), np.zeros((*E_h.shape[:2], dof)))
     return E_r
 
 
