@@ -178,6 +178,31 @@ def motions() -> Iterator[Figure]:
         yield Figure("Sensors of the state", name, "" if estimator == "ekf" else "90 % in the band / 97 of 100",
                      f"python benchmarks/motions.py {world} --estimator {estimator}",
                      row(world, "{1} / {5} / {7} / {9} of {11}"))  # fmt: skip
+    for world, dof in (("radar", 3), ("radar_in_space", 6)):
+        yield Figure("Sensors of the state", f"`{world}`: pose ANEES ({dof}) / in band / ANEES of the whole state (1)",
+                     "90 % in the band", f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip
+    for motion in ("slipping_unicycle", "constant_velocity"):
+        for of in ("without", "with"):
+            yield Figure("Sensors of the state", f"`stop_and_go`, `{motion}`, {of} zero-velocity updates: pose ANEES (3) / sigma / error at "
+                         "the end of stops / windows of stops noticed / false", "" if of == "without" else "smaller sigmas, ANEES not worse",
+                         "python benchmarks/standing.py", row(f"{motion}, {of}:", "{1} / {7} m / {12} m / {20} / {22}"))  # fmt: skip
+    on_logs = "python benchmarks/real_state_sensors.py"
+    for name, wanted, start, text in (
+        ("Lost in the Woods, a gyroscope of .1 deg/s bias: bias found / sigma / off / left out", "within 3 sigmas",
+         "woods, wide gate:", "{1} deg/s / {4} deg/s / {9} sigmas / {13} of {15}"),
+        ("the same, with the usual gate", "", "woods, usual gate:", "{1} deg/s / {4} deg/s / {9} sigmas / {13} of {15}"),
+        ("hall, a wheel of +1 %: odometry named first without / with a compass", "all of them", "hall, wheel +1 %:",
+         "{3} of {5} / {7} of {9}"),
+        ("hall, true wheels: odometry named first without / with a compass", "none", "hall, wheel true:",
+         "{3} of {5} / {7} of {9}"),
+        ("Victoria Park, GPS: lever arm / sigma / d2 from the given one (2)", "d2 below 11.8", "park: arm",
+         "({0}, {1}) m / {4} m / {11}"),
+        ("Victoria Park, GPS: left out / NIS (1) / correlation of successive innovations", "below two sigmas, .10", "park: arm",
+         "{16} of {18} / {20} / {22}"),
+        ("Victoria Park, centroid of the map by the fixes of either half: apart / sigma / d2 (2)", "d2 below 11.8",
+         "park: centroids", "{3} m / {7} m / {10}"),
+    ):  # fmt: skip
+        yield Figure("Sensors of the state", name, wanted, on_logs, row(start, text))
     for world in ("slipping_unicycle", "constant_velocity", "constant_turn_rate"):
         yield Figure("Motions", f"`{world}`: pose ANEES (3) / in band / ANEES of the whole state (1)", "90 % in the band",
                      f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip

@@ -31,7 +31,8 @@ def test_every_number_of_a_preset_names_its_source(name: str) -> None:
     own = {f.name for f in dataclasses.fields(plain) if getattr(preset.sensor, f.name) != getattr(plain, f.name)}
     assert set(preset.sources) == own | {"rate_hz", "dropouts"}
     assert all(len(source) > 20 for source in preset.sources.values())
-    assert 0 < preset.dropouts < 1
+    assert 0 <= preset.dropouts < 1
+    assert (preset.dropouts > 0) == (name in (*presets.TABLE_2, "laser_scanner"))
     km.Slam([km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(preset.sensor)})])
 
 
@@ -45,7 +46,23 @@ def test_a_configuration_takes_what_it_does_not_say_from_a_preset(tmp_path: Path
     assert build_slam(load_config(tmp_path / "again.yaml")).robots["robot"].sensors["s"].sensor == sensor
 
 
-@pytest.mark.parametrize(("type_", "preset"), [("bearing", "sonar"), ("range", "rfid"), ("position", "laser")])
+DEVICES = "{imu: {type: gyro, preset: mems_imu}, rtk: {type: gps, preset: rtk_receiver, sigma_m: 0.1}}"
+
+
+@pytest.mark.parametrize(("motion", "world"), [("unicycle", "plane"), ("velocity_3d", "space")])
+def test_devices_are_those_of_the_plane_and_of_space(motion: str, world: str, tmp_path: Path) -> None:
+    path = tmp_path / "preset.yaml"
+    path.write_text(f"robots: {{each: {{motion: {{type: {motion}}}, sensors: {DEVICES}}}}}\n")
+    robot = build_slam(load_config(path)).robots["robot"]
+    imu, rtk = robot.sensors["imu"].sensor, robot.sensors["rtk"].sensor
+    assert imu.world == rtk.world == world
+    assert (imu.sigma_rad_per_sqrt_s, rtk.sigma_m) == (presets.MEMS_IMU.sensor.sigma_rad_per_sqrt_s, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("type_", "preset"),
+    [("bearing", "sonar"), ("range", "rfid"), ("position", "laser"), ("gyro", "laser_scanner")],
+)
 def test_a_preset_of_another_type_of_sensor_is_refused(type_: str, preset: str, tmp_path: Path) -> None:
     path = tmp_path / "preset.yaml"
     path.write_text(f"robots: {{each: {{sensors: {{s: {{type: {type_}, preset: {preset}}}}}}}}}\n")
@@ -72,7 +89,7 @@ def test_a_world_takes_rate_and_dropouts_from_a_preset_unless_it_says_otherwise(
     assert reported == pytest.approx(1 - presets.RFID.dropouts, abs=0.12)
 
 
-@pytest.mark.parametrize("name", presets.ALL)
+@pytest.mark.parametrize("name", presets.TABLE_2)
 def test_every_preset_has_its_world(name: str) -> None:
     world = load_world(name)
     sensor = build_slam(world.config(), simulate(world, seed=0)).robots["robot"].sensors[name].sensor

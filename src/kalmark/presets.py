@@ -1,4 +1,4 @@
-"""Sensors of [S] Table 2 with noise, field of view, range, rate and dropouts: every number names its source.
+"""Sensors of [S] Table 2 and common devices, with noise, range, rate and dropouts: every number names its source.
 
     laser = km.presets.LASER
     km.Mount(laser.sensor); laser.rate_hz; laser.dropouts; laser.sources["range_max_m"]
@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from kalmark.models.sensors import Bearing, Range, RangeBearing
+from kalmark.models.sensors import Bearing, Gps2D, Gyro2D, Range, RangeBearing, Speed
 
 HOKUYO = "Hokuyo, Communication Protocol Specification for SCIP2.0, C-42-03320B"
 WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat, a laser that sees cylinders"
@@ -128,4 +128,67 @@ RFID = _preset(
 )
 """A reader of passive UHF tags with two antennas: poor ranges, fair bearings."""
 
-ALL = {"laser": LASER, "sonar": SONAR, "camera": CAMERA, "rgbd": RGBD, "arva": ARVA, "rfid": RFID}
+TABLE_2 = {"laser": LASER, "sonar": SONAR, "camera": CAMERA, "rgbd": RGBD, "arva": ARVA, "rfid": RFID}
+"""Those of [S] Table 2."""
+
+# ---------------------------------------------------------------------- devices
+UTM = "Hokuyo, UTM-30LX-EW specification"
+SCIP = f"{HOKUYO}, Table 2, of the UTM-30LX"
+LASER_SCANNER = _preset(
+    RangeBearing,
+    sigma_range_m=(0.03, f"{UTM}: accuracy 0.1 to 10 m +- 30 mm"),
+    sigma_bearing_rad=(
+        math.radians(360.0 / 1440.0) / math.sqrt(12.0),
+        f"{SCIP}: 1440 steps a turn, anywhere in one; a detector that fits several beams finds more",
+    ),
+    range_min_m=(0.1, f"{UTM}: range 0.1 to 30 m"),
+    range_max_m=(30.0, f"{UTM}: range 0.1 to 30 m"),
+    fov_rad=(math.radians(270.25), f"{SCIP}: detection range 270.25 deg"),
+    rate_hz=(40.0, f"{UTM}: 25 ms a scan"),
+    dropouts=(0.41, "assumption: as often as the small laser"),
+)
+"""A 2-D laser scanner: Hokuyo UTM-30LX."""
+
+EUROC = "Burri et al., The EuRoC micro aerial vehicle datasets, IJRR 2016, imu0/sensor.yaml of its ADIS16448"
+MEMS_IMU = _preset(
+    Gyro2D,
+    sigma_radps=(0.0, "none beside the density"),
+    sigma_rad_per_sqrt_s=(1.6968e-4, f"{EUROC}: gyroscope_noise_density 1.6968e-04 rad/s/sqrt(Hz)"),
+    sigma_bias_radps=(math.radians(0.5), "assumption: half a degree a second when it is switched on"),
+    sigma_bias_radps_per_sqrt_s=(1.9393e-5, f"{EUROC}: gyroscope_random_walk 1.9393e-05 rad/s^2/sqrt(Hz)"),
+    rate_hz=(200.0, f"{EUROC}: rate_hz 200"),
+    dropouts=(0.0, "assumption: none, it is read by wire"),
+)
+"""The gyroscope of a MEMS inertial unit: ADIS16448."""
+
+F9P = "u-blox, ZED-F9P data sheet UBX-17051259"
+RTK_RECEIVER = _preset(
+    Gps2D,
+    sigma_m=(
+        0.01 / math.sqrt(2.0 * math.log(2.0)),
+        f"{F9P}: RTK 0.01 m + 1 ppm CEP, near its base; half of a Gaussian is within 1.177 sigmas",
+    ),
+    rate_hz=(1.0, "assumption: one position a second, as u-blox receivers are set when they are new"),
+    dropouts=(0.0, "assumption: none under an open sky; where the ambiguities are not fixed it is worse"),
+)
+"""A satellite receiver with corrections of a base (RTK) that has fixed its ambiguities: u-blox ZED-F9P."""
+
+BURGER = "ROBOTIS, TurtleBot3 e-Manual, Burger"
+WHEEL_ENCODER = _preset(
+    Speed,
+    sigma_mps=(
+        0.01 * 0.22,
+        f"assumption: slip of 1 % at 0.22 m/s, the greatest speed ({BURGER}); its encoders of 4096 steps a turn, read "
+        "20 times a second on wheels of 33 mm, add 0.3 mm/s",
+    ),
+    sigma_scale=(0.02, "assumption: 0.7 mm of the radius of the wheels, 33 mm"),
+    rate_hz=(20.0, "assumption: 20 Hz, of joint_states in logs of that robot"),
+    dropouts=(0.0, "assumption: none, it is read by wire"),
+)
+"""Wheel encoders of a small robot: TurtleBot3 Burger."""
+
+DEVICES = {
+    "laser_scanner": LASER_SCANNER, "mems_imu": MEMS_IMU, "rtk_receiver": RTK_RECEIVER, "wheel_encoder": WHEEL_ENCODER,
+}  # fmt: skip
+"""Common devices, by their data sheets."""
+ALL = TABLE_2 | DEVICES

@@ -139,8 +139,8 @@ class Expectations:
     those in view).  e (L, m) is the expectation h(x), Z (L, p, p) the covariance that an innovation would have, with
     the noise of the sensor.  E_r (L, p, 3 or 6), E_s and E_p are the Jacobians in the robot's pose, in the mount,
     whether it is in the map or not, and in the parameters of the sensor that are in the map (none: 0 columns).  E_l
-    (L, p, n) is the Jacobian in the landmark.  All are padded with NaN where landmarks differ in size, and NaN of what
-    cannot be expected.
+    (L, p, n) is the Jacobian in the landmark.  Of a sensor that sees its velocity E_s is NaN.  All are padded with NaN
+    where landmarks differ in size, and NaN of what cannot be expected.
     """
 
     robot: str
@@ -189,6 +189,7 @@ class Report:
     come from.  `gaps` are times without controls, up to now, for which the pose was widened.
     `repeats` were found in the map after the scan, and not merged.
     `replaced` is how far, in m, a robot was moved to where the last fixes place it that it did not believe.
+    `standing` is the reading of zero velocity that was added to the event, of a robot that was noticed to stand.
     """
 
     __slots__ = (
@@ -205,6 +206,7 @@ class Report:
         "repeats",
         "replaced",
         "seen_at",
+        "standing",
         "y",
         "z",
     )
@@ -219,6 +221,7 @@ class Report:
         self.gaps: tuple[Gap, ...] = ()
         self.repeats: tuple[Repeat, ...] = ()
         self.replaced = 0.0
+        self.standing: Observation | None = None
         self.compared: Compared | None = None
         self.seen_at: Array = NOTHING
         self.y = y

@@ -363,3 +363,12 @@ def test_on_lost_in_the_woods_within_1_m_only_the_invariant_filter_knows_what_it
     assert low < figures["sigma_ratio"] < high
     if estimator == "invariant":
         assert figures["map_difference_sigma"] < 0.2
+
+
+@pytest.mark.parametrize(("name", "used"), [("compass_and_gyro", {"lidar"}), ("radar", set())])
+def test_readings_of_the_state_and_range_rates_are_not_in_the_batch_solution(name: str, used: set[str]) -> None:
+    world = load_world(name, ["steps=60"])
+    log = simulate(world, seed=1)
+    run = record(build_slam(world.config(), log), log, progress=False)
+    assert set(run.history.sensor.tolist()) > used
+    assert set(given_by(run).associations.sensor.tolist()) == used

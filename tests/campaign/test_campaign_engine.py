@@ -106,6 +106,12 @@ def test_a_run_has_the_numbers_of_the_ordinary_path(case: str, tmp_path: Path) -
         ("cloister", ["robots.robot.sensing={lidar: {outliers: 0.1}}"], "invariant", "no outliers"),
         ("cloister", ["filter={landmarks: {type: polar}}"], "invariant", "points with known ids"),
         ("cloister", ["filter={map: {type: postponed}}"], "invariant", "dense maps"),
+        (
+            "loop_b2",
+            ["robots.robot.route={type: constant, u: [0.25, 0.0, 0.025], stop_s: 3.0}"],
+            "invariant",
+            "stands still",
+        ),
     ],
 )
 def test_what_the_engine_does_not_run_is_said(name: str, overrides: list[str], estimator: str, why: str) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import results_space
+from kalmark.config import build_slam, config_dict
 from kalmark.errors import DivergedError
 from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.logs.log import Log
@@ -19,6 +20,7 @@ from kalmark.models.sensors import Bearing, RangeBearing
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
+from kalmark.simulate import load_world, simulate
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 from results_space import spiral
@@ -251,3 +253,10 @@ def test_measurements_outside_the_image_are_noticed() -> None:
     history = replace(run.history, cameras=(camera._replace(size=(320.0, 240.0)),))
     (line,) = replace(run, history=history, summary={}).evaluate()["warnings"]
     assert line.endswith("of camera eye lie outside its image of 320 x 240 pixels: set width_px and height_px")
+
+
+def test_a_sensor_that_notices_that_its_robot_stands_needs_no_observations() -> None:
+    world = load_world("stop_and_go", ["steps=60"])
+    log, config = simulate(world, seed=1), world.config()
+    run = record(build_slam(config, log), log, config=config_dict(config), progress=False)
+    assert not [line for line in run.evaluate()["warnings"] if "still" in line]

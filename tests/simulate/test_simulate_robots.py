@@ -14,6 +14,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, scan_many, to_frame_many
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
+from kalmark.simulate.robots import simulation
 from kalmark.simulate.sights import gaussian
 
 
@@ -192,3 +193,13 @@ def test_a_simulated_log_is_written_and_read_back(tmp_path: Path) -> None:
     assert all(a.t_ns == b.t_ns and type(a) is type(b) for a, b in zip(log, back, strict=True))
     assert all((a.y == b.y).all() and a.ids == b.ids for a, b in zip(scans(log), scans(back), strict=True))
     assert (back.truth["beta"].poses == log.truth["beta"].poses).all()
+
+
+def test_a_constant_route_stops_as_often_and_as_long_as_it_says() -> None:
+    world = load_world("stop_and_go", ["steps=600"])
+    ((_, states),) = simulation(world, seed=1).states.items()
+    way = np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1)
+    stood = way < 1e-12
+    assert [*stood[:150]] == [False] * 150
+    assert [*stood[150:300]] == [True] * 150
+    assert not stood[300:450].any()

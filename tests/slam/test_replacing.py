@@ -15,13 +15,19 @@ from kalmark.geometry.frames import compose
 R = 0.25 * np.eye(2)
 
 
+ARM = np.array([2.0, 0.7, 0.0])
+
+
 def rover() -> km.Robot:
-    lidar = km.Mount(km.sensors.RangeBearing(0.1, 0.02))
-    return km.Robot("r", motion=km.motion.Odometry2D(), sensors={"lidar": lidar}, cov=np.diag([0.01, 0.01, 0.001]))
+    sensors = {"lidar": km.Mount(km.sensors.RangeBearing(0.1, 0.02)), "gps": km.Mount(km.sensors.Gps2D(0.5), at=ARM)}
+    return km.Robot("r", motion=km.motion.Odometry2D(), sensors=sensors, cov=np.diag([0.01, 0.01, 0.001]))
 
 
-def driven(steps: int, moved: Any, seed: int = 0) -> tuple[km.Slam, Array, list[Any]]:
-    """Drive a circle with fixes; after half of the steps the robot is carried to another place, `moved`."""
+def driven(steps: int, moved: Any, seed: int = 0, sensor: bool = False) -> tuple[km.Slam, Array, list[Any]]:
+    """Drive a circle with fixes; after half of the steps the robot is carried to another place, `moved`.
+
+    With `sensor` the fixes are readings of an antenna.
+    """
     rng, slam, x, reports = np.random.default_rng(seed), km.Slam(rover()), np.zeros(3), []
     for k in range(1, steps + 1):
         u = np.array([0.5, 0.0, 0.05])
@@ -29,8 +35,9 @@ def driven(steps: int, moved: Any, seed: int = 0) -> tuple[km.Slam, Array, list[
         if k == steps // 2:
             x = compose(np.array(moved), x)[0]
         slam.process(km.Control(0.5 * k, "r", u + rng.normal(0, [0.01, 0.0, 0.01])))
-        y = x[:2] + rng.normal(0, 0.5, 2)
-        reports.append(slam.process(km.Fix(0.5 * k, "r", y, R)))
+        y = compose(x, ARM if sensor else np.zeros(3))[0][:2] + rng.normal(0, 0.5, 2)
+        fix = km.Scan(0.5 * k, "r", "gps", [y]) if sensor else km.Fix(0.5 * k, "r", y, R)
+        reports.append(slam.process(fix))
     return slam, x, reports
 
 
@@ -44,9 +51,10 @@ def test_one_wild_fix_moves_nothing() -> None:
     np.testing.assert_array_equal(slam.covariance("r"), P)
 
 
+@pytest.mark.parametrize("sensor", [False, True], ids=["fixes", "antenna"])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_robot_that_was_carried_away_is_placed_by_the_fixes_that_agree(seed: int) -> None:
-    slam, truth, reports = driven(80, (40.0, -25.0, 1.2), seed)
+def test_a_robot_that_was_carried_away_is_placed_by_the_fixes_that_agree(seed: int, sensor: bool) -> None:
+    slam, truth, reports = driven(80, (40.0, -25.0, 1.2), seed, sensor)
     moved = [report.replaced for report in reports if report.replaced]
     assert len(moved) == 1
     assert moved[0] > 10

@@ -59,7 +59,7 @@ def average(scan: ScanContext, decisions: Sequence[Decision]) -> Average | None:
     likeliest = np.maximum(numbers[np.argmax(numbers >= 0, axis=0), np.arange(len(mixture.rows))], 0)
     R = np.ascontiguousarray(scan.noise(model, slots[likeliest], mixture.rows))
     y = scan.y[mixture.rows]
-    update = Update(model.model, scan.robot, scan.channel.mount, slots, model.d, y, R)
+    update = Update(model.model, scan.robot, scan.channel.second(scan.robot), slots, model.d, y, R)
     return Average(mixture.rows, names, numbers, weights, update)
 
 

@@ -72,7 +72,7 @@ class Query:
             around = scan.pose()[None, : scan.dimensions]
             return tracks.observable(channel) + self._known.near(channel.models, around, AROUND)
         sorts = tracks.sorts_of(channel.kinds, len(scan.map.blocks))
-        self._pairs = scan.map.pairs(sorts, scan.robot, channel.mount, places, nearest, farther)
+        self._pairs = scan.map.pairs(sorts, scan.robot, channel.second(scan.robot), places, nearest, farther)
         self._names = [tracks.names[slot] for slot in self._pairs.slots.tolist()]
         if len(self._known):
             names = self._names + self._known.near(channel.models, places, nearest)
@@ -87,7 +87,7 @@ class Query:
         """Return the joint marginal of robot, mount and landmarks, those known exactly among them."""
         scan = self.scan
         mapped = [name for name in names if name not in self._known]
-        read = scan.map.marginal(scan.robot, scan.channel.mount, scan.tracks.slots_of(mapped))
+        read = scan.map.marginal(scan.robot, scan.channel.second(scan.robot), scan.tracks.slots_of(mapped))
         if len(mapped) == len(names):
             return read
         known = [name for name in names if name in self._known]

@@ -87,7 +87,7 @@ def refusal(world: Any, configs: Mapping[str, Config]) -> str:
         why = "the batched engine simulates no outliers, swapped or hidden ids"
     if not why and not isinstance(simulated.route, Constant | Drive):
         why = f"the batched engine does not drive a {type(simulated.route).__name__}"
-    if not why and isinstance(simulated.route, Constant) and not any(simulated.route.u):
+    if not why and isinstance(simulated.route, Constant) and (simulated.route.stop_s or not any(simulated.route.u)):
         why = "the batched engine has no robot that stands still"
     if not why and not world.ids:
         why = "the batched engine needs known ids"

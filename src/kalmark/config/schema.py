@@ -26,7 +26,7 @@ from kalmark.config.sections import (
     section_of,
 )
 from kalmark.config.tree import OVERRIDE, name_of
-from kalmark.declare import classes, register
+from kalmark.declare import classes, register, registered_name
 from kalmark.errors import ConfigError
 from kalmark.geometry.rotations import from_euler
 from kalmark.models.protocols import state_columns
@@ -43,7 +43,6 @@ Topic = Annotated[Any, Choice("topic")]
 
 Plugins = Annotated[tuple[str, ...], Field(strict=False)]
 
-_UNITS = {"range": "m", "bearing": "rad"}
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
 _PLANE_FOR_SPACE = "a key of the plane for a robot of space"
 STATES = {
@@ -187,6 +186,11 @@ class Immediate:
     """
 
 
+Preset = Literal[
+    "laser", "sonar", "camera", "rgbd", "arva", "rfid", "laser_scanner", "mems_imu", "rtk_receiver", "wheel_encoder"
+]
+
+
 class Mounted(ModelSection):
     """What every sensor has, whatever its type; and a `mount`, see below."""
 
@@ -202,6 +206,21 @@ class Mounted(ModelSection):
     """How landmarks are found in raw scans: one that finds what the sensor measures."""
     robust: Literal["huber", "student"] | None = None
     """How outliers count less: bounded, or hardly at all.  All observations count in full if absent."""
+    preset: Preset | None = None
+    """Take what is not given from a documented sensor of this type: see presets.md."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_from_preset(cls, value: Any) -> Any:
+        from kalmark import presets
+
+        if not isinstance(value, dict) or str(value.get("preset")) not in presets.ALL:
+            return value
+        preset = presets.ALL[value["preset"]]
+        if cls.of_name != (name := registered_name(type(preset.sensor))):
+            raise expected(f"a preset of this type of sensor: {value['preset']} is a {name}", "preset")
+        of_it = {key: getattr(preset.sensor, key) for key in preset.sources if key in cls.model_fields}
+        return of_it | value
 
 
 class PlaneMounted(Mounted):
@@ -211,22 +230,6 @@ class PlaneMounted(Mounted):
     """Start landmarks at first sight, or late; late ones are points."""
     mount: MountConfig = MountConfig()
     """Where the sensor sits on the robot."""
-    preset: Literal["laser", "sonar", "camera", "rgbd", "arva", "rfid"] | None = None
-    """Take what is not given from a documented sensor: camera for bearing, arva for range, others for range_bearing."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _take_from_preset(cls, value: Any) -> Any:
-        from kalmark import presets
-
-        if not isinstance(value, dict) or str(value.get("preset")) not in presets.ALL:
-            return value
-        sensor = presets.ALL[value["preset"]].sensor
-        measured = [part for part, unit in _UNITS.items() if f"{part}_{unit}" in sensor.columns]
-        fits = all((f"sigma_{part}_{unit}" in cls.model_fields) == (part in measured) for part, unit in _UNITS.items())
-        if not fits:
-            raise expected(f"a preset of this type of sensor: {value['preset']} is a {'_'.join(measured)}", "preset")
-        return vars(sensor) | value
 
 
 class SpaceMounted(Mounted):

@@ -41,7 +41,7 @@ OBSERVATION = (
 )  # fmt: skip
 READING = (  # of a robot itself by its own sensors, and of senders
     "heading_rad", "theta_rad", "rssi_dbm", "difference_m", "roll_rad", "pitch_rad",
-    "speed_mps",
+    "speed_mps", "range_rate_mps",
 )  # fmt: skip
 CANONICAL = (*CONTROL, *OBSERVATION, *READING)
 """The order in which known columns make a control or an observation, whatever their order in the file."""

@@ -144,7 +144,7 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
     if isinstance(model, protocols.NonAdditiveSensor) and not model.additive:
         found.covariance("noise_at", model.noise_at(v), p, {"v": v})
     if "invert" in dir(model):
-        _inverse(model, y, view, measured, found)
+        _inverse(model, y, view, measured, found, v if isinstance(model, protocols.SeesVelocity) else None)
     if isinstance(model, protocols.Calibrated) and len(model.parameters):
         a = np.tile(model.parameters, (len(v), 1))
         own = Rn(a.shape[1])
@@ -165,11 +165,17 @@ def _changing(model: Any, v: Array, y: Array) -> Any:
     return -type(model).expected(model.code, np.array(model.parameters), angular, np.ascontiguousarray(v), y)[1]
 
 
-def _inverse(model: Any, y: Array, view: Space, measured: Space, found: _Findings) -> None:
-    """Check what a sensor starts landmarks from: a view, a ray or the two rays of a line."""
+def _inverse(
+    model: Any, y: Array, view: Space, measured: Space, found: _Findings, moving: Array | None
+) -> None:  # fmt: skip
+    """Check what a sensor starts landmarks from: a view, a ray or the two rays of a line.
+
+    Of a sensor that sees its velocity, that is the first half of the views `moving` (K, 2 d).
+    """
     sized = model.columns[-1] == "size_m"  # a tag, found by iterations; its size has no error,
     exact = sized + sum(name in ("right_m", "left_m") for name in model.columns)  # nor have the ends of a wall
     back, V_y = model.invert(y)
+    view = view if moving is None else Rn(view.size // 2)
     d, k, n = view.size, np.shape(back)[1], y.shape[1] - exact
     segment = exact and not sized
     if k not in ((d,) if protocols.finds_depth(model) and not segment else (d, d - 1, 2 * d)):
@@ -188,6 +194,7 @@ def _inverse(model: Any, y: Array, view: Space, measured: Space, found: _Finding
     found.jacobian("V_y", V_y, inverted, y[:, :n], of, to, {"y": y})
     if k != 2 * d:
         whole = np.column_stack([back, np.ones(len(back))]) if k == d - 1 else back  # a ray, at any distance
+        whole = whole if moving is None else np.column_stack([whole, moving[kept][:, d:]])
         found.same("expect(invert(y)) = y", _expect(model, whole, y)[0], y, measured, {"y": y})
 
 
@@ -205,7 +212,10 @@ def views(model: Any, rng: Rng) -> tuple[Array, Space]:
     if d == 4:
         v[:, 3] = rng.uniform(0.01, 1, len(v))  # an inverse distance
     seen = v[model.sees(v)] if isinstance(model, protocols.Visible) and "sees_segments" not in dir(model) else v
-    return (seen if len(seen) else v)[:DRAWS], Rn(d)
+    seen = (seen if len(seen) else v)[:DRAWS]
+    if isinstance(model, protocols.SeesVelocity):
+        seen, d = np.column_stack([seen, rng.normal(0, 1, seen.shape)]), 2 * d
+    return seen, Rn(d)
 
 
 def _views_of_state(model: Any, rng: Rng) -> tuple[Array, Space]:

@@ -14,6 +14,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.compiled import address_of, compiled
 from kalmark.models.observe import LINEARIZE, MOUNT, View, linearize_in_plane, linearize_in_space
+from kalmark.models.velocity_view import linearize_moving
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ def known_view(view: Any) -> Any:
     """Return the argument of `linearize` for landmarks known exactly, of the one for landmarks of the map."""
     if not isinstance(view, tuple):
         return KnownView(view)
-    linearize = linearize_known_in_plane if len(view[MOUNT]) == 3 else linearize_known_in_space
+    of_mount = {3: linearize_known_in_plane, 7: linearize_known_in_space}
+    linearize = of_mount.get(len(view[MOUNT]), linearize_known_moving)  # of a mount with a mark behind it
     return address_of(linearize, LINEARIZE), *view[1:]
 
 
@@ -79,4 +81,12 @@ def linearize_known_in_space(view: View, head: Array, l: Array, y: Array) -> tup
     """Return e (K, m + n), z (K, p), E_h (K, p, h) and E_l (K, p, 0) in space; y (K, m + n), l (K, 0)."""
     measured, known = split(y, len(view[6]))
     e, z, E_h, _E_l = linearize_in_space(view, head, known, measured)
+    return completed(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))
+
+
+@compiled
+def linearize_known_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return e (K, m + n), z (K, p), E_h (K, p, h), E_l (K, p, 0) of a sensor that sees its velocity; y (K, m + n)."""
+    measured, known = split(y, len(view[6]))
+    e, z, E_h, _E_l = linearize_moving(view, head, known, measured)
     return completed(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))

@@ -187,16 +187,30 @@ def sensor_address(axes: int) -> int:
 
 @compiled
 def _sensor_in_plane(mount: Array, head: Array) -> tuple[Array, Array]:
-    """Return the position S (2,) of a mount on a robot, and S_h (2, h); h is the pose and, if in the map, the mount."""
-    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 else mount)
-    return _position(T, T_r, T_s, 2, len(head))
+    """Return the position S (2,) of a mount on a robot, and S_h (2, h); h is the pose and, if in the map, the mount.
+
+    Of a mount with a mark behind it (`velocity_view.py`) h is the pose and a state that it does not depend on.
+    """
+    marked = len(mount) > 3
+    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 and not marked else mount[:3])
+    S, S_h = _position(T, T_r, T_s, 2, len(head))
+    if marked:
+        S_h[:, 3:] = 0.0
+    return S, S_h
 
 
 @compiled
 def _sensor_in_space(mount: Array, head: Array) -> tuple[Array, Array]:
-    """Return the position S (3,) of a mount on a robot, and S_h (3, h); h is the pose and, if in the map, the mount."""
-    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 else mount)
-    return _position(T, T_r, T_s, 3, len(head))
+    """Return the position S (3,) of a mount on a robot, and S_h (3, h); h is the pose and, if in the map, the mount.
+
+    Of a mount with a mark behind it (`velocity_view.py`) h is the pose and a state that it does not depend on.
+    """
+    marked = len(mount) > 7
+    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 and not marked else mount[:7])
+    S, S_h = _position(T, T_r, T_s, 3, len(head))
+    if marked:
+        S_h[:, 6:] = 0.0
+    return S, S_h
 
 
 @compiled

@@ -322,6 +322,16 @@ class Calibrated(Parametrized, Protocol):
         """Return E_p (K, m, p): how the measurements of v (K, d) change with the parameters."""
 
 
+@runtime_checkable
+class SeesVelocity(Protocol):
+    """A sensor of landmarks that stand still, whose measurements depend on its own velocity, too.
+
+    Its v (K, 2 d) are points and, behind them, the velocity of the sensor, both in its frame (`velocity_view.py`).
+    """
+
+    sees_velocity: bool
+
+
 POSE, CHANGE, TWIST = "pose", "change", "twist"  # the views of a sensor of the state, see `models/state_view.py`
 
 
@@ -502,7 +512,7 @@ _OF: dict[type, tuple[type, ...]] = {
     Sensor: (
         FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
         _InnovationSize, _NamesParameters, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous,
-        FarCorrected, OwnNoise, StartNoise, Checked, OfState, TimedNoise, Drifting,
+        FarCorrected, OwnNoise, StartNoise, Checked, SeesVelocity, OfState, TimedNoise, Drifting,
     ),
     Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Joining, Placed),
 }  # fmt: skip

@@ -21,6 +21,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import by_address, compiled, signature_of
+from kalmark.errors import EventError
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.directions import spherical_many
 from kalmark.models import cameras, landmarks3d, lines, tags
@@ -153,3 +154,11 @@ def residual(y: Array, e: Array, angular: Flags) -> Array:
             for i in range(len(z)):
                 z[i, j] = wrap(z[i, j])
     return z
+
+
+def refuse_negative_ranges(y: Array) -> None:
+    """Refuse measurements y (K, m) whose first component, a range, is negative."""
+    ranges = y[:, 0].tolist()
+    if min(ranges, default=0.0) < 0:
+        i, value = next((i, value) for i, value in enumerate(ranges) if value < 0)
+        raise EventError(f"observation {i}: range is {value} m, expected at least 0")

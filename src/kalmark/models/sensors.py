@@ -21,7 +21,9 @@ from kalmark.geometry.directions import inv_spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import cameras, lines, seen, tags, walls
+from kalmark.models.doppler import Radar2D, Radar3D, RangeRate2D, RangeRate3D
 from kalmark.models.radio import RangeDifference2D, RangeDifference3D, SignalStrength2D, SignalStrength3D
+from kalmark.models.seen import refuse_negative_ranges
 from kalmark.models.state_sensors import (
     AbsolutePose2D,
     AbsolutePose3D,
@@ -39,14 +41,17 @@ from kalmark.models.state_sensors import (
     Odometer2D,
     Odometer3D,
     Speed,
+    ZeroVelocity2D,
+    ZeroVelocity3D,
 )
 
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "Bearing", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity",
     "GroundSpeed", "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D",
-    "Omnidirectional", "PinHole", "Position2D", "Position3D", "Range", "RangeBearing", "RangeBearing3D",
-    "RangeBearingSignature", "RangeDifference2D", "RangeDifference3D", "Segments",
-    "SignalStrength2D", "SignalStrength3D", "Speed", "Stereo", "TagCorners", "TagPose", "Wall",
+    "Omnidirectional", "PinHole", "Position2D", "Position3D", "Radar2D", "Radar3D", "Range", "RangeBearing",
+    "RangeBearing3D", "RangeBearingSignature", "RangeDifference2D", "RangeDifference3D", "RangeRate2D", "RangeRate3D",
+    "Segments", "SignalStrength2D", "SignalStrength3D", "Speed", "Stereo", "TagCorners", "TagPose", "Wall",
+    "ZeroVelocity2D", "ZeroVelocity3D",
 ]  # fmt: skip
 
 TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed
@@ -74,14 +79,6 @@ def _cached(variances: tuple[float, ...], count: int) -> Array:
 def constant(variances: tuple[float, ...], count: int) -> Array:
     """Return `count` copies of a diagonal covariance (count, m, m)."""
     return _cached(variances, count).copy()
-
-
-def refuse_negative_ranges(y: Array) -> None:
-    """Refuse measurements y (K, m) whose first component, a range, is negative."""
-    ranges = y[:, 0].tolist()
-    if min(ranges, default=0.0) < 0:
-        i, value = next((i, value) for i, value in enumerate(ranges) if value < 0)
-        raise EventError(f"observation {i}: range is {value} m, expected at least 0")
 
 
 @compiled

@@ -25,7 +25,8 @@ from kalmark.models.seen import residual
 
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
-    "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D", "Speed",
+    "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D", "Speed", "ZeroVelocity2D",
+    "ZeroVelocity3D",
 ]  # fmt: skip
 
 STILL_MPS = 1e-6  # a ground speed below which its direction means nothing
@@ -54,6 +55,15 @@ def place(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Ar
     e, E_v = v[:, :d].copy(), np.zeros((1, d, 3 if v.shape[1] == 3 else 6))
     for i in range(d):
         E_v[0, i, i] = 1.0
+    return e, y - e, E_v
+
+
+@compiled
+def antenna(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the position of a pose v (1, 3) or (1, 7), with the bias `par` (d,)."""
+    e, _z, E_v = place(code, par, angular, v, y)
+    for i in range(e.shape[1]):
+        e[0, i] += par[i]
     return e, y - e, E_v
 
 
@@ -286,27 +296,50 @@ class Heading(StateSensor):
 @declared
 class _Gps(StateSensor):
     sigma_m: Annotated[Positive, "Noise of each coordinate."] = 1.0
+    _: KW_ONLY
+    sigma_bias_m: Annotated[
+        NotNegative, "Standard deviation of an error that lasts, at first; above 0 it is in the map and is estimated."
+    ] = 0.0
+    sigma_bias_m_per_sqrt_s: Annotated[
+        NotNegative, "Random walk of an error that lasts; above 0 it is in the map and is estimated."
+    ] = 0.0
 
     views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = place
+    expected: ClassVar[Any] = antenna
+    varied: ClassVar[Any] = plus
 
 
 @register("sensor", "gps")
 class Gps2D(_Gps):
     """The position of an antenna, at its mount, in the map's frame: GPS, a total station, a beacon system."""
 
+    _: KW_ONLY
+    bias_x_m: Bias = 0.0
+    bias_y_m: Bias = 0.0
+
     world: ClassVar[str] = "plane"
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 2
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
+        (f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xy"
+    )
 
 
 @register("sensor", "gps")
 class Gps3D(_Gps):
     """The position of an antenna, at its mount, in the map's frame."""
 
+    _: KW_ONLY
+    bias_x_m: Bias = 0.0
+    bias_y_m: Bias = 0.0
+    bias_z_m: Bias = 0.0
+
     world: ClassVar[str] = "space"
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 3
+    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
+        (f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xyz"
+    )
 
 
 @register("sensor", "absolute_pose")
@@ -534,6 +567,44 @@ class GroundSpeed(StateSensor):
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",)
     views: ClassVar[str] = TWIST
     expected: ClassVar[Any] = ground_speed
+
+
+@declared
+class _ZeroVelocity(StateSensor):
+    window_s: Annotated[Positive, "Time over which a robot must stand to be noticed."] = 1.0
+    _: KW_ONLY
+    slowest_mps: Annotated[Positive, "The slowest motion that is not to be taken for standing."] = 0.05
+    slowest_radps: Annotated[Positive, "The slowest turn that is not to be taken for standing."] = 0.05
+    false_alarm: Annotated[Probability, "Share of windows in which so slow a motion is taken for standing."] = 0.001
+    sigma_mps: Annotated[Positive, "Velocity of a robot that stands, on each axis."] = 0.005
+    sigma_radps: Annotated[Positive, "Turn rate of a robot that stands, about each axis."] = 0.005
+
+    views: ClassVar[str] = TWIST
+    expected: ClassVar[Any] = place
+
+
+@register("sensor", "zero_velocity")
+class ZeroVelocity2D(_ZeroVelocity):
+    """No sensor but what is noticed of the others: that the robot stands, which is a reading of zero velocity.
+
+    It has no rows in a log; rows that it has are readings, of a brake for example.  docs/state_sensors.md.
+    """
+
+    world: ClassVar[str] = "plane"
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "w_radps")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps", "sigma_mps", "sigma_radps")
+
+
+@register("sensor", "zero_velocity")
+class ZeroVelocity3D(_ZeroVelocity):
+    """No sensor but what is noticed of the others: that the robot stands, which is a reading of zero velocity.
+
+    It has no rows in a log; rows that it has are readings, of a brake for example.  docs/state_sensors.md.
+    """
+
+    world: ClassVar[str] = "space"
+    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    sigmas: ClassVar[tuple[str, ...]] = (*("sigma_mps",) * 3, *("sigma_radps",) * 3)
 
 
 # ------------------------------------------------------------------ of the way since the last reading

@@ -146,7 +146,7 @@ def carried_in_space(t: Array, T_l: Array, s: Array) -> Chain:
     return v, np.zeros((6, 6)), V_s, V_t @ T_l
 
 
-_CHAINS: dict[tuple[str, bool], tuple[Any, Any]] = {  # by view, and whether it is of the state: in plane and space
+CHAINS: dict[tuple[str, bool], tuple[Any, Any]] = {  # by view, and whether it is of the state: in plane and space
     (POSE, False): (pose_in_plane, pose_in_space),
     (CHANGE, False): (change_in_plane, change_in_space),
     (TWIST, False): (mean_twist_in_plane, mean_twist_in_space),
@@ -203,7 +203,7 @@ class PythonStateView:
             carried: Any = carried_in_plane if pose == 3 else carried_in_space
             v, V_r, V_s, V_l = carried(*self.motion.body_velocity(l[0]), np.array(mount))
         else:
-            chain = _CHAINS[sensor.views, False][pose != 3]
+            chain = CHAINS[sensor.views, False][pose != 3]
             v, V_r, V_s, V_l = chain(head[:pose].copy(), np.array(mount), l[0].copy(), float(y[0, -1]), 0)
         expected, E_v = sensor.expect(v[None])
         e = y.copy()
@@ -223,7 +223,7 @@ def state_view_of(sensor: OfState, motion: Any, mount: Array) -> Any:
     if type(sensor) not in built_in("sensor") or (of_state and type(motion) not in built_in("motion")):
         return PythonStateView(sensor, motion, mount, angular)
     of: Any = sensor
-    chain = _CHAINS[of.views, of_state][len(mount) != 3]
+    chain = CHAINS[of.views, of_state][len(mount) != 3]
     return (
         address_of(linearize_state, LINEARIZE),
         address_of(chain, CHAIN),
@@ -248,4 +248,4 @@ def view_of_state(sensor: OfState, motion: Any, mount: Array, state: Array, befo
         carried: Any = carried_in_plane if pose == 3 else carried_in_space
         v: Array = carried(*motion.body_velocity(state), mount)[0]
         return v
-    return _CHAINS[sensor.views, False][pose != 3](state[:pose].copy(), mount, before, since_s, 0)[0]
+    return CHAINS[sensor.views, False][pose != 3](state[:pose].copy(), mount, before, since_s, 0)[0]

@@ -24,7 +24,7 @@ from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.logs.progress import track
 from kalmark.models.landmarks import Point2D, Point3D, Tag
-from kalmark.models.protocols import Landmark
+from kalmark.models.protocols import Landmark, OfState, SeesVelocity
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.history import History, as_id
@@ -153,7 +153,8 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
     )
     ids = {str(id_): id_ for id_ in landmarks} | {name: name for name in robots}
     fused = np.flatnonzero(history.fused)
-    rows = fused if rows is None else rows
+    rows = _of_places(history, slam, fused if rows is None else rows)
+    fused = _of_places(history, slam, fused)
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
     started = {name for row, name in names.items() if history.outcome[row] != "associated"}
     beforehand = {ids.get(str(name), name): prior for name, prior in {**_surveyed(history), **(known or {})}.items()}
@@ -196,6 +197,19 @@ def _surveyed(history: History) -> Known:
         and prior.landmark not in gone
     ]
     return {as_id(prior.landmark): (prior.mean, prior.covariance) for prior in points}
+
+
+def _of_places(history: History, slam: Slam, rows: Index) -> Index:
+    """Return those rows of the history that say where landmarks or other robots are, seen from a pose alone.
+
+    Readings of the state do not, nor do range rates.
+    """
+    mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
+    others = {key for key, mount in mounted.items() if isinstance(mount.sensor, SeesVelocity | OfState)}
+    if not others:
+        return rows
+    keys = zip(history.robot[history.step[rows]].tolist(), history.sensor[rows].tolist(), strict=True)
+    return rows[np.array([key not in others for key in keys], dtype=np.bool_)]
 
 
 def _in_the_end(history: History, rows: Index) -> list[str]:

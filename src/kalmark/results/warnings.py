@@ -58,6 +58,7 @@ LOW = 0.5  # squares of innovations over those of the stated noise: it is 1.4 ti
 TINY_NIS = 0.1
 TINY = 1e-6  # of those squares, where a log has no noise
 NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
+NOTICES = registered_name(sensors.ZeroVelocity2D)  # a sensor that needs no observations
 COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 
 
@@ -301,8 +302,9 @@ def _sensors(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         if key == "each" and run.log.robots and not mine:
             yield "robots.each of the configuration stands for no robot of the log: each one is named"
         used = sorted({sensor for robot, sensor in seen if robot in mine})
-        for name in (given or {}).get("sensors") or {} if mine else ():
-            if name not in used:
+        configured: Mapping[str, Any] = (given or {}).get("sensors") or {}
+        for name, section in configured.items() if mine else ():
+            if name not in used and (section or {}).get("type") != NOTICES:
                 near = get_close_matches(name, used, n=1, cutoff=0.5)
                 hint = f"; did you mean {near[0]}?" if near else ""
                 yield f"no observation is by the sensor {name} of {', '.join(mine)}, which is configured{hint}"

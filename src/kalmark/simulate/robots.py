@@ -28,8 +28,10 @@ from kalmark.models.observe import composed
 from kalmark.models.protocols import (
     POSE,
     Drifting,
+    HasVelocity,
     OfState,
     Ranging,
+    SeesVelocity,
     TimedNoise,
     calibrating,
     coasts,
@@ -38,7 +40,9 @@ from kalmark.models.protocols import (
     range_limit,
     true_control,
 )
+from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, view_of_state
+from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
@@ -58,7 +62,7 @@ class SimSensor:
     at: Array
     sensing: Sensing
     laser: Laser | None = None
-    last: tuple[int, Array] | None = None  # step and robot's pose of the last reading of a sensor of the state
+    last: tuple[int, Array] | None = None  # step and robot's pose of the last reading or scan
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -260,7 +264,7 @@ def scans(
     """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
     found: list[tuple[Scan, tuple[Id | None, ...]]] = []
     for name, carried in robot.sensors.items():
-        if not carried.sensing.scans_at(k):
+        if not carried.sensing.scans_at(k) or isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
             continue
         if carried.laser is not None:
             y = laser.beams(carried.laser, carried.sensing, composed(robot.pose, carried.at)[0], things, chance.sight)
@@ -275,15 +279,26 @@ def scans(
             continue
         sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
-        sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight)
+        t = np.zeros(0)
+        if isinstance(sensor, SeesVelocity):  # of what stands still
+            t, others = moving_at(robot, carried, k, world.dt_s), {}
+        sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight, t)
         sighted, real = sights.faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
         y = sights.noisy(sensor, sighted.e, chance.sight)
         kept = sights.possible(sensor, y)
         if len(kept):
             told = [sighted.ids[i] for i in kept] if world.ids else None
             scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=told)
+            carried.last = k, robot.pose.copy()
             found.append((scan, tuple(real[i] for i in kept)))
     return found
+
+
+def moving_at(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:
+    """Return the velocity (2 or 3,) of a sensor at step k in its frame, or the mean since its last scan."""
+    k_before, before = carried.last or (0, robot.states[0][: len(robot.pose)])
+    state = robot.state if isinstance(robot.motion, HasVelocity) else np.array(before)
+    return velocity_of(robot.motion, carried.at, robot.pose, state, (k - k_before) * dt_s)[0]
 
 
 def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Chance) -> Array | None:
@@ -308,10 +323,16 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
     return SE3.plus(e[0], error)[None]  # a pose of space has more numbers than errors
 
 
-def seen_by(sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator) -> Sighted:
-    """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last."""
+def seen_by(
+    sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator, velocity: Array
+) -> Sighted:  # fmt: skip
+    """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last.
+
+    `velocity` is that of a sensor that sees it, in its frame, of others empty.
+    """
     near = things.near(T[: world.dimensions], range_limit(sensor))
     v = in_frame(things.sort, T, things.values[near])
+    v = np.column_stack([v, np.tile(velocity, (len(v), 1))])
     inside, e = sights.exact(sensor, v, things.sizes[near])
     near, v, e = near[inside], v[inside], e[inside]
     distance = np.linalg.norm(sights.centre(things.sort, v, world.dimensions), axis=1)

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from pydantic import Field
 
 from kalmark.arrays import Array
-from kalmark.config.sections import Number, OneOf, Positive, Section
+from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian, matrix
 from kalmark.models.motion import (
@@ -38,16 +38,24 @@ Driver = Callable[[Array], Array]  # true state -> control of the next step
 
 
 class Constant(Section):
-    """The same control at every step: a circle or a line."""
+    """The same control at every step: a circle or a line, with stops if these take any time."""
 
     type: Literal["constant"] = "constant"
     u: Annotated[tuple[Number, ...], Field(strict=False)]
     """The control, in the motion model's columns."""
+    drive_s: Positive = 10.0
+    """Time between stops."""
+    stop_s: NotNegative = 0.0
+    """Time of a stop, in which the control is zero."""
 
     def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
         """Return the function from a true state (size,) to the control (m,)."""
-        u = np.array(self.u)
-        return lambda state: u
+        u, stop = np.array(self.u), np.zeros(len(self.u))
+        if not self.stop_s:
+            return lambda state: u
+        steps, stops = (max(1, round(time / dt_s)) for time in (self.drive_s, self.stop_s))
+        controls = cycle([u] * steps + [stop] * stops)
+        return lambda state: next(controls)
 
 
 class Drive(Section):

@@ -125,7 +125,10 @@ class Estimate:
                 self.slot(name)
             if self.tracks.sort(name) is None:
                 raise MapError(f"{name!r} is a sensor's mount or a control's bias, expected a landmark or a robot")
-        return expectations(self.map, self.tracks, self.state.channels[robot, sensor], robot, sensor, chosen, in_view)
+        channel = self.state.channels[robot, sensor]
+        if channel.counts and (why := self.state.look_back((robot, sensor))):
+            raise MapError(f"sensor {sensor!r} of {robot!r} expects nothing: {why}")
+        return expectations(self.map, self.tracks, channel, robot, sensor, chosen, in_view)
 
     def slot(self, name: Id) -> int:
         """Return the slot of a robot or landmark in `map`."""

@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 
 from kalmark.errors import MapError
-from kalmark.events import Fix, Scan
+from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Update
 from kalmark.models.observe import fix_view
 from kalmark.report import Judged, Observation, Report
@@ -39,12 +39,30 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         done = done._replace(e=done.e[:, : event.width])
         report.e, report.z, report.Z = done.e, done.z, done.Z
         report.judged = (Judged([0], [None], [event.robot], done, reader.gate),)
+        if reader.is_position:
+            position = replacing.LeftOut(event.y[0], R[0], done.e[0])
+            report.replaced = _believed(state, event.robot, position, done.fused[0])
     if reader.counts:
         with suppress(MapError):  # it is full: the next reading is the first again
             state.clone(key, event.t_ns)
         for slot in state.clones.refer(key, set(state.clones.of(key)) - set(held)):
             state.map.remove(slot)
     return report
+
+
+def stood(state: State, event: Event) -> Observation | None:
+    """Correct by a velocity of zero where a robot is noticed to stand at the end of an event."""
+    key = event.robot, state.standing[event.robot]
+    reader = state.readers[key]
+    assert reader.standing is not None
+    stands = reader.standing.take(event, lambda *sensor: state.readers[sensor].constants(state.map))
+    if stands and reader.t_ns != event.t_ns:
+        zero = Scan(t_ns=event.t_ns, robot=key[0], sensor=key[1], y=np.zeros((1, len(reader.sensor.columns))))
+        return read(state, zero, reader).observations[0]
+    if stands is False:
+        for slot in state.clones.refer(key, ()):  # from where a robot that moves now was
+            state.map.remove(slot)
+    return None
 
 
 def fix(state: State, event: Fix) -> Report:
@@ -60,14 +78,19 @@ def fix(state: State, event: Fix) -> Report:
     done = state.corrected(update, event, state.estimator.for_fixes())
     report.e, report.z, report.Z = done.e, done.z, done.Z
     report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)
-    left_out = state.moving[event.robot].left_out
-    if done.fused[0]:
-        left_out.clear()
-    else:
-        del left_out[: len(left_out) + 1 - replacing.KEPT]
-        left_out.append(replacing.LeftOut(event.y, event.cov, done.e[0]))
-        report.replaced = _replace(state, event.robot)
+    report.replaced = _believed(state, event.robot, replacing.LeftOut(event.y, event.cov, done.e[0]), done.fused[0])
     return report
+
+
+def _believed(state: State, name: str, position: replacing.LeftOut, fused: bool) -> float:
+    """Keep a measured position that was left out; return how far, m, the robot is moved if these agree, 0 if not."""
+    left_out = state.moving[name].left_out
+    if fused:
+        left_out.clear()
+        return 0.0
+    del left_out[: len(left_out) + 1 - replacing.KEPT]
+    left_out.append(position)
+    return _replace(state, name)
 
 
 def _replace(state: State, name: str) -> float:

@@ -73,7 +73,7 @@ def policy_of(
         association, upkeep, mount.attention, mount.detector, _deferred(mount), delayed, _starts(association, upkeep),
         averages(association), upkeep.hold_back and not weighs(association), reviews,
         0.0 if channel.joins else linear or 0.0,
-        upkeep.keep_poses if delayed is None else 0,
+        upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
     )  # fmt: skip
 
 
@@ -101,10 +101,10 @@ def _starts(association: Association, upkeep: Upkeep) -> tuple[Answer, ...]:
 
 
 def channel_of(
-    robots: Mapping[str, Robot], mount: Mount, slot: int, landmarks: Landmark | None, association: Association,
-    estimator: Estimator,
+    robots: Mapping[str, Robot], robot: Robot, mount: Mount, slot: int, landmarks: Landmark | None,
+    association: Association, estimator: Estimator,
 ) -> Channel:  # fmt: skip
-    """Return the channel of a mount whose block is on a slot (-1: none).
+    """Return the channel of a robot's mount whose block is on a slot (-1: none).
 
     Raises ModelError if sensor or landmark are of another world than the robots, or do not fit each other.
     """
@@ -122,7 +122,7 @@ def channel_of(
     def threshold(dof: int) -> float:
         return association.threshold(dof, estimator.default_gate)
 
-    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, mount.robust)
+    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, robot.motion, mount.robust)
 
 
 def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:

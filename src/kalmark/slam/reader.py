@@ -15,22 +15,28 @@ from kalmark.models import protocols
 from kalmark.models.protocols import POSE, Motion, OfState
 from kalmark.models.state_view import sees_state, state_view_of
 from kalmark.slam.checks import measurements
+from kalmark.slam.standing import Standing
 
+POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures where an antenna is
 LEAST_S = 1e-6  # between two readings that tell how the robot moved
 
 
 class Reader:
     """A sensor of the state of a robot that moves by `motion`; `mount` is the slot of its mount, -1 for none.
 
-    `counts`: what it measures counts from its last reading, where a clone of the robot's pose was left.
+    `counts`: what it measures counts from its last reading, where a clone of the robot's pose was left.  `standing`
+    notices of a `zero_velocity` that its robot stands.  `is_position`: as a fix it says where a lost robot is.
     """
 
-    def __init__(self, sensor: OfState, motion: Motion, at: Array, mount: int) -> None:
+    def __init__(
+        self, sensor: OfState, motion: Motion, at: Array, mount: int, standing: Standing | None = None
+    ) -> None:  # fmt: skip
         self.sensor: Any = sensor
         self.at: Array = np.array(at)
-        self.mount, self.motion = mount, motion
+        self.mount, self.motion, self.standing = mount, motion, standing
         self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
+        self.is_position = tuple(sensor.columns) in POSITIONS
         if self.of_state and not np.diagonal(sensor.noise(np.zeros((1, len(sensor.columns))))[0]).all():
             name, wanted = type(sensor).__name__, "a positive number for each component"
             raise ModelError(f"{name}: the noise of one reading is 0, expected {wanted}: the state has the velocity")
@@ -69,6 +75,13 @@ class Reader:
         if self.counts and since_s < LEAST_S:
             raise EventError(f"{when(event)}: {event.sensor!r} was read at that time already, expected one reading")
         return since_s
+
+    def constants(self, map_: Map) -> tuple[Array, Array] | None:
+        """Return the sensor's own constants (c,) in the map and their covariance (c, c), None where it has none."""
+        own = 0 if self.mount < 0 else len(map_.mean(self.mount)) - len(self.at)
+        if own == 0:
+            return None
+        return map_.mean(self.mount)[-own:], map_.covariance([self.mount])[-own:, -own:]
 
     def drift(self, map_: Map, since_s: float) -> None:
         """Let the sensor's constants walk since the last reading."""

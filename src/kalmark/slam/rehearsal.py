@@ -14,7 +14,15 @@ from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.filter.compressed.map import CompressedMap
 from kalmark.geometry import frames, frames3d
 from kalmark.models.check import views
-from kalmark.models.protocols import TWIST, Landmark, OfState, Reparametrizable, SegmentVisible, image_size
+from kalmark.models.protocols import (
+    TWIST,
+    Landmark,
+    OfState,
+    Reparametrizable,
+    SeesVelocity,
+    SegmentVisible,
+    image_size,
+)
 from kalmark.models.sensors import Spatial
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.robot import IDENTITY, Mount, Robot
@@ -105,7 +113,7 @@ class _Scene:
             return
         self.v = views(self.sensor, rng)[0][:SEEN].copy()
         self.places = None
-        if len(T) == 3 or self.v.shape[1] == 3:
+        if len(T) == 3 or self.v.shape[1] == 3 or isinstance(self.sensor, SeesVelocity):
             here = frames.from_frame_many if len(T) == 3 else frames3d.from_frame_many
             self.places = here(T, np.ascontiguousarray(self.v[:, : 2 if len(T) == 3 else 3]))[0]
 

@@ -1,5 +1,7 @@
 """A robot that is elsewhere than the filter believes, placed again by fixes that agree with each other.
 
+Fixes are positions of the robot, or those of an antenna on it, which a sensor of the state measures.
+
 A fix outside its gate is left out.  A filter that has lost its robot would leave out all of them.  So the last fixes
 that were left out, one after the other, are compared with where the filter believed the robot to be: if a shift and a
 turn about the vertical axis lead from there to all of them, within their noise, the robot is moved by it.  What that
@@ -24,7 +26,7 @@ TURN_RAD = 0.3  # to so much they must tell the heading
 
 
 class LeftOut(NamedTuple):
-    """A fix y (d,) with covariance R (d, d) that was left out when the filter believed the robot at p (d,)."""
+    """A fix y (d,) with covariance R (d, d) that was left out when the filter believed what it is of at p (d,)."""
 
     y: Array
     R: Array

@@ -125,7 +125,10 @@ def _state(state: State) -> Description:
             name: [m.error, *(getattr(m.held, key) for key in OF_MOVING), _watched(m.held.gaps), _left_out(m)]
             for name, m in state.moving.items()
         },
-        "readers": [[*key, reader.t_ns] for key, reader in state.readers.items()],
+        "readers": [
+            [*key, reader.t_ns, None if reader.standing is None else reader.standing.state()]
+            for key, reader in state.readers.items()
+        ],
         "surveys": {
             "trial": [[_id(name), count] for name, count in state.surveys.trial.items()],
             "misfits": [
@@ -245,8 +248,11 @@ class Saved:
         state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
         state.surveys.misfits = {name: (int(out), frozenset(fit)) for name, out, fit in judged["misfits"]}
         state.surveys.strangers = {str(robot): set(names) for robot, names in judged["strangers"]}
-        for robot, sensor, t_ns in s["readers"]:
-            state.readers[robot, sensor].t_ns = _time(t_ns)
+        for robot, sensor, t_ns, window in s["readers"]:
+            reader = state.readers[robot, sensor]
+            reader.t_ns = _time(t_ns)
+            if reader.standing is not None:
+                reader.standing.restore(window)
         carried: dict[ChannelKey, Channel | Reader] = {**state.channels, **state.readers}
         for key, channel in carried.items():
             channel.mount = tracks.slots.get(mount_name(*key), -1)

@@ -14,6 +14,7 @@ and `merging` follow the corrections, `own_readings` are corrections by what is 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -110,7 +111,10 @@ class Slam(Estimate):
             names = sorted(state.robots)
             raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
         try:
-            return take(event)
+            report: Report = take(event)
+            if event.robot in state.standing:
+                report.standing = own_readings.stood(state, event)
+            return report
         except EventError:
             state.t_ns = before
             raise
@@ -161,13 +165,21 @@ class Slam(Estimate):
         scan = ScanContext(
             state.map, state.tracks, state.clones, state.estimator, channel, robot, event, ids, R, report
         )  # fmt: skip
-        if self.before_scan is not None:
+        why = state.look_back(key) if channel.counts else ""
+        if self.before_scan is not None and not why:
             self.before_scan(event.robot, event.sensor)
-        if len(event.y):
+        if why:
+            report.blank(channel.dof)
+            report.observations = tuple(Observation(k, i, "ignored", None, None, why) for k, i in enumerate(ids))
+        elif len(event.y):
             self._fuse(scan, policy)
             if gaps and any(o.outcome == "associated" for o in report.observations):
                 state.moving[event.robot].held.located(event.t_ns)
         maintenance.maintain(state, scan, policy)
+        if channel.counts:
+            with suppress(MapError):  # it is full: the next scan is the first again
+                state.clone(key, event.t_ns)
+            state.release(key)
         return report
 
     def _fix(self, event: Fix) -> Report:

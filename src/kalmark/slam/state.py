@@ -20,8 +20,9 @@ from kalmark.models.protocols import Landmark, OfState, world_of
 from kalmark.slam.checks import fault_of
 from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
-from kalmark.slam.reader import Reader
+from kalmark.slam.reader import LEAST_S, Reader
 from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.standing import standing_of
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.scan import Start
@@ -47,7 +48,8 @@ class Settings:
 class State:
     """The map, the tracks and the clones of some robots, with the channels and readers of their sensors.
 
-    `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed.
+    `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
+    `standing` are, of robots that are noticed to stand, the names of the sensors that do.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
@@ -60,6 +62,7 @@ class State:
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
         self.readers: dict[ChannelKey, Reader] = {}
+        self.standing: dict[str, str] = {}
         self.inner = {bias_name(name) for name in robots}
         self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}
         for robot in robots.values():
@@ -92,10 +95,15 @@ class State:
                 self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
             if isinstance(mount.sensor, OfState):
                 refuse_other_world(self.robots, type(mount.sensor).__name__, world_of(mount.sensor))
-                self.readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot)
+                standing = standing_of(mount.sensor, robot)
+                if standing is not None:
+                    self.standing[robot.name] = name
+                self.readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot, standing)
                 continue
             association = mount.association or settings.association
-            channel = channel_of(self.robots, mount, mount_slot, settings.landmarks, association, self.estimator)
+            channel = channel_of(
+                self.robots, robot, mount, mount_slot, settings.landmarks, association, self.estimator
+            )  # fmt: skip
             self.channels[robot.name, name] = channel
             upkeep = mount.upkeep or settings.upkeep
             self.policies[robot.name, name] = policy_of(mount, channel, association, upkeep, settings.reparametrize)
@@ -133,12 +141,21 @@ class State:
         self.clones.clones[number].users.add(key)
         return number
 
+    def look_back(self, key: ChannelKey) -> str:
+        """Let a channel that counts from its last scan do so; return what keeps it from that, "" for nothing."""
+        channel, held = self.channels[key], self.clones.of(key)
+        channel.clone = self.clones[held[-1]] if held else -1
+        if not held or self.t_ns is None:
+            return "the first scan: none to count the velocity from"
+        channel.since[0] = (self.t_ns - self.clones.clones[held[-1]].t_ns) * 1e-9
+        return "" if channel.since[0] >= LEAST_S else "at the time of the last scan: none to count the velocity from"
+
     def release(self, key: ChannelKey) -> None:
         """Remove the clones that no measurement of a channel needs any more; a delayed start needs the last one."""
         used = {m.clone for track in self.tracks.tentative.values() for m in track.measurements
                 if (m.robot, m.sensor) == key}  # fmt: skip
         used |= {m.clone for pending in self.tracks.waiting() if pending.channel == key for m in pending.measurements}
-        if key in self.readers or self.policies[key].delayed is not None:
+        if key in self.readers or self.channels[key].counts or self.policies[key].delayed is not None:
             used.update(self.clones.of(key)[-1:])
         for slot in self.clones.refer(key, used):
             self.map.remove(slot)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,7 @@ from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, 
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
+from kalmark.models.velocity_view import moving_view_of
 
 Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
 
@@ -42,16 +43,24 @@ class ObservationModel:
     landmark: Landmark
     sensor: Any
     at: Array
+    motion: Any = None
+    since: Array = field(default_factory=lambda: np.zeros(1))
 
     @cached_property
     def model(self) -> Any:
         """What `linearize` takes.  Made when it is first needed: models that are built in are compiled then."""
+        return self.view()
+
+    def view(self) -> Any:
+        """Return what `linearize` takes of landmarks in the map."""
+        if isinstance(self.sensor, protocols.SeesVelocity):
+            return moving_view_of(self.sensor, self.landmark, self.motion, self.at, self.since)
         return view_of(self.sensor, self.landmark, self.at)
 
     @cached_property
     def exactly(self) -> KnownModel:
         """The same for landmarks known exactly, which are not in the map."""
-        return KnownModel(self.landmark, self.sensor, self.at)
+        return KnownModel(self.landmark, self.sensor, self.at, self.motion, self.since)
 
     @cached_property
     def built_in(self) -> bool:
@@ -91,7 +100,7 @@ class KnownModel(ObservationModel):
     @cached_property
     def model(self) -> Any:
         """What `linearize` takes."""
-        return known_view(view_of(self.sensor, self.landmark, self.at))
+        return known_view(self.view())
 
     @cached_property
     def d(self) -> int:
@@ -108,14 +117,19 @@ class Channel:
     """A sensor of a robot on its mount `at`, whose slot is `mount` (-1: not in the map), starting `landmark`s.
 
     `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
+    `motion` is that of its robot: a sensor that sees its velocity has it from the state; else it `counts`, from a clone
+    of the robot's pose at its last scan, `since` (1,) seconds ago.
     `robust`: how outliers count less, one of `ROBUST` (None: all count in full).
     """
 
     def __init__(
         self, sensor: Sensor, at: Array, mount: int, landmark: Landmark, threshold: Callable[[int], float],
-        others: Sequence[Landmark], robust: str | None = None,
+        others: Sequence[Landmark], motion: Any = None, robust: str | None = None,
     ) -> None:  # fmt: skip
         self.sensor: Any = sensor
+        self.motion, self.sees_velocity = motion, isinstance(sensor, protocols.SeesVelocity)
+        self.counts = self.sees_velocity and not isinstance(motion, protocols.HasVelocity)
+        self.clone, self.since = -1, np.zeros(1)
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
@@ -140,7 +154,8 @@ class Channel:
         self.far: ObservationModel | None = None  # of poses, for measurements far from what is expected
         if isinstance(sensor, protocols.FarCorrected):
             self.far = ObservationModel(landmark, TagPose(), self.at)
-        self.depths = any(isinstance(model.landmark, AsPoint) for model in self.models.values())
+        rays = any(isinstance(model.landmark, AsPoint) for model in self.models.values())
+        self.depths = rays and not self.sees_velocity  # it tells depths
 
     def _models(self, others: Sequence[Landmark]) -> dict[str, ObservationModel]:
         """Return the models of all kinds of blocks that this sensor can observe: its landmarks and those like them."""
@@ -153,8 +168,10 @@ class Channel:
             types += [AsPoint(ray) for ray in others if self._has_point(ray) and ray.kind not in seen]
         models: dict[str, ObservationModel] = {}
         for landmark in (*types, self.landmark):
-            model = ObservationModel(landmark, self.sensor, self.at)
+            model = ObservationModel(landmark, self.sensor, self.at, self.motion, self.since)
             models |= {kind: model for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
+        if self.sees_velocity:
+            models.pop(ROBOT, None)  # which does not stand still
         return models
 
     def _has_point(self, other: Landmark) -> bool:
@@ -165,6 +182,8 @@ class Channel:
     def _refuse_misfit(self) -> None:
         """Refuse a kind of landmark that one of kalmark's own sensors does not observe."""
         sensor, kind = type(self.sensor).__name__, self.landmark.kind
+        if self.sees_velocity and self.mount >= 0:
+            raise ModelError(f"the mount of a {sensor} has sigmas, expected one that is known")
         if isinstance(self.landmark, InverseDepth2D) and finds_depth(self.sensor):
             raise ModelError(f"a {sensor} does not see the rays to landmarks of unknown depth, {kind}, expected point")
         if not self.models[kind].built_in:
@@ -187,6 +206,15 @@ class Channel:
         return len(self.sensor.angular)
 
     # ------------------------------------------------------------------ where it is
+    def second(self, robot: int) -> int:
+        """Return the slot of what the head has behind the robot's pose: state, clone, mount, or -1 for nothing."""
+        return self.clone if self.counts else robot if self.sees_velocity else self.mount
+
+    def head(self, map_: Map, robot: int) -> Array:
+        """Return the head (h,) of what is observed: the robot's pose and what comes `second`."""
+        second, pose = self.second(robot), map_.mean(robot)[: len(self.at)]
+        return pose if second < 0 else np.concatenate([pose, map_.mean(second)])
+
     def observer(self, map_: Map, robot: int) -> Array:
         """Return the observer block (size,): the robot's pose, then mount and parameters if they are in the map."""
         pose = map_.mean(robot)[: len(self.at)]
@@ -250,7 +278,7 @@ class Channel:
 
     def innovations(self, map_: Map, robot: int, model: ObservationModel, slots: Index, y: Array) -> Array:
         """Return the innovations z (K, p) of y (K, m) from the blocks `slots`."""
-        return linearize(model.model, self.observer(map_, robot), map_.means(slots, model.d), y)[1]
+        return linearize(model.model, self.head(map_, robot), map_.means(slots, model.d), y)[1]
 
     def predict(
         self, map_: Map, robot: int, model: ObservationModel, slots: Index, y: Array, R: Array
@@ -260,7 +288,7 @@ class Channel:
             cuts = [slice(i, i + AT_ONCE) for i in range(0, len(slots), AT_ONCE)]
             parts = [self.predict(map_, robot, model, slots[cut], y[cut], R[cut]) for cut in cuts]
             return np.concatenate([Z for Z, _ in parts]), np.concatenate([d2 for _, d2 in parts])
-        return model.predict(*map_.marginal(robot, self.mount, slots), y, R)
+        return model.predict(*map_.marginal(robot, self.second(robot), slots), y, R)
 
     def landmark_of(
         self, map_: Map, robot: int, y: Array, R: Array, own_noise: bool, which: int = 0

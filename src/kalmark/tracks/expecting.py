@@ -75,6 +75,9 @@ def expectations(
         chosen = np.flatnonzero(seen.in_view) if only_in_view else np.arange(len(rows))
         if len(chosen):
             found.append((rows[chosen], linearised_known(map_, channel, slot, model, l[chosen], seen.y[chosen])))
+    if channel.sees_velocity:  # of a state, the pose in it, too; a clone is not where the robot is
+        twice = 1 if channel.counts else 2
+        found = [(rows, part._replace(E_h=_in_pose(part.E_h, channel.pose_dof, twice))) for rows, part in found]
     h, n = (max((getattr(part, key).shape[2] for _, part in found), default=0) for key in ("E_h", "E_l"))
     h, dof = max(h, 2 * channel.pose_dof), channel.pose_dof
     whole = Linearised(*(np.full((count, *shape), np.nan) for shape in ((m,), (p, p), (p, h), (p, n))))
@@ -90,6 +93,12 @@ def expectations(
         E_h[:, :, :dof], E_h[:, :, dof : 2 * dof], E_h[:, :, 2 * dof :], whole.E_l,
     )  # fmt: skip
     return _of_rows(all_, np.flatnonzero(in_view)) if only_in_view else all_
+
+
+def _in_pose(E_h: Array, dof: int, times: int) -> Array:
+    """Return the Jacobian (K, p, dof) in a robot's pose, with which so many blocks of the columns of E_h begin."""
+    E_r: Array = sum((E_h[:, :, k * dof : (k + 1) * dof] for k in range(times)), np.zeros((*E_h.shape[:2], dof)))
+    return E_r
 
 
 def _reached(map_: Map, tracks: Tracks, channel: Channel, robot: int) -> list[Id]:
@@ -173,12 +182,12 @@ def _out_of_view(sensor: Any, v: Array) -> str:
 # ---------------------------------------------------------------------- expectations
 def linearised(map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, y: Array) -> Linearised:
     """Return expectations of blocks of one kind, linearised as a correction would be."""
-    m, here, mount, at = map_.marginal(robot, channel.mount, slots)
-    index, _, mean = observed_block(m.x, m.blocks, m.atoms, here, mount, at, model.d)
-    observer = channel.observer(map_, robot)
-    l = np.ascontiguousarray(mean[len(observer) :].reshape(len(slots), model.d))
-    e, E_h, E_l, R = at_pose(channel, model, observer, l, y)
-    seen = E_h if channel.mount >= 0 else np.ascontiguousarray(E_h[:, :, : channel.pose_dof])
+    m, here, second, at = map_.marginal(robot, channel.second(robot), slots)
+    index, _, mean = observed_block(m.x, m.blocks, m.atoms, here, second, at, model.d)
+    head = channel.head(map_, robot)
+    l = np.ascontiguousarray(mean[len(head) :].reshape(len(slots), model.d))
+    e, E_h, E_l, R = at_pose(channel, model, head, l, y)
+    seen = E_h if second >= 0 else np.ascontiguousarray(E_h[:, :, : channel.pose_dof])
     Z = innovation(m.P, index, seen, E_l, R, np.zeros((len(e), R.shape[1])))[0]
     return Linearised(e, Z, E_h, E_l)
 
@@ -187,24 +196,27 @@ def linearised_known(
     map_: Map, channel: Channel, robot: int, model: ObservationModel, l: Array, y: Array
 ) -> Linearised:  # fmt: skip
     """Return expectations of landmarks l (K, n) of one kind that are known exactly."""
-    e, E_h, E_l, R = at_pose(channel, model, channel.observer(map_, robot), l, y)
-    dof = channel.pose_dof
+    e, E_h, E_l, R = at_pose(channel, model, channel.head(map_, robot), l, y)
+    dof, second = channel.pose_dof, channel.second(robot)
     P, seen = map_.covariance([robot])[:dof, :dof], E_h[:, :, :dof]
-    if channel.mount >= 0:
-        whole, own = map_.covariance([robot, channel.mount]), len(map_.rows(robot))
+    if second >= 0:
+        whole, own = map_.covariance([robot, second]), len(map_.rows(robot))
         rows = np.r_[0:dof, own : len(whole)]
         P, seen = whole[np.ix_(rows, rows)], E_h
     return Linearised(e, seen @ P @ seen.swapaxes(1, 2) + R, E_h, E_l)
 
 
 def at_pose(
-    channel: Channel, model: ObservationModel, observer: Array, l: Array, y: Array
+    channel: Channel, model: ObservationModel, head: Array, l: Array, y: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Return e (K, m), E_h (K, p, h), E_l (K, p, n) and the noise R (K, p, p) of landmarks l (K, n).
 
-    The Jacobian E_h is in the pose, in the mount and in the parameters that are in the map.
+    The Jacobian E_h is in the pose, in the mount and in the parameters that are in the map; of a sensor that sees its
+    velocity in the pose and in the robot's state.
     """
-    head = observer if channel.mount >= 0 else np.concatenate([observer, channel.at])
+    observer = head
+    if len(head) == len(channel.at):  # the Jacobian in a mount that is not in the map, too
+        head = np.concatenate([head, channel.at])
     e = linearize(model.model, head, l, y)[0]
     if isinstance(model.landmark, protocols.Segmented):
         e = y  # of a line, the part of its segment that is in the image

@@ -99,21 +99,23 @@ class ScanContext:
         """Return the correction by the observations `rows` of the blocks `slots` (K,)."""
         y, R = (self.y, self.R) if len(rows) == len(self.y) else (self.y[rows], self.R[rows])
         R = self.channel.noise(self.map, self.robot, model, slots, R, self.own_noise)
-        R = self._weighed(model, slots, y, R)
-        return Update(model.model, self.robot, self.channel.mount, slots, model.d, y, R, self.channel.gate)
+        R, second = self._weighed(model, slots, y, R), self.channel.second(self.robot)
+        return Update(model.model, self.robot, second, slots, model.d, y, R, self.channel.gate)
 
     def known_update(self, model: ObservationModel, l: Array, rows: list[int]) -> Update:
         """Return the correction by the observations `rows` of the landmarks l (K, n), which are known exactly."""
         y, slots = np.concatenate([self.y[rows], l], axis=1), np.full(len(rows), self.robot)
         R = np.ascontiguousarray(self.noise_of(model, l, rows))
-        exactly, mount = model.exactly, self.channel.mount
+        exactly, second = model.exactly, self.channel.second(self.robot)
         R = self._weighed(exactly, slots, y, R)
-        return Update(exactly.model, self.robot, mount, slots, exactly.d, y, R, self.channel.gate)
+        return Update(exactly.model, self.robot, second, slots, exactly.d, y, R, self.channel.gate)
 
     def _weighed(self, model: ObservationModel, slots: Index, y: Array, R: Array) -> Array:
         """Return the noise (K, p, p) with which outliers count less, where that is wanted."""
         how = self.channel.robust
-        return R if how is None else model.weighed(*self.map.marginal(self.robot, self.channel.mount, slots), y, R, how)
+        if how is None:
+            return R
+        return model.weighed(*self.map.marginal(self.robot, self.channel.second(self.robot), slots), y, R, how)
 
     def start_of(self, k: int, which: int = 0) -> Start:
         """Return the landmark that explains the k-th observation; of two that do, `which`."""

@@ -1,0 +1,167 @@
+"""Range rates of landmarks that stand still (Doppler): alone, or with range and direction, as a radar measures them.
+
+A landmark at p in the sensor's frame, of a sensor with the velocity t in the same frame, has the rate of its range
+d|p|/dt = -p' t / |p|: a turn of the sensor does not change a distance.  So what is seen is v = (p, t), and how it comes
+about is in `models/velocity_view.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import KW_ONLY
+from typing import Annotated, ClassVar
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags
+from kalmark.compiled import compiled
+from kalmark.declare import Limit, NotNegative, Positive, declared, register
+from kalmark.geometry.directions import inv_spherical_many, spherical_many
+from kalmark.geometry.frames import inv_scan_many, scan_many
+from kalmark.models.seen import refuse_negative_ranges, residual
+
+__all__ = ["Radar2D", "Radar3D", "RangeRate2D", "RangeRate3D"]
+
+NEAREST_M = 1e-3  # nearer than this a landmark has no direction
+
+
+@compiled
+def moving(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect the range rate of v = (p, t) (K, 2 d), behind range and angles if y (K, m) has them; E_v (K, m, 2 d)."""
+    k, d, m = len(v), v.shape[1] // 2, y.shape[1]
+    e, E_v, p = np.empty((k, m)), np.zeros((k, m, 2 * d)), v[:, :d].copy()
+    if m > 1:
+        place, Y_p = scan_many(p) if d == 2 else spherical_many(p)
+        for i in range(k):
+            for a in range(d):
+                e[i, a] = place[i, a]
+                for b in range(d):
+                    E_v[i, a, b] = Y_p[i, a, b]
+    for i in range(k):
+        square, along = NEAREST_M * NEAREST_M, 0.0
+        for a in range(d):
+            square += p[i, a] * p[i, a]
+            along += p[i, a] * v[i, d + a]
+        distance = math.sqrt(square)
+        e[i, m - 1] = -along / distance
+        for a in range(d):
+            E_v[i, m - 1, a] = (along * p[i, a] / square - v[i, d + a]) / distance
+            E_v[i, m - 1, d + a] = -p[i, a] / distance
+    return e, residual(y, e, angular), E_v
+
+
+@declared
+class _Doppler:
+    """What all of them share: limits of sight, and what they expect."""
+
+    sigma_rate_mps: Annotated[Positive, "Noise of the range rate."] = 0.1
+    _: KW_ONLY
+    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
+    fov_rad: Annotated[Positive, "Field of view about the sensor's x axis."] = 2 * math.pi
+
+    world: ClassVar[str]
+    columns: ClassVar[tuple[str, ...]] = ("range_rate_mps",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_rate_mps",)
+    expected: ClassVar[Callable[..., tuple[Array, Array, Array]]] = moving
+    additive: ClassVar[bool] = True
+    sees_velocity: ClassVar[bool] = True
+    code: ClassVar[int] = 0
+
+    @property
+    def angular(self) -> tuple[bool, ...]:
+        """Which components are angles: those in rad."""
+        return tuple(column.endswith("_rad") for column in self.columns)
+
+    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
+        """Return the expected measurements (K, m) of points and velocities v (K, 2 d), and E_v (K, m, 2 d)."""
+        angular, m = np.array(self.angular, dtype=np.bool_), len(self.columns)
+        e, _, E_v = moving(0, np.zeros(0), angular, np.ascontiguousarray(v, dtype=np.float64), np.zeros((len(v), m)))
+        return e, E_v
+
+    def noise(self, y: Array) -> Array:
+        """Return the noise R (K, m, m) of measurements y (K, m)."""
+        return np.tile(np.diag([vars(self)[name] ** 2 for name in self.sigmas]), (len(y), 1, 1))
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, d or 2 d), which begin with points, are within the limits of sight."""
+        p = v[:, : 2 if self.world == "plane" else 3]
+        distance, off = np.linalg.norm(p, axis=1), np.arctan2(np.linalg.norm(p[:, 1:], axis=1), p[:, 0])
+        inside: Flags = (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
+        return inside
+
+
+@register("sensor", "range_rate")
+class RangeRate2D(_Doppler):
+    """Rate of the range of a landmark that stands still.
+
+    It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
+    """
+
+    world: ClassVar[str] = "plane"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
+
+
+@register("sensor", "range_rate")
+class RangeRate3D(_Doppler):
+    """Rate of the range of a landmark that stands still.
+
+    It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
+    """
+
+    world: ClassVar[str] = "space"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+
+
+@register("sensor", "radar")
+class Radar2D(_Doppler):
+    """A radar: range, bearing and range rate of a landmark that stands still.
+
+    Where the robot has no velocity in its state it is the mean since the last scan.
+    """
+
+    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
+    sigma_bearing_rad: Annotated[Positive, "Noise of the bearing."] = 0.02
+
+    world: ClassVar[str] = "plane"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "range_rate_mps")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad", "sigma_rate_mps")
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return points (K, 2) and V_y (K, 2, 3): the rate tells nothing of the place.  [S] (62)."""
+        p, P_y = inv_scan_many(np.ascontiguousarray(y[:, :2]))
+        return p, np.concatenate([P_y, np.zeros((len(y), 2, 1))], axis=2)
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
+@register("sensor", "radar")
+class Radar3D(_Doppler):
+    """A radar: range, azimuth, elevation and range rate of a landmark that stands still.
+
+    Where the robot has no velocity in its state it is the mean since the last scan.
+    """
+
+    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
+    sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
+    sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
+
+    world: ClassVar[str] = "space"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad", "range_rate_mps")
+    sigmas: ClassVar[tuple[str, ...]] = (
+        "sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad", "sigma_rate_mps",
+    )  # fmt: skip
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return points (K, 3) and V_y (K, 3, 4): the rate tells nothing of the place."""
+        p, P_y = inv_spherical_many(np.ascontiguousarray(y[:, :3]))
+        return p, np.concatenate([P_y, np.zeros((len(y), 3, 1))], axis=2)
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
