@@ -217,3 +217,27 @@ def test_a_negative_range_is_refused_and_a_rate_alone_starts_no_landmark() -> No
         slam.process(km.Scan(0.0, "r", "radar", [[-1.0, 0.0, 0.0]], [3]))
     o = slam.process(km.Scan(0.0, "r", "rate", [[-1.0]], [3])).observations[0]
     assert (o.outcome, o.reason) == ("ignored", "a RangeRate2D measurement alone cannot start a landmark")
+
+
+def test_a_radar_tells_the_depth_of_what_bearings_have_begun() -> None:
+    nees, at = [], np.array([0.3, 0.2, 0.1])
+    posts = np.array([[10.0, 3.0], [8.0, -6.0], [14.0, 4.0], [12.0, -2.0]])
+    motion, radar = km.motion.Unicycle(0.05, 0.02), km.sensors.Radar2D(0.05)
+    camera = km.Mount(km.sensors.Bearing(0.01), landmark=km.landmarks.InverseDepth2D())
+    view = moving_view_of(radar, km.landmarks.Point2D(), motion, at, np.array([0.2]))
+    for seed in range(12):
+        rng, x, outcomes = np.random.default_rng(seed), np.zeros(3), set[str]()
+        slam = km.Slam(km.Robot("r", motion=motion, sensors={"camera": camera, "radar": km.Mount(radar, at=at)}))
+        for k in range(30):
+            slam.process(km.Control(0.2 * k, "r", np.array([1.0, 0.05]) + rng.normal(0, [0.05, 0.02])))
+            before, x = x, motion.move(x, np.array([1.0, 0.05]), 0.2)[0]
+            y = linearize(view, np.concatenate([x, before]), posts, np.zeros((4, 3)))[0]
+            bearings = km.geometry.observe(x, posts)[0][:, 1:] + rng.normal(0, 0.01, (4, 1))
+            slam.process(km.Scan(0.2 * (k + 1), "r", "camera", bearings, [1, 2, 3, 4]))
+            if k > 3:
+                scan = km.Scan(0.2 * (k + 1), "r", "radar", y + rng.normal(0, [0.2, 0.02, 0.05], (4, 3)), [1, 2, 3, 4])
+                outcomes |= {o.outcome for o in slam.process(scan).observations if k > 4}
+        assert outcomes == {"associated"}
+        error = SE2.minus(slam.mean("r"), x)
+        nees.append(error @ np.linalg.solve(slam.covariance("r"), error))
+    assert 1.3 < np.mean(nees) < 5.6  # 99.7 % of the mean of 12 chi-squares of 3 are within 1.5 and 5.3

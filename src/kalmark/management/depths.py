@@ -84,13 +84,14 @@ def _scales(scan: ScanContext, v: Array, y: Array, R: Array) -> tuple[Array, Arr
     The logarithms (K,) of the likeliest factors and their variances (K,).
     """
     sensor, W = scan.channel.calibrated(scan.map), np.linalg.inv(R)
-    angular = np.array(sensor.angular, dtype=np.bool_)
+    angular, d = np.array(sensor.angular, dtype=np.bool_), v.shape[1]
+    velocity = np.tile(scan.channel.velocity(scan.map, scan.robot), (len(v), 1))  # of a sensor that sees it
 
     def compared(scales: Array) -> tuple[Array, Array]:
         """Return innovations z (K, m) and their derivatives (K, m) in the logarithms of the scales (K,)."""
         far = scales[:, None] * v
-        e, E_v = sensor.expect(far)
-        return residual(y, e, angular), -np.einsum("kmd,kd->km", E_v, far)
+        e, E_v = sensor.expect(np.concatenate([far, velocity], axis=1))
+        return residual(y, e, angular), -np.einsum("kmd,kd->km", E_v[:, :, :d], far)
 
     costs = []
     for scale in SCALES:

@@ -23,7 +23,7 @@ from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, 
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
-from kalmark.models.velocity_view import moving_view_of
+from kalmark.models.velocity_view import moving_view_of, velocity_of
 
 Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
 
@@ -214,6 +214,13 @@ class Channel:
         """Return the head (h,) of what is observed: the robot's pose and what comes `second`."""
         second, pose = self.second(robot), map_.mean(robot)[: len(self.at)]
         return pose if second < 0 else np.concatenate([pose, map_.mean(second)])
+
+    def velocity(self, map_: Map, robot: int) -> Array:
+        """Return the velocity (2 or 3,) of a sensor that sees it, in its frame, of another one nothing (0,)."""
+        if not self.sees_velocity:
+            return np.zeros(0)
+        second, pose = map_.mean(self.second(robot)), map_.mean(robot)[: len(self.at)]
+        return velocity_of(self.motion, self.at, pose, second, float(self.since[0]))[0]
 
     def observer(self, map_: Map, robot: int) -> Array:
         """Return the observer block (size,): the robot's pose, then mount and parameters if they are in the map."""
