@@ -241,3 +241,18 @@ def test_a_radar_tells_the_depth_of_what_bearings_have_begun() -> None:
         error = SE2.minus(slam.mean("r"), x)
         nees.append(error @ np.linalg.solve(slam.covariance("r"), error))
     assert 1.3 < np.mean(nees) < 5.6  # 99.7 % of the mean of 12 chi-squares of 3 are within 1.5 and 5.3
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_range_rate_of_what_bearings_have_begun_tells_no_distance() -> None:
+    sensors = {
+        "camera": km.Mount(km.sensors.Bearing(0.01), landmark=km.landmarks.InverseDepth2D()),
+        "rate": km.Mount(km.sensors.RangeRate2D(0.05)),
+    }
+    motion = km.motion.ConstantTurnRate()
+    slam = km.Slam(km.Robot("r", motion=motion, start=(0, 0, 0, 1.0, 0), sensors=sensors))
+    slam.process(km.Scan(0.0, "r", "camera", [[0.3]], [1]))
+    before = np.sqrt(slam.covariance(1)[-1, -1])
+    o = slam.process(km.Scan(0.1, "r", "rate", [[-np.cos(0.3)]], [1])).observations[0]
+    assert o.outcome == "associated"
+    assert np.sqrt(slam.covariance(1)[-1, -1]) > 0.9 * before

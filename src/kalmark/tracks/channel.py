@@ -154,7 +154,8 @@ class Channel:
         self.far: ObservationModel | None = None  # of poses, for measurements far from what is expected
         if isinstance(sensor, protocols.FarCorrected):
             self.far = ObservationModel(landmark, TagPose(), self.at)
-        self.depths = any(isinstance(model.landmark, AsPoint) for model in self.models.values())
+        rays = any(isinstance(model.landmark, AsPoint) for model in self.models.values())
+        self.depths = rays and (full or not self.sees_velocity)  # it tells depths; a range rate alone does not
 
     def _models(self, others: Sequence[Landmark]) -> dict[str, ObservationModel]:
         """Return the models of all kinds of blocks that this sensor can observe: its landmarks and those like them."""
