@@ -20,6 +20,8 @@ from ros_bags import (
     START,
     Outgoing,
     field,
+    fix,
+    geodetic,
     header,
     imu,
     odometry,
@@ -94,6 +96,19 @@ def test_an_inertial_unit_is_a_gyroscope_and_a_compass_whose_first_heading_is_th
     assert f"{wanted}  # GUESS: its first heading is that of the start; GUESS: its axes are those of the robot" in text
 
 
+def test_a_robot_that_hardly_moves_starts_with_the_heading_of_its_compass(tmp_path: Path) -> None:
+    """Satellite fixes say where it is; without a way to lay upon them only the compass says where it looks."""
+    messages = [odometry(T0 + t * 10**8, pose(0.01 * t, 0, 0)) for t in range(10)]
+    messages += [fix(T0 + t * 3 * 10**8, geodetic([0.0, 0.0, 0.0])) for t in range(3)]
+    messages += [imu(T0 + 5, (0, 0, 0), (0, 0, np.sin(0.4), np.cos(0.4)), 0.01)]
+    text = config_of(tmp_path, sorted(messages, key=lambda m: m.t_ns))
+    wanted = (
+        "start: {x_m: 0, y_m: 0, theta_rad: 0.8, sigma_xy_m: 5, sigma_theta_rad: 0.2}  # GUESS: its heading is that of"
+    )
+    assert wanted in text
+    assert "declination_rad: 0, sigma_declination_rad: 0.2}  # GUESS: its north is true north, or nearly" in text
+
+
 def test_an_orientation_without_a_covariance_is_not_taken(tmp_path: Path) -> None:
     messages = [odometry(T0 + t, pose(t, 0, 0)) for t in range(3)] + [imu(T0 + 5, (0, 0, 0))]
     assert "/imu: {type: imu, gyro: gyro, at: controls}" in config_of(tmp_path, messages)
@@ -137,11 +152,11 @@ def test_robots_are_told_apart_by_the_first_part_of_their_topics(tmp_path: Path)
 def test_a_clock_of_a_simulator_beside_messages_without_header_gives_way_to_the_recorder(tmp_path: Path) -> None:
     twist = {"linear": {"x": 1.0}, "angular": {"z": 0.1}}
     messages = [Outgoing("/cmd_vel", "geometry_msgs/msg/Twist", T0 + t, twist) for t in range(3)]
-    fix: dict[str, Any] = {
+    located: dict[str, Any] = {
         "header": header(10**9, "map"),
         "pose": {"pose": pose(1, 2, 0), "covariance": np.eye(6).ravel()},
     }
-    messages.append(Outgoing("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", T0 + 5, fix))
+    messages.append(Outgoing("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", T0 + 5, located))
     text = config_of(tmp_path, messages)
     assert text.count("time: recorded") == 2
     assert open_run(tmp_path / "config.yaml")[1].events[-1].t_ns == T0 + 5
