@@ -363,6 +363,24 @@ def diagnosis() -> Iterator[Figure]:
                  "python benchmarks/diagnosis.py --real", row("real:", "{0} of {2}"))  # fmt: skip
 
 
+def outliers() -> Iterator[Figure]:
+    """Yield how much spurious ranges under right ids do."""
+    command = "python benchmarks/outliers.py"
+    for case, title in (
+        ("later", "3 % of the ranges anywhere, but not first sightings"),
+        ("any", "3 % of the ranges anywhere"),
+    ):
+        for way, start in (
+            ("all taken", "all taken"),
+            ("gate .9999", "gate .9999"),
+            ("`huber`", "huber"),
+            ("`student`", "student"),
+        ):
+            wanted = "2 to 4 / / / 0" if case == "later" and way != "all taken" else ""
+            yield Figure("Outliers", f"{title}, {way}: pose NEES / path, m / landmarks, m / landmarks off by .5 m", wanted,
+                         command, row(f"{case} {start}", "{0} / {1} / {3} / {5}"))  # fmt: skip
+
+
 def tuning() -> Iterator[Figure]:
     """Yield how real logs fit on their second half, tuned by the first."""
     command, shown = "python benchmarks/tuning.py", "{2} / {5} / {9}, {10} m, {11} m to {13}, {14} m, {15} m"
@@ -576,6 +594,7 @@ def figures() -> list[Figure]:
         gaps,
         storms,
         diagnosis,
+        outliers,
         tuning,
         partial_measurements,
         known_maps,

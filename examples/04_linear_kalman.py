@@ -16,7 +16,8 @@ S_d, S_m = np.diag([0.01, 0.01, 0, 0]), 0.04 * np.eye(2)
 
 odometry = km.motion.Odometry2D(sigma_x_m=0.1, sigma_y_m=0.1, sigma_theta_rad=0.0)
 position = km.Mount(km.sensors.Position2D(sigma_x_m=0.2, sigma_y_m=0.2))
-slam = km.Slam([km.Robot("robot", odometry, sensors={"camera": position}, cov=np.diag([0.04, 0.04, 0.0]))])
+robot = km.Robot("robot", odometry, sensors={"camera": position}, cov=np.diag([0.04, 0.04, 0.0]))
+slam = km.Slam([robot], km.association.ByIdentity(gate="off"))  # these numbers are at random: no gate for the post
 slam.add_landmark("post", mean=(3.0, 1.0), cov=np.eye(2))
 x, S = np.array([0.0, 0, 3, 1]), np.diag([0.04, 0.04, 1, 1])
 

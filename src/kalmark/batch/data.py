@@ -280,10 +280,9 @@ class Replay:
 
     def _value(self, name: Id, poses: Array) -> Array:
         """Return where the map, or else its first sighting, puts a landmark."""
-        if name in self.known:
-            return np.asarray(self.known[name][0], dtype=np.float64)
-        if name in self.given.landmarks:
-            mean, size = self.given.landmarks[name][0], self.given.landmark.space.size
+        if name in self.known or name in self.given.landmarks:
+            mean = np.asarray((self.known if name in self.known else self.given.landmarks)[name][0], dtype=np.float64)
+            size = self.given.landmark.space.size
             if mean.shape != (size,) or not np.isfinite(mean).all():
                 raise unsolved(
                     f"landmark {str(name)!r} is at {mean.tolist()}, expected a point of {size} finite numbers"

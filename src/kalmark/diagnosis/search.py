@@ -12,7 +12,7 @@ import numpy as np
 from kalmark.batch.state import LANDMARKS, looked
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import Finding, Where
-from kalmark.diagnosis.linear import Linear
+from kalmark.diagnosis.linear import OUT, Linear
 from kalmark.logs.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
@@ -133,10 +133,12 @@ class Search:
 
     def _outliers(self, far: Any) -> str:
         """Return "wrong_ids" if most of the observations that are `far` off fit another landmark, else "outliers"."""
-        problem, fits, number, first = self.linear.problem, 0, 0, 0
+        problem, fits, number, first, begin = self.linear.problem, 0, 0, 0, 0
         poses, places, *_ = self.linear.moved().groups
         for factor in problem.factors:
-            k = len(factor.R)
+            k, p, _ = factor.R.shape
+            noise = self.linear.noise[begin : begin + k * p].reshape(k, p) / OUT  # that of outliers
+            begin += k * p
             blocks = factor.term.blocks
             mine = np.flatnonzero(far[first : first + k])
             first += k
@@ -145,6 +147,6 @@ class Search:
             for row in mine[:LOOKED_AT].tolist():
                 rows = np.full(len(places), row)
                 z, _ = looked(factor.view, poses[blocks[0].rows[rows]], places, factor.y[rows])
-                d2 = np.einsum("ki,ij,kj->k", z, np.linalg.inv(factor.R[row]), z)
+                d2 = np.einsum("ki,ij,kj->k", z, np.linalg.inv(factor.R[row] * np.outer(noise[row], noise[row])), z)
                 number, fits = number + 1, fits + bool(np.nanmin(d2) < NEAR)
         return "wrong_ids" if 2 * fits > number else "outliers"

@@ -30,6 +30,12 @@ def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
     return policy.association.threshold(scan.channel.dof, gate(SURVEYED, scan.channel.dof))
 
 
+def is_tried(state: State, scan: ScanContext, names: Sequence[Any]) -> bool:
+    """Return whether a scan says something of surveys: of those on trial, or of landmarks that did not fit before."""
+    trial = state.surveys.trial.keys()
+    return bool(state.surveys.strangers.get(scan.event.robot)) or (bool(trial) and not trial.isdisjoint(names))
+
+
 def corrected(
     state: State, scan: ScanContext, names: Sequence[Any], update: Update, least: float,
     estimator: Estimator | None = None,
@@ -44,7 +50,7 @@ def corrected(
     trial, known = state.surveys.trial, state.tracks.known
     beyond = np.flatnonzero(~done.fused & (done.d2 <= update.gate)).tolist()
     tried = [name in trial or name in known for name in names]
-    fitting = [names[k] for k in np.flatnonzero(done.fused).tolist() if tried[k]]
+    fitting = [names[k] for k in np.flatnonzero(done.fused & (done.d2 <= least)).tolist()]
     lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
     out = np.array([k for k in beyond if lost or not tried[k]], dtype=np.int64)
     if not len(out):
