@@ -193,7 +193,7 @@ class Run:
 
 
 class Recorded(Run):
-    """A run with the readings of EuRoC's unit, from a start at rest on, the true place and a heading known to .5 deg."""
+    """A run with the readings of EuRoC's unit, from rest: at the true place, with a heading known to .5 deg."""
 
     def __init__(self, sensor: str, estimator: str, seed: SeedSequence, scale: float) -> None:
         t, rows = table("gt_V1_01_easy.csv")
@@ -201,10 +201,8 @@ class Recorded(Run):
         at = np.arange(len(self.flight.states)) / RATE_HZ
         self.flight.states[:, :3] = CubicSpline(t, rows[:, :3])(at)  # without the drift of an integral
         self.biases = np.column_stack([np.interp(at, t, column) for column in rows[:, 10:].T])
-        self.u, self.points = (
-            table("mav0/imu0/data.csv.gz")[1][: len(at) - 1],
-            points(self.flight.states, POINTS, self.rng),
-        )
+        self.u = table("mav0/imu0/data.csv.gz")[1][: len(at) - 1]
+        self.points = points(self.flight.states, POINTS, self.rng)
         self.sensor, landmark = SENSORS[sensor]
         unit = km.motion.Inertial(*(scale * UNIT.densities[[0, 6, 3, 9]]))
         sigmas = np.repeat([0.0, 0.0, 0.0, 0.1, 0.1], 3)
