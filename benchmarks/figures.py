@@ -215,6 +215,10 @@ def inertial() -> Iterator[Figure]:
         name = f"V1_01, {sensor} points, `{estimator}`: position / attitude ANEES (3) / in band / state ANEES (15)"
         yield Figure("Inertial", name, wanted, f"python benchmarks/inertial.py path --sensor {sensor} --estimator {estimator}",
                      row(f"path {sensor} {estimator}:", "{3} % / {14} / {18} / {30}"))  # fmt: skip
+    for scale in (1, 10):
+        name = f"V1_01, readings of the unit, densities times {scale}, stereo points: position / attitude ANEES (3) / state ANEES (15)"
+        yield Figure("Inertial", name, ".3 %", f"python benchmarks/inertial.py recorded --runs 2 --scale {scale}",
+                     row("recorded stereo invariant:", "{3} % / {14} / {30}"))  # fmt: skip
     for estimator in ("invariant", "ekf"):
         wanted = "0 of 100" if estimator == "invariant" else ""
         yield Figure("Inertial", f"information about position and yaw, `{estimator}`: most, start 1 / runs that gain any", wanted,

@@ -1,12 +1,16 @@
 """An inertial unit and a camera along EuRoC's trajectory V1_01, with simulated readings and points; and at rest.
 
     python benchmarks/inertial.py path [--runs 20] [--sensor stereo] [--estimator invariant]
+    python benchmarks/inertial.py recorded [--runs 2] [--scale 10] [--estimator invariant]
     python benchmarks/inertial.py gauge [--runs 100] [--estimator invariant]
     python benchmarks/inertial.py still [--minutes 5] [--estimator invariant]
 
 `path`: the unit reads at 200 Hz, the camera sees at 20 Hz.  Noise and biases are those of EuRoC's data sheet, the start
 is known to 1 deg of roll and pitch, 0.01 rad/s and 0.05 m/s^2.  Printed: the position error as a share of the
 path, RMS over the runs, and the ANEES of attitude, position and state, with the share of scans in the 95 % band.
+
+`recorded`: the same with EuRoC's own readings and a start that is found at rest; the points are simulated still.  The
+densities of the data sheet are multiplied by `--scale`, as the drone shakes.
 
 `gauge`: 10 s of it, from 20 s on, with an unknown start, 20 deg and 1 m.  `still`: one run at rest.  Both print how the
 information about the directions that nothing observes, shifts and turns about the gravity, compares with that of the
@@ -17,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import gzip
 import math
 import os
 from pathlib import Path
@@ -33,7 +38,7 @@ import kalmark as km
 from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
 from kalmark.results.measures import anees_interval, path_m
 
-TRUTH = "visual/euroc_v101_micro/gt_V1_01_easy.csv"
+FOLDER = "visual/euroc_v101_micro"
 RATE_HZ, EVERY, ROOM_M = 200, 10, 1.5
 POINTS, FEW = 150, 30  # of a room: of the trajectory as a whole, and where the information is asked for
 UNIT = km.motion.Inertial(1.6968e-4, 1.9393e-5, 2.0e-3, 3.0e-3)
@@ -63,13 +68,19 @@ class Flight:
         self.states, self.readings = states, readings
 
 
+def table(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times (N,) of a table of EuRoC's, s from the first one on, and its numbers (N, m)."""
+    path = Path(os.environ.get("KALMARK_DATA", "../shared/data")) / FOLDER / name
+    with gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as file:
+        rows = list(csv.reader(file))[1:]
+    t_ns = np.array([int(row[0]) for row in rows])
+    return (t_ns - t_ns[0]) * 1e-9, np.array([[float(cell) for cell in row[1:]] for row in rows])
+
+
 def euroc(seconds: float | None = None) -> Flight:
     """Return the flight whose velocity and orientation are those of EuRoC's truth, by splines."""
-    folder = Path(os.environ.get("KALMARK_DATA", "../shared/data"))
-    with (folder / TRUTH).open() as file:
-        rows = np.array([[float(cell) for cell in row] for row in list(csv.reader(file))[1:]])
-    t = (rows[:, 0] - rows[0, 0]) * 1e-9
-    way, turn = CubicSpline(t, rows[:, 1:4]), RotationSpline(t, Rotation.from_quat(rows[:, [5, 6, 7, 4]]))
+    t, rows = table("gt_V1_01_easy.csv")
+    way, turn = CubicSpline(t, rows[:, :3]), RotationSpline(t, Rotation.from_quat(rows[:, [4, 5, 6, 3]]))
     at = np.arange(0.0, min(t[-1], seconds or math.inf), 1.0 / RATE_HZ)
     return flown(np.concatenate([way(at[0]), turn(at[0]).as_quat()]), way(at, 1), turn(at).as_quat())
 
@@ -181,11 +192,37 @@ class Run:
         return np.concatenate(parts)
 
 
-def path(seed: SeedSequence, sensor: str, estimator: str, seconds: float | None) -> tuple[np.ndarray, float]:
+class Recorded(Run):
+    """A run with the readings of EuRoC's unit, from rest: at the true place, with a heading known to .5 deg."""
+
+    def __init__(self, sensor: str, estimator: str, seed: SeedSequence, scale: float) -> None:
+        t, rows = table("gt_V1_01_easy.csv")
+        self.flight, self.rng, self.at = euroc(), np.random.default_rng(seed), CAMERA
+        at = np.arange(len(self.flight.states)) / RATE_HZ
+        self.flight.states[:, :3] = CubicSpline(t, rows[:, :3])(at)  # without the drift of an integral
+        self.biases = np.column_stack([np.interp(at, t, column) for column in rows[:, 10:].T])
+        self.u = table("mav0/imu0/data.csv.gz")[1][: len(at) - 1]
+        self.points = points(self.flight.states, POINTS, self.rng)
+        self.sensor, landmark = SENSORS[sensor]
+        unit = km.motion.Inertial(*(scale * UNIT.densities[[0, 6, 3, 9]]))
+        sigmas = np.repeat([0.0, 0.0, 0.0, 0.1, 0.1], 3)
+        sigmas[5] = math.radians(0.5)
+        start = np.concatenate([self.flight.states[0, :7], np.zeros(9)])
+        rest = km.motion.at_rest(unit, at[:-1], self.u, start, np.diag(sigmas**2))
+        until_ns = round(rest.until_s * 1e9)
+        mount = km.Mount(self.sensor, at=self.at)
+        robot = km.Robot("unit", unit, rest.start, {"camera": mount}, cov=rest.cov, rests_until_ns=until_ns)
+        self.slam = km.Slam([robot], estimator=ESTIMATORS[estimator], landmarks=landmark)
+
+
+def path(seed: SeedSequence, given: argparse.Namespace) -> tuple[np.ndarray, float]:
     """Return of each scan the position error and the NEES of attitude, position and state (scans, 4), and the path."""
     pin()
-    flight = euroc(seconds)
-    run, found = Run(flight, sensor, estimator, seed), []
+    if given.what == "recorded":
+        run: Run = Recorded(given.sensor, given.estimator, seed, given.scale)
+    else:
+        run = Run(euroc(given.seconds), given.sensor, given.estimator, seed)
+    flight, found = run.flight, []
     for n in run.scans():
         d, P = run.error(n), run.slam.covariance("unit")
         parts = [slice(3, 6), slice(0, 3), slice(0, 15)]
@@ -196,7 +233,7 @@ def path(seed: SeedSequence, sensor: str, estimator: str, seconds: float | None)
 
 def paths(given: argparse.Namespace) -> None:
     """Print the errors and the ANEES of the runs along EuRoC's trajectory."""
-    jobs = [delayed(path)(s, given.sensor, given.estimator, given.seconds) for s in SeedSequence(0).spawn(given.runs)]
+    jobs = [delayed(path)(seed, given) for seed in SeedSequence(0).spawn(given.runs)]
     runs = Parallel(n_jobs=2)(jobs)
     each, length = np.array([found for found, _ in runs])[:, 1:], runs[0][1]
     error = np.sqrt(np.mean(each[:, :, 0] ** 2, axis=1))
@@ -206,7 +243,7 @@ def paths(given: argparse.Namespace) -> None:
         mean, (low, high) = each[:, :, i].mean(axis=0), anees_interval(dof, given.runs)
         inside = np.mean((mean > low) & (mean < high))
         words.append(f"{name} ANEES ({dof}) {mean.mean():.2f}, in the band {inside:.1%}")
-    print(f"path {given.sensor} {given.estimator}: " + "; ".join(words))
+    print(f"{given.what} {given.sensor} {given.estimator}: " + "; ".join(words))
 
 
 def gauged(flight: Flight, estimator: str, seed: SeedSequence, every: int) -> np.ndarray:
@@ -245,14 +282,15 @@ def still(given: argparse.Namespace) -> None:
 def main() -> None:
     """Print the row of one question."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["path", "gauge", "still"])
+    parser.add_argument("what", choices=["path", "recorded", "gauge", "still"])
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--sensor", choices=[*SENSORS], default="stereo")
     parser.add_argument("--estimator", choices=[*ESTIMATORS], default="invariant")
+    parser.add_argument("--scale", type=float, default=10.0)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--seconds", type=float, help="not the whole trajectory, but its beginning")
     given = parser.parse_args()
-    {"path": paths, "gauge": gauges, "still": still}[given.what](given)
+    {"path": paths, "recorded": paths, "gauge": gauges, "still": still}[given.what](given)
 
 
 if __name__ == "__main__":

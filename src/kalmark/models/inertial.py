@@ -19,13 +19,11 @@ from kalmark.declare import NotNegative, Positive, register
 from kalmark.errors import ModelError
 from kalmark.geometry.rotations import (
     exp,
-    from_euler,
     left_jacobian,
     left_jacobian_rate,
     matrix,
     multiply,
     skew,
-    to_euler,
 )
 from kalmark.geometry.spaces import ROTATION, SCALAR, VECTOR3, Space
 from kalmark.models.kinematics import NODES, WEIGHTS, MotionModel
@@ -34,7 +32,7 @@ GRAVITY = 16  # where the gravity begins in a state that has it
 INERTIAL_DOF = 15  # of one that has none
 WINDOW_S, WINDOWS = 0.1, 5  # of readings that are compared, and how many of them at least are at rest
 SIGMAS = 5.0  # by which a window at rest may differ from the mean of those before it
-SHAKEN = 10.0  # times the noise of the data sheet that readings at rest may scatter by
+SHAKEN = 100.0  # times the noise of the data sheet that readings at rest may scatter by: motors run
 
 
 @compiled
@@ -225,9 +223,10 @@ def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) ->
     """Return the start of a unit of which the first readings u (N, 6), at `t_s` (N,), are made at rest.
 
     `start` (size,) and `cov` (dof, dof) are what is known without them: position, heading and the prior of the biases
-    are taken from there.  Roll, pitch and the bias of the rate come from the means; a bias of the force looks like a
-    tilt, so they are as uncertain as the prior of it says, and correlated with it.  With the gravity in the state the
-    attitude is the start's and the gravity is found instead.  Raises ModelError if the unit does not begin at rest.
+    are taken from there.  The tilt and the bias of the rate come from the means: the attitude of the start is turned
+    to the vertical by the shortest way.  A bias of the force looks like a tilt, so both are as uncertain as its prior
+    says, and correlated.  With the gravity in the state the attitude is the start's and the gravity is found instead.
+    Raises ModelError if the unit does not begin at rest.
     """
     count = _resting(motion, t_s, u, np.sqrt(np.diag(cov)))
     until_s, dt_s = float(t_s[count - 1]), float(np.median(np.diff(t_s)))
@@ -235,12 +234,12 @@ def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) ->
     state, P = start.copy(), cov.copy()
     state[7:10], state[10:13] = 0.0, w
     P[6:, :], P[:, 6:] = 0.0, 0.0
+    shaken = float(u[count - round(WINDOW_S / dt_s) : count, 3:].var(axis=0).mean())
+    P[6:9, 6:9] = shaken * (WINDOW_S / (2.0 * math.pi)) ** 2 * np.eye(3)  # vibrations faster than a window
     P[9:12, 9:12] = w_var * np.eye(3)
     up, prior = f / np.linalg.norm(f), float(cov[12, 12])
     if motion.space.dof == INERTIAL_DOF:
-        level = from_euler(np.array([math.atan2(up[1], up[2]), math.atan2(-up[0], math.hypot(up[1], up[2])), 0.0]))[0]
-        yaw = to_euler(start[3:7])[0][2]
-        state[3:7] = multiply(exp(np.array([0.0, 0.0, yaw])), level)
+        state[3:7] = multiply(exp(_shortest_turn(matrix(start[3:7]) @ up)), start[3:7])
     share = prior / (prior + f_var)  # of what the length of f has too much, that is the bias's
     excess = float(np.linalg.norm(f)) - motion.gravity_mps2
     state[13:16] = share * excess * up
@@ -264,6 +263,14 @@ def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) ->
     return Rest(until_s, state, P)
 
 
+def _shortest_turn(v: Array) -> Array:
+    """Return the rotation vector (3,) of the shortest turn of a unit vector v (3,) to the vertical."""
+    axis = np.array([v[1], -v[0], 0.0])
+    sine = math.hypot(v[0], v[1])
+    axis = axis / sine if sine > 0 else np.array([1.0, 0.0, 0.0])
+    return axis * math.atan2(sine, v[2])
+
+
 def _resting(motion: Inertial, t_s: Array, u: Array, sigmas: Array) -> int:
     """Return how many of the readings u (N, 6) are made at rest before the first that may not be.
 
@@ -278,11 +285,11 @@ def _resting(motion: Inertial, t_s: Array, u: Array, sigmas: Array) -> int:
         )
     windows, variances = u[: count * n].reshape(count, n, 6), motion.densities**2
     means, white = windows.mean(axis=1), variances[:6] / dt_s
-    scatter = windows[:WINDOWS].var(axis=1, ddof=1).mean(axis=0)
-    first, k = means[:WINDOWS].mean(axis=0), np.arange(1, count)[:, None]
+    own = np.maximum(windows.var(axis=1, ddof=1), white)  # of a reading: more than white noise, where it vibrates
+    scatter, first, k = own[:WINDOWS].mean(axis=0), means[:WINDOWS].mean(axis=0), np.arange(1, count)[:, None]
     off = np.append(np.abs(first[:3]), abs(float(np.linalg.norm(first[3:])) - motion.gravity_mps2))
     known = np.append(sigmas[9:12], sigmas[12]) + np.sqrt(scatter[:4] / (n * WINDOWS))
-    spread = np.maximum(scatter, white) * (1.0 + 1.0 / k) / n + variances[6:] * (k * n * dt_s)
+    spread = (own[1:] + np.cumsum(own, axis=0)[:-1] / k**2) / n + variances[6:] * (k * n * dt_s)
     still = (np.abs(means[1:] - np.cumsum(means, axis=0)[:-1] / k) <= SIGMAS * np.sqrt(spread)).all(axis=1)
     resting = count if still.all() else int(np.argmin(still))  # less the window in which it may begin to move
     if resting < WINDOWS or (scatter > SHAKEN**2 * white).any() or (off > SIGMAS * known).any():
@@ -300,6 +307,7 @@ def _mean_at_rest(motion: Inertial, u: Array, dt_s: float, at: int) -> tuple[Arr
     white, walk = float(motion.densities[at] ** 2), float(motion.densities[6 + at] ** 2)
     best = math.sqrt(3.0 * white / walk) if walk > 0 else math.inf
     n = min(len(u), max(round(WINDOWS * WINDOW_S / dt_s), math.ceil(min(best / dt_s, len(u)))))
-    last = u[-n:]
-    variance = max(white / dt_s, float(last.var(axis=0, ddof=1).mean())) / n + walk * n * dt_s / 3.0
-    return last.mean(axis=0), variance
+    size = max(2, round(WINDOW_S / dt_s))
+    means = u[len(u) - n // size * size :].reshape(-1, size, 3).mean(axis=1)  # vibrations are not white
+    variance = max(white / (n * dt_s), float(means.var(axis=0, ddof=1).mean()) / len(means)) + walk * n * dt_s / 3.0
+    return u[-n:].mean(axis=0), variance
