@@ -135,3 +135,25 @@ def test_a_range_tells_the_depth_of_what_a_bearing_began() -> None:
         assert run.outcomes["associated"] == STEPS // 2 * POINTS
     assert 2.0 < np.mean([run.pose_nees for run in runs]) < 4.2
     assert 1.3 < np.mean([run.landmark_nees for run in runs]) < 2.8
+
+
+def standing(landmark: Any, seed: int) -> float:
+    """Return the mean pose NEES (6) of a robot that stands before a stereo pair."""
+    rng, pair, motion = np.random.default_rng(seed), km.sensors.Stereo(), km.motion.Odometry3D(1e-4, 1e-4, 1e-4, 1e-4)
+    slam = km.Slam([km.Robot("r", motion, sensors={"pair": km.Mount(pair, at=CAMERA_AT, landmark=landmark)})])
+    points = np.column_stack([rng.uniform(4, 14, POINTS), rng.uniform(-3, 3, POINTS), rng.uniform(-2, 2, POINTS)])
+    T, N, nees = np.array([0, 0, 0, 0, 0, 0, 1.0]), motion.control_noise(np.zeros(6)), []
+    for k in range(100):
+        T = motion.move(T, rng.multivariate_normal(np.zeros(6), N), 0.0)[0]
+        slam.process(km.Control(0.1 * k, "r", np.zeros(6)))
+        v = frames3d.to_frame_many(frames3d.compose(T, CAMERA_AT)[0], points)[0]
+        seen, y = np.flatnonzero(pair.sees(v)), pair.expect(v)[0] + rng.normal(size=(POINTS, 4))
+        slam.process(km.Scan(0.1 * k, "r", "pair", y[seen], seen.tolist()))
+        d = frames3d.minus(slam.mean("r"), T)
+        nees.append(d @ np.linalg.solve(slam.covariance("r"), d))
+    return float(np.mean(nees))
+
+
+@pytest.mark.parametrize("landmark", IN_SPACE[:2], ids=lambda kind: kind.kind)
+def test_anchored_points_of_a_stereo_pair_that_stands_are_not_corrected_by_parallaxes(landmark: Any) -> None:
+    assert 3.5 < np.mean([standing(landmark, seed) for seed in range(5)]) < 9.0

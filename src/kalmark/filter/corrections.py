@@ -133,7 +133,8 @@ def iterate(
     correction = np.zeros(len(P_ss))
     origin = mean[:3].copy()
     turned = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
-    depths = anchored(table if most > 1 else table[:0])  # a single step is worse off with it: docs/bearing_only.md
+    parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
+    depths = anchored(table if parallaxes else table[:0])
     v, H, HP, Z = linear
     s, S = s_j, S_j = v, HP  # of the types of a sensor's place and Jacobian, which only inverse distances need
     baselines = (depths, s, S, s)
@@ -243,7 +244,7 @@ def invariant(
     origin, x_before = mean[:3].copy(), x.copy()
     before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     V, correction = gain(P, n, index, H, M, v, (h, count))
-    depths = anchored(atoms if limits[0] > 1 else atoms[:0])
+    depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
     rows, baselines = index[:h], (depths, s, S, s)
     if len(depths):

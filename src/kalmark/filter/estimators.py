@@ -22,7 +22,8 @@ class Update(NamedTuple):
     """One correction: y (K, m) with noise R (K, p, p), of the first d numbers of the K blocks `slots`.
 
     `model` is the observation model, compiled (a tuple) or in Python; `robot` and `mount` are slots, `mount` -1 if it
-    is not in the map.  What has d2 > gate is not fused.
+    is not in the map.  What has d2 > gate is not fused.  With `parallax`, inverse distances are corrected by the parallax
+    that they stand for, if the estimator iterates; a sensor that finds depth measures themselves.
     """
 
     model: Any
@@ -33,6 +34,7 @@ class Update(NamedTuple):
     y: Array
     R: Array
     gate: float = math.inf
+    parallax: bool = True
 
 
 class Movement(NamedTuple):
@@ -143,28 +145,29 @@ class _Estimator:
         Observations whose covariance is not positive definite are left out; if only that of all together is not, they
         are fused one after the other.
         """
-        model, robot, mount, slots, d, y, R, gate = update
+        model, robot, mount, slots, d, y, R, gate, parallax = update
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
         scan = robot_here, mount_here, here, d, y, R, gate
-        done = self._fused(model, m, scan)
+        done = self._fused(model, m, scan, parallax)
         if not done.valid and not done.fused.any():
-            done = self._one_by_one(model, m, scan, done)
+            done = self._one_by_one(model, m, scan, done, parallax)
         map_.corrected(robot, self.transports)
         return done
 
-    def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan) -> Correction:
+    def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan, parallax: bool) -> Correction:
         run = type(self).compiled if isinstance(model, tuple) else type(self).source
-        return Correction(*run(model, m.whole, scan, self._option(m)))
+        whole = m.whole if parallax else (*m.whole[:-1], corrections.routines(m.axes, False))
+        return Correction(*run(model, whole, scan, self._option(m)))
 
     def _one_by_one(
-        self, model: Any, m: StochasticMap, scan: corrections.Scan, together: Correction
+        self, model: Any, m: StochasticMap, scan: corrections.Scan, together: Correction, parallax: bool
     ) -> Correction:  # fmt: skip
         """Fuse those of a scan one after the other that could not be fused together."""
         robot, mount, slots, d, y, R, gate = scan
         d2, fused = together.d2.copy(), together.fused.copy()
         for k in np.flatnonzero(d2 <= gate).tolist():
             one = slice(k, k + 1)
-            done = self._fused(model, m, (robot, mount, slots[one], d, y[one], R[one], gate))
+            done = self._fused(model, m, (robot, mount, slots[one], d, y[one], R[one], gate), parallax)
             fused[k] = done.fused[0]
             if not done.valid:
                 d2[k] = np.nan
@@ -175,7 +178,7 @@ class _Estimator:
 
         Returns d2 (K,) of the pairs of the first one, and whether the covariances are valid.
         """
-        model, *scan = update
+        model, *scan = update[:-1]
         run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
         m = map_.opened(update.robot, update.mount, update.slots, self.transports).map
         d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)

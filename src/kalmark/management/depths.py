@@ -75,7 +75,7 @@ def approach(scan: ScanContext, model: ObservationModel, slots: Index, rows: lis
     inverse = np.exp(-log_scale[far, None]) / np.linalg.norm(v[far], axis=1)[:, None]
     R_far = SHARE * (variance[far, None] * inverse**2)[:, None]
     view = InverseRange(model.landmark, scan.channel.at)
-    return Update(view, scan.robot, scan.channel.mount, slots[far], model.d, inverse, R_far, scan.channel.gate)
+    return Update(view, scan.robot, scan.channel.mount, slots[far], model.d, inverse, R_far, scan.channel.gate, False)
 
 
 def _scales(scan: ScanContext, v: Array, y: Array, R: Array) -> tuple[Array, Array]:

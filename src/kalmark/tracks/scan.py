@@ -100,7 +100,8 @@ class ScanContext:
         y, R = (self.y, self.R) if len(rows) == len(self.y) else (self.y[rows], self.R[rows])
         R = self.channel.noise(self.map, self.robot, model, slots, R, self.own_noise)
         R, second = self._weighed(model, slots, y, R), self.channel.second(self.robot)
-        return Update(model.model, self.robot, second, slots, model.d, y, R, self.channel.gate)
+        parallax = not self.channel.finds_depth
+        return Update(model.model, self.robot, second, slots, model.d, y, R, self.channel.gate, parallax)
 
     def known_update(self, model: ObservationModel, l: Array, rows: list[int]) -> Update:
         """Return the correction by the observations `rows` of the landmarks l (K, n), which are known exactly."""
