@@ -249,22 +249,23 @@ def inverse_depth_linearity(T: Array, l: Array, sigma_rho: Array) -> Array:
 @compiled
 def anchored_as_point(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the points v (K, 3) of anchored points l (K, 7) in the frame T, V_T (K, 3, 6) and V_l (K, 3, 7)."""
-    p, P_l = anchored_to_point(l)
-    v, V_T, V_p = to_frame_many(T, p)
-    return v, V_T, chained(V_p, P_l)
+    return through_point(T, *anchored_to_point(l))
 
 
 @compiled
 def inverse_depth_as_point(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the points v (K, 3) of inverse-depth points l (K, 6) in the frame T, V_T (K, 3, 6) and V_l (K, 3, 6)."""
-    p, P_l = inverse_depth_to_point(l)
-    v, V_T, V_p = to_frame_many(T, p)
-    return v, V_T, chained(V_p, P_l)
+    return through_point(T, *inverse_depth_to_point(l))
 
 
 @compiled
 def homogeneous_as_point(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the points v (K, 3) of homogeneous points l (K, 4) in the frame T, V_T (K, 3, 6) and V_l (K, 3, 4)."""
-    p, P_l = homogeneous_to_point(l)
+    return through_point(T, *homogeneous_to_point(l))
+
+
+@compiled
+def through_point(T: Array, p: Array, P_l: Array) -> tuple[Array, Array, Array]:
+    """Return points p (K, 3) in the frame T, v (K, 3), V_T (K, 3, 6) and V_l (K, 3, n), by their P_l (K, 3, n)."""
     v, V_T, V_p = to_frame_many(T, p)
     return v, V_T, chained(V_p, P_l)
