@@ -22,8 +22,8 @@ class Update(NamedTuple):
     """One correction: y (K, m) with noise R (K, p, p), of the first d numbers of the K blocks `slots`.
 
     `model` is the observation model, compiled (a tuple) or in Python; `robot` and `mount` are slots, `mount` -1 if it
-    is not in the map.  What has d2 > gate is not fused.  With `parallax`, inverse distances are corrected by the parallax
-    that they stand for, if the estimator iterates; a sensor that finds depth measures themselves.
+    is not in the map.  What has d2 > gate is not fused.  With `parallax`, inverse distances are corrected by the
+    parallax that they stand for, if the estimator iterates; a sensor that finds depth measures the distances themselves.
     """
 
     model: Any
