@@ -23,7 +23,7 @@ class Update(NamedTuple):
 
     `model` is the observation model, compiled (a tuple) or in Python; `robot` and `mount` are slots, `mount` -1 if it
     is not in the map.  What has d2 > gate is not fused.  With `parallax`, inverse distances are corrected by the
-    parallax that they stand for, if the estimator iterates; a sensor that finds depth measures the distances themselves.
+    parallax that they stand for, if the estimator iterates; a sensor that finds depth measures the distances.
     """
 
     model: Any
