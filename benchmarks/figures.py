@@ -587,7 +587,7 @@ def structure() -> Iterator[Figure]:
 
 
 def figures() -> list[Figure]:
-    """Return all figures, in the order of the page."""
+    """Return all figures, in the order of the page: those of a section together."""
     parts = (
         exactness,
         campaigns,
@@ -608,7 +608,9 @@ def figures() -> list[Figure]:
         speed,
         structure,
     )
-    return [figure for part in parts for figure in part()]
+    found = [figure for part in parts for figure in part()]
+    sections = list(dict.fromkeys(figure.section for figure in found))
+    return sorted(found, key=lambda figure: sections.index(figure.section))
 
 
 HEAD = """# Measured figures
