@@ -47,7 +47,7 @@ def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     def opened(text: str, log: Log, *overrides: str) -> tuple[Config, Log]:
         path = tmp_path / "my.yaml"
         path.write_text(text)
-        monkeypatch.setattr(opening_module, "open_config_log", lambda _: log)
+        monkeypatch.setattr(opening_module, "open_config_log", lambda _, **__: log)
         return open_run(path, tmp_path, overrides)
 
     return opened

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from kalmark.cli.shared import writable
@@ -61,6 +60,8 @@ def convert(
 
 def _write_path(out: Path, log: Log | None, run: Run | None, robot: str | None) -> None:
     """Write the path of a robot: of a run the estimated one, of a log the true one.  Raises KalmarkError."""
+    import numpy as np
+
     from kalmark.logs.log import Trajectory
     from kalmark.logs.poses import write_path
 
