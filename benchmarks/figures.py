@@ -172,12 +172,12 @@ def motions() -> Iterator[Figure]:
         ("compass_and_gyro", 3, "ekf"),
         ("diver", 6, "invariant"),
     ):
+        text = "{1} / {5} / {9} / {11} of {13}" if world == "diver" else "{1} / {5} / {7} / {9} of {11}"  # it has a state
         name = (
             f"`{world}`, `{estimator}`: pose ANEES ({dof}) / in band / NEES of its constants (1) / runs inside 99.7 %"
         )
         yield Figure("Sensors of the state", name, "" if estimator == "ekf" else "90 % in the band / 97 of 100",
-                     f"python benchmarks/motions.py {world} --estimator {estimator}",
-                     row(world, "{1} / {5} / {7} / {9} of {11}"))  # fmt: skip
+                     f"python benchmarks/motions.py {world} --estimator {estimator}", row(world, text))  # fmt: skip
     for world, dof in (("radar", 3), ("radar_in_space", 6)):
         yield Figure("Sensors of the state", f"`{world}`: pose ANEES ({dof}) / in band / ANEES of the whole state (1)",
                      "90 % in the band", f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip
