@@ -172,7 +172,9 @@ def motions() -> Iterator[Figure]:
         ("compass_and_gyro", 3, "ekf"),
         ("diver", 6, "invariant"),
     ):
-        text = "{1} / {5} / {9} / {11} of {13}" if world == "diver" else "{1} / {5} / {7} / {9} of {11}"  # it has a state
+        text = (
+            "{1} / {5} / {9} / {11} of {13}" if world == "diver" else "{1} / {5} / {7} / {9} of {11}"
+        )  # it has a state
         name = (
             f"`{world}`, `{estimator}`: pose ANEES ({dof}) / in band / NEES of its constants (1) / runs inside 99.7 %"
         )
