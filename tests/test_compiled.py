@@ -6,13 +6,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import numba
 import numpy as np
 import pytest
 
 from kalmark import compiled
-from kalmark.compiled import address_of, by_address, signature_of
+from kalmark.compiled import _CheckedFiles, address_of, by_address, signature_of
 from kalmark.filter.corrections import compile_correction, compiled_textbook
 
 SUM = signature_of("f8(f8[::1])")
@@ -90,6 +91,7 @@ def test_a_job_that_fails_is_not_taken_for_done(tmp_path: Path) -> None:
 DAMAGED = """
 import sys
 from pathlib import Path
+from unittest.mock import patch
 import numpy as np
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import product
@@ -125,3 +127,13 @@ def test_compiled_code_that_is_damaged_on_the_disk_is_noticed_and_made_anew(tmp_
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "20\n"
+
+
+def test_two_processes_that_save_two_overloads_at_once_name_two_files(tmp_path: Path) -> None:
+    one, other = (_CheckedFiles(str(tmp_path), "f", source_stamp=0) for _ in range(2))
+    with patch.object(other, "_load_index", return_value={}):  # read before the other was saved
+        one.save("a", 1)
+        other.save("b", 2)
+    assert other.load("b") == 2 and one.load("a") in (1, None)
+    one.save("a", 1)
+    assert (one.load("a"), one.load("b")) == (1, 2)

@@ -69,6 +69,16 @@ def cache_folder(part: str) -> str:
 class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc, unused-ignore]
     """The files of one function's compiled code, which end with their checksums."""
 
+    def save(self, key: Any, data: Any) -> None:
+        """Save the code of an overload in a file that is named by its key.
+
+        numba numbers them: two processes that save two overloads at once would give both the same number, and one of
+        them would run the code of the other.
+        """
+        name = self._data_name(int.from_bytes(hashlib.sha256(repr(key).encode()).digest()[:8], "big"))
+        self._save_data(name, data)
+        self._save_index({**self._load_index(), key: name})
+
     def _load_index(self) -> Any:
         return super()._load_index() if _whole(self._index_path) is not None else {}
 
