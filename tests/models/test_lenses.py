@@ -49,6 +49,11 @@ CAMERAS: dict[str, tuple[str, tuple[float, ...], tuple[float, ...], Array]] = { 
         np.array([848.0, 800.0]),
     ),
     "ideal fisheye": ("equidistant", K, (), SIZE),
+    "tsai": ("tsai", (525.06, 524.245, 308.649, 236.536), (-0.1035, 0.1735), SIZE),
+    "tsai with a limit": ("tsai", K, (0.1, -0.02), SIZE),
+    "davison": ("davison", (195.0, 195.0, 162.0, 125.0), (9e-6 * 195**2,), np.array([320.0, 240.0])),
+    "davison, the other way": ("davison", K, (-0.05,), SIZE),
+    "fov": ("fov", K, (0.9,), SIZE),
 }
 EXACT = [name for name, (lens, _, _, _) in CAMERAS.items() if lens != "radial"]
 
@@ -110,6 +115,23 @@ def test_the_lenses_agree_where_one_is_a_case_of_the_other(rng: np.random.Genera
     ideal = cameras.project(cameras.EQUIDISTANT, v, cameras.parameters("equidistant", K))[0]
     angle = np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2])
     np.testing.assert_allclose(np.hypot(*((ideal - K[2:]) / K[:2]).T), angle, atol=1e-12)
+
+
+def test_davison_s_lens_is_that_of_monoslam() -> None:
+    k, kd = (195.0, 195.0, 162.0, 125.0), 9e-6  # of pixels, SceneLib2
+    par = cameras.parameters("davison", k, (kd * 195**2,))
+    for u, v in ((10.0, 20.0), (300.0, 200.0), (162.0, 125.0)):
+        a, b = u - 162.0, v - 125.0
+        straight = np.array([a, b]) / np.sqrt(1 - 2 * kd * (a * a + b * b)) / 195.0
+        ray = cameras.back_project(cameras.DAVISON, np.array([[u, v]]), par)[0][0]
+        np.testing.assert_allclose(ray[:2] / ray[2], straight, atol=1e-14)
+
+
+@pytest.mark.parametrize("lens", ["davison", "fov"])
+def test_a_lens_of_one_number_takes_one(lens: str) -> None:
+    for wrong in ((), (0.1, 0.2), *(((-1.0,), (4.0,)) if lens == "fov" else ())):
+        with pytest.raises(ModelError, match="one number"):
+            cameras.parameters(lens, K, wrong)
 
 
 def test_the_pixels_are_those_of_the_formulas_written_out() -> None:

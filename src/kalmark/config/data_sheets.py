@@ -1,17 +1,20 @@
-"""The noise of an inertial unit as Kalibr's `imu.yaml` has it, for a motion that names such a file as `data_sheet`."""
+"""Files that a configuration names: a motion Kalibr's `imu.yaml`, as `data_sheet`; a camera its `calibration`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from kalmark.config.tree import OVERRIDE, Tree, show
 from kalmark.declare import class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import most
+from kalmark.logs.calibration import INTRINSICS, read_calibration
 from kalmark.logs.source import mapping
 
-KEY = "data_sheet"
+KEY, CALIBRATION = "data_sheet", "calibration"
 NAMES = (
     "gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density", "accelerometer_random_walk",
 )  # fmt: skip
@@ -46,30 +49,64 @@ def _density(path: Path, name: str, value: Any) -> float:
     return float(value)
 
 
+def calibration(path: str | Path, camera: str | None = None) -> dict[str, Any]:
+    """Return a camera's calibration (OpenCV, Kalibr, ROS, EuRoC) as parameters of `pinhole`; its mount as `mount`.
+
+    `camera` names one of several in the file.  Raises ConfigError: file, key, value and what was expected.
+    """
+    try:
+        return read_calibration(Path(path), camera)
+    except LogError as error:
+        raise ConfigError(str(error)) from None
+
+
 def take_data_sheets(tree: Tree, path: Path | None) -> None:
-    """Put the noise of each `data_sheet` that a motion of the tree, read from the file `path`, names in its place.
+    """Put what is in each `data_sheet` and `calibration` that a tree, read from the file `path`, names in its place.
 
     What is given beside it stays.  The file is looked for beside `path`, that of an override in the working directory.
     Raises ConfigError.
     """
     robots = tree.values.get("robots")
     for name, robot in robots.items() if isinstance(robots, dict) else ():
-        motion = robot.get("motion") if isinstance(robot, dict) else None
-        if not isinstance(motion, dict) or KEY not in motion or not _has_one(motion.get("type")):
+        if not isinstance(robot, dict):
             continue
-        key = ("robots", name, "motion", KEY)
-        place, given = tree.place(key), motion.pop(KEY)
-        if not isinstance(given, str):
-            raise ConfigError(f"{place}: {'.'.join(key)}: got {show(given)}, expected the path of Kalibr's imu.yaml")
-        beside = Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
-        try:
-            found = data_sheet(beside / given)
-        except ConfigError as error:
-            raise ConfigError(f"{place}: {'.'.join(key)}: {error}") from None
-        motion |= found | motion
+        _take(tree, path, ("robots", name, "motion"), robot.get("motion"))
+        sensors = robot.get("sensors")
+        for sensor, section in sensors.items() if isinstance(sensors, dict) else ():
+            _take(tree, path, ("robots", name, "sensors", sensor), section)
 
 
-def _has_one(kind: Any) -> bool:
-    """Return whether a type of motion has the parameters of a data sheet."""
-    models = classes("motion").get(kind, []) if isinstance(kind, str) else []
-    return any(own.name == _parameter(NAMES[0]) for model in models for own in parameters(model))
+def _take(tree: Tree, path: Path | None, where: tuple[str, ...], section: Any) -> None:
+    """Put what the file of a motion or a sensor says in its place."""
+    key = KEY if where[-1] == "motion" and len(where) == 3 else CALIBRATION
+    if not isinstance(section, dict) or key not in section or not _has_one(key, section.get("type")):
+        return
+    place, given = tree.place((*where, key)), section.pop(key)
+    name = f"{place}: {'.'.join((*where, key))}"
+    file, camera = given, None
+    if key == CALIBRATION and isinstance(given, dict) and given.keys() == {"file", "camera"}:
+        file, camera = given["file"], str(given["camera"])
+    if not isinstance(file, str):
+        of_camera = "the path of a camera's calibration, or {file: PATH, camera: NAME}"
+        wanted = "the path of Kalibr's imu.yaml" if key == KEY else of_camera
+        raise ConfigError(f"{name}: got {show(given)}, expected {wanted}")
+    beside = Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
+    try:
+        found = data_sheet(beside / file) if key == KEY else calibration(beside / file, camera)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
+    if key == CALIBRATION and not _has("sensor", section["type"], "lens"):
+        if np.any(found["distortion"]):
+            raise ConfigError(f"{name}: got a lens with distortion, expected one without: {section['type']} has none")
+        found = {own: value for own, value in found.items() if own not in ("lens", "distortion")}
+    section |= found | section
+
+
+def _has_one(key: str, kind: Any) -> bool:
+    """Return whether a type of motion has the parameters of a data sheet, or one of sensor those of a calibration."""
+    return _has("motion", kind, _parameter(NAMES[0])) if key == KEY else _has("sensor", kind, INTRINSICS[0])
+
+
+def _has(role: str, kind: Any, name: str) -> bool:
+    models = classes(role).get(kind, []) if isinstance(kind, str) else []
+    return any(own.name == name for model in models for own in parameters(model))

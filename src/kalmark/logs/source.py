@@ -24,6 +24,7 @@ Refuse = Callable[[str], None]
 """Takes one line about a bad row: raises it as a LogError, or notes it and lets reading go on (`on_error`)."""
 
 _PLAIN_TIME = re.compile(r"(-?)([0-9]+)(?:\.([0-9]{0,9}))?")
+_OPENCV_HEAD = re.compile(r"\A%YAML:[^\n]*")  # which is no YAML
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _LONGEST_TIME = 60  # characters; 2**63 ns in seconds has 20
 _T_MAX_NS = 2**63 - 1
@@ -280,8 +281,8 @@ def placed(pose: Array) -> dict[str, float]:
 
 
 def mapping(path: Path) -> dict[str, Any]:
-    """Return the content of a YAML file.  Raises LogError if it is none."""
-    text = read_text(path)
+    """Return the content of a YAML file, OpenCV's among them.  Raises LogError if it is none."""
+    text = _OPENCV_HEAD.sub("", read_text(path)).replace("!!opencv-matrix", "")
     try:
         content = YAML(typ="safe", pure=True).load(text)
     except Exception as error:  # of odd YAML the parser raises anything: unhashable keys, dates, integers, recursion

@@ -6,6 +6,9 @@ lens             from v to the pixel                                            
 RADIAL           x_d = x (1 + d1 r^2 + d2 r^4 + ...), x on the plane z = 1       fx fy cx cy, limit, n, d (n), c
 RADTAN           the same with k1 k2 k3, and tangential p1 p2 (OpenCV)          fx fy cx cy, limit, 5, k1 k2 k3 p1 p2
 EQUIDISTANT      theta_d = theta (1 + k1 theta^2 + k2 theta^4 + ...)            fx fy cx cy, limit, n, k (n)
+TSAI             x = x_d (1 + c1 r_d^2 + c2 r_d^4 + ...)                        fx fy cx cy, limit, n, c (n), its limit
+DAVISON          r_d = r / sqrt(1 + 2 k r^2)                                    fx fy cx cy, limit, 1, k
+FOV              r_d = atan(2 r tan(w / 2)) / w                                 fx fy cx cy, limit, 1, w
 OMNI             `project_omni`, `back_project_omni`                            cx cy c d e, n, a (n), b
 ===============  =============================================================  ===============================
 
@@ -13,9 +16,10 @@ Intrinsics are k = (fx, fy, cx, cy) in pixels.  `limit` is the radius on the pla
 at which the distortion stops growing and the image would fold over.  Pixels and Jacobians are NaN where a lens shows
 nothing: beyond the limit, and behind the camera (z <= 0; an EQUIDISTANT lens sees there too, up to its limit, and OMNI
 gives a pixel to every direction).  `parameters` makes `par`.  The correction c of a radial distortion has the same form
-as that.  OMNI is Scaramuzza's (2006): polynomials between the angle and the radius in the image, and an affine matrix
-of the pixels.  Nothing depends on the length of v, so that v may be the ray to a landmark of unknown depth.  [TB]
-`pinHole`, `invPinHole`, `omniCam`, `invOmniCam`.
+as that.  TSAI (1987) has a polynomial that takes the distortion off, limited in r_d; DAVISON (MonoSLAM, 2007) and FOV
+(Devernay and Faugeras, 2001) have one number.  OMNI is Scaramuzza's (2006): polynomials between the angle and the
+radius in the image, and an affine matrix of the pixels.  Nothing depends on the length of v, so that v may be the ray
+to a landmark of unknown depth.  [TB] `pinHole`, `invPinHole`, `omniCam`, `invOmniCam`.
 """
 
 from __future__ import annotations
@@ -30,8 +34,11 @@ from kalmark.compiled import compiled
 from kalmark.errors import ModelError
 from kalmark.geometry.directions import unit_many
 
-RADIAL, RADTAN, EQUIDISTANT, OMNI = 0, 1, 2, 3
-LENSES = {"radial": RADIAL, "radtan": RADTAN, "equidistant": EQUIDISTANT, "omnidirectional": OMNI}
+RADIAL, RADTAN, EQUIDISTANT, OMNI, TSAI, DAVISON, FOV = range(7)
+LENSES = {
+    "radial": RADIAL, "radtan": RADTAN, "equidistant": EQUIDISTANT, "omnidirectional": OMNI, "tsai": TSAI,
+    "davison": DAVISON, "fov": FOV,
+}  # fmt: skip
 HEAD = 6  # numbers before the coefficients
 ROUNDING = 1e-15
 
@@ -57,9 +64,22 @@ def parameters(lens: str, k: Any, forward: Any = (), backward: Any = None, size:
             raise ModelError(f"distortion {d.tolist()}: radtan expects k1, k2, p1, p2 and perhaps k3")
         d = np.pad(d, (0, 5 - len(d)))[[0, 1, 4, 2, 3]]
         limit = valid_radius(d[:3])
-    else:
+    elif lens == "equidistant":
         limit = min(valid_radius(d), math.pi)
+    elif lens == "tsai":
+        c = np.array([valid_radius(d)])
+        limit = float(grown(c[0], d)[0]) if np.isfinite(c[0]) else math.inf
+    else:
+        limit = one_number_limit(lens, d)
     return np.concatenate([k, [limit, len(d)], d, c])
+
+
+def one_number_limit(lens: str, d: Array) -> float:
+    """Return the limit of a lens of one number d (1,): DAVISON and FOV.  Raises ModelError."""
+    if len(d) != 1 or (lens == "fov" and not 0.0 < d[0] < math.pi):
+        wanted = "k" if lens == "davison" else "w, an angle in rad above 0 and below pi"
+        raise ModelError(f"distortion {d.tolist()}: {lens} expects one number, {wanted}")
+    return 1.0 / math.sqrt(-2.0 * d[0]) if lens == "davison" and d[0] < 0.0 else math.inf
 
 
 @compiled
@@ -72,6 +92,8 @@ def project(lens: int, v: Array, par: Array) -> tuple[Array, Array]:
         e, E_v = _project_equidistant(v, par[:4], d)
     elif lens == RADTAN:
         e, E_v = _project_radtan(v, par[:4], d)
+    elif lens >= TSAI:
+        e, E_v = _project_radius(lens, v, par)
     else:
         e, E_v = project_pinhole(v, par[:4], d)
     for i in range(len(v)):
@@ -86,8 +108,8 @@ def project(lens: int, v: Array, par: Array) -> tuple[Array, Array]:
 def back_project(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
     """Return the viewing rays m (K, 3), unit vectors, of pixels y (K, 2), and M_y (K, 3, 2).
 
-    RADTAN and EQUIDISTANT invert `project` to the last digit, NaN for pixels that the lens cannot reach.  RADIAL and
-    OMNI are as good as their second polynomial.
+    RADIAL and OMNI are as good as their second polynomial; all others invert `project` to the last digit, NaN for
+    pixels that the lens cannot reach.
     """
     n = HEAD + int(par[5])
     if lens == OMNI:
@@ -96,6 +118,8 @@ def back_project(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
         return _back_project_equidistant(y, par)
     if lens == RADTAN:
         return _back_project_radtan(y, par)
+    if lens >= TSAI:
+        return _back_project_radius(lens, y, par)
     return back_project_pinhole(y, par[:4], par[n:])
 
 
@@ -249,6 +273,74 @@ def _back_project_equidistant(y: Array, par: Array) -> tuple[Array, Array]:
         M_y[i, 0, 1], M_y[i, 1, 0] = (rate * c - scale) * cos * sin / par[1], (rate * c - scale) * cos * sin / par[0]
         M_y[i, 2, 0], M_y[i, 2, 1] = -rate * s * cos / par[0], -rate * s * sin / par[1]
     return m, M_y
+
+
+@compiled
+def distorted_radius(lens: int, r: float, par: Array) -> tuple[float, float]:
+    """Return the r_d in the image of r >= 0 on the plane z = 1 by TSAI, DAVISON or FOV, and its derivative."""
+    d = par[HEAD]
+    if lens == DAVISON:
+        root = math.sqrt(1.0 + 2.0 * d * r * r)
+        return r / root, 1.0 / (root * root * root)
+    if lens == FOV:
+        t = 2.0 * math.tan(0.5 * d)
+        return math.atan(t * r) / d, t / (d * (1.0 + t * t * r * r))
+    n = HEAD + int(par[5])
+    rd = shrunk(r, par[HEAD:n], par[n])
+    return rd, 1.0 / grown(rd, par[HEAD:n])[1]
+
+
+@compiled
+def undistorted_radius(lens: int, rd: float, par: Array) -> tuple[float, float]:
+    """Return the r on the plane z = 1 of r_d >= 0 in the image by TSAI, DAVISON or FOV, and its derivative; or NaN."""
+    d = par[HEAD]
+    if lens == DAVISON:
+        rest = 1.0 - 2.0 * d * rd * rd
+        return (rd / math.sqrt(rest), rest**-1.5) if rest > 0.0 else (np.nan, np.nan)
+    if lens == FOV:
+        t, c = 2.0 * math.tan(0.5 * d), math.cos(rd * d)
+        return (math.tan(rd * d) / t, d / (t * c * c)) if rd * d < 0.5 * math.pi else (np.nan, np.nan)
+    n = HEAD + int(par[5])
+    return grown(rd, par[HEAD:n]) if rd < par[n] else (np.nan, np.nan)
+
+
+@compiled
+def _project_radius(lens: int, v: Array, par: Array) -> tuple[Array, Array]:
+    x, X_v = plane_many(v)
+    XD_x = np.empty((len(v), 2, 2))
+    for i in range(len(v)):
+        r = math.hypot(x[i, 0], x[i, 1])
+        rd, rate = distorted_radius(lens, r, par) if v[i, 2] > 0.0 and r < par[4] else (np.nan, np.nan)
+        _scaled(x[i], XD_x[i], r, rd, rate)
+    return _pixels(par[:4], x, XD_x, X_v)
+
+
+@compiled
+def _back_project_radius(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
+    v, X_xd, M_y = np.ones((len(y), 3)), np.empty((len(y), 2, 2)), np.empty((len(y), 3, 2))
+    for i in range(len(y)):
+        v[i, 0], v[i, 1] = (y[i, 0] - par[2]) / par[0], (y[i, 1] - par[3]) / par[1]
+        rd = math.hypot(v[i, 0], v[i, 1])
+        r, rate = undistorted_radius(lens, rd, par)
+        _scaled(v[i], X_xd[i], rd, r, rate)
+    m, M_v = unit_many(v)
+    for i in range(len(y)):
+        for a in range(3):
+            for b in range(2):
+                M_y[i, a, b] = (M_v[i, a, 0] * X_xd[i, 0, b] + M_v[i, a, 1] * X_xd[i, 1, b]) / par[b]
+    return m, M_y
+
+
+@compiled
+def _scaled(x: Array, J: Array, r: float, new: float, rate: float) -> None:
+    """Bring x (2 or 3,) in place from the radius r to the new one; J (2, 2) becomes the Jacobian."""
+    scale = new / r if r > 0.0 else rate
+    for a in range(2):
+        for b in range(2):
+            along = (rate - scale) * x[a] * x[b] / (r * r) if r > 0.0 else 0.0
+            J[a, b] = along + (scale if a == b else 0.0)
+    x[0] *= scale
+    x[1] *= scale
 
 
 # ---------------------------------------------------------------------- pin holes

@@ -570,12 +570,14 @@ class _PinHole(_Camera):
 class _Lens(_PinHole):
     """A pin-hole camera with a lens.
 
-    `lens`: "radial" (coefficients of r^2, r^4, ...), "radtan" (k1, k2, p1, p2, k3), "equidistant" (k1 to k4, fish-eye).
+    `lens`: "radial" (coefficients of r^2, r^4, ...), "radtan" (k1, k2, p1, p2, k3), "equidistant" (k1 to k4, fish-eye),
+    "tsai" (coefficients of r_d^2, r_d^4, ... that take the distortion off), "davison" (k), "fov" (w).
     """
 
     lens: Annotated[
-        Literal["radial", "radtan", "equidistant"],
-        "What `distortion` means: `radial` d1 r^2 + d2 r^4 + ..., `radtan` k1 k2 p1 p2 k3, `equidistant` k1 to k4.",
+        Literal["radial", "radtan", "equidistant", "tsai", "davison", "fov"],
+        "What `distortion` means: `radial` d1 r^2 + d2 r^4 + ..., `radtan` k1 k2 p1 p2 k3, `equidistant` k1 to k4,"
+        " `tsai` c1 r_d^2 + c2 r_d^4 + ... to undistort, `davison` k of r_d = r / sqrt(1 + 2 k r^2), `fov` w in rad.",
     ] = "radial"
     distortion: Annotated[Numbers, "Coefficients of the lens; none for an ideal one."] = ()
     sigma_px: PixelNoise = 1.0
@@ -599,7 +601,7 @@ class _Lens(_PinHole):
 class PinHole(_Lens):
     """A camera that sees points: pixels u, v.
 
-    [TB] pinHole.
+    [TB] pinHole.  `calibration` names a file of OpenCV, Kalibr, ROS or EuRoC instead: cameras.md.
     """
 
 
