@@ -1,6 +1,6 @@
 """How consistent motions and sensors of the state are: runs of a shipped world each, scored against the truth.
 
-    python benchmarks/motions.py [WORLD ...] [--runs 100]
+    python benchmarks/motions.py [WORLD ...] [--runs 100] [--seed 0]
 
 The runs are those of `kalmark campaign WORLD --runs 100`.  Printed for each: the mean pose ANEES (3) and how many steps
 are inside the 95 % band of so many runs; the ANEES of a state with more than a pose, by its degrees of freedom; at the
@@ -73,9 +73,9 @@ def run(name: str, seed: SeedSequence, estimator: str) -> Scored:
     return Scored(scores.series["pose"][0], state, value, len(better), better, scores.diverged)
 
 
-def report(name: str, runs: int, estimator: str) -> None:
+def report(name: str, runs: int, estimator: str, seed: int) -> None:
     """Print the row of a world."""
-    scored = Parallel(n_jobs=2)(delayed(run)(name, seed, estimator) for seed in SeedSequence(0).spawn(runs))
+    scored = Parallel(n_jobs=2)(delayed(run)(name, s, estimator) for s in SeedSequence(seed).spawn(runs))
     pose = np.mean([one.pose for one in scored], axis=0)
     low, high = anees_interval(3 * load_world(name).dimensions - 3, runs)
     known = np.isfinite(pose)
@@ -99,9 +99,10 @@ def main() -> None:
     parser.add_argument("worlds", nargs="*", default=WORLDS)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--estimator", default="invariant")
+    parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     for name in given.worlds:
-        report(name, given.runs, given.estimator)
+        report(name, given.runs, given.estimator, given.seed)
 
 
 if __name__ == "__main__":
