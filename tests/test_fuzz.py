@@ -14,7 +14,12 @@ pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be w
 import fuzz
 
 TARGETS = fuzz.targets()
-FOUND: list[tuple[str, bytes]] = [("g2o", b"\0PARAMS_SE3OFFSET 0\0 1\nEDGE")]
+FOUND: list[tuple[str, bytes]] = [
+    ("g2o", b"\0PARAMS_SE3OFFSET 0\0 1\nEDGE"),
+    ("config", b"log: {path: ~log, to_s: 0 }\n"),
+    ("plaza", b"122E22222223 .1 2\n"),
+    ("freiburg", b"ODOMETRY 0 1 0\nSENSOR " + 390 * b"\0"),
+]
 
 
 @pytest.mark.parametrize("name", TARGETS)

@@ -178,6 +178,143 @@ def test_the_numbers_of_a_camera_are_those_of_its_info(tmp_path: Path) -> None:
     assert "landmarks: {type: tag}" in text and "motion: {type: constant_velocity_3d" in text
 
 
+# ------------------------------------------------------------------ what bags of the field have
+def test_an_odometry_whose_poses_stand_still_is_taken_for_its_velocities(tmp_path: Path) -> None:
+    text = config_of(tmp_path, [odometry(T0 + t * 10**8, pose(0, 0, 0), 1.0, 0.1) for t in range(5)])
+    assert "/odom: {type: unicycle}" in text and "GUESS: its velocities, because its poses stand still" in text
+
+
+def test_velocities_and_satellite_fixes_start_with_an_unknown_heading(tmp_path: Path) -> None:
+    twist = {"header": header(T0, "base_link"), "twist": {"linear": {"x": 1.0}}}
+    messages = [Outgoing("/twist", "geometry_msgs/msg/TwistStamped", T0, twist)]
+    messages += [fix(T0 + t * 10**9, geodetic([float(t), 0.0, 0.0])) for t in range(5)]
+    assert "theta_rad: 0, sigma_xy_m: 5, sigma_theta_rad: 1.5}  # GUESS" in config_of(tmp_path, messages)
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_a_robot_without_controls_goes_on_as_it_goes(space: bool, tmp_path: Path) -> None:
+    beams = {"header": header(T0, "laser"), "angle_increment": 0.1, "range_max": 9.0, "ranges": [1.0, 2.0]}
+    if space:
+        messages = [fix(T0 + t * 10**9, geodetic([0.0, 0.0, 0.0])) for t in range(3)]
+    else:
+        messages = [Outgoing("/scan", "sensor_msgs/msg/LaserScan", T0, beams)]
+    text = config_of(tmp_path, messages)
+    assert f"motion: {{type: {'constant_velocity_3d' if space else 'constant_velocity'}," in text
+    open_run(tmp_path / "config.yaml")
+
+
+def markers(frame: str, w: float = 1.0, topic: str = "/markers") -> Outgoing:
+    """Return two markers, of which one has the place of the other; w of 0 leaves their rotations away."""
+    listed = [
+        {"id": k, "header": header(T0, frame), "pose": {"position": {"x": 1.0 + k}, "orientation": {"w": w}}}
+        for k in range(2)
+    ]
+    return Outgoing(topic, "visualization_msgs/msg/MarkerArray", T0, {"markers": listed})
+
+
+def test_markers_in_a_frame_of_the_world_are_a_map_and_no_observations(tmp_path: Path) -> None:
+    messages = [
+        odometry(T0, pose(0, 0, 0)),
+        odometry(T0 + 1, pose(1, 0, 0)),
+        markers("map"),
+        markers("odom", topic="/b"),
+    ]
+    text = config_of(tmp_path, messages)
+    assert text.count("is one of the world: a map, not what a sensor of the robot sees") == 2
+
+
+def test_markers_without_rotations_are_points(tmp_path: Path) -> None:
+    empty = Outgoing("/markers", "visualization_msgs/msg/MarkerArray", T0, {})
+    base = tf("/tf_static", T0, transform("base_link", "camera", T0, pose(0.5, 0, 0)))
+    text = config_of(tmp_path, [base, odometry(T0, pose(0, 0, 0)), odometry(T0 + 1, pose(1, 0, 0)), empty,
+                                markers("camera", w=0.0)])  # fmt: skip
+    assert "markers: {type: position}  # its mount is that of tf" in text
+    log = open_run(tmp_path / "config.yaml")[1]
+    assert log.events[0].y.tolist() == [] and log.events[1].y.tolist() == [[1.0, 0.0], [2.0, 0.0]]
+    assert log.describes["robots"]["robot"]["sensors"]["markers"]["mount"]["x_m"] == 0.5
+
+
+@pytest.mark.parametrize("levels", ["", "/fleet"])
+def test_frames_with_the_prefix_of_a_robot_are_its_own(levels: str, tmp_path: Path) -> None:
+    """Of commanded velocities, which name no frame."""
+    messages = []
+    for k, name in enumerate(("a", "b")):
+        messages += [Outgoing(f"{levels}/{name}/cmd_vel", "geometry_msgs/msg/Twist", T0, {"linear": {"x": 1.0}})]
+        messages += [tf("/tf_static", T0, transform(f"{name}/base_link", f"{name}/camera", T0, pose(k + 1.0, 0, 0)))]
+        messages += [markers(f"{name}/camera", topic=f"{levels}/{name}/seen")]
+    text = config_of(tmp_path, messages)
+    assert text.count("its mount is that of tf") == 2 and f"{levels}/b/cmd_vel: {{type: unicycle, robot: b}}" in text
+    robots = open_run(tmp_path / "config.yaml")[1].describes["robots"]
+    assert [m["mount"]["x_m"] for name in "ab" for m in robots[name]["sensors"].values()] == [1.0, 2.0]
+
+
+def test_two_odometries_of_one_robot_are_not_two_robots(tmp_path: Path) -> None:
+    messages = [
+        odometry(T0 + t, pose(t, 0, 0), topic=f"/{name}/odom") for t in range(3) for name in ("wheel", "visual")
+    ]
+    messages += [tf("/tf", T0 + t, transform("odom", "base_link", T0 + t, pose(t, 0, 0))) for t in range(3)]
+    text = config_of(tmp_path, messages)
+    assert "/visual/odom: {type: odometry_2d}  #" in text and "# not used: /wheel/odom" in text
+
+
+def test_robots_whose_odometry_is_in_tf_alone_have_their_names_there(tmp_path: Path) -> None:
+    messages = []
+    for t in range(3):
+        messages += [tf("/tf", T0 + t, transform(f"{n}/odom", f"{n}/base_link", T0 + t, pose(t, 0, 0))) for n in "ab"]
+    text = config_of(tmp_path, [*messages, markers("b/base_link", topic="/b/seen")])
+    assert (
+        "frame: a/odom, child_frame: a/base_link, robot: a}" in text
+        and "sensor: b_seen, take: [x_m, y_m, z_m], robot: b" in text
+    )
+
+
+@pytest.mark.parametrize("kind", ["all", "some"])
+def test_a_time_of_0_in_headers_is_none(kind: str, tmp_path: Path) -> None:
+    messages = [odometry(T0 + t * 10**9, pose(t, 0, 0)) for t in range(4)]
+    for message in messages if kind == "all" else messages[:1]:
+        message.fields["header"] = header(0, "odom")
+    text = config_of(tmp_path, messages)
+    assert ("time: recorded" in text) == (kind == "all")
+    log = open_run(tmp_path / "config.yaml")[1]
+    assert [event.t_ns for event in log.events] == [m.t_ns for m in messages[1 if kind == "all" else 2 :]]
+    assert [line.split(": ", 1)[1] for line in log.skipped] == (
+        [] if kind == "all" else ["/odom: 1 messages with a time of 0; `time: recorded` takes the recorder's"]
+    )
+
+
+@pytest.mark.parametrize(("back_ns", "wanted"), [(3600 * 10**9, "time: recorded"), (1, "on_error: skip")])
+def test_a_clock_that_was_set_back_gives_way_to_the_recorder(back_ns: int, wanted: str, tmp_path: Path) -> None:
+    messages = [odometry(T0 + t * 10**9, pose(t, 0, 0)) for t in range(6)]
+    late = messages[3:] if back_ns > 1 else messages[3:4]
+    for message in late:
+        message.fields["header"] = header(message.t_ns - back_ns - (10**9 if back_ns == 1 else 0), "odom")
+    text = config_of(tmp_path, messages)
+    assert wanted in text and ("runs back by 3.6e+03 s" in text or "run back by 1e-09 s" in text)
+    controls = open_run(tmp_path / "config.yaml")[1].events
+    assert sum(control.u[0] for control in controls) == pytest.approx(5)
+
+
+def test_positions_without_a_covariance_get_a_guess(tmp_path: Path) -> None:
+    bare = {"header": header(T0, "map"), "pose": {"pose": pose(0, 0, 0)}}
+    messages = [odometry(T0, pose(0, 0, 0)), odometry(T0 + 1, pose(1, 0, 0)), fix(T0, [48.0, 11.0, 0.0], sigma=0.0),
+                Outgoing("/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", T0, bare)]  # fmt: skip
+    text = config_of(tmp_path, messages)
+    assert "/pose: {type: fix, sigma_m: 0.5}" in text and "sigma_m: 2}" in text
+    open_run(tmp_path / "config.yaml")
+
+
+def test_poses_that_a_robot_is_to_have_are_not_its_odometry(tmp_path: Path) -> None:
+    goals = [Outgoing("/goal_pose", "geometry_msgs/msg/PoseStamped", T0 + t, {"header": header(T0 + t, "map"),
+             "pose": pose(t, 0, 0)}) for t in range(20)]  # fmt: skip
+    assert "# not used: /goal_pose" in config_of(tmp_path, [*goals, fix(T0, [48.0, 11.0, 0.0])])
+
+
+def test_a_car_s_wheelbase_is_to_be_looked_at(tmp_path: Path) -> None:
+    car = Outgoing("/drive", "ackermann_msgs/msg/AckermannDriveStamped", T0, {"header": header(T0, "base_link")})
+    text = config_of(tmp_path, [car])
+    assert "motion: {type: ackermann, wheelbase_m: 2.83, encoder_offset_m: 0}  # GUESS: its wheelbase" in text
+
+
 def test_a_file_that_is_no_bag_gets_one_line(kalmark: Kalmark, tmp_path: Path) -> None:
     for name, content in (("x.bag", b"not a bag"), ("x.mcap", b""), ("x.db3", b"SQLite format 3"), ("x.txt", b"a")):
         (tmp_path / name).write_bytes(content)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import kalmark as km
 from kalmark.config import load_config
 from kalmark.errors import DivergedError, EventError, LogError, RunError
 from kalmark.events import Control, Fix, Scan
@@ -40,6 +41,14 @@ def test_recording_leaves_the_filter_exactly_as_processing_alone_does(run: Run) 
     assert np.array_equal(run.history.mean[-1], slam.mean("rover"))
     assert np.array_equal(run.history.covariance[-1], slam.covariance("rover"))
     assert run.landmarks.ids == slam.landmarks().ids
+
+
+def test_candidates_of_a_robot_of_the_plane_with_a_velocity_have_places_in_the_plane() -> None:
+    robot = km.Robot("r", km.motion.ConstantVelocity(), sensors={"eye": km.Mount(km.sensors.RangeBearing())})
+    slam = km.Slam([robot], association=km.association.Automatic())
+    scans = [Scan(t_s=k / 10, robot="r", sensor="eye", y=[[3.0, 0.1], [4.0, 1.0], [5.0, -1.0]]) for k in range(15)]
+    history = record(slam, scans, progress=False).history
+    assert history.candidate_place.shape == (len(history.candidate_row), 2) and len(history.candidate_row) > 0
 
 
 def test_every_scan_is_a_step_and_every_observation_has_its_row(run: Run) -> None:

@@ -16,6 +16,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -259,7 +260,9 @@ def find_data(path: Path | str, base: Path | str | None = None) -> Path:
     the download cache.  It may begin with the name of these folders themselves, as oracle/NAME.json.gz does for a
     `KALMARK_ORACLE` that ends in /oracle.
     """
-    path = Path(path).expanduser()
+    path = Path(path)
+    with suppress(RuntimeError):  # ~ and the name of nobody: a file may be named so
+        path = path.expanduser()
     named = [Path(os.environ[name]) for name in ("KALMARK_DATA", "KALMARK_ORACLE") if os.environ.get(name)]
     places = [folder / path for folder in (Path(base or ""), *named, cache_folder())]  # an absolute path stays as it is
     places += [folder.parent / path for folder in named if path.parts[:1] == (folder.name,)]

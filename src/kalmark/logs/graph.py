@@ -34,7 +34,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan
+from kalmark.events import Control, Event, Id, Scan, shown
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
@@ -103,7 +103,7 @@ def pose_id(text: str) -> int:
     """Return the id of a pose, by which they are in order.  Raises ValueError."""
     found = landmark_id(text)
     if not isinstance(found, int):
-        raise ValueError(f"id {text!r} of a pose, expected a whole number")
+        raise ValueError(f"id {shown(text)} of a pose, expected a whole number")
     return found
 
 

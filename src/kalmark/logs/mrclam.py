@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, order
+from kalmark.events import Control, Event, Id, Scan, order, shown
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, nearest, quantity, read_points, rows, timed_rows
 
@@ -84,7 +84,7 @@ def read_barcodes(path: Path, request: Request) -> dict[int, Id]:
             subject, barcode = map(int, cells)
             subjects[barcode] = f"robot{subject}" if subject <= len(MRCLAM_ROBOTS) else subject
         except ValueError:
-            request.refuse(f"{path}:{line}: {' '.join(cells)!r}, expected a subject and its barcode")
+            request.refuse(f"{path}:{line}: {shown(' '.join(cells))}, expected a subject and its barcode")
     return subjects
 
 

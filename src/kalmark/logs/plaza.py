@@ -14,7 +14,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan
+from kalmark.events import Control, Event, Id, Scan, shown
 from kalmark.logs.arrays import arrays
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Refuse, Request, nanoseconds, number, one_robot, rows, timed_rows
@@ -78,7 +78,9 @@ def ranges(path: Path, refuse: Refuse) -> Iterator[tuple[int, int, int, float]]:
             if row[3] < 0:
                 raise ValueError
         except ValueError:
-            refuse(f"{path}:{line}: {' '.join(cells)!r}, expected time, receiver, beacon and a range of at least 0")
+            refuse(
+                f"{path}:{line}: {shown(' '.join(cells))}, expected time, receiver, beacon and a range of at least 0"
+            )
         else:
             yield row
 

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -154,10 +154,10 @@ def nanoseconds(text: str, unit_ns: int = 1_000_000_000) -> int:
     else:
         try:
             t_s = Decimal(text if "_" not in text else "")
-            if not abs(t_s) < _T_MAX_NS:  # of 1e999990 an integer has a million digits
+            if not t_s.copy_abs() < _T_MAX_NS:  # abs overflows; of 1e999990 an integer has a million digits
                 raise ValueError(text)
             t_ns = int((t_s * unit_ns).to_integral_value())
-        except (InvalidOperation, OverflowError, ValueError):
+        except (ArithmeticError, ValueError):  # of Decimal: no number, or one too large
             raise ValueError(text) from None
     if abs(t_ns) > _T_MAX_NS:
         raise ValueError(text)
@@ -227,7 +227,7 @@ def read_points(
                 raise ValueError
             points[id_of(cells[0])] = np.array([number(cell) for cell in cells[1:3]])
         except ValueError:
-            refuse(f"{path}:{line}: {' '.join(cells)!r}, expected {expected}")
+            refuse(f"{path}:{line}: {shown(' '.join(cells))}, expected {expected}")
     return points
 
 

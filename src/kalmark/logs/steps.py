@@ -25,7 +25,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan
+from kalmark.events import Control, Event, Id, Scan, shown
 from kalmark.logs.log import Log
 from kalmark.logs.source import (
     STEP_NS,
@@ -75,7 +75,7 @@ def events_of(
         try:
             record = read(where, cells)
         except ValueError:
-            request.refuse(f"{where}: {' '.join(cells)!r}, expected {expected}")
+            request.refuse(f"{where}: {shown(' '.join(cells))}, expected {expected}")
             continue
         if record is None:
             continue

@@ -264,7 +264,7 @@ class _Recorder:
             gaps=joined(self.gaps),
             repeats=repeated(self.slam),
             stepped=self.stepped.__name__.lower(),
-            **decisions(reports, 3 if n > 3 else 2),
+            **decisions(reports, 3 if any(space.world == "space" for space in spaces) else 2),
             **self.foresight.columns(m, p),
         )
 

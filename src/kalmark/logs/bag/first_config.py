@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry import rotations
+from kalmark.logs.bag.frames import BASES
 from kalmark.logs.bag.geodesy import local
-from kalmark.logs.bag.importer import BASES, DAY_NS, sensor_name, short
+from kalmark.logs.bag.importer import DAY_NS, sensor_name, short
 from kalmark.logs.bag.inertial import heading_of, heading_of_field
 from kalmark.logs.bag.messages import BEAM, CORNERS, POSE, Measured
 from kalmark.logs.bag.survey import Poses, Survey, TopicSummary, yaw
@@ -22,14 +24,24 @@ from kalmark.logs.source import placed
 
 TRUE = ("truth", "vicon", "mocap", "optitrack", "/gt", "gt_", "_gt")
 LATER = ("filtered", "global", "map", "gps")  # odometry of these names has been corrected by something else
+WANTED = ("goal", "target", "setpoint", "clicked", "initial", "desired")  # poses that the robot is to have
+WORLD = ("map", "odom", "world", "earth")
+LEAST_POSES = 10
 IDS, CLUSTERS = ("id", "ids", "track_id", "label"), ("cluster", "cluster_id", "segment")
 SPACE = ("", "odometry_3d", "velocity_3d")
-COASTING = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3}
+COASTING = {
+    True: {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3},
+    False: {"type": "constant_velocity", "sigma_vx_mps_per_sqrt_s": 0.3, "sigma_vy_mps_per_sqrt_s": 0.3,
+            "sigma_w_radps_per_sqrt_s": 0.3},
+}  # fmt: skip
+"""The motion of a robot without controls, in space or in the plane."""
 AT_REST = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
 SLOW = 0.5
 """An odometry of less than two messages for each of a sensor's gives increments that end at its scans."""
 NEAR_NS = 500_000_000
 LEAST_WAY_M = 2.0
+JUMP_S = 1.0  # headers that run backwards by more are of a clock that was set
+SATELLITE_M, POSE_M, POSE_RAD = 2.0, 0.5, 0.2  # sigmas of positions and headings that come without a covariance
 GUESS = "GUESS:"
 HEADING_S, HEADING_RAD = 1.0, 0.02
 """Headings are taken so often, and are not believed to be better: errors of a compass last."""
@@ -40,9 +52,11 @@ GYRO_RADPS, BIAS = 0.005, {"sigma_bias_radps": 0.01, "sigma_bias_radps_per_sqrt_
 
 @dataclass
 class _Lines:
-    """Lines of the file: topics of the log, and of each robot its motion, start and sensors."""
+    """Lines of the file: of the log, its topics, and of each robot its motion, start and sensors."""
 
+    log: list[str] = field(default_factory=list)
     topics: list[str] = field(default_factory=list)
+    entries: dict[str, tuple[dict[str, Any], str]] = field(default_factory=dict)
     robots: dict[str, list[str]] = field(default_factory=dict)
     unused: list[str] = field(default_factory=list)
 
@@ -61,7 +75,7 @@ def first_config(found: Survey, file: Path | None = None) -> str:
         return "\n".join([*head, "  # kalmark wrote this bag: it holds a whole log, and no topics are needed", ""])
     writer = _Writer(found)
     lines = writer.lines()
-    out = [*head, "  topics:", *(f"    {line}" for line in lines.topics)]
+    out = [*head, *lines.log, "  topics:", *(f"    {line}" for line in lines.topics)]
     out += [f"    # not used: {line}" for line in lines.unused]
     if lines.robots:
         out.append("robots:")
@@ -130,14 +144,32 @@ class _Writer:
         self.tail: list[str] = []
 
     def _namespaces(self) -> list[str]:
-        """Return the names of the robots: the first parts of topics, where several of them have controls."""
-        named = {topic.name.strip("/").split("/")[0] for topic in self.usable if _moves(topic) and _parts(topic) > 1}
+        """Return the names of the robots: the one part in which topics of controls, or frames of odometry, differ."""
+        moving, named = [topic for topic in self.usable if _moves(topic)], set[str]()
+        one_tree = any(topic.name in ("/tf", "tf") for topic in self.usable)
+        for a, b in combinations(moving, 2):
+            pairs = list(zip(_parts(a), _parts(b), strict=False))
+            other = [k for k, (x, y) in enumerate(pairs) if x != y]
+            alike = a.type == b.type and len(_parts(a)) == len(_parts(b)) and len(other) == 1
+            same = one_tree and a.child and a.child == b.child
+            if alike and not same and other[0] < len(pairs) - 1:
+                named.update(pairs[other[0]])
+        if not moving:
+            named = {child.split("/")[0] for parent, child in self.found.pairs if _is_odometry(parent, child)}
         return sorted(named) if len(named) > 1 else []
 
     def robot(self, topic: TopicSummary) -> str:
         """Return the robot that a topic is of."""
-        first = topic.name.strip("/").split("/")[0]
-        return first if first in self.spaces else self.spaces[0] if self.spaces else "robot"
+        mine = next((name for name in self.spaces if name in _parts(topic)), None)
+        return mine or (self.spaces[0] if self.spaces else "robot")
+
+    def useless(self, topic: TopicSummary) -> str:
+        """Return why a topic of observations cannot be used, "" if it can."""
+        frame = topic.frame.lstrip("/")
+        odometries = {each.frame.lstrip("/") for each in self.usable if each.offers.twist and each.offers.pose}
+        if topic.offers.seen is not None and frame and (frame in odometries or frame.split("/")[-1] in WORLD):
+            return f"its frame {frame} is one of the world: a map, not what a sensor of the robot sees"
+        return _useless(topic)
 
     def lines(self) -> _Lines:
         """Return what is to be written."""
@@ -147,6 +179,9 @@ class _Writer:
             robots.setdefault(self.robot(topic), []).append(topic)
         for robot, topics in robots.items():
             self.one(robot, topics, out)
+        self.clock([self.found.named(name) for name in out.entries], out)
+        for name, (entry, why) in out.entries.items():
+            out.topics.append(f"{quoted(name)}: {mapping(entry)}  # {why}")
         for topic in self.found.topics:
             if not topic.count:
                 out.unused.append(f"{topic.name} ({short(topic.type)}): no messages")
@@ -154,30 +189,31 @@ class _Writer:
 
     def one(self, robot: str, topics: Sequence[TopicSummary], out: _Lines) -> None:
         """Add the lines of one robot."""
-        scans = [topic for topic in topics if topic.offers.seen is not None and not _useless(topic)]
-        control, kind = self.control(topics, not any(map(_in_pixels, scans)))
-        used = self.used(topics, scans, control, kind)
-        start = self.start(control, used, kind in SPACE)
+        scans = [topic for topic in topics if topic.offers.seen is not None and not self.useless(topic)]
+        control, kind = self.control(robot, topics, not any(map(_in_pixels, scans)))
+        space = kind in SPACE if kind else not any(topic.columns[:2] == BEAM for topic in scans)
+        used = self.used(topics, scans, control, kind, space)
+        start = self.start(control, used, space)
         true = [self.found.named(name).poses.frames for name, (entry, _) in used.items() if entry["type"] == "truth"]
         ahead = start.at[2] if start is not None else yaw(true[0][0]) if true else 0.0
-        readings = _Readings(self, control, kind, start, ahead)
+        readings = _Readings(self, control, kind, space, start, ahead)
         used |= readings.entries(topics)
-        clock = self.clock([self.found.named(name) for name in used])
         whose = {"robot": robot} if robot != "robot" else {}
-        out.topics += [
-            f"{quoted(name)}: {mapping(entry | whose | clock)}  # {why}" for name, (entry, why) in used.items()
-        ]
+        out.entries |= {name: (entry | whose, why) for name, (entry, why) in used.items()}
         out.unused += [
-            f"{topic.name} ({short(topic.type)}): {_useless(topic) or readings.unused(topic) or self.why_not(topic)}"
+            f"{topic.name} ({short(topic.type)}): "
+            f"{self.useless(topic) or readings.unused(topic) or self.why_not(topic)}"
             for topic in topics
             if topic.name not in used
         ]
-        space = kind in SPACE
         lines = []
         if kind:
-            lines.append(f"motion: {{type: {kind}}}  # its noise has defaults; `kalmark tune` estimates it")
-        elif scans:
-            lines += [f"motion: {mapping(COASTING)}  # {GUESS} there is no topic of controls"]
+            car = {"wheelbase_m": 2.83, "encoder_offset_m": 0.0} if kind == "ackermann" else {}
+            why = f"{GUESS} its wheelbase; " if car else ""
+            motion = mapping({"type": kind} | car)
+            lines.append(f"motion: {motion}  # {why}its noise has defaults; `kalmark tune` estimates it")
+        elif used:
+            lines += [f"motion: {mapping(COASTING[space])}  # {GUESS} there is no topic of controls"]
             lines += [f"start: {mapping(AT_REST)}  # {GUESS} at rest, about"]
         lines += [] if start is None else [readings.start()]
         if scans or readings.sensors:
@@ -190,7 +226,7 @@ class _Writer:
             out.robots[robot] = lines
 
     def used(
-        self, topics: Sequence[TopicSummary], scans: Sequence[TopicSummary], control: Any, kind: str
+        self, topics: Sequence[TopicSummary], scans: Sequence[TopicSummary], control: Any, kind: str, space: bool
     ) -> dict[str, tuple[dict[str, Any], str]]:
         """Return the entries of the topics that are used, each with the reason."""
         used: dict[str, tuple[dict[str, Any], str]] = {}
@@ -205,30 +241,36 @@ class _Writer:
         for topic in topics:
             if topic.name not in used and (entry_and_why := self.place(topic)) is not None:
                 used[topic.name] = entry_and_why
-        space = kind in SPACE
         return used | {topic.name: (self.of_scan(topic, space), told(topic)) for topic in scans}
 
     # -------------------------------------------------------------- controls
-    def control(self, topics: Sequence[TopicSummary], flat: bool) -> tuple[TopicSummary | tuple[str, str] | None, str]:
+    def control(
+        self, robot: str, topics: Sequence[TopicSummary], flat: bool
+    ) -> tuple[TopicSummary | tuple[str, str] | None, str]:
         """Return the topic, or the frames, of a robot's controls, and their type."""
         odometries = [t for t in topics if t.offers.twist and t.offers.pose and not _is_true(t) and t.poses.frames]
         odometries.sort(key=lambda t: (not t.poses.moves, any(word in t.name.lower() for word in LATER), t.name))
         for topic in odometries[:1]:
+            if topic.turns and not topic.poses.moves:
+                return topic, "unicycle" if flat else "velocity_3d"
             return topic, "odometry_2d" if flat and topic.poses.flat else "odometry_3d"
         for pair, poses in self.found.pairs.items():
-            if any(map(_has_frames, topics)) and "odom" in pair[0] and any(base in pair[1] for base in BASES):
+            whose = pair[1].split("/")[0] == robot if self.spaces else True
+            if any(map(_has_frames, topics)) and _is_odometry(*pair) and whose:
                 return pair, "odometry_2d" if flat and poses.flat else "odometry_3d"
         for topic in (t for t in topics if t.offers.drive):
             return topic, "ackermann"
         for topic in sorted((t for t in topics if t.offers.twist), key=lambda t: ("cmd" in t.name, t.name)):
             return topic, "unicycle" if flat else "velocity_3d"
-        for topic in (t for t in topics if t.offers.pose and not _is_true(t) and t.poses.cov is None and t.poses.moves):
+        for topic in (t for t in topics if t.offers.pose and not _is_true(t) and not t.offers.noisy and _is_path(t)):
             return topic, "odometry_2d" if flat and topic.poses.flat else "odometry_3d"
         return None, ""
 
     def of_control(self, topic: TopicSummary) -> str:
         """Return why this is the control."""
         path = f"its path is {'flat' if topic.poses.frames and topic.poses.flat else 'not flat'}"
+        if topic.offers.pose is not None and topic.poses.frames and not topic.poses.moves and topic.turns:
+            return f"{told(topic)}; {GUESS} its velocities, because its poses stand still"
         if topic.offers.pose is not None:
             return f"{told(topic)}: {path}" + ("" if topic.offers.twist else f"; {GUESS} it is an odometry")
         commanded = ", as commanded" if "cmd" in topic.name else ""
@@ -240,13 +282,17 @@ class _Writer:
         if topic.offers.globe is not None and topic.origin is not None:
             entry: dict[str, Any] = {"type": "fix", "origin": [float(v) for v in topic.origin]}
             if topic.poses.cov is None:
-                return entry | {"sigma_m": 2.0}, f"{told(topic)}; {GUESS} sigma_m, as the receiver has no covariance"
+                why = f"{told(topic)}; {GUESS} sigma_m, as the receiver has no covariance"
+                return entry | {"sigma_m": SATELLITE_M}, why
             return entry, f"{told(topic)}; the origin is the first fix"
         if topic.offers.pose is None or not topic.poses.frames:
             return None
         if _is_true(topic):
             return {"type": "truth"}, f"{told(topic)}; {GUESS} by its name"
-        if topic.offers.twist is None and topic.poses.cov is not None and "initial" not in topic.name:
+        if topic.offers.twist is None and topic.offers.noisy and not _is_wanted(topic):
+            if topic.poses.cov is None:
+                why = f"{told(topic)}; {GUESS} positions in the map, and sigma_m, as they have no covariance"
+                return {"type": "fix", "sigma_m": POSE_M}, why
             return {"type": "fix"}, f"{told(topic)}; {GUESS} positions in the map, with their covariance"
         return None
 
@@ -271,7 +317,7 @@ class _Writer:
             return None
         fix, poses = fixes[0], control.poses if isinstance(control, TopicSummary) else self.found.pairs[control]
         if fix.offers.pose is not None:
-            cov = np.zeros((6, 6)) if fix.poses.cov is None else fix.poses.cov
+            cov = np.diag([POSE_M**2] * 3 + [POSE_RAD**2] * 3) if fix.poses.cov is None else fix.poses.cov
             sigmas = [math.sqrt(max(cov[0, 0], cov[1, 1], 1e-4)), math.sqrt(max(cov[5, 5], 1e-4))]
             first = fix.poses.frames[0]
             at = [float(first[0]), float(first[1]), yaw(first)]
@@ -280,11 +326,24 @@ class _Writer:
             return _Start(*found, f"{GUESS} the way by odometry laid upon that by {fix.name}", north=True)
         return _Start([0.0] * 3, [5.0, 1.5], f"{GUESS} its heading, from east to the left", north=True, known=False)
 
-    def clock(self, topics: Sequence[TopicSummary]) -> dict[str, str]:
-        """Return `time: recorded` for all if some messages have no header and the others' is another clock."""
+    def clock(self, topics: Sequence[TopicSummary], out: _Lines) -> None:
+        """Take the recorder's time where headers have none; for all where theirs is another clock, or one that was set.
+
+        Messages out of order by less are left out.
+        """
         other = any(topic.header and abs(topic.offset_s) > DAY_NS * 1e-9 for topic in topics)
         bare = any(not topic.header and topic.offers.transforms is None for topic in topics)
-        return {"time": "recorded"} if other and bare else {}
+        jumped = next((topic for topic in topics if topic.back_s > JUMP_S), None)
+        late = next((topic for topic in topics if topic.back_s > 0 and topic.offers.pose is not None), None)
+        since = ""
+        if jumped is not None:
+            since = f"; {GUESS} the recorder's time, as that of {jumped.name} runs back by {jumped.back_s:.3g} s"
+        for name, (entry, why) in out.entries.items():
+            if jumped is not None or (other and bare) or self.found.named(name).unset:
+                out.entries[name] = entry | {"time": "recorded"}, why + since
+        if late is not None and jumped is None:
+            why = f"the times of {late.name} run back by {late.back_s:.3g} s: such messages are left out"
+            out.log.append(f"  on_error: skip  # {GUESS} {why}")
 
     # -------------------------------------------------------------- sensors
     def of_scan(self, topic: TopicSummary, space: bool) -> dict[str, Any]:
@@ -316,9 +375,9 @@ class _Writer:
 
     def mount(self, topic: TopicSummary, control: Any) -> Array | None:
         """Return where tf has the frame of a sensor in that of its robot."""
-        base = control.child if isinstance(control, TopicSummary) else control[1] if control else ""
-        bases = [each for each in (base, *BASES) if each and each.lstrip("/") in self.found.frames.names()]
-        return self.found.frames.fixed(bases[0], topic.frame) if bases else None
+        named = control.child if isinstance(control, TopicSummary) else control[1] if control else ""
+        base = self.found.frames.base([named], topic.frame)
+        return None if base is None else self.found.frames.fixed(base, topic.frame)
 
     def model(self, topic: TopicSummary, space: bool) -> tuple[dict[str, Any], str]:
         """Return a sensor's section, and why."""
@@ -351,9 +410,11 @@ class _Writer:
 class _Readings:
     """Decides which readings of inertial units and compasses are taken, for one robot, and how good they may be."""
 
-    def __init__(self, writer: _Writer, control: Any, kind: str, start: _Start | None, ahead: float) -> None:
+    def __init__(
+        self, writer: _Writer, control: Any, kind: str, space: bool, start: _Start | None, ahead: float
+    ) -> None:
         self.writer, self.control, self.kind, self.begin, self.ahead = writer, control, kind, start, ahead
-        self.space = kind in SPACE
+        self.space = space
         self.sensors: list[str] = []
         self.taken: set[str] = set()
         self.heading: float | None = None  # the first that was measured, and taken
@@ -460,8 +521,8 @@ class _Readings:
         self.sensors.append(f"{quoted(name)}: {mapping(section)}  # {why}")
 
 
-def _parts(topic: TopicSummary) -> int:
-    return len(topic.name.strip("/").split("/"))
+def _parts(topic: TopicSummary) -> list[str]:
+    return topic.name.strip("/").split("/")
 
 
 def _moves(topic: TopicSummary) -> bool:
@@ -470,6 +531,18 @@ def _moves(topic: TopicSummary) -> bool:
 
 def _is_true(topic: TopicSummary) -> bool:
     return any(word in topic.name.lower() for word in TRUE)
+
+
+def _is_wanted(topic: TopicSummary) -> bool:
+    return any(word in topic.name.lower() for word in WANTED)
+
+
+def _is_path(topic: TopicSummary) -> bool:
+    return topic.poses.moves and len(topic.poses.frames) >= LEAST_POSES and not _is_wanted(topic)
+
+
+def _is_odometry(parent: str, child: str) -> bool:
+    return "odom" in parent and any(base in child for base in BASES)
 
 
 def _has_frames(topic: TopicSummary) -> bool:
@@ -499,6 +572,8 @@ def aligned(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], list[flo
 
     By least squares; None where they have too little way in common.
     """
+    if not odometry.moves:
+        return None
     t_ns, frames = np.array(odometry.t_ns), np.array(odometry.frames)
     lla = np.array([frame[:3] for frame in fixes.poses.frames])
     enu = local(lla, fixes.origin)[:, :2]

@@ -11,6 +11,7 @@ from kalmark.arrays import Array
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag.messages import Transform
 
+BASES = ("base_link", "base_footprint")
 STILL = 1e-6
 """m, and of a quaternion: a transform that changed by less did not move."""
 
@@ -47,6 +48,14 @@ class Frames:
                 waiting.append(other)
         return found.get(child)
 
-    def names(self) -> set[str]:
-        """Return all frames."""
-        return {name for pair in self.first for name in pair}
+    def base(self, named: Iterable[str | None], frame: str) -> str | None:
+        """Return the robot's frame, to which a sensor's frame is fixed: the first of these names that there is.
+
+        Else one of BASES, with the prefix of several robots or without, None if there is none.
+        """
+        there = {name for pair in self.first for name in pair}
+        for each in named:
+            if each and each.lstrip("/") in there:
+                return each.lstrip("/")
+        bases = [name for base in BASES for name in sorted(there) if name.split("/")[-1] == base]
+        return next((base for base in bases if self.fixed(base, frame) is not None), None)

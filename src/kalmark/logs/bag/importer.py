@@ -21,7 +21,18 @@ from kalmark.logs.bag import tables
 from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.geodesy import local
 from kalmark.logs.bag.inertial import GRAVITY, GYRO, HEADING, INCLINATION, heading_of, heading_of_field, means
-from kalmark.logs.bag.messages import BEAM, MESSAGES, POINT, POSE, Measured, Message, Place, Pose, Seen
+from kalmark.logs.bag.messages import (
+    BEAM,
+    MESSAGES,
+    NO_ROTATION,
+    POINT,
+    POSE,
+    Measured,
+    Message,
+    Place,
+    Pose,
+    Seen,
+)
 from kalmark.logs.bag.reading import Bag, Received, find_bag, has_header, stamp
 from kalmark.logs.bag.topics import (
     Carried,
@@ -42,7 +53,6 @@ from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, placed, seconds
 from kalmark.logs.table import Refused
 
-BASES = ("base_link", "base_footprint")
 LEVEL = math.cos(math.radians(5))  # a sensor tilted by less is taken as level
 FOREVER_S = 1e9
 DAY_NS = 86_400_000_000_000
@@ -130,9 +140,10 @@ class _Importer:
         raise LogError(f"{self.bag.path}: topic {name} gives {what} to {topic.robot!r}, expected {wanted}")
 
     def in_space(self, robot: str) -> bool:
-        """Return whether a robot moves in space: by its controls; one without any does."""
-        own = [topic.space for topic in self.topics.values() if topic.robot == robot and topic.columns]
-        return own[0] if own else True
+        """Return whether a robot moves in space: by its controls; one without any does if it has no laser scanner."""
+        mine = {name: topic for name, topic in self.topics.items() if topic.robot == robot}
+        own = [topic.space for topic in mine.values() if topic.columns]
+        return own[0] if own else not any(self.offers[name].seen is beams_of for name in mine)
 
     # -------------------------------------------------------------- mounts
     def look_ahead(self) -> None:
@@ -149,8 +160,8 @@ class _Importer:
         for received in self.bag.messages(tf | scans | moves):
             if received.topic in tf:
                 self.frames.take(MESSAGES[received.type].transforms(received.message))  # type: ignore[misc]
-            elif received.topic in scans and received.topic not in self.of_sensor:
-                self.of_sensor[received.topic] = frame_id(received.message)
+            elif received.topic in scans and not self.of_sensor.get(received.topic):
+                self.of_sensor[received.topic] = frame_id(received.message)  # none in markers that list nothing
             elif received.topic in moves:
                 robot = self.topics[received.topic].robot
                 self.base.setdefault(robot, getattr(received.message, "child_frame_id", ""))
@@ -160,9 +171,9 @@ class _Importer:
     def _mount(self, name: str, scan: Topic) -> None:
         """Note where a sensor is mounted, if tf says so; in the plane also how its points are made level."""
         assert isinstance(scan, Carried)
-        bases = (scan.base_frame, self.base.get(scan.robot), *BASES)
-        base = next((each for each in bases if each and each.lstrip("/") in self.frames.names()), None)
-        mount = None if base is None else self.frames.fixed(base, self.of_sensor.get(name, ""))
+        frame = self.of_sensor.get(name, "")
+        base = self.frames.base((scan.base_frame, self.base.get(scan.robot)), frame)
+        mount = None if base is None else self.frames.fixed(base, frame)
         if mount is None:
             return
         keys = [(scan.robot, sensor) for sensor in scan.sensors(name)]
@@ -215,6 +226,9 @@ class _Importer:
         """Take one message; what is bad in it is refused, with its topic and time."""
         topic, offer = self.topics[received.topic], self.offers[received.topic]
         t_ns = self.time(received, topic)
+        if t_ns is None:
+            self.left_out[received.topic, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
+            return
         try:
             if isinstance(topic, Scans):
                 self.scan(received, topic, offer, t_ns)
@@ -232,9 +246,14 @@ class _Importer:
             at = f"{received.topic} at t={seconds(t_ns)} s"
             self.request.refuse(f"{self.bag.path}: {at}: {refused}")
 
-    def time(self, received: Received, topic: Topic) -> int:
-        """Return the time (ns) of a message.  Raises LogError if headers and the recorder have different clocks."""
+    def time(self, received: Received, topic: Topic) -> int | None:
+        """Return the time (ns) of a message, None if its header has 0, which says nothing.
+
+        Raises LogError if headers and the recorder have different clocks.
+        """
         own = has_header(received.message) and topic.time != "recorded"
+        if own and topic.time == "auto" and stamp(received.message) == 0:
+            return None
         if topic.time == "header" and not own:
             what = f"topic {received.topic}: messages of the type {short(received.type)} have no header"
             raise LogError(f"{self.bag.path}: {what}, expected `time: recorded`")
@@ -261,8 +280,10 @@ class _Importer:
 
     def pose(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
         """Take one pose: of odometry, as a fix or as truth."""
-        if not np.isfinite(pose.frame).all():
+        if not np.isfinite(pose.frame[:3]).all():
             raise Refused(f"pose {pose.frame.tolist()}, expected finite numbers")
+        if np.isnan(pose.frame[3:]).any() and not isinstance(topic, Fixes):
+            raise Refused(NO_ROTATION)
         if isinstance(topic, Fixes):
             self.fix(topic, t_ns, pose.frame[:3], None if pose.cov is None else pose.cov[:3, :3])
         elif isinstance(topic, Truths):
@@ -471,17 +492,24 @@ class _Importer:
         default = seen.columns if space or not points else POINT[:2]
         wanted = tuple(topic.take) if topic.take is not None else default
         if wanted == seen.columns:
-            return wanted, y
+            return wanted, turned_at_all(wanted, y)
         given = dict(zip(seen.columns, y.T, strict=True))
         if points:
             given |= polar(y, space)
         for column in wanted:
             if column not in given or (column in POSE[3:] and not space):
                 raise Refused(f"take has {column}, expected some of {', '.join(given)}")
-        return wanted, np.column_stack([given[column] for column in wanted])
+        return wanted, turned_at_all(wanted, np.column_stack([given[column] for column in wanted]))
 
 
 beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].seen
+
+
+def turned_at_all(columns: tuple[str, ...], y: Array) -> Array:
+    """Return observations (K, m) whose rotations, if they are taken, are there.  Raises Refused."""
+    if np.isnan(y[:, [column in POSE[3:] for column in columns]]).any():
+        raise Refused(f"{NO_ROTATION}, or `take: [{', '.join(POINT)}]`")
+    return y
 
 
 def polar(p: Array, space: bool) -> dict[str, Array]:

@@ -1,9 +1,9 @@
 """What each type of message says of a robot: one row a type in `MESSAGES`.
 
-A row names what can be read from the message: where the robot is (`pose`), how fast it moves (`twist`), its speed and
-steering (`drive`), a position on the globe (`globe`), what a sensor saw (`seen`), what an inertial unit measured
-(`rates`, `attitude`, `force`), a magnetic field (`field`), frames (`transforms`), a camera (`camera`).  A topic of a
-configuration (`topics.py`) asks for one of them.  A function refuses a message by `Refused`.
+A row names what can be read from the message: where the robot is (`pose`; `noisy`: with a covariance), how fast it
+moves (`twist`), its speed and steering (`drive`), a position on the globe (`globe`), what a sensor saw (`seen`), what
+an inertial unit measured (`rates`, `attitude`, `force`), a magnetic field (`field`), frames (`transforms`), a camera
+(`camera`).  A topic of a configuration (`topics.py`) asks for one of them.  A function refuses a message by `Refused`.
 """
 
 from __future__ import annotations
@@ -95,6 +95,7 @@ class Message:
 
     what: str
     pose: Callable[[Any], Pose] | None = None
+    noisy: bool = False
     twist: Callable[[Any], Twist] | None = None
     drive: Callable[[Any], Array] | None = None
     globe: Callable[[Any], Place | None] | None = None
@@ -108,6 +109,9 @@ class Message:
 
 
 # ------------------------------------------------------------------ where it is, how fast it is
+NO_ROTATION = "quaternion has length 0, expected 1"
+
+
 def frame_of(position: Any, rotation: Any) -> Array:
     """Return the frame (7,) of a position and a quaternion, which is normalised.  Raises Refused."""
     return np.append([position.x, position.y, position.z], unit(rotation))
@@ -123,8 +127,14 @@ def unit(rotation: Any) -> Array:
 
 
 def pose_frame(pose: Any) -> Array:
-    """Return the frame (7,) of a geometry_msgs/Pose.  Raises Refused."""
-    return frame_of(pose.position, pose.orientation)
+    """Return the frame (7,) of a geometry_msgs/Pose.  Raises Refused.
+
+    Its rotation is NaN where the message has none: zeros, as programs write that have positions only.
+    """
+    q = pose.orientation
+    if any((q.x, q.y, q.z, q.w)):
+        return frame_of(pose.position, q)
+    return np.array([pose.position.x, pose.position.y, pose.position.z, *[np.nan] * 4])
 
 
 def covariance(values: Any, size: int = 6) -> Array:
@@ -358,7 +368,8 @@ MESSAGES: dict[str, Message] = {
     "nav_msgs/msg/Odometry": Message("odometry", pose=odometry_pose,
                                      twist=lambda m: velocity(m.twist.twist, m.twist.covariance)),
     "geometry_msgs/msg/PoseStamped": Message("pose", pose=stamped_pose),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": Message("pose", pose=stamped_pose_with_covariance),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": Message("pose", pose=stamped_pose_with_covariance,
+                                                             noisy=True),
     "geometry_msgs/msg/Twist": Message("velocity", twist=velocity),
     "geometry_msgs/msg/TwistStamped": Message("velocity", twist=lambda m: velocity(m.twist)),
     "geometry_msgs/msg/TwistWithCovarianceStamped": Message(

@@ -20,23 +20,26 @@ from kalmark.logs.table import Refused
 
 GAP = 5.0  # an interval longer than so many usual ones is a gap
 FLAT_M, FLAT_RAD = 0.05, 0.05  # height and tilt of a path of the plane vary by less
+STILL = 1e-3  # m, m/s, rad/s: what moves by less stands still
 
 
 @dataclass
 class Poses:
-    """The poses that a topic or a pair of frames has, with the covariance of the first."""
+    """The poses that a topic or a pair of frames has; the covariance of the first, None if one is none in x and y."""
 
     t_ns: list[int] = field(default_factory=list)
     frames: list[Array] = field(default_factory=list)
     cov: Array | None = None
 
     def take(self, t_ns: int, pose: Pose) -> None:
-        """Take one more pose, unless it is not later than the last."""
+        """Take one more pose, unless it is not later than the last; without a rotation it is not turned."""
         if not self.t_ns:
             self.cov = pose.cov
+        if pose.cov is None or not positive(pose.cov[:2, :2]):
+            self.cov = None
         if not self.t_ns or t_ns > self.t_ns[-1]:
             self.t_ns.append(t_ns)
-            self.frames.append(pose.frame)
+            self.frames.append(np.where(np.isnan(pose.frame), [0.0] * 6 + [1.0], pose.frame))
 
     @property
     def flat(self) -> bool:
@@ -49,8 +52,7 @@ class Poses:
     @property
     def moves(self) -> bool:
         """Whether the poses differ."""
-        frames = np.array(self.frames)
-        return bool(np.ptp(frames, axis=0).max() > 1e-3)
+        return bool(self.frames) and bool(np.ptp(np.array(self.frames), axis=0).max() > STILL)
 
 
 @dataclass
@@ -58,7 +60,8 @@ class TopicSummary:
     """One topic: its messages, their median rate (Hz), the longest gap (s) and when it began (s), their frames.
 
     `gaps` counts the intervals of more than five usual ones.  `header` says whether its messages have a time of their
-    own, which is `offset_s` behind that of the recorder in the first of them.
+    own, which is `offset_s` behind that of the recorder in the first of them, and runs backwards by `back_s` at most;
+    `unset`: that it has a place for one, and zeros in it.  `turns` says whether a velocity in them is not 0.
     """
 
     name: str
@@ -73,11 +76,15 @@ class TopicSummary:
     child: str = ""
     header: bool = False
     offset_s: float = 0.0
+    back_s: float = 0.0
     error: str = ""
     poses: Poses = field(default_factory=Poses)
     columns: tuple[str, ...] = ()
     fields: tuple[str, ...] = ()
     named: bool = False
+    unset: bool = False
+    turns: bool = False
+    latest_ns: int = 0
     origin: Array | None = None
     camera: dict[str, Any] | None = None
     first: dict[str, Measured] = field(default_factory=dict)
@@ -122,9 +129,16 @@ def survey(path: Path) -> Survey:
             summary, m = summaries[received.topic], received.message
             own = has_header(m)
             t_ns = stamp(m) if own else received.recorded_ns
-            if not summary.frame and own:
+            if own and not summary.frame:
                 summary.frame, summary.child = m.header.frame_id, getattr(m, "child_frame_id", "")
-                summary.header, summary.offset_s = True, (received.recorded_ns - t_ns) * 1e-9
+            if own and t_ns == 0:
+                summary.unset, t_ns = not summary.header, received.recorded_ns
+            elif own:
+                if not summary.header:
+                    summary.header, summary.offset_s = True, (received.recorded_ns - t_ns) * 1e-9
+                summary.unset = False
+                summary.back_s = max(summary.back_s, (summary.latest_ns - t_ns) * 1e-9)
+                summary.latest_ns = max(summary.latest_ns, t_ns)
             try:
                 _look(summary, m, t_ns)
                 if summary.offers.transforms is not None:
@@ -167,6 +181,8 @@ def _look(summary: TopicSummary, m: Any, t_ns: int) -> None:
     offers = summary.offers
     if offers.pose is not None:
         summary.poses.take(t_ns, offers.pose(m))
+    if offers.twist is not None and not summary.turns:
+        summary.turns = bool(np.abs(offers.twist(m).v).max() > STILL)
     if offers.globe is not None:
         place = offers.globe(m)
         if place is not None and np.isfinite(place.lla[:2]).all():
@@ -188,6 +204,11 @@ def _look(summary: TopicSummary, m: Any, t_ns: int) -> None:
         summary.columns = summary.columns or seen.columns
         summary.named = summary.named or any(id_ is not None for id_ in seen.ids)
     summary.frame = summary.frame or frame_id(m)
+
+
+def positive(cov: Array) -> bool:
+    """Return whether a covariance (n, n) is positive definite."""
+    return bool(np.isfinite(cov).all() and np.linalg.eigvalsh(cov)[0] > 0)
 
 
 def yaw(frame: Array) -> float:
