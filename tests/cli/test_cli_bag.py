@@ -176,6 +176,37 @@ def test_the_numbers_of_a_camera_are_those_of_its_info(tmp_path: Path) -> None:
         in text
     )
     assert "landmarks: {type: tag}" in text and "motion: {type: constant_velocity_3d" in text
+    assert "CameraInfo; GUESS: the images were not rectified" in text
+
+
+@pytest.mark.parametrize(
+    ("info", "said"),
+    [
+        (
+            {"distortion_model": "double_sphere", "d": [0.1]},
+            "distortion_model is 'double_sphere', expected one of radtan",
+        ),
+        ({"distortion_model": "rational_polynomial", "d": [0.1] * 8}, "at most the 5 coefficients of radtan"),
+        ({"k": [0.0] * 9}, "focal lengths 0, 0 of a camera that is not calibrated"),
+    ],
+)
+def test_the_numbers_of_a_camera_that_kalmark_does_not_have_are_to_be_given(
+    info: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    given = {"header": header(T0, "camera"), "width": 800, "height": 600, "k": [500.0, 0, 400, 0, 510, 300, 0, 0, 1]}
+    boxes = {"header": header(T0, "camera"), "detections": [{"bbox": {"center": {"position": {"x": 9.0, "y": 9.0}}}}]}
+    text = config_of(tmp_path, [
+        Outgoing("/camera_info", "sensor_msgs/msg/CameraInfo", T0, given | info),
+        Outgoing("/boxes", "vision_msgs/msg/Detection2DArray", T0, boxes),
+    ])  # fmt: skip
+    assert "GUESS: its numbers: /camera_info has " in text and said in text and "# not used: /camera_info" in text
+
+
+def test_images_are_counted_and_the_configuration_says_what_to_do_with_them(kalmark: Kalmark, tmp_path: Path) -> None:
+    image = Outgoing("/camera/image_raw", "sensor_msgs/msg/Image", T0, {"header": header(T0, "camera")})
+    text = config_of(tmp_path, [image, odometry(T0, pose(0, 0, 0)), odometry(T0 + 9, pose(1, 0, 0))])
+    assert "# not used: /camera/image_raw (sensor_msgs/Image): images: let a detector find tags" in text
+    assert "images, not read" in kalmark("bag", tmp_path / "mcap").out
 
 
 # ------------------------------------------------------------------ what bags of the field have

@@ -43,7 +43,7 @@ def rig(log: Log) -> dict[str, Any]:
 def project(p: np.ndarray, s: dict[str, Any]) -> np.ndarray:
     """Return the pixels (K, 2) of points (K, 3) through one of the two lenses, written down from their definition."""
     x, y, z = p.T
-    d = s["distortion"]
+    d = [*s["distortion"], 0.0]
     if s["lens"] == "equidistant":
         r = np.hypot(x, y)
         theta = np.arctan2(r, z)
@@ -176,8 +176,8 @@ def test_damaged_files_are_refused_in_one_line(data: Data, tmp_path: Path) -> No
     bag.write_bytes(whole)
     cameras = folder / "cameras.yaml"
     cameras.chmod(0o644)
-    cameras.write_text(cameras.read_text().replace("equidistant", "fov"))
-    with pytest.raises(LogError, match=r"cameras\.yaml: cam0: distortion_model is 'fov', expected equidistant"):
+    cameras.write_text(cameras.read_text().replace("equidistant", "odd"))
+    with pytest.raises(LogError, match=r"cameras\.yaml: cam0: distortion_model is 'odd', expected one of"):
         open_log(folder)
     cameras.write_text("cam0: [1, 2\nx: 3\n")
     with pytest.raises(LogError, match=r"cameras\.yaml:\d: not YAML"):

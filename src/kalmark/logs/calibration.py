@@ -36,6 +36,18 @@ PINHOLES = (None, "pinhole", "kannalabrandt8")  # of `camera_model` and `Camera.
 DEEPEST = 3
 
 
+def lens(model: str, coefficients: Sequence[float]) -> dict[str, Any]:
+    """Return the keys of a lens, by the name that programs have for it.  Raises ValueError: value and expectation."""
+    name, d = LENSES.get(model.lower()), [float(each) for each in coefficients]
+    if name is None:
+        raise ValueError(f"distortion_model is {shown(model)}, expected one of {', '.join(LENSES)}")
+    most = COEFFICIENTS[name]
+    if any(d[most:]):
+        raise ValueError(f"distortion is {shown(d)}, expected at most the {most} coefficients of {name}")
+    d = d[:most]
+    return {"lens": name, "distortion": d + [0.0] * (4 - len(d)) if name == "radtan" and any(d) else d}
+
+
 def read_calibration(path: Path, camera: str | None = None) -> dict[str, Any]:
     """Return a calibration as the keys of a `pinhole`: intrinsics, size, lens, distortion and, if known, the mount.
 
@@ -112,24 +124,21 @@ class _Calibration:
     def lens(self, k: list[float]) -> dict[str, Any]:
         """Return the lens and its distortion."""
         given = self.word("distortion_model") or self.word("type") or ("fisheye" if self.fisheye() else "radtan")
-        if given not in LENSES:
-            raise self.error("distortion_model", given, f"one of {', '.join(LENSES)}")
-        lens = LENSES[given]
         name = next((n for n in ("distortion_coefficients", "distortion_coeffs") if n in self.content), None)
         if given == "none":
             d = []
         elif name is not None:
             d = self.numbers(name, range(15))
         else:
-            names = ("k1", "k2", "k3", "k4") if lens == "equidistant" else ("k1", "k2", "p1", "p2", "k3")
+            names = ("k1", "k2", "k3", "k4") if LENSES.get(given) == "equidistant" else ("k1", "k2", "p1", "p2", "k3")
             d = [self.one(n) if n in self.content else 0.0 for n in names]
         if "dx" in self.content:  # Tsai: coefficients in powers of mm
             f2 = k[0] * self.one("dx") * k[1] * self.one("dy")
             return {"lens": "tsai", "distortion": [d[0] * f2, d[1] * f2 * f2]}
-        if any(d[COEFFICIENTS[lens] :]):
-            raise self.error("distortion", d, f"at most the {COEFFICIENTS[lens]} coefficients of {lens}")
-        d = d[: COEFFICIENTS[lens]]
-        return {"lens": lens, "distortion": d + [0.0] * (4 - len(d)) if lens == "radtan" and any(d) else d}
+        try:
+            return lens(given, d)
+        except ValueError as error:
+            raise LogError(f"{self.path}: {error}") from None
 
     def fisheye(self) -> bool:
         """Return whether OpenCV's flag says that the lens is a fish-eye."""

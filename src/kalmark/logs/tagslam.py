@@ -20,6 +20,7 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag.reading import Bag, stamp
+from kalmark.logs.calibration import lens
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     Format,
@@ -41,8 +42,6 @@ INCREMENT = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
 MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3}
 VELOCITY = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
 MOUNT_SIGMAS = {"sigma_position_m": 0.05, "sigma_rotation_deg": 3.0}  # of a camera whose pose is not given
-LENSES = {"equidistant": "equidistant", "radtan": "radtan", "plumb_bob": "radtan"}
-COEFFICIENTS = {"equidistant": 4, "radtan": 5}
 MAX_HAMMING = 2
 HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
 SIGMA = 0.005
@@ -143,9 +142,10 @@ def read_cameras(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Arr
         for key in ("intrinsics", "distortion_model", "distortion_coeffs", "resolution", "tagtopic", "rig_body"):
             if key not in camera:
                 raise LogError(f"{path}: {name} has no {key}, expected a camera of TagSLAM")
-        if camera["distortion_model"] not in LENSES:
-            known = ", ".join(LENSES)
-            raise LogError(f"{path}: {name}: distortion_model is {camera['distortion_model']!r}, expected {known}")
+        try:
+            lens(str(camera["distortion_model"]), camera["distortion_coeffs"])
+        except (TypeError, ValueError) as error:
+            raise LogError(f"{path}: {name}: {error}") from None
     try:
         return cameras, {name: frame_of(entry["pose"]) for name, entry in poses.items()}
     except (KeyError, TypeError, ValueError) as error:
@@ -154,11 +154,10 @@ def read_cameras(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Arr
 
 def described_camera(camera: dict[str, Any], mount: dict[str, float], pixel_noise: float) -> dict[str, Any]:
     """Return the section of one camera that sees tags."""
-    lens, given = LENSES[camera["distortion_model"]], [float(c) for c in camera["distortion_coeffs"]]
     section: dict[str, Any] = {"type": "tag_corners"}
     section |= dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), map(float, camera["intrinsics"]), strict=True))
     section |= dict(zip(("width_px", "height_px"), map(int, camera["resolution"]), strict=True))
-    section |= {"lens": lens, "distortion": given + [0.0] * (COEFFICIENTS[lens] - len(given))}
+    section |= lens(camera["distortion_model"], camera["distortion_coeffs"])
     return section | {"sigma_px": pixel_noise, "mount": mount}
 
 

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from kalmark.arrays import Array
-from kalmark.geometry import rotations
+from kalmark.logs.bag.first_readings import Readings
+from kalmark.logs.bag.first_sensors import CLUSTERS, IDS, entry_of, is_tag, line_of
+from kalmark.logs.bag.first_start import POSE_M, start_of
+from kalmark.logs.bag.first_words import GUESS, mapping, quoted, told
 from kalmark.logs.bag.frames import BASES
-from kalmark.logs.bag.geodesy import local
-from kalmark.logs.bag.importer import DAY_NS, sensor_name, short
-from kalmark.logs.bag.inertial import heading_of, heading_of_field
-from kalmark.logs.bag.messages import BEAM, CORNERS, POSE, Measured
-from kalmark.logs.bag.survey import Poses, Survey, TopicSummary, yaw
-from kalmark.logs.bag.topics import Scans
-from kalmark.logs.source import placed
+from kalmark.logs.bag.importer import DAY_NS, short
+from kalmark.logs.bag.messages import BEAM, CORNERS, POSE
+from kalmark.logs.bag.survey import IMAGES, Survey, TopicSummary, yaw
 
 TRUE = ("truth", "vicon", "mocap", "optitrack", "/gt", "gt_", "_gt")
 LATER = ("filtered", "global", "map", "gps")  # odometry of these names has been corrected by something else
 WANTED = ("goal", "target", "setpoint", "clicked", "initial", "desired")  # poses that the robot is to have
 WORLD = ("map", "odom", "world", "earth")
 LEAST_POSES = 10
-IDS, CLUSTERS = ("id", "ids", "track_id", "label"), ("cluster", "cluster_id", "segment")
 SPACE = ("", "odometry_3d", "velocity_3d")
 COASTING = {
     True: {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3},
@@ -36,18 +30,11 @@ COASTING = {
 }  # fmt: skip
 """The motion of a robot without controls, in space or in the plane."""
 AT_REST = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
+IMAGES_ADVICE = "images: let a detector find tags or features in them and record its topic, or see docs/detectors.md"
 SLOW = 0.5
 """An odometry of less than two messages for each of a sensor's gives increments that end at its scans."""
-NEAR_NS = 500_000_000
-LEAST_WAY_M = 2.0
 JUMP_S = 1.0  # headers that run backwards by more are of a clock that was set
-SATELLITE_M, POSE_M, POSE_RAD = 2.0, 0.5, 0.2  # sigmas of positions and headings that come without a covariance
-GUESS = "GUESS:"
-HEADING_S, HEADING_RAD = 1.0, 0.02
-"""Headings are taken so often, and are not believed to be better: errors of a compass last."""
-NORTH_RAD, START_RAD, FIELD_RAD = 0.2, 0.1, 0.1
-"""Sigmas: of where north is, of a declination by the first heading, of a heading by a magnetic field."""
-GYRO_RADPS, BIAS = 0.005, {"sigma_bias_radps": 0.01, "sigma_bias_radps_per_sqrt_s": 0.0001}
+SATELLITE_M = 2.0  # sigma of positions on the globe that come without a covariance
 
 
 @dataclass
@@ -79,59 +66,10 @@ def first_config(found: Survey, file: Path | None = None) -> str:
     out += [f"    # not used: {line}" for line in lines.unused]
     if lines.robots:
         out.append("robots:")
-    for robot, told in lines.robots.items():
-        out += [f"  {quoted(robot)}:", *(f"    {line}" for line in told)]
+    for robot, section in lines.robots.items():
+        out += [f"  {quoted(robot)}:", *(f"    {line}" for line in section)]
     out += writer.tail
     return "\n".join(out) + "\n"
-
-
-def quoted(text: str) -> str:
-    """Return a text as YAML has it."""
-    plain = text and text[0].isalpha() | (text[0] in "/_") and all(c.isalnum() or c in "/_-." for c in text)
-    return text if plain and text not in ("true", "false", "null", "yes", "no", "on", "off") else f"'{text}'"
-
-
-def number(value: float) -> str:
-    """Return a number with as many digits as mean something here."""
-    return f"{value:.6g}"
-
-
-def mapping(values: dict[str, Any]) -> str:
-    """Return a mapping on one line of YAML."""
-    parts = []
-    for key, value in values.items():
-        if isinstance(value, dict):
-            text = mapping(value)
-        elif isinstance(value, list | tuple):
-            text = f"[{', '.join(v if isinstance(v, str) else repr(float(v)) for v in value)}]"
-        elif value is None:
-            text = "null"
-        else:
-            words = quoted(value) if isinstance(value, str) else str(value)
-            text = number(value) if isinstance(value, float) else words
-        parts.append(f"{key}: {text}")
-    return f"{{{', '.join(parts)}}}"
-
-
-def told(topic: TopicSummary) -> str:
-    """Return a topic in words."""
-    rate = f", {topic.rate_hz:.3g} Hz" if math.isfinite(topic.rate_hz) else ""
-    frames = f", {topic.frames}" if topic.frames else ""
-    return f"{topic.count} {short(topic.type).split('/')[-1]}{rate}{frames}"
-
-
-@dataclass
-class _Start:
-    """Where a robot starts: x, y, heading, their two sigmas, and why.
-
-    `north`: the map's axes are east and north; `known`: whether something tells the heading.
-    """
-
-    at: list[float]
-    sigmas: list[float]
-    why: str
-    north: bool = False
-    known: bool = True
 
 
 class _Writer:
@@ -193,10 +131,10 @@ class _Writer:
         control, kind = self.control(robot, topics, not any(map(_in_pixels, scans)))
         space = kind in SPACE if kind else not any(topic.columns[:2] == BEAM for topic in scans)
         used = self.used(topics, scans, control, kind, space)
-        start = self.start(control, used, space)
+        start = start_of(self.found, control, used, space)
         true = [self.found.named(name).poses.frames for name, (entry, _) in used.items() if entry["type"] == "truth"]
         ahead = start.at[2] if start is not None else yaw(true[0][0]) if true else 0.0
-        readings = _Readings(self, control, kind, space, start, ahead)
+        readings = Readings(self.found, control, kind, space, start, ahead)
         used |= readings.entries(topics)
         whose = {"robot": robot} if robot != "robot" else {}
         out.entries |= {name: (entry | whose, why) for name, (entry, why) in used.items()}
@@ -219,8 +157,8 @@ class _Writer:
         if scans or readings.sensors:
             lines += ["sensors:", *(f"  {line}" for line in readings.sensors)]
         for topic in scans:
-            lines.append(f"  {self.sensor(topic, control, space)}")
-            if topic.columns == CORNERS or (space and topic.columns == POSE and _is_tag(topic)):
+            lines.append(f"  {line_of(self.found, topic, control, space)}")
+            if topic.columns == CORNERS or (space and topic.columns == POSE and is_tag(topic)):
                 self.tail = ["landmarks: {type: tag}"]
         if lines:
             out.robots[robot] = lines
@@ -241,7 +179,7 @@ class _Writer:
         for topic in topics:
             if topic.name not in used and (entry_and_why := self.place(topic)) is not None:
                 used[topic.name] = entry_and_why
-        return used | {topic.name: (self.of_scan(topic, space), told(topic)) for topic in scans}
+        return used | {topic.name: (entry_of(topic, space), told(topic)) for topic in scans}
 
     # -------------------------------------------------------------- controls
     def control(
@@ -304,27 +242,11 @@ class _Writer:
             return "frames: the mounts of sensors are taken from them"
         if topic.offers.camera is not None:
             return "the numbers of a camera"
+        if topic.type in IMAGES:
+            return IMAGES_ADVICE
         if topic.offers.pose is not None or topic.offers.twist is not None:
             return "if it is `truth` or a `fix`, say so"
         return "no type of message that kalmark reads"
-
-    def start(self, control: Any, used: dict[str, tuple[dict[str, Any], str]], space: bool) -> _Start | None:
-        """Return a robot's start in the frame of its fixes, None if nothing tells it or truth does."""
-        if control is None or space or any(entry["type"] == "truth" for entry, _ in used.values()):
-            return None
-        fixes = [self.found.named(name) for name, (entry, _) in used.items() if entry["type"] == "fix"]
-        if not fixes:
-            return None
-        fix, poses = fixes[0], control.poses if isinstance(control, TopicSummary) else self.found.pairs[control]
-        if fix.offers.pose is not None:
-            cov = np.diag([POSE_M**2] * 3 + [POSE_RAD**2] * 3) if fix.poses.cov is None else fix.poses.cov
-            sigmas = [math.sqrt(max(cov[0, 0], cov[1, 1], 1e-4)), math.sqrt(max(cov[5, 5], 1e-4))]
-            first = fix.poses.frames[0]
-            at = [float(first[0]), float(first[1]), yaw(first)]
-            return _Start(at, sigmas, f"{GUESS} the first pose of {fix.name}")
-        if (found := aligned(poses, fix)) is not None:
-            return _Start(*found, f"{GUESS} the way by odometry laid upon that by {fix.name}", north=True)
-        return _Start([0.0] * 3, [5.0, 1.5], f"{GUESS} its heading, from east to the left", north=True, known=False)
 
     def clock(self, topics: Sequence[TopicSummary], out: _Lines) -> None:
         """Take the recorder's time where headers have none; for all where theirs is another clock, or one that was set.
@@ -344,181 +266,6 @@ class _Writer:
         if late is not None and jumped is None:
             why = f"the times of {late.name} run back by {late.back_s:.3g} s: such messages are left out"
             out.log.append(f"  on_error: skip  # {GUESS} {why}")
-
-    # -------------------------------------------------------------- sensors
-    def of_scan(self, topic: TopicSummary, space: bool) -> dict[str, Any]:
-        """Return the entry of a topic of observations."""
-        entry: dict[str, Any] = {"type": "scan", "sensor": sensor_name(topic.name, Scans())}
-        for key, names in (("ids", IDS), ("clusters", CLUSTERS)):
-            name = next((each for each in topic.fields if each in names), None)
-            if name and not {"ids", "clusters"} & entry.keys():
-                entry[key] = name
-        if topic.columns == CORNERS:
-            entry["size_m"] = 0.16
-        if topic.columns == ("range_m",):
-            entry["landmark"] = sensor_name(topic.name, Scans())
-        if topic.columns == POSE and not _is_tag(topic):
-            entry["take"] = [*POSE[:3]] if space else [*POSE[:2]]
-        return entry
-
-    def sensor(self, topic: TopicSummary, control: Any, space: bool) -> str:
-        """Return the line of a sensor's section."""
-        mount = self.mount(topic, control)
-        section, why = self.model(topic, space)
-        if mount is None:
-            section["mount"] = dict.fromkeys(placed(np.array([0.0] * 6 + [1.0])), 0.0) if space else {
-                "x_m": 0.0, "y_m": 0.0, "theta_rad": 0.0}  # fmt: skip
-            why = f"{why}; {GUESS} the mount: tf does not have {topic.frame or 'its frame'}".removeprefix("; ")
-        else:
-            why = f"{why}; its mount is that of tf".removeprefix("; ")
-        return f"{sensor_name(topic.name, Scans())}: {mapping(section)}  # {why}"
-
-    def mount(self, topic: TopicSummary, control: Any) -> Array | None:
-        """Return where tf has the frame of a sensor in that of its robot."""
-        named = control.child if isinstance(control, TopicSummary) else control[1] if control else ""
-        base = self.found.frames.base([named], topic.frame)
-        return None if base is None else self.found.frames.fixed(base, topic.frame)
-
-    def model(self, topic: TopicSummary, space: bool) -> tuple[dict[str, Any], str]:
-        """Return a sensor's section, and why."""
-        columns = topic.columns
-        if columns[:2] == BEAM:
-            detector = {"type": "trunks"}
-            section = {"type": "range_bearing", "detector": detector, "association": {"type": "auto"}}
-            return section, f"{GUESS} posts and trunks are its landmarks; or corners, reflectors"
-        if columns == ("range_m",):
-            section = {"type": "range"} if space else {"type": "range", "initialization": {"type": "trilateration"}}
-            return section, f"{GUESS} `landmark` of its topic is what it measures"
-        if columns == CORNERS or columns[:1] == ("u_px",):
-            camera = self.camera(topic)
-            kind = "tag_corners" if columns == CORNERS else "pinhole"
-            numbers = camera or {"fx_px": 600.0, "fy_px": 600.0, "cx_px": 640.0, "cy_px": 512.0,
-                                 "width_px": 1280, "height_px": 1024}  # fmt: skip
-            why = "its numbers are those of CameraInfo" if camera else f"{GUESS} its numbers: there is no CameraInfo"
-            return {"type": kind} | numbers, why
-        kind = ("tag_pose" if _is_tag(topic) else "position_3d") if space else "position"
-        named = {} if topic.named or {*topic.fields} & {*IDS} else {"association": {"type": "auto"}}
-        return {"type": kind} | named, ""
-
-    def camera(self, topic: TopicSummary) -> dict[str, Any] | None:
-        """Return the numbers of the camera of a topic: of its frame, or else the only ones."""
-        infos = [each for each in self.found.topics if each.camera is not None]
-        mine = [each for each in infos if each.frame == topic.frame] or (infos if len(infos) == 1 else [])
-        return mine[0].camera if mine else None
-
-
-class _Readings:
-    """Decides which readings of inertial units and compasses are taken, for one robot, and how good they may be."""
-
-    def __init__(
-        self, writer: _Writer, control: Any, kind: str, space: bool, start: _Start | None, ahead: float
-    ) -> None:
-        self.writer, self.control, self.kind, self.begin, self.ahead = writer, control, kind, start, ahead
-        self.space = space
-        self.sensors: list[str] = []
-        self.taken: set[str] = set()
-        self.heading: float | None = None  # the first that was measured, and taken
-
-    def entries(self, topics: Sequence[TopicSummary]) -> dict[str, tuple[dict[str, Any], str]]:
-        """Return the entries of the topics that are used, each with the reason."""
-        used = {}
-        for topic in sorted(topics, key=lambda each: each.offers.rates is None):  # compasses last
-            if {"rates", "attitude"} & topic.first.keys() and (entry := self.unit(topic)) is not None:
-                used[topic.name] = (entry, told(topic))
-            elif "field" in topic.first and not self.space and self.heading is None:
-                used[topic.name] = (self.compass(topic), told(topic))
-        return used
-
-    def unused(self, topic: TopicSummary) -> str:
-        """Return why a topic of an inertial unit or a compass is not used, "" if it is no such."""
-        if topic.offers.rates is not None:
-            return topic.error or "no rates, and no covariance of its orientation"
-        if topic.offers.field is not None:
-            return "headings by a magnetic field are for the plane, and for robots without another heading"
-        return ""
-
-    def unit(self, topic: TopicSummary) -> dict[str, Any] | None:
-        """Return the entry of an inertial unit, None if nothing of it is taken; note its sensors."""
-        entry: dict[str, Any] = {"type": "imu"}
-        rates, attitude = topic.first.get("rates"), topic.first.get("attitude")
-        spread = None if attitude is None or attitude.cov is None else np.diagonal(attitude.cov)
-        level = self.space and spread is not None and spread[:2].min() > 0
-        if rates is None:
-            entry["gyro"] = None
-        else:
-            entry |= self.gyro(topic, rates)
-        if attitude is not None and spread is not None and spread[2] > 0:
-            entry |= {"heading": self.named("compass", topic)}
-            self.compass_line(entry["heading"], topic, attitude.v, max(math.sqrt(spread[2]), HEADING_RAD))
-        if level and spread is not None:
-            entry |= {"inclination": self.named("level", topic)}
-            section = {"type": "inclination", "sigma_rad": max(math.sqrt(spread[:2].max()), HEADING_RAD)}
-            self.line(entry["inclination"], section, topic, f"{GUESS} its noise")
-        if {"heading", "inclination"} & entry.keys():
-            entry["every_s"] = HEADING_S
-        return None if entry == {"type": "imu", "gyro": None} else entry
-
-    def gyro(self, topic: TopicSummary, rates: Measured) -> dict[str, Any]:
-        """Return what an entry says of the rates; note their sensor."""
-        name = self.named("gyro", topic)
-        sigma, why = GYRO_RADPS, f"{GUESS} its noise and its bias"
-        if rates.cov is not None and rates.cov[2, 2] > 0:
-            sigma, why = math.sqrt(rates.cov[2, 2]), f"{GUESS} its bias; its noise is that of its message"
-        at = {}
-        if "odometry" in self.kind:
-            at = {"at": "controls"}
-            usual = self.control.rate_hz if isinstance(self.control, TopicSummary) else math.nan
-            many = topic.rate_hz / usual
-            sigma /= math.sqrt(many) if many > 1 else 1.0
-        self.line(name, {"type": "gyro", "sigma_radps": sigma} | BIAS, topic, why)
-        return {"gyro": name} | at
-
-    def compass(self, topic: TopicSummary) -> dict[str, Any]:
-        """Return the entry of a magnetic field; note its sensor."""
-        name = self.named("compass", topic)
-        self.compass_line(name, topic, topic.first["field"].v, FIELD_RAD)
-        return {"type": "compass", "sensor": name, "every_s": HEADING_S}
-
-    def compass_line(self, name: str, topic: TopicSummary, v: Array, sigma: float) -> None:
-        """Note a sensor of headings, its declination such that its first heading is that of the start."""
-        mount = self.writer.mount(topic, self.control)
-        R = np.eye(3) if mount is None else rotations.matrix(np.array(mount[3:]))
-        heading = heading_of(v, np.eye(3) if self.space else R) if len(v) == 4 else heading_of_field(R @ v)
-        self.heading = heading if self.heading is None else self.heading
-        section: dict[str, Any] = {"type": "heading", "sigma_heading_rad": sigma}
-        if self.begin is not None and self.begin.north:
-            section |= {"declination_rad": 0.0, "sigma_declination_rad": NORTH_RAD}
-            self.line(name, section, topic, f"{GUESS} its north is true north, or nearly")
-            return
-        ahead = heading_of(np.array([0.0, 0, 0, 1]), R.T) if self.space else 0.0  # of the sensor, at the start
-        off = 0.0 if heading is None else math.remainder(self.ahead + ahead - heading, 2 * math.pi)
-        section |= {"declination_rad": off, "sigma_declination_rad": START_RAD}
-        self.line(name, section, topic, f"{GUESS} its first heading is that of the start")
-
-    def start(self) -> str:
-        """Return the line of the robot's start; a heading that nothing else tells is that of the compass."""
-        begin = self.begin
-        assert begin is not None
-        at, sigmas, why = begin.at, begin.sigmas, begin.why
-        if not begin.known and self.heading is not None:
-            at, sigmas = [*at[:2], self.heading], [sigmas[0], NORTH_RAD]
-            why = f"{GUESS} its heading is that of its compass"
-        keys = ("x_m", "y_m", "theta_rad", "sigma_xy_m", "sigma_theta_rad")
-        return f"start: {mapping(dict(zip(keys, [*at, *sigmas], strict=True)))}  # {why}"
-
-    def named(self, name: str, topic: TopicSummary) -> str:
-        """Return the name of a sensor, with that of its topic if another has it."""
-        name = f"{sensor_name(topic.name, Scans())}_{name}" if name in self.taken else name
-        self.taken.add(name)
-        return name
-
-    def line(self, name: str, section: dict[str, Any], topic: TopicSummary, why: str) -> None:
-        """Note the line of a sensor; a mount that tf does not have is to be given where it counts."""
-        if self.writer.mount(topic, self.control) is not None:
-            why = f"{why}; its mount is that of tf"
-        else:
-            why = f"{why}; {GUESS} its axes are those of the robot"
-        self.sensors.append(f"{quoted(name)}: {mapping(section)}  # {why}")
 
 
 def _parts(topic: TopicSummary) -> list[str]:
@@ -553,10 +300,6 @@ def _in_pixels(topic: TopicSummary) -> bool:
     return topic.columns[:1] in (("u_px",), ("u1_px",))
 
 
-def _is_tag(topic: TopicSummary) -> bool:
-    return topic.what.endswith("of tags")
-
-
 def _useless(topic: TopicSummary) -> str:
     """Return why a topic of observations cannot be used, "" if it can."""
     if topic.offers.seen is None or topic.columns:
@@ -565,27 +308,3 @@ def _useless(topic: TopicSummary) -> str:
         known = {*IDS, *CLUSTERS} & {*topic.fields}
         return "" if known else f"points with {', '.join(topic.fields)}, no ids and no clusters"
     return topic.error or "nothing was seen"
-
-
-def aligned(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], list[float]] | None:
-    """Return the start (x, y, heading) that lays a way by odometry upon satellite fixes, and its sigmas.
-
-    By least squares; None where they have too little way in common.
-    """
-    if not odometry.moves:
-        return None
-    t_ns, frames = np.array(odometry.t_ns), np.array(odometry.frames)
-    lla = np.array([frame[:3] for frame in fixes.poses.frames])
-    enu = local(lla, fixes.origin)[:, :2]
-    after = np.clip(np.searchsorted(t_ns, fixes.poses.t_ns), 1, len(t_ns) - 1)
-    near = np.abs(t_ns[after] - np.array(fixes.poses.t_ns)) < NEAR_NS
-    p, q = frames[after[near], :2], enu[near]
-    if len(p) < 3 or np.ptp(p, axis=0).max() < LEAST_WAY_M:
-        return None
-    a, b = p - p.mean(axis=0), q - q.mean(axis=0)
-    turn = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-    R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    spread = math.sqrt(float(np.mean((b - a @ R.T) ** 2))) + 0.05
-    start = R @ (frames[0, :2] - p.mean(axis=0)) + q.mean(axis=0)
-    heading = math.remainder(yaw(frames[0]) + turn, 2 * math.pi)
-    return [float(start[0]), float(start[1]), heading], [spread, max(spread / float(np.linalg.norm(a)), 0.05)]

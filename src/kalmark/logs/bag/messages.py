@@ -18,6 +18,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.logs.bag.topics import Scans
+from kalmark.logs.calibration import lens
 from kalmark.logs.table import Refused
 
 POINT = ("x_m", "y_m", "z_m")
@@ -208,18 +209,20 @@ def transform(m: Any) -> Transform:
     return Transform(t_ns, m.header.frame_id.lstrip("/"), m.child_frame_id.lstrip("/"), frame)
 
 
-LENSES = {"plumb_bob": ("radtan", 5), "equidistant": ("equidistant", 4)}
-
-
 def camera(m: Any) -> dict[str, Any]:
-    """Return the keys of a camera's section for a sensor_msgs/CameraInfo, whose matrix is K in ROS 1, k in ROS 2."""
+    """Return the keys of a camera's section for a sensor_msgs/CameraInfo, whose matrix is K in ROS 1, k in ROS 2.
+
+    Raises Refused: of a camera that is not calibrated, and of a lens that kalmark does not have.
+    """
     K, D = ([float(v) for v in getattr(m, name, getattr(m, name.upper(), ()))] for name in "kd")
     section: dict[str, Any] = {"fx_px": K[0], "fy_px": K[4], "cx_px": K[2], "cy_px": K[5]}
     section |= {"width_px": int(m.width), "height_px": int(m.height)}
-    if m.distortion_model in LENSES and any(D):
-        lens, count = LENSES[m.distortion_model]
-        section |= {"lens": lens, "distortion": (D + [0.0] * count)[:count]}
-    return section
+    if not (K[0] > 0 and K[4] > 0):
+        raise Refused(f"focal lengths {K[0]:g}, {K[4]:g} of a camera that is not calibrated, expected numbers > 0")
+    try:
+        return section | (lens(m.distortion_model, D) if any(D) else {})
+    except ValueError as error:
+        raise Refused(str(error)) from None
 
 
 # ------------------------------------------------------------------ what a sensor saw

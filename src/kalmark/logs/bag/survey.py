@@ -20,6 +20,7 @@ from kalmark.logs.table import Refused
 
 GAP = 5.0  # an interval longer than so many usual ones is a gap
 FLAT_M, FLAT_RAD = 0.05, 0.05  # height and tilt of a path of the plane vary by less
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")  # counted, and not read
 STILL = 1e-3  # m, m/s, rad/s: what moves by less stands still
 
 
@@ -154,7 +155,7 @@ def survey(path: Path) -> Survey:
 
 def _summary(name: str, kind: str, count: int) -> TopicSummary:
     known = MESSAGES.get(kind)
-    return TopicSummary(name, kind, count, known.what if known else "")
+    return TopicSummary(name, kind, count, known.what if known else "images, not read" if kind in IMAGES else "")
 
 
 def _rates(bag: Bag, summaries: dict[str, TopicSummary]) -> tuple[float, float]:
