@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from kalmark import association, detect, geometry
     from kalmark.declare import register
     from kalmark.diagnosis.verdict import Verdict, diagnose
-    from kalmark.events import Control, Fix, Scan
+    from kalmark.events import Control, Fix, Frame, Scan
     from kalmark.filter import estimators
     from kalmark.logs import Log, log_from, open_log, stream_log
     from kalmark.management import initialization
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "Attention", "Control", "Delayed", "Expectations", "Fix", "KalmarkError", "Log", "Mount", "Observation", "Report",
-    "Robot", "Run", "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators", "geometry",
-    "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record", "register",
-    "sensors", "stream_log",
+    "Attention", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount", "Observation",
+    "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators",
+    "geometry", "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record",
+    "register", "sensors", "stream_log",
 ]  # fmt: skip
 
 _MODULES = {
@@ -57,7 +57,7 @@ _MODULES = {
 _NAMES = {
     "kalmark.declare": ("register",),
     "kalmark.diagnosis.verdict": ("Verdict", "diagnose"),
-    "kalmark.events": ("Control", "Fix", "Scan"),
+    "kalmark.events": ("Control", "Fix", "Frame", "Scan"),
     "kalmark.logs": ("Log", "log_from", "open_log", "stream_log"),
     "kalmark.management.attention": ("Attention",),
     "kalmark.management.delayed": ("Delayed",),

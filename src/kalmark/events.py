@@ -1,13 +1,13 @@
-"""What happens to a robot: `Control`, `Scan` and `Fix`, the only things that enter the filter.
+"""What happens to a robot: `Control`, `Scan`, `Frame` and `Fix`, the only things that enter the filter.
 
-Logs, the simulator and a live robot all speak these three.  Time is int64 nanoseconds inside, seconds at the edge.
+Logs, the simulator and a live robot all speak these four.  Time is int64 nanoseconds inside, seconds at the edge.
 """
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any
@@ -282,9 +282,91 @@ class Fix:
         return self.t_ns * 1e-9
 
 
-Event = Control | Scan | Fix
+@dataclass(frozen=True, slots=True, init=False, eq=False)
+class Frame:
+    """What one camera of one robot took at one instant: an image, and the depth of its pixels where that is measured.
 
-_RANK = {Control: 0, Scan: 1, Fix: 2}
+    The detector of its sensor makes a scan of it.  `image` (H, W) or (H, W, 3) of bytes, blue, green and red, and
+    `depth` (H, W) in m, 0 where there is none, are arrays, or functions that read them each time they are needed: a log
+    of many frames holds no pixel.
+    """
+
+    t_ns: int
+    robot: str
+    sensor: str
+    image: Array | Callable[[], Array]
+    depth: Array | Callable[[], Array] | None
+
+    def __init__(
+        self,
+        t_s: float | None = None,
+        robot: str = "",
+        sensor: str = "",
+        image: Any = (),
+        depth: Any = None,
+        *,
+        t_ns: int | None = None,
+    ) -> None:
+        set_ = object.__setattr__
+        t_ns = nanoseconds(t_s, t_ns, "frame", robot)
+        try:
+            set_(self, "t_ns", t_ns)
+            set_(self, "robot", _text(robot, "robot"))
+            set_(self, "sensor", _text(sensor, "sensor"))
+            set_(self, "image", image if callable(image) else _pixels(image))
+            set_(self, "depth", depth if depth is None or callable(depth) else _depths(depth))
+        except EventError as error:
+            what = f"frame of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
+            raise EventError(f"{what}: {error}") from None
+
+    @property
+    def t_s(self) -> float:
+        """The time in seconds."""
+        return self.t_ns * 1e-9
+
+    def pixels(self) -> Any:
+        """Return the image (H, W) or (H, W, 3) as bytes.  Raises EventError."""
+        return self._read(self.image, _pixels)
+
+    def grey(self) -> Any:
+        """Return the image (H, W) as bytes, .114 blue + .587 green + .299 red (ITU-R BT.601).  Raises EventError."""
+        pixels = self.pixels()
+        if pixels.ndim == 2:
+            return pixels
+        blue, green, red = (pixels[:, :, k].astype(np.uint32) for k in range(3))
+        return ((1868 * blue + 9617 * green + 4899 * red + 8192) >> 14).astype(np.uint8)
+
+    def depths(self) -> Array | None:
+        """Return the depth (H, W) of the pixels in m, 0 where there is none; None if none was measured.
+
+        Raises EventError.
+        """
+        return None if self.depth is None else self._read(self.depth, _depths)
+
+    def _read(self, source: Any, checked: Callable[[Any], Any]) -> Any:
+        try:
+            return checked(source()) if callable(source) else source
+        except (EventError, OSError) as error:
+            raise EventError(f"{when(self)}: {error}") from None
+
+
+def _pixels(image: Any) -> Any:
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8 or not pixels.size or not (pixels.ndim == 2 or pixels.shape[2:] == (3,)):
+        raise EventError(f"the image is {pixels.dtype} {pixels.shape}, expected bytes (H, W) or (H, W, 3)")
+    return np.ascontiguousarray(pixels)
+
+
+def _depths(depth: Any) -> Array:
+    metres = np.asarray(depth)
+    if metres.dtype.kind not in "uif" or not metres.size or metres.ndim != 2:
+        raise EventError(f"the depth is {metres.dtype} {metres.shape}, expected numbers (H, W) in m")
+    return metres.astype(np.float64)
+
+
+Event = Control | Scan | Frame | Fix
+
+_RANK: dict[type, int] = {Control: 0, Scan: 1, Frame: 1, Fix: 2}
 
 
 def when(event: Event) -> str:
@@ -293,5 +375,8 @@ def when(event: Event) -> str:
 
 
 def order(event: Event) -> tuple[int, int, str, str]:
-    """Sort key of events: time, then Control, Scan, Fix, then robot, then sensor (a stable sort keeps arrival)."""
-    return event.t_ns, _RANK[type(event)], event.robot, event.sensor if isinstance(event, Scan) else ""
+    """Sort key of events: time, then Control, Scan or Frame, Fix, then robot, then sensor.
+
+    A stable sort keeps arrival.
+    """
+    return event.t_ns, _RANK[type(event)], event.robot, event.sensor if isinstance(event, Scan | Frame) else ""

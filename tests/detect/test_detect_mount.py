@@ -160,6 +160,36 @@ def test_tags_are_found_where_the_sensor_expects_them_in_an_image() -> None:
     assert np.allclose(found[:3], tag[:3], atol=0.02)
 
 
+def test_a_frame_is_what_its_image_as_a_scan_is_and_is_read_when_it_is_needed() -> None:
+    cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
+    camera = km.sensors.TagCorners(fx_px=500, fy_px=500, cx_px=320, cy_px=240, width_px=640, height_px=480)
+    q = np.array([0.97, 0.1, -0.12, 0.05])
+    image = rendered(cv2, expected_corners(np.array([0.1, -0.05, 1.2, *(q / np.linalg.norm(q))]), 0.3), 7)
+    mount = km.Mount(camera, detector=km.detect.Tags(size_m=0.3))
+    robot = km.Robot("r", km.motion.Odometry3D(), sensors={"camera": mount, "blind": km.Mount(camera)})
+    one, other, reads = km.Slam(robot), km.Slam(robot), iter([image])
+    seen = one.process(km.Scan(1.0, "r", "camera", image))
+    frames = [km.Frame(1.0, "r", "camera", lambda: next(reads))]
+    run = km.record(other, frames, progress=False)
+    assert [o[1:] for o in seen.observations] == [(7, "new", 7, None, "", ())]
+    assert np.array_equal(one.mean(7), other.mean(7))
+    assert run.history.stepped == "scan"
+    assert run.history.landmark.tolist() == ["7"]
+    with pytest.raises(km.errors.EventError, match="frame at t=2 s: 'blind' has no detector for images"):
+        other.process(km.Frame(2.0, "r", "blind", image))
+    with pytest.raises(km.errors.EventError, match=r"t=2 s: the image is float64 \(480, 640\), expected bytes"):
+        other.process(km.Frame(2.0, "r", "camera", lambda: image * 1.0))
+    assert other.t_ns == 1_000_000_000
+
+
+def test_a_frame_is_grey_by_the_weights_of_its_colours() -> None:
+    colours = np.random.default_rng(1).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    frame = km.Frame(0.0, "r", "camera", colours, lambda: np.ones((40, 60), np.uint16))
+    grey = colours @ np.array([0.114, 0.587, 0.299])
+    assert np.abs(frame.grey() - grey).max() <= 0.51
+    assert frame.depths().dtype == np.float64
+
+
 def expected_corners(tag: np.ndarray, size_m: float) -> np.ndarray:
     s = size_m / 2
     p = tag[:3] + np.array([[-s, -s, 0], [s, -s, 0], [s, s, 0], [-s, s, 0]]) @ matrix(tag[3:]).T

@@ -20,11 +20,12 @@ from kalmark.arrays import Array, Flags
 from kalmark.batch.course import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
 from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, Ints, State, unsolved
-from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, when
 from kalmark.geometry.spaces import mount_space
 from kalmark.models.observe import inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor
 from kalmark.slam.checks import measurements
+from kalmark.slam.policy import FrameDetector
 from kalmark.tracks.channel import huber_length
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ class Replay:
         elif step < len(given.t_ns) and (event.t_ns, event.robot) == (given.t_ns[step], given.robot[step]):
             self.nodes.append(self._node(event.robot, event.t_ns))
             if step in self.rows:
-                self._scan(event, self.rows[step])
+                self._scan(self._found(event), self.rows[step])
 
     def _counts(self, event: Event) -> bool:
         """Return whether an event is in one of the segments; where a robot comes to the next one it is lost."""
@@ -180,10 +181,18 @@ class Replay:
             return self.chain.node_at(robot, t_ns)
         return self.apart.setdefault((robot, t_ns), len(self.apart))
 
+    def _found(self, event: Scan | Frame) -> Scan:
+        """Return the scan of what the detector of a sensor, if it has one, found."""
+        detector = self.given.robots[event.robot].sensors[event.sensor].detector
+        if isinstance(event, Scan):
+            return event if detector is None else detector(event)
+        if not isinstance(detector, FrameDetector):
+            raise unsolved(f"{when(event)}: {event.sensor!r} has no detector for images")
+        return detector.scan_of(event)
+
     def _scan(self, scan: Scan, rows: list[int]) -> None:
         used, node = self.given.associations, self.nodes[-1]
-        mount = self.given.robots[scan.robot].sensors[scan.sensor]
-        scan, index = scan if mount.detector is None else mount.detector(scan), used.index[rows]
+        mount, index = self.given.robots[scan.robot].sensors[scan.sensor], used.index[rows]
         if (used.sensor[rows] != scan.sensor).any() or (index >= len(scan.y)).any():
             raise unsolved(f"scan at t={scan.t_s:.9g} s is not the one of the run, expected its log")
         R = self._noise(scan, mount.sensor, rows)

@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import Positive, register
 from kalmark.errors import EventError, ModelError
-from kalmark.events import Scan, when
+from kalmark.events import Frame, Scan, when
 from kalmark.models.sensors import TagCorners
 
 Family = Literal["16h5", "25h9", "36h10", "36h11"]
@@ -60,8 +60,15 @@ class Tags:
         """Return the scan of the tags in an image, given as a scan whose y (H, W) are grey values of 0 to 255."""
         if not len(scan.y):
             return scan
+        return self._scan(scan, np.clip(np.rint(scan.y), 0, 255).astype(np.uint8))
+
+    def scan_of(self, frame: Frame) -> Scan:
+        """Return the scan of the tags in a frame."""
+        return self._scan(frame, frame.pixels())
+
+    def _scan(self, scan: Scan | Frame, image: Any) -> Scan:
         try:
-            y, ids = self.detect(np.clip(np.rint(scan.y), 0, 255).astype(np.uint8))
+            y, ids = self.detect(image)
         except EventError as error:
             raise EventError(f"{when(scan)}: {error}") from None
         return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=y if ids else (), ids=ids or None)

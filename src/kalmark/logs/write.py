@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, when
 from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
 from kalmark.logs.source import landmark_id, nanoseconds, seconds
@@ -85,6 +85,9 @@ def controls(log: Log) -> Table:
 def scans(log: Log) -> Table:
     """Return header and rows of scans.csv."""
     events = [event for event in log if isinstance(event, Scan)]
+    frame = next((event for event in log if isinstance(event, Frame)), None)
+    if frame is not None:
+        raise LogError(f"{when(frame)}: an image, expected controls, scans and fixes")
     columns = union(checked(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in events if len(s.y))
     noise = cov_columns(max((s.y.shape[1] for s in events if s.cov is not None), default=0))
     rows: list[dict[str, str]] = []

@@ -14,7 +14,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.batch.course import Chain
 from kalmark.errors import RunError
-from kalmark.events import Control, Scan
+from kalmark.events import Control, Fix, Frame, Scan
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.rotations import matrix
 
@@ -48,7 +48,7 @@ def g2o_text(run: Run, log: Log, robots: Mapping[str, Robot]) -> str:
     for event in log.events:
         if isinstance(event, Control):
             chain.take(event)
-        elif isinstance(event, Scan) and event.robot in robots and (step := next(steps, None)) is not None:
+        elif not isinstance(event, Fix) and event.robot in robots and (step := next(steps, None)) is not None:
             node = chain.node_at(event.robot, event.t_ns)
             nodes[node] = history.poses[step]
             sights += [(node, *seen) for seen in _observed(event, robots[event.robot], history, rows.get(step, []))]
@@ -59,10 +59,11 @@ def g2o_text(run: Run, log: Log, robots: Mapping[str, Robot]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _observed(event: Scan, robot: Robot, history: Any, rows: list[int]) -> Iterator[tuple[str, Array, Array]]:
+def _observed(event: Scan | Frame, robot: Robot, history: Any, rows: list[int]) -> Iterator[tuple[str, Array, Array]]:
     """Yield landmark, position in the robot's frame (d,) and covariance of the observations that were fused."""
     mount = robot.sensors[event.sensor]
-    at, m, own = np.array(mount.at), len(mount.sensor.columns), event.cov if mount.detector is None else None
+    at, m = np.array(mount.at), len(mount.sensor.columns)
+    own = event.cov if isinstance(event, Scan) and mount.detector is None else None
     for row in rows:
         y = history.y[row, :m]
         R = mount.sensor.noise(y[None])[0] if own is None else own if own.ndim == 2 else own[int(history.index[row])]

@@ -13,7 +13,7 @@ from numba.core import event as numba_event
 from kalmark.arrays import Array
 from kalmark.declare import is_own, registered_name
 from kalmark.errors import DivergedError, EventError, LogError
-from kalmark.events import Control, Event, Fix, Scan
+from kalmark.events import Control, Event, Fix, Frame, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.progress import track
 from kalmark.logs.source import nearest
@@ -114,8 +114,9 @@ class _Recorder:
     def __init__(self, slam: Slam, log: Log) -> None:
         self.slam, self.log = slam, log
         kinds = {type(event) for event in log.events}
-        self.stepped: type[Event] = next((kind for kind in (Scan, Fix) if kind in kinds), Control)
-        scans = sum(type(e) is self.stepped for e in log.events)
+        steps: tuple[tuple[str, set[type]], ...] = (("scan", {Scan, Frame}), ("fix", {Fix}), ("control", {Control}))
+        self.stepped_by, self.stepped = next((step for step in steps if step[1] & kinds), steps[-1])
+        scans = sum(type(e) in self.stepped for e in log.events)
         self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS)
         self.foresight = Foresight(slam, scans)
         self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
@@ -165,10 +166,11 @@ class _Recorder:
             self.fixes.append(
                 UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0], report.replaced)
             )
-        if type(event) is not self.stepped:
+        if type(event) not in self.stepped:
             return
-        scan = event if type(event) is Scan else Scan(t_ns=event.t_ns, robot=event.robot)
-        if scan is not event:
+        scan = report.event  # of a frame, what its detector found
+        if not isinstance(scan, Scan):
+            scan = Scan(t_ns=event.t_ns, robot=event.robot)
             report = Report(scan)  # a step without observations
         self.step_ns.append(math.nan if self.compiler.was_busy else self.spent_ns)
         self.spent_ns, self.compiler.was_busy = 0, False
@@ -263,7 +265,7 @@ class _Recorder:
             biases=biases(self.slam),
             gaps=joined(self.gaps),
             repeats=repeated(self.slam),
-            stepped=self.stepped.__name__.lower(),
+            stepped=self.stepped_by,
             **decisions(reports, 3 if any(space.world == "space" for space in spaces) else 2),
             **self.foresight.columns(m, p),
         )

@@ -28,7 +28,7 @@ from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
-from kalmark.events import LONGEST_PAUSE_NS, Control, Event, Fix, Id, Scan, checked_id, seconds, when
+from kalmark.events import LONGEST_PAUSE_NS, Control, Event, Fix, Frame, Id, Scan, checked_id, seconds, when
 from kalmark.filter.estimators import Compiling, Estimator, Invariant
 from kalmark.geometry.spaces import RHO
 from kalmark.management import reparametrize as points
@@ -42,7 +42,7 @@ from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_c
 from kalmark.slam.checks import numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
-from kalmark.slam.policy import Policy, refuse_other_world
+from kalmark.slam.policy import FrameDetector, Policy, refuse_other_world
 from kalmark.slam.robot import Robot, robots_given
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import CURE, Settings, State
@@ -85,7 +85,7 @@ class Slam(Estimate):
         settings = Settings(association, estimator, landmarks, map, reparametrize, numbers, upkeep)
         super().__init__(State(by_name, settings))
         self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may ask `expect`
-        self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
+        self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Frame: self._frame, Fix: self._fix}
         if isinstance(estimator, Compiling):
             kinds = [kind for channel in self.state.channels.values() for kind in channel.landmark.space.kinds]
             axes = max(robot.motion.space.axes for robot in by_name.values())
@@ -99,7 +99,7 @@ class Slam(Estimate):
         """
         state, take = self.state, self._takes.get(type(event))
         if take is None:
-            raise EventError(f"got {type(event).__name__}, expected a Control, a Scan or a Fix")
+            raise EventError(f"got {type(event).__name__}, expected a Control, a Scan, a Frame or a Fix")
         before = state.t_ns
         if before is not None and event.t_ns < before:
             raise EventError(f"{when(event)} comes after one at t={seconds(before)} s")
@@ -145,14 +145,31 @@ class Slam(Estimate):
         key = event.robot, event.sensor
         if key in state.readers:
             return own_readings.read(state, event, state.readers[key])
-        if key not in state.channels:
-            names = sorted(state.robots[event.robot].sensors)
+        policy = self._policy(event)
+        return self._found(event if policy.detector is None else policy.detector(event))
+
+    def _frame(self, event: Frame) -> Report:
+        detector = self._policy(event).detector
+        if not isinstance(detector, FrameDetector):
+            raise EventError(f"{when(event)}: {event.sensor!r} has no detector for images, expected one")
+        return self._found(detector.scan_of(event))
+
+    def _policy(self, event: Scan | Frame) -> Policy:
+        """Return the policy for what a sensor of landmarks saw.  Raises EventError."""
+        policy = self.state.policies.get((event.robot, event.sensor))
+        if policy is None:
+            names = sorted(self.state.robots[event.robot].sensors)
             raise EventError(f"{when(event)}: sensor is {event.sensor!r}, expected one of {names}")
+        return policy
+
+    def _found(self, event: Scan) -> Report:
+        """Take what was found of landmarks."""
+        state = self.state
+        key = event.robot, event.sensor
         if event.ids is not None and not state.inner.isdisjoint(event.ids):
             name = next(i for i in event.ids if i in state.inner)
             raise EventError(f"{when(event)}: id {name!r} names a robot's bias or mount, expected another")
         channel, policy = state.channels[key], state.policies[key]
-        event = event if policy.detector is None else policy.detector(event)
         R = measurements(event, channel.sensor, channel.check)
         if policy.averages:
             refuse_averaging(state.map, state.estimator, event)

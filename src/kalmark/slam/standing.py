@@ -25,7 +25,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import ModelError
-from kalmark.events import Control, Event, Scan
+from kalmark.events import Control, Event, Frame, Scan
 from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState, TimedNoise, coasts
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.slam.robot import Robot
@@ -139,7 +139,7 @@ class Standing:
         """Take an event of the robot; return whether it stood in the window that ends with it, None within one."""
         name = event.sensor if isinstance(event, Scan) else CONTROLS
         source = self.sources.get(name)
-        if source is None or (isinstance(event, Scan) and not len(event.y)):
+        if source is None or isinstance(event, Frame) or (isinstance(event, Scan) and not len(event.y)):
             return None
         if isinstance(event, Control):
             source.take(event.t_ns, event.u, self.motion.control_noise(event.u) if event.cov is None else event.cov)

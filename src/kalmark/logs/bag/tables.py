@@ -25,7 +25,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Event, Fix, Id, Scan, order
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, order, when
 from kalmark.logs.bag.reading import Bag, Received
 from kalmark.logs.bag.write import RECORD, Outgoing, header
 from kalmark.logs.log import Log, PositionTrack, Trajectory
@@ -87,6 +87,8 @@ def of_event(log: Log) -> Any:
             return record(CONTROLS, event.t_ns, event.robot, event.u, columns=columns, cov=event.cov)
         if isinstance(event, Fix):
             return record(FIXES, event.t_ns, event.robot, event.y, columns=POSITION[: len(event.y)], cov=event.cov)
+        if isinstance(event, Frame):
+            raise LogError(f"{when(event)}: an image, expected controls, scans and fixes")
         columns = log.sensor_columns.get((event.robot, event.sensor), ())
         ids = ["" if id_ is None else id_text(id_) for id_ in event.ids or ()]
         return record(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov)
