@@ -1,12 +1,13 @@
 """Where the landmarks of a simulated world stand: Sola's cloister ([S] App. C), a loop, a random field, a list.
 
 Layouts of the plane serve robots of space as well: their landmarks are at z = 0.  Those of space are the toolbox's
-thick cloister and house ([TB] `thickCloister`, `house`), a random box and a room of tags.
+thick cloister and house ([TB] `thickCloister`, `house`), a random box, a room of tags and planes with textures.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Annotated, Any, Literal
@@ -17,9 +18,11 @@ from pydantic import AfterValidator, Field, model_validator
 
 from kalmark.arrays import Array
 from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, expected
-from kalmark.geometry.frames3d import from_euler_pose
+from kalmark.geometry.frames3d import from_euler_pose, from_frame
+from kalmark.simulate.rendering import Plane, texture
 
 TOUCH_M = 1e-3  # walls this near to each other meet
+PANEL_M = 0.4, 1.0  # width and height of a panel
 STRAIGHT = 0.05  # sine of an angle between walls, below which they make no corner
 
 Count = Annotated[int, Field(ge=1)]
@@ -45,19 +48,21 @@ Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)
 class Scenery:
     """What there is to see: points (N, 2|3), segments (S, 6) from end to end, tags (T, 7) as poses, in m.
 
-    In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags.
+    In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags.  `planes` have textures,
+    for cameras whose images are rendered.
     """
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     segments: Array = field(default_factory=lambda: np.empty((0, 6)))
     tags: Array = field(default_factory=lambda: np.empty((0, 7)))
     tag_sizes: Array = field(default_factory=lambda: np.empty(0))
+    planes: tuple[Plane, ...] = ()
 
     @property
     def of_space(self) -> bool:
         """Whether it cannot be in the plane."""
         solid = bool(len(self.segments)) and self.segments.shape[1] == 6
-        return self.points.shape[1] == 3 or solid or bool(len(self.tags))
+        return self.points.shape[1] == 3 or solid or bool(len(self.tags)) or bool(self.planes)
 
 
 class OfPoints(Section):
@@ -228,6 +233,22 @@ class RandomBox(OfPoints):
         return rng.uniform(self.min_m, self.max_m, (self.count, 3))
 
 
+def before_wall(
+    size: tuple[float, float], wall: int, off_m: float, along: float, z: float, turned: float = 0.0
+) -> Array:  # fmt: skip
+    """Return the pose (7,) of a tag or picture on a wall of a room: 0 the western, 1 northern, 2 eastern, 3 southern.
+
+    `size` is the length and width of the room, whose corner is the origin; the middle of the picture is `off_m` before
+    the wall, at `along` from -1 to 1 on it and at the height `z` [m]; it is turned about its upright axis [rad].
+    """
+    middle = np.array(size) / 2
+    reach, half = middle if wall % 2 == 0 else middle[::-1]
+    c, s = math.cos(-math.pi / 2 * wall), math.sin(-math.pi / 2 * wall)
+    x, y = reach - off_m, half * along
+    place = middle[0] - c * x - s * y, middle[1] - s * x + c * y, z
+    return from_euler_pose(np.array([*place, -math.pi / 2, 0.0, math.pi / 2 * (1 - wall) + turned]))[0]
+
+
 class TagRoom(Section):
     """A room with tags on its four walls, all facing inwards; its south-western corner is the origin."""
 
@@ -245,16 +266,9 @@ class TagRoom(Section):
 
     def scenery(self, rng: Generator) -> Scenery:
         """Return the tags (4 per_wall heights, 7), always the same."""
-        middle = np.array([self.length_m, self.width_m]) / 2
-        across = 2 * np.arange(1, self.per_wall + 1) / (self.per_wall + 1) - 1
-        tags = []
-        for wall in range(4):  # west, north, east, south
-            reach, along = middle if wall % 2 == 0 else middle[::-1]
-            c, s = math.cos(-math.pi / 2 * wall), math.sin(-math.pi / 2 * wall)
-            for z, y in product(self.heights_m, along * across):
-                place = middle[0] - c * reach - s * y, middle[1] - s * reach + c * y, z
-                turns = -math.pi / 2, 0.0, math.pi / 2 * (1 - wall)
-                tags.append(from_euler_pose(np.array([*place, *turns]))[0])
+        across = (2 * np.arange(1, self.per_wall + 1) / (self.per_wall + 1) - 1).tolist()
+        size = self.length_m, self.width_m
+        tags = [before_wall(size, wall, 0.0, y, z) for wall in range(4) for z, y in product(self.heights_m, across)]
         return Scenery(tags=np.array(tags), tag_sizes=np.full(len(tags), self.size_m))
 
 
@@ -273,8 +287,8 @@ def corners(walls: Array) -> Array:
     return np.array(found).reshape(-1, 2)
 
 
-class ListedTag(Section):
-    """A tag: x to the right of who looks at it, y down, z away from them, into what it is stuck to."""
+class _Placed(Section):
+    """A pose: x to the right of a viewer, y down, z away from the viewer."""
 
     x_m: Number = 0.0
     """Its middle."""
@@ -288,13 +302,18 @@ class ListedTag(Section):
     """About y, second."""
     yaw_deg: Number = 0.0
     """About z, third."""
-    size_m: Positive = 0.3
-    """Its side."""
 
     def pose(self) -> Array:
         """Return its pose (7,)."""
         turns = np.radians([self.roll_deg, self.pitch_deg, self.yaw_deg])
         return from_euler_pose(np.array([self.x_m, self.y_m, self.z_m, *turns]))[0]
+
+
+class ListedTag(_Placed):
+    """A tag: x to the right of a viewer, y down, z away from the viewer, into the wall behind it."""
+
+    size_m: Positive = 0.3
+    """Its side."""
 
 
 class Listed(Section):
@@ -333,4 +352,80 @@ class Listed(Section):
         return Scenery(points, segments, tags, np.array([tag.size_m for tag in self.tags]))
 
 
-Layout = Annotated[Any, OneOf(Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed)]
+class ListedPlane(_Placed):
+    """A rectangle with a random texture; its axes are those of a tag."""
+
+    width_m: Positive = 1.0
+    """Along x."""
+    height_m: Positive = 1.0
+    """Along y."""
+
+
+class _Textured(Section):
+    """Planes with random textures."""
+
+    pixel_m: Positive = 0.005
+    """A pixel of the textures."""
+    per_m2: Positive = 60.0
+    """Quadrangles of random grey values in a square metre, 2 to 40 cm wide."""
+
+    def textured(self, planes: Iterable[tuple[Array, float, float]], rng: Generator) -> Scenery:
+        """Return planes of these middles (7,), widths and heights [m]."""
+        out = []
+        for middle, width, height in planes:
+            drawn = texture(width, height, self.pixel_m, rng, self.per_m2)
+            rows, columns = drawn.shape
+            corner = np.array([-0.5 * columns * self.pixel_m, -0.5 * rows * self.pixel_m, 0.0])
+            pose = middle.copy()
+            pose[:3] = from_frame(middle, corner)[0]
+            out.append(Plane(pose, drawn, self.pixel_m))
+        return Scenery(planes=tuple(out))
+
+
+class TexturedPlanes(_Textured):
+    """Planes with random textures, for cameras whose images are rendered."""
+
+    type: Literal["textured_planes"] = "textured_planes"
+    planes: Annotated[tuple[ListedPlane, ...], Field(strict=False, min_length=1)]
+    """Their middles and sizes."""
+
+    def scenery(self, rng: Generator) -> Scenery:
+        """Return the planes with random textures."""
+        return self.textured(((plane.pose(), plane.width_m, plane.height_m) for plane in self.planes), rng)
+
+
+class TexturedRoom(_Textured):
+    """A room with random textures on floor, walls and panels, for cameras whose images are rendered.
+
+    Its south-western corner is the origin.
+    """
+
+    type: Literal["textured_room"] = "textured_room"
+    length_m: Positive = 6.0
+    """From west to east."""
+    width_m: Positive = 5.0
+    """From south to north."""
+    height_m: Positive = 3.0
+    """Of the walls."""
+    panels: Annotated[int, Field(ge=0)] = 8
+    """Upright panels of 0.4 to 1 m, turned at random, up to `panel_depth_m` before a random wall."""
+    panel_depth_m: Positive = 1.0
+    """The largest distance of a panel from its wall."""
+
+    def scenery(self, rng: Generator) -> Scenery:
+        """Return the floor, the walls and the panels, with random textures."""
+        size, top = (self.length_m, self.width_m), self.height_m
+        floor = from_euler_pose(np.array([size[0] / 2, size[1] / 2, 0.0, math.pi, 0.0, 0.0]))[0]
+        planes = [(floor, *size)]
+        planes += [(before_wall(size, wall, 0.0, 0.0, top / 2), size[1 - wall % 2], top) for wall in range(4)]
+        for wall in rng.integers(0, 4, self.panels).tolist():
+            width, height = rng.uniform(*PANEL_M, 2).tolist()
+            z = rng.uniform(height / 2, max(height, top - height / 2))
+            off, y, turned = rng.uniform((0.3, -0.8, -0.6), (1.0, 0.8, 0.6)).tolist()
+            planes.append((before_wall(size, wall, self.panel_depth_m * off, y, z, turned), width, height))
+        return self.textured(planes, rng)
+
+
+Layout = Annotated[Any, OneOf(
+    Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed, TexturedPlanes, TexturedRoom,
+)]  # fmt: skip

@@ -44,6 +44,7 @@ from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
+from kalmark.simulate.layouts import Scenery
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
 from kalmark.simulate.worlds import World
@@ -124,9 +125,9 @@ def simulate(world: World, seed: int | SeedSequence | Generator = 0) -> Log:
 def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simulation:
     """Return one simulated run: its log, and what the log does not tell."""
     chance = Chance(seed)
-    things = scenery_of(world, chance.layout)
-    centres = np.concatenate([sort.centres() for sort in things.values() if len(sort.values)])
-    area = np.array([centres.min(axis=0), centres.max(axis=0)])
+    scenery = world.world.scenery(chance.layout)
+    things = things_in(world, scenery, chance.layout)
+    area = area_of(scenery, things)
     robots = [sim_robot(world, name, area, chance) for name in world.robots]
     times = [round(k * world.dt_s * 1e9) for k in range(world.steps + 1)]
     events: list[Event] = []
@@ -157,12 +158,25 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
 
 def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
     """Place what there is to see, points with a signature each if a sensor measures signatures."""
-    things = sights.things_of(world.world.scenery(rng), world.dimensions)
+    return things_in(world, world.world.scenery(rng), rng)
+
+
+def things_in(world: World, scenery: Scenery, rng: Generator) -> dict[str, Things]:
+    """Return what there is to see of a scenery, points with a signature each if a sensor measures signatures."""
+    things = sights.things_of(scenery, world.dimensions)
     if world.has_signatures:
         points = things[POINTS]
         signatures = rng.uniform(0.0, world.signature_max, len(points.values))
         points.values = np.column_stack([points.values, signatures])
     return things
+
+
+def area_of(scenery: Scenery, things: dict[str, Things]) -> Array:
+    """Return the lower and the upper corner of all there is (2, D)."""
+    places = [sort.centres() for sort in things.values() if len(sort.values)]
+    places += [plane.corners() for plane in scenery.planes]
+    centres = np.concatenate(places)
+    return np.array([centres.min(axis=0), centres.max(axis=0)])
 
 
 def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
