@@ -1,11 +1,14 @@
 """Bags with the configuration that `kalmark bag` wrote, and logs as MCAP and back.
 
-    KALMARK_DATA=... python benchmarks/bags.py [nav2] [tags] [mcap]
+    KALMARK_DATA=... python benchmarks/bags.py [nav2] [tags] [wrong] [mcap]
 
 nav2: the bag of a TurtleBot, odometry and the pose of AMCL as fixes, no line edited.  `fixes`: given to the filter and
 rejected; `off`: distance of the fixes from where the filter expects them, median and largest.
-tags: TagSLAM's bags by topic.  Their cameras, the sizes of the tags and the mount are in files of their own: those are
-the lines edited.  `corners`: RMS of their distances from the filter's, px; in brackets of the importer of those files.
+tags: TagSLAM's bags by topic.  Their cameras, the sizes of the tags, the wrong detections and the mount are in files of
+their own: those are the lines edited.  `corners`: RMS of their distances from the filter's, px; in brackets of the
+importer of those files.
+wrong: tests 13 and 22 with the wrong detections in, as they are, with a gate, with a robust loss: observations that are
+left out and the RMSE of the path, m.
 mcap: a log written as MCAP and read back: events, and whether log and map are the same to the last bit.
 """
 
@@ -15,6 +18,7 @@ import json
 import re
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +30,7 @@ from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs import Log, find_data, open_log
 from kalmark.logs.bag.first_config import first_config
 from kalmark.logs.bag.survey import survey
-from kalmark.logs.source import placed
+from kalmark.logs.source import placed, seconds
 from kalmark.logs.tagslam import SIGMA, Scene, frame_of, read_cameras, read_scene
 from kalmark.results.mcap import export
 from kalmark.results.record import record
@@ -68,6 +72,27 @@ def tags(test: int, folder: Path) -> None:
     print(f"corners {found['corner_rms_px']:.2f} px ({other['corner_rms_px']:.2f})")
 
 
+def wrong(test: int, folder: Path) -> None:
+    """Run one of TagSLAM's bags with the detections that its file calls wrong."""
+    own = open_run("tagslam", f"tagslam_test/test_{test}")[1]
+    where = find_data(f"tagslam_test/test_{test}")
+    lines = edited(first_config(survey(where / "tag_detections.bag.bz2")).splitlines(), where, own)
+    text, out = re.sub(r", ignore: \{[^}]*\}", "", "\n".join(lines)), []
+    truth = replace(own, truth={"robot": own.truth["rig"]})
+    for what, changed in (
+        ("plain", text),
+        ("gate .9999", f"{text}\nassociation: {{type: identity, gate: 0.9999}}"),
+        ("huber", text.replace('"sigma_px"', '"robust": "huber", "sigma_px"')),
+    ):
+        file = folder / f"wrong_{test}.yaml"
+        file.write_text(changed + "\n")
+        config, log = open_run(file)
+        found = record(build_slam(config, log), log, progress=False).with_truth(truth).evaluate()
+        seen, lost, off = found["observations"], found["rejected"], found["robots"]["robot"]["ate_m"]
+        out.append(f"{what} {lost} of {seen} left out, path {off:.4f}")
+    print(f"wrong, test {test}: {'; '.join(out)}")
+
+
 def edited(lines: list[str], where: Path, own: Log) -> list[str]:
     """Return the lines of a first configuration with what only a user knows: the camera, the sizes, the mount."""
     (camera,) = own.describes["robots"]["rig"]["sensors"].values()
@@ -81,6 +106,10 @@ def edited(lines: list[str], where: Path, own: Log) -> list[str]:
     usual = max(set(sizes.values()), key=list(sizes.values()).count)
     others = {str(tag): size for tag, size in sizes.items() if size != usual}
     size = f"size_m: {usual}" + (f", sizes: {json.dumps(others)}" if others else "")
+    ignored: dict[int, list[str]] = {}
+    for t_ns, tag in sorted(scene.squashed):
+        ignored.setdefault(tag, []).append(seconds(t_ns))
+    size += f", ignore: {json.dumps(ignored)}" if ignored else ""
     noise = odometry_noise(scene, scans)
     out = [re.sub(r"size_m: [0-9.]+", size, line) for line in lines]
     out = [re.sub(r"(\w+_tags\w*): \{type: tag_corners.*", rf"\1: {json.dumps(section)}", line) for line in out]
@@ -125,13 +154,15 @@ def bytes_of_map(slam: Slam, log: Log) -> bytes:
 
 def main() -> None:
     """Print the figures."""
-    wanted = sys.argv[1:] or ["nav2", "tags", "mcap"]
+    wanted = sys.argv[1:] or ["nav2", "tags", "wrong", "mcap"]
     with tempfile.TemporaryDirectory() as aside:
         folder = Path(aside)
         if "nav2" in wanted:
             nav2(folder)
         for test in TESTS if "tags" in wanted else ():
             tags(test, folder)
+        for test in TESTS[1:] if "wrong" in wanted else ():
+            wrong(test, folder)
         for name in LOGS if "mcap" in wanted else ():
             mcap(name, folder)
 

@@ -429,6 +429,24 @@ def test_observations_are_scans(
     np.testing.assert_array_equal(scan.y, np.array(y).reshape(len(y), -1) if y else np.empty((0, 0)))
 
 
+def test_observations_are_left_out_by_their_ids_and_times(tmp_path: Path) -> None:
+    t_ns = [T0 + 123_456_789, T0 + 223_456_789]
+    listed = [{"id": k, "pose": AT} for k in (4, 5)]
+    messages = [Outgoing("/seen", "visualization_msgs/msg/MarkerArray", t, {"markers": listed}) for t in t_ns]
+    path = bag_of(tmp_path, messages)
+
+    def ids(ignore: Any) -> list[Any]:
+        log = open_log(path, topics={"/seen": {"type": "scan", "take": ["x_m", "y_m", "z_m"], "ignore": ignore}})
+        assert [line.split(": ", 1)[1] for line in log.skipped] == ["/seen: 2 observations that `ignore` names"]
+        return [event.ids for event in log.events]
+
+    assert ids([5]) == [(4,), (4,)]
+    assert ids({5: [1700000000.123456789], "4": ["1700000000.223456789"]}) == [(4,), (5,)]
+    for wrong in (5, "5", {5: 1}, {5: ["soon"]}):
+        with pytest.raises(LogError, match=r"ignore is .*, expected a list of ids, or a mapping"):
+            open_log(path, topics={"/seen": {"type": "scan", "ignore": wrong}})
+
+
 def cloud(points: np.ndarray, names: str = "x y z id") -> dict[str, Any]:
     """Return the fields of a PointCloud2 of float32 coordinates and 16 bit numbers."""
     kind = np.dtype({"names": names.split(), "formats": ["<f4"] * 3 + ["<u2"] * (len(names.split()) - 3)}, align=True)

@@ -393,6 +393,7 @@ class _Importer:
     def scan(self, received: Received, topic: Scans, offer: Message, t_ns: int) -> None:
         """Take what a sensor saw."""
         seen = offer.seen(received.message, topic)  # type: ignore[misc]
+        seen = seen.without([topic.ignores(id_, t_ns) for id_ in seen.ids])
         for reason, count in seen.left_out.items():
             self.left_out[received.topic, reason] += count
         columns, y = self.chosen(received.topic, topic, seen)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -79,6 +79,14 @@ class Seen:
             return
         self.y.append(list(y))  # type: ignore[union-attr]
         self.ids.append(id_)
+
+    def without(self, ignored: Sequence[bool]) -> Seen:
+        """Return this without the observations that `ignore` of the topic names."""
+        if not any(ignored):
+            return self
+        rows = [(y, id_) for y, id_, out in zip(self.y, self.ids, ignored, strict=True) if not out]
+        left_out = self.left_out + Counter({"observations that `ignore` names": sum(ignored)})
+        return Seen(self.columns, [y for y, _ in rows], [id_ for _, id_ in rows], left_out)
 
 
 class Transform(NamedTuple):

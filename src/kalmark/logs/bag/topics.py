@@ -7,12 +7,13 @@ those of the control that comes of it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 from kalmark.declare import Number, Within, class_of, classes, declared, parameters, refuse, register
 from kalmark.errors import LogError, ModelError
 from kalmark.events import Id, shown
-from kalmark.logs.source import landmark_id, nearest
+from kalmark.logs.source import landmark_id, nanoseconds, nearest
 
 
 @declared
@@ -115,6 +116,10 @@ class Carried(Topic):
         return (getattr(self, "sensor", None) or topic.strip("/").replace("/", "_"),)
 
 
+def _microseconds(time: Any) -> int:
+    return (nanoseconds(str(time)) + 500) // 1000
+
+
 def _a_size(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e3
 
@@ -137,6 +142,9 @@ class Scans(Carried):
     landmark: Annotated[Any, "Range: id of the landmark that is measured."] = None
     size_m: Annotated[float | None, Within(gt=0), "Corners of tags: side of the black square."] = None
     sizes: Annotated[Any, "Corners of tags: sides by id, of tags with another one; all others have `size_m`."] = None
+    ignore: Annotated[
+        Any, "Observations to leave out: a list of ids, or a mapping of ids to lists of times in s, to the microsecond."
+    ] = None
     max_hamming: Annotated[int, Within(ge=0), "Tags: the most corrected bits."] = 2
 
     def __post_init__(self) -> None:
@@ -148,6 +156,27 @@ class Scans(Carried):
             raise refuse(self, "landmark", "an id")
         if self.sizes is not None and not (isinstance(self.sizes, Mapping) and all(map(_a_size, self.sizes.values()))):
             raise refuse(self, "sizes", "a mapping of ids to lengths in m")
+        try:
+            self.ignored  # noqa: B018 - what is not a list or a mapping is refused here
+        except (TypeError, ValueError):
+            raise refuse(self, "ignore", "a list of ids, or a mapping of ids to lists of times in s") from None
+
+    @cached_property
+    def ignored(self) -> dict[Id, frozenset[int] | None]:
+        """The ids of `ignore`, with the times (us) at which they are left out, None: at all times."""
+        given = self.ignore or {}
+        if isinstance(given, Mapping):
+            return {landmark_id(str(id_)): frozenset(map(_microseconds, times)) for id_, times in given.items()}
+        if isinstance(given, str):
+            raise TypeError(given)
+        return dict.fromkeys(landmark_id(str(id_)) for id_ in given)
+
+    def ignores(self, id_: Id | None, t_ns: int) -> bool:
+        """Return whether an observation of this id at this time is to be left out."""
+        if id_ not in self.ignored:
+            return False
+        times = self.ignored[id_]
+        return times is None or (t_ns + 500) // 1000 in times
 
     def size(self, tag: Id) -> float | None:
         """Return the size (m) of a tag, None if it has none."""
