@@ -468,7 +468,7 @@ def instrumented() -> None:
                 atheris.instrument_func(function)
 
 
-def guided(name: str, seconds: int, found: Path) -> None:
+def guided(name: str, seconds: int, found: Path, timeout_s: int) -> None:
     """Attack one target, guided by coverage, in this process, which libFuzzer ends."""
     import atheris
 
@@ -477,9 +477,11 @@ def guided(name: str, seconds: int, found: Path) -> None:
     corpus.mkdir(parents=True, exist_ok=True)
     for k, seed in enumerate(target.seeds):
         (corpus / f"seed{k}").write_bytes(seed)
-    instrumented()
     folder = Path(tempfile.mkdtemp())
-    options = (f"-max_total_time={seconds}", f"-timeout={TIMEOUT_S}", f"-rss_limit_mb={RSS_MB}",
+    for seed in target.seeds:  # what the first of them compiles is no hang
+        attacked(target, seed, folder)
+    instrumented()
+    options = (f"-max_total_time={seconds}", f"-timeout={timeout_s}", f"-rss_limit_mb={RSS_MB}",
                f"-max_len={LONGEST_INPUT}", f"-artifact_prefix={found / name}/", "-print_final_stats=1")  # fmt: skip
     atheris.Setup([sys.argv[0], *options, str(corpus)], lambda data: attacked(target, data, folder))
     atheris.Fuzz()
@@ -493,6 +495,7 @@ def main() -> None:
     parser.add_argument("--inputs", type=int, help="so many of each target, without coverage")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--found", type=Path, default=Path("fuzz"), help="folder of what was found")
+    parser.add_argument("--timeout", type=int, default=TIMEOUT_S, help="seconds after which an input hangs")
     parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--again", nargs=2, metavar=("TARGET", "FILE"), help="one input that was found")
     asked = parser.parse_args()
@@ -500,7 +503,7 @@ def main() -> None:
         print(attacked(targets()[asked.again[0]], Path(asked.again[1]).read_bytes(), Path(tempfile.mkdtemp())))
         return
     if asked.alone:
-        guided(asked.target[0], asked.seconds, asked.found)
+        guided(asked.target[0], asked.seconds, asked.found, asked.timeout)
         return
     totals = np.zeros(3, dtype=int)
     for name in asked.target or targets():
@@ -533,6 +536,7 @@ def in_process(name: str, asked: Any) -> tuple[int, int, int]:
     left = asked.seconds
     while left > 0:
         command = [sys.executable, __file__, "--alone", name, "--seconds", str(left), "--found", str(asked.found)]
+        command += ["--timeout", str(asked.timeout)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         stats = [line.split() for line in done.stderr.splitlines() if line.startswith("stat::number_of_executed_units")]
         inputs += int(stats[-1][1]) if stats else 0
