@@ -11,6 +11,10 @@ class EventError(KalmarkError):
     """A control, scan or fix that cannot be used; the map is exactly what it was before."""
 
 
+class ImageError(EventError):
+    """A frame whose image cannot be read.  A run goes on without it."""
+
+
 class ModelError(KalmarkError):
     """A motion, sensor or landmark model that is wrong in itself or does not fit the others.
 

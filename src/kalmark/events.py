@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.errors import EventError, KalmarkError
+from kalmark.errors import EventError, ImageError, KalmarkError
 
 Id = int | str
 
@@ -325,11 +325,11 @@ class Frame:
         return self.t_ns * 1e-9
 
     def pixels(self) -> Any:
-        """Return the image (H, W) or (H, W, 3) as bytes.  Raises EventError."""
+        """Return the image (H, W) or (H, W, 3) as bytes.  Raises ImageError."""
         return self._read(self.image, _pixels)
 
     def grey(self) -> Any:
-        """Return the image (H, W) as bytes, .114 blue + .587 green + .299 red (ITU-R BT.601).  Raises EventError."""
+        """Return the image (H, W) as bytes, .114 blue + .587 green + .299 red (ITU-R BT.601).  Raises ImageError."""
         pixels = self.pixels()
         if pixels.ndim == 2:
             return pixels
@@ -339,7 +339,7 @@ class Frame:
     def depths(self) -> Array | None:
         """Return the depth (H, W) of the pixels in m, 0 where there is none; None if none was measured.
 
-        Raises EventError.
+        Raises ImageError.
         """
         return None if self.depth is None else self._read(self.depth, _depths)
 
@@ -347,7 +347,7 @@ class Frame:
         try:
             return checked(source()) if callable(source) else source
         except (EventError, OSError) as error:
-            raise EventError(f"{when(self)}: {error}") from None
+            raise ImageError(f"{when(self)}: {error}") from None
 
 
 def _pixels(image: Any) -> Any:

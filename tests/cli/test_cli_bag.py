@@ -205,8 +205,8 @@ def test_the_numbers_of_a_camera_that_kalmark_does_not_have_are_to_be_given(
 def test_images_are_counted_and_the_configuration_says_what_to_do_with_them(kalmark: Kalmark, tmp_path: Path) -> None:
     image = Outgoing("/camera/image_raw", "sensor_msgs/msg/Image", T0, {"header": header(T0, "camera")})
     text = config_of(tmp_path, [image, odometry(T0, pose(0, 0, 0)), odometry(T0 + 9, pose(1, 0, 0))])
-    assert "# not used: /camera/image_raw (sensor_msgs/Image): images: let a detector find tags" in text
-    assert "images, not read" in kalmark("bag", tmp_path / "mcap").out
+    assert "# not used: /camera/image_raw (sensor_msgs/Image): images: `{type: images}` gives them to" in text
+    assert "images" in kalmark("bag", tmp_path / "mcap").out
 
 
 # ------------------------------------------------------------------ what bags of the field have

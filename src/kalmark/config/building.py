@@ -18,7 +18,8 @@ from kalmark.config.sections import model_of
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
-from kalmark.events import Control, Scan
+from kalmark.events import Control, Frame, Scan
+from kalmark.logs.images.pictures import size_of
 from kalmark.logs.known_map import KnownLandmark, read_known
 from kalmark.logs.log import Log, true_start
 from kalmark.models.inertial import Inertial, at_rest
@@ -108,6 +109,7 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
     if log is not None:
         refuse_scans(config, key, name, mounts, log)
+        refuse_uncalibrated(config, key, name, log)
     watched = {key: getattr(robot, key) for key in ("gaps", "max_speed_mps", "max_turn_radps")}
     return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov, **watched, **rests)
 
@@ -193,7 +195,7 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
             kind = "its beams" if raw else f"its type {config.robots[key].sensors[sensor].type}"
             fitting, wanted = [] if raw else _fitting("sensor", given), f"{', '.join(columns)} of {kind}"
             raise _other_columns(log, name, sensor, given, wanted, fitting, f"{key}.sensors.{sensor}", columns)
-    used = {event.sensor: None for event in log.events if isinstance(event, Scan) and event.robot == name}
+    used = {event.sensor: None for event in log.events if isinstance(event, Scan | Frame) and event.robot == name}
     other = next((sensor for sensor in used if sensor not in mounts), None)
     if other is None or config.log.on_error == "skip":
         return
@@ -207,6 +209,27 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
     known = f"one of {', '.join(mounts)}" if mounts else "none, as none is configured"
     what = f"{name} has scans of the sensor {other!r}, expected {known}"
     raise LogError(f"{where}: {what}; if it is another one, add robots.{key}.sensors.{other}")
+
+
+def refuse_uncalibrated(config: Config, key: str, name: str, log: Log) -> None:
+    """Refuse images by a camera whose calibration nobody gave, or that is for images of another size."""
+    took: dict[str, list[Frame]] = {}
+    for event in log.events:
+        if isinstance(event, Frame) and event.robot == name:
+            took.setdefault(event.sensor, []).append(event)
+    for sensor, frames in took.items():
+        section = config.robots[key].sensors.get(sensor)
+        if section is None or "fx_px" not in type(section).model_fields:
+            continue
+        where = ("robots", key, "sensors", sensor)
+        if "fx_px" not in section.model_fields_set:
+            wanted = f"fx_px, ..., or {'.'.join((*where, 'calibration'))}: a file of OpenCV, ROS, Kalibr or EuRoC"
+            raise config.error(where, f"got images by a camera without a calibration, expected {wanted}")
+        size = size_of(frames)
+        if any(getattr(section, name) != pixels for name, pixels in size.items()):
+            got = f"got a calibration for {section.width_px:g} x {section.height_px:g} px"
+            wanted = " x ".join(map(str, size.values()))
+            raise config.error(where, f"{got}, expected one for the images of {wanted} px")
 
 
 def _other_columns(

@@ -7,9 +7,9 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from kalmark.config.reading import config_of, did_you_mean, resolve_config, shipped_configs
+from kalmark.config.reading import ENDINGS, config_of, did_you_mean, resolve_config, shipped_configs
 from kalmark.config.schema import COMMON, TRUTH, Config
-from kalmark.config.tree import OVERRIDE, Tree, read_tree
+from kalmark.config.tree import OVERRIDE, Tree, read_tree, tree_of
 from kalmark.errors import ConfigError, LogError
 from kalmark.logs import FORMATS, find_data, open_log
 from kalmark.logs.formats import recognise
@@ -28,10 +28,10 @@ def open_run(
     """Return a configuration as it is in force, and the log it names, or the one at `log_path` read in the same way.
 
     What the log describes of its robots, sensors and landmarks is in force where the configuration says nothing.
+    In the place of a configuration there may be a log that describes all of its rig itself.
     Raises ConfigError, LogError.
     """
-    path = resolve_config(path_or_name)
-    tree = read_tree(path, overrides)
+    path, tree = tree_at(path_or_name, overrides)
     values = {key: value for key, value in tree.values.items() if key in ("log", "plugins")}
     alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
     log = open_config_log(alone, progress=progress)
@@ -39,6 +39,30 @@ def open_run(
     config = config_of(laid_over(tree, log), path)
     found = {"known": str(known_path(config))} if config.map.known not in (None, TRUTH) else {}
     return config.model_copy(update={"log": alone.log, "map": config.map.model_copy(update=found)}), log
+
+
+def tree_at(path_or_name: str | Path, overrides: Sequence[str]) -> tuple[Path | None, Tree]:
+    """Return a configuration's file, None of a log alone, and its tree.  Raises ConfigError."""
+    try:
+        path = resolve_config(path_or_name)
+    except ConfigError:
+        log = log_alone(path_or_name)
+        if log is None:
+            raise
+        return None, tree_of({"log": {"path": str(log)}}, overrides)
+    if path.suffix not in ENDINGS and (log := log_alone(path)) is not None:
+        return None, tree_of({"log": {"path": str(log)}}, overrides)
+    return path, read_tree(path, overrides)
+
+
+def log_alone(path: str | Path) -> Path | None:
+    """Return where a log is that describes all of its rig itself, as images do; None if there is none."""
+    try:
+        found = find_data(path)
+        entry, _ = recognise(found, None)
+    except LogError:
+        return None
+    return found.resolve() if entry.describes_all else None
 
 
 def known_path(config: Config) -> Path:

@@ -20,7 +20,7 @@ from kalmark.errors import ConfigError, KalmarkError
 
 Model = TypeVar("Model", bound=BaseModel)
 
-_ENDINGS = (".yaml", ".yml")
+ENDINGS = (".yaml", ".yml")
 _EXPECTED = {
     "float_type": "a number",
     "finite_number": "a finite number",
@@ -90,7 +90,7 @@ def resolve_name(path_or_name: str | Path, shipped: dict[str, Path], what: str) 
         return shipped[str(path_or_name)]
     if path.is_dir():
         raise ConfigError(f"{path}: got a folder, expected a {what}: a YAML file or one of {', '.join(shipped)}")
-    if path.suffix in _ENDINGS and path.stem in shipped:
+    if path.suffix in ENDINGS and path.stem in shipped:
         return shipped[path.stem]
     nearest = did_you_mean(path.stem, [*shipped])
     raise ConfigError(f"{path}: no such file, expected a {what}: a YAML file or one of {', '.join(shipped)}{nearest}")

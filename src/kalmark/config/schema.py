@@ -353,12 +353,20 @@ class LogConfig(Section):
     """kitti_stereo_features: hold the mean of two rates between them, or the first (mean if absent)."""
     tag_size_m: Positive | None = None
     """tagslam: size of the tags that tagslam.yaml gives none of their own."""
-    cameras: Literal["all", "given"] | None = None
-    """tagslam: all, or those with a pose in camera_poses.yaml (all if absent)."""
+    cameras: Literal["all", "given"] | Annotated[tuple[str, ...], Field(strict=False)] | None = None
+    """tagslam: all, or those with a pose in camera_poses.yaml (all if absent); euroc: a list of names ([cam0])."""
     odometry: Literal["auto", "none"] | None = None
     """tagslam: use the odometry of the bag (auto if absent)."""
     sigma_px: Positive | None = None
     """tagslam: noise of a corner's coordinate (the pixel_noise of tagslam.yaml if absent)."""
+    fps: Positive | None = None
+    """images, video: images a second, where they have no times, or others."""
+    imu: Literal["auto", "none"] | None = None
+    """euroc: let the inertial unit move the robot (auto if absent)."""
+    depth: Literal["auto", "none"] | None = None
+    """tum_rgbd: take the depth images (auto if absent)."""
+    depth_scale: Positive | None = None
+    """tum_rgbd: the number of 1 m in a depth image (5000 if absent)."""
     topics: dict[str, Topic] | None = None
     """bag: topics by name, and what each of them is in the log, see below."""
 

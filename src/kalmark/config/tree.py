@@ -71,6 +71,14 @@ def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
     return tree
 
 
+def tree_of(values: dict[str, Any], overrides: Sequence[str] = ()) -> Tree:
+    """Return plain values as a tree with the overrides applied.  Raises ConfigError."""
+    tree = Tree(values)
+    for override in overrides:
+        _override(tree, override)
+    return tree
+
+
 def show(value: Any) -> str:
     """Return a value as an error message quotes it: short, on one line."""
     if value is None:

@@ -16,6 +16,10 @@ from kalmark.logs.bag.importer import BAG
 from kalmark.logs.carmen import CARMEN
 from kalmark.logs.download import find_data
 from kalmark.logs.graph import G2O
+from kalmark.logs.images.euroc import EUROC
+from kalmark.logs.images.folder import IMAGES, VIDEO
+from kalmark.logs.images.kitti import KITTI_ODOMETRY
+from kalmark.logs.images.tum import TUM_RGBD
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
@@ -31,7 +35,7 @@ from kalmark.logs.victoria_park import VICTORIA_PARK
 
 FORMATS: dict[str, Format] = {entry.name: entry for entry in (
     NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB, TAGSLAM, KITTI_STEREO, PLAZA,
-    BAG, G2O, CARMEN, TUM, KITTI,
+    BAG, G2O, CARMEN, TUM, KITTI, EUROC, TUM_RGBD, KITTI_ODOMETRY, IMAGES, VIDEO,
 )}  # fmt: skip
 
 

@@ -37,7 +37,7 @@ def log_from(
     or number for all rows.  None and NaN are empty cells.  `describes` is what a `rig.yaml` would say.  The other
     arguments are those of `open_log`.  Raises LogError, with table and row (from 1) for a bad one.
     """
-    given = dict(zip(FILES, (controls, scans, fixes, truth, landmarks, gps, measurements), strict=True))
+    given = dict(zip(FILES, (controls, scans, fixes, truth, landmarks, gps, measurements), strict=False))
     there = {file: sheet(file.removesuffix(CSV), table) for file, table in given.items() if table is not None}
     if not {*EVENTS} & there.keys():
         raise LogError("log_from: no controls, scans, fixes or measurements, expected at least one of them")

@@ -8,6 +8,7 @@
 `landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags;
                 in the plane id, x_m, y_m[, x2_m, y2_m]: points, both ends of walls
 `gps.csv`       t_s, robot, x_m, y_m, antenna_x_m, antenna_y_m: fixes that only score a run
+`frames.csv`    t_s, robot, sensor, image[, depth]: files beside it, depths of 16 bits, 5000 a metre
 `rig.yaml`      what the log describes of its robots and sensors, in the shape of a configuration
 
 A row of `scans.csv` whose id and values are all empty is a scan that saw nothing.
@@ -31,14 +32,16 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Id, Scan, order, shown
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, order, shown
+from kalmark.logs.images.pictures import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
 from kalmark.logs.table import CONTROL, OBSERVATION, PARQUET, READING, Refused, Row, Sheet, read_table
 
 RIG = "rig.yaml"
-FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv")
-EVENTS = ("controls.csv", "scans.csv", "fixes.csv", "measurements.csv")
+FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv",
+         "frames.csv")  # fmt: skip
+EVENTS = ("controls.csv", "scans.csv", "fixes.csv", "measurements.csv", "frames.csv")
 LANDMARK3 = ("x_m", "y_m", "z_m", "x2_m", "y2_m", "z2_m", "qx", "qy", "qz", "qw")
 POSE2, POSE3 = ("x_m", "y_m", "theta_rad"), ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 WALL = ("x_m", "y_m", "x2_m", "y2_m")
@@ -143,7 +146,7 @@ class _Reader:
         self.gps: dict[str, PositionTrack] = {}
         self.readers: tuple[Callable[[Path | Sheet], Iterator[Event] | None], ...] = (
             self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps,
-            self.measurements,
+            self.measurements, self.frames,
         )  # fmt: skip
 
     def note(self, row: Row) -> None:
@@ -227,6 +230,22 @@ class _Reader:
 
         table = read_table(path, ("t_s", "robot", "sensor"), known=(*CONTROL, *OBSERVATION, *READING))
         return table.made(self.request, make, by_sensor=True)
+
+    def frames(self, path: Path | Sheet) -> Iterator[Event]:
+        """Yield the frames of `frames.csv`, without those whose images cannot be used."""
+        folder, album = Path(str(path)).parent, Album()
+
+        def make(row: Row) -> Frame | None:
+            self.note(row)
+            if not row.text("image"):
+                raise Refused("image is empty, expected a file beside this one")
+            depth = row.text("depth") if "depth" in row.table.index else ""
+            file, other = folder / row.text("image"), folder / depth if depth else None
+            return album.frame(row.t_ns, row.robot, row.sensor, file, other)
+
+        table = read_table(path, ("t_s", "robot", "sensor", "image"), allowed=("depth",))
+        yield from table.made(self.request, make, by_sensor=True)
+        album.report(self.request)
 
     def fixes(self, path: Path | Sheet) -> Iterator[Event]:
         """Yield the absolute positions of `fixes.csv`."""

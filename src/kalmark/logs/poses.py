@@ -71,10 +71,10 @@ def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
             yield t_ns, np.append(values[:3], np.array(values[3:]) / norm)
 
 
-def kitti_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
-    """Yield times (ns), which increase, and poses (7,)."""
+def kitti_rows(path: Path, request: Request, t_ns: Times | None = None) -> Iterator[tuple[int, Array]]:
+    """Yield times (ns), which increase, and poses (7,); the times t_ns (N,) are those in the file beside if absent."""
     lines = list(rows(path))
-    t_ns = kitti_times(path)
+    t_ns = kitti_times(path) if t_ns is None else t_ns
     if len(t_ns) != len(lines):
         raise LogError(f"{path}: {len(lines)} poses and {len(t_ns)} times, expected as many")
     for k, (line, cells) in enumerate(lines):

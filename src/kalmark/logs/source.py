@@ -73,7 +73,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Format:
-    """Describe one log format: how to tell it (`find` gives the path to read, or None) and how to read it."""
+    """Describe one log format: how to tell it (`find` gives the path to read, or None) and how to read it.
+
+    With `describes_all` a log says all that a configuration needs.
+    """
 
     name: str
     what: str
@@ -81,6 +84,7 @@ class Format:
     read: Callable[..., Log]
     options: tuple[str, ...] = ()
     robot_prefix: str = ""
+    describes_all: bool = False
 
 
 def one_robot(

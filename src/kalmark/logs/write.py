@@ -12,7 +12,8 @@ from ruamel.yaml import YAML
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, when
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan
+from kalmark.logs.images.pictures import write_depth, write_image
 from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
 from kalmark.logs.source import landmark_id, nanoseconds, seconds
@@ -20,6 +21,7 @@ from kalmark.logs.table import CANONICAL, PARQUET, cov_columns
 
 Table = tuple[list[str], list[dict[str, str]]]
 POSITION = ("x_m", "y_m", "z_m")
+FRAMES, IMAGES = "frames.csv", "images"
 EMPTY: Table = ([], [])  # measurements.csv: what has no id is written into scans.csv, too
 
 
@@ -32,7 +34,7 @@ def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path
     unnamed column, two scans of one sensor at one time, an id that would be read as another).
     """
     folder = Path(folder)
-    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log), EMPTY)
+    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log), EMPTY, frames(log, folder))
     folder.mkdir(parents=True, exist_ok=True)
     for file_name, (header, rows) in zip(FILES, tables, strict=True):
         other = (folder / file_name).with_suffix(PARQUET)
@@ -40,7 +42,7 @@ def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path
             old.unlink(missing_ok=True)
         if not rows:
             continue
-        if parquet:
+        if parquet and file_name != FRAMES:
             write_parquet(other, header, rows)
             continue
         with (folder / file_name).open("w", newline="", encoding="utf-8") as file:
@@ -85,9 +87,6 @@ def controls(log: Log) -> Table:
 def scans(log: Log) -> Table:
     """Return header and rows of scans.csv."""
     events = [event for event in log if isinstance(event, Scan)]
-    frame = next((event for event in log if isinstance(event, Frame)), None)
-    if frame is not None:
-        raise LogError(f"{when(frame)}: an image, expected controls, scans and fixes")
     columns = union(checked(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in events if len(s.y))
     noise = cov_columns(max((s.y.shape[1] for s in events if s.cov is not None), default=0))
     rows: list[dict[str, str]] = []
@@ -107,6 +106,25 @@ def scans(log: Log) -> Table:
             told = {} if id_ is None else {"id": id_text(id_)}
             rows.append(begin | told | cells(columns, used, y) | upper(cov, f"scan at {s.t_s} s"))
     return ["t_s", "robot", "sensor", "id", *columns, *noise], rows
+
+
+def frames(log: Log, folder: Path) -> Table:
+    """Return header and rows of frames.csv, and write the images below the folder: IMAGES/SENSOR/NANOSECONDS.png."""
+    rows: list[dict[str, str]] = []
+    for frame in log:
+        if not isinstance(frame, Frame):
+            continue
+        row = start(frame) | {"sensor": name(frame.sensor)}
+        depth = frame.depths()
+        for column, pixels, write in (("image", frame.pixels(), write_image), ("depth", depth, write_depth)):
+            if pixels is None:
+                continue
+            place = Path(IMAGES, f"{frame.robot}_{frame.sensor}".replace("/", "_"), f"{frame.t_ns}_{column}.png")
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            write(folder / place, pixels)
+            row[column] = place.as_posix()
+        rows.append(row)
+    return ["t_s", "robot", "sensor", "image", *(["depth"] if any("depth" in row for row in rows) else [])], rows
 
 
 def fixes(log: Log) -> Table:

@@ -12,7 +12,7 @@ from numba.core import event as numba_event
 
 from kalmark.arrays import Array
 from kalmark.declare import is_own, registered_name
-from kalmark.errors import DivergedError, EventError, LogError
+from kalmark.errors import DivergedError, EventError, ImageError, LogError
 from kalmark.events import Control, Event, Fix, Frame, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.progress import track
@@ -49,10 +49,10 @@ def record(
     """Process every event of a log (or of any iterable) and return the run, ready to evaluate and save.
 
     A bar on standard error appears after two seconds unless `progress` is False.  With `on_error` "skip" an event the
-    filter refuses is left out and listed in `run.skipped`.  A filter that diverges so far that it refuses to go on ends
-    the run in either case: `run.stopped` says why and the summary has `diverged`.  `config` is what to save as the
-    run's configuration; by default it is read off the filter's models.  Raises LogError if the log has other columns
-    than the filter's motions and sensors.
+    filter refuses is left out and listed in `run.skipped`, as is always a frame whose image cannot be read.  A filter
+    that diverges so far that it refuses to go on ends the run in either case: `run.stopped` says why and the summary
+    has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's models.
+    Raises LogError if the log has other columns than the filter's motions and sensors.
     """
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
@@ -66,7 +66,7 @@ def record(
             try:
                 recorder.process(event)
             except EventError as error:
-                if on_error == "raise":
+                if on_error == "raise" and not isinstance(error, ImageError):
                     raise
                 recorder.skipped.append(str(error))
             except DivergedError as error:

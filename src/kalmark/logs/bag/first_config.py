@@ -15,7 +15,7 @@ from kalmark.logs.bag.first_words import GUESS, mapping, quoted, told
 from kalmark.logs.bag.frames import BASES
 from kalmark.logs.bag.importer import DAY_NS, short
 from kalmark.logs.bag.messages import BEAM, CORNERS, POSE
-from kalmark.logs.bag.survey import IMAGES, Survey, TopicSummary, yaw
+from kalmark.logs.bag.survey import Survey, TopicSummary, yaw
 
 TRUE = ("truth", "vicon", "mocap", "optitrack", "/gt", "gt_", "_gt")
 LATER = ("filtered", "global", "map", "gps")  # odometry of these names has been corrected by something else
@@ -30,7 +30,7 @@ COASTING = {
 }  # fmt: skip
 """The motion of a robot without controls, in space or in the plane."""
 AT_REST = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
-IMAGES_ADVICE = "images: let a detector find tags or features in them and record its topic, or see docs/detectors.md"
+IMAGES_ADVICE = "images: `{type: images}` gives them to the detector of a sensor, such as tags (docs/detectors.md)"
 SLOW = 0.5
 """An odometry of less than two messages for each of a sensor's gives increments that end at its scans."""
 JUMP_S = 1.0  # headers that run backwards by more are of a clock that was set
@@ -242,7 +242,7 @@ class _Writer:
             return "frames: the mounts of sensors are taken from them"
         if topic.offers.camera is not None:
             return "the numbers of a camera"
-        if topic.type in IMAGES:
+        if topic.offers.image is not None:
             return IMAGES_ADVICE
         if topic.offers.pose is not None or topic.offers.twist is not None:
             return "if it is `truth` or a `fix`, say so"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.events import Control, Event, Fix, Frame, Scan, order
 from kalmark.geometry import rotations
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
@@ -38,6 +39,7 @@ from kalmark.logs.bag.topics import (
     Carried,
     Compass,
     Fixes,
+    Images,
     Imu,
     Moved,
     Noisy,
@@ -49,6 +51,7 @@ from kalmark.logs.bag.topics import (
     Truths,
     topic_of,
 )
+from kalmark.logs.images.pictures import Forward
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, placed, seconds
 from kalmark.logs.table import Refused
@@ -109,6 +112,9 @@ class _Importer:
         self.ways: dict[str, dict[int, Array]] = {}
         self.origins: dict[str, Array] = {}
         self.left_out: Counter[tuple[str, str]] = Counter()
+        self.received: Counter[str] = Counter()
+        self.images: dict[str, Forward] = {}
+        self.cameras: dict[tuple[str, str], dict[str, Any]] = {}
         self.clocks: dict[bool, tuple[str, int]] = {}
         self.frames, self.of_sensor, self.base = Frames(), dict[str, str](), dict[str, str]()
         self.mounts: dict[tuple[str, str], dict[str, float]] = {}
@@ -194,6 +200,7 @@ class _Importer:
     def log(self) -> Log:
         """Return the log."""
         self.look_ahead()
+        self.calibrate()
         for received in self.bag.messages(self.topics):
             self.take(received)
         self.interpolated()
@@ -218,13 +225,16 @@ class _Importer:
         for topic in self.topics.values():
             if topic.columns:
                 robots.setdefault(topic.robot, {})["motion"] = {"type": type_of(topic)}
+        for (robot, sensor), camera in self.cameras.items():
+            robots.setdefault(robot, {}).setdefault("sensors", {})[sensor] = camera
         for (robot, sensor), mount in self.mounts.items():
-            robots.setdefault(robot, {}).setdefault("sensors", {})[sensor] = {"mount": mount}
+            robots.setdefault(robot, {}).setdefault("sensors", {}).setdefault(sensor, {})["mount"] = mount
         return {"robots": robots} if robots else {}
 
     def take(self, received: Received) -> None:
         """Take one message; what is bad in it is refused, with its topic and time."""
         topic, offer = self.topics[received.topic], self.offers[received.topic]
+        self.received[received.topic] += 1
         t_ns = self.time(received, topic)
         if t_ns is None:
             self.left_out[received.topic, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
@@ -232,6 +242,8 @@ class _Importer:
         try:
             if isinstance(topic, Scans):
                 self.scan(received, topic, offer, t_ns)
+            elif isinstance(topic, Images):
+                self.image(received, topic, t_ns)
             elif isinstance(topic, Sparse):
                 self.of_robot(received, topic, offer, t_ns)
             elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
@@ -404,6 +416,31 @@ class _Importer:
         ids = seen.ids if seen.ids else None
         self.events.append(Scan(t_ns=t_ns, robot=topic.robot, sensor=sensor, y=y, ids=ids))
 
+    def image(self, received: Received, topic: Images, t_ns: int) -> None:
+        """Take an image, whose pixels are read from the bag when they are needed."""
+        name = received.topic
+        if name not in self.images:
+            self.images[name] = Forward(partial(images_of, self.bag.path, name))
+        read, sensor = partial(self.images[name].at, self.received[name] - 1), sensor_name(name, topic)
+        self.events.append(Frame(t_ns=t_ns, robot=topic.robot, sensor=sensor, image=read))
+
+    def calibrate(self) -> None:
+        """Take the calibrations of the cameras whose images are taken.  Raises LogError."""
+        for name, topic in self.topics.items():
+            if not isinstance(topic, Images):
+                continue
+            parts = name.removesuffix("/compressed").rpartition("/")
+            info = self.bag.find(topic.info) if topic.info else f"{parts[0]}{parts[1]}camera_info"
+            known = MESSAGES.get(self.bag.topics[info].type) if info in self.bag.topics else None
+            first = next(iter(self.bag.messages({info})), None) if known and known.camera else None
+            if first is None or known is None or known.camera is None:
+                continue
+            try:
+                numbers = known.camera(first.message)
+            except Refused as refused:
+                raise LogError(f"{self.bag.path}: {info}: {refused}") from None
+            self.cameras[topic.robot, sensor_name(name, topic)] = {"type": "pinhole"} | numbers
+
     def of_robot(self, received: Received, topic: Sparse, offer: Message, t_ns: int) -> None:
         """Take what an inertial unit or a compass measured of its robot; in the plane made level."""
         m, R = received.message, self.level.get(received.topic, (np.eye(3), False))[0]
@@ -529,9 +566,21 @@ def type_of(topic: Topic) -> str:
     return registered_name(type(topic)) or type(topic).__name__
 
 
-def sensor_name(name: str, scan: Scans) -> str:
+def sensor_name(name: str, scan: Carried) -> str:
     """Return the name of a topic's sensor."""
     return scan.sensors(name)[0]
+
+
+def images_of(path: Path, name: str) -> Iterator[Any]:
+    """Yield the images of a topic in grey values (H, W); an OSError instead of one that cannot be decoded."""
+    with Bag(path) as bag:
+        decode = MESSAGES[bag.topics[name].type].image
+        assert decode is not None
+        for received in bag.messages({name}):
+            try:
+                yield decode(received.message)
+            except OSError as error:
+                yield error
 
 
 def frame_id(message: Any) -> str:

@@ -3,7 +3,8 @@
 A row names what can be read from the message: where the robot is (`pose`; `noisy`: with a covariance), how fast it
 moves (`twist`), its speed and steering (`drive`), a position on the globe (`globe`), what a sensor saw (`seen`), what
 an inertial unit measured (`rates`, `attitude`, `force`), a magnetic field (`field`), frames (`transforms`), a camera
-(`camera`).  A topic of a configuration (`topics.py`) asks for one of them.  A function refuses a message by `Refused`.
+(`camera`), an image in grey values (`image`).  A topic of a configuration (`topics.py`) asks for one of them.  A
+function refuses a message by `Refused`.
 """
 
 from __future__ import annotations
@@ -115,6 +116,7 @@ class Message:
     field: Callable[[Any], Measured | None] | None = None
     transforms: Callable[[Any], list[Transform]] | None = None
     camera: Callable[[Any], dict[str, Any]] | None = None
+    image: Callable[[Any], Any] | None = None
 
 
 # ------------------------------------------------------------------ where it is, how fast it is
@@ -231,6 +233,46 @@ def camera(m: Any) -> dict[str, Any]:
         return section | (lens(m.distortion_model, D) if any(D) else {})
     except ValueError as error:
         raise Refused(str(error)) from None
+
+
+# ------------------------------------------------------------------ images
+def image(m: Any) -> Any:
+    """Return a sensor_msgs/Image in grey values (H, W).  Raises OSError."""
+    import cv2
+
+    encodings = {
+        "mono8": (np.uint8, 1, None), "8UC1": (np.uint8, 1, None), "mono16": (np.uint16, 1, None),
+        "16UC1": (np.uint16, 1, None), "bgr8": (np.uint8, 3, cv2.COLOR_BGR2GRAY),
+        "8UC3": (np.uint8, 3, cv2.COLOR_BGR2GRAY),
+        "rgb8": (np.uint8, 3, cv2.COLOR_RGB2GRAY), "bgra8": (np.uint8, 4, cv2.COLOR_BGRA2GRAY),
+        "rgba8": (np.uint8, 4, cv2.COLOR_RGBA2GRAY), "bayer_rggb8": (np.uint8, 1, cv2.COLOR_BayerBG2GRAY),
+        "bayer_bggr8": (np.uint8, 1, cv2.COLOR_BayerRG2GRAY), "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
+        "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
+    }  # fmt: skip
+    if m.encoding not in encodings:
+        raise OSError(f"encoding {m.encoding!r}, expected one of {', '.join(encodings)}")
+    kind, channels, code = encodings[m.encoding]
+    dtype = np.dtype(kind).newbyteorder(">" if m.is_bigendian else "<")
+    data = np.frombuffer(np.ascontiguousarray(m.data).tobytes(), dtype=np.uint8)
+    width = int(m.width) * channels * dtype.itemsize
+    if not m.height or not width or int(m.step) < width or len(data) != int(m.step) * int(m.height):
+        raise OSError(f"{len(data)} bytes, expected {m.height} rows of {m.step} for {m.width} pixels of {m.encoding}")
+    pixels = np.ascontiguousarray(data.reshape(int(m.height), int(m.step))[:, :width]).view(dtype)
+    if dtype.itemsize == 2:
+        return (pixels >> 8).astype(np.uint8)
+    pixels = pixels.reshape(int(m.height), int(m.width), channels) if channels > 1 else pixels
+    return pixels.copy() if code is None else cv2.cvtColor(pixels, code)
+
+
+def compressed_image(m: Any) -> Any:
+    """Return a sensor_msgs/CompressedImage in grey values (H, W).  Raises OSError."""
+    import cv2
+
+    data = np.frombuffer(np.ascontiguousarray(m.data).tobytes(), dtype=np.uint8)
+    decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if decoded is None:
+        raise OSError(f"{len(data)} bytes of {m.format!r} that cannot be decoded, expected an image")
+    return decoded
 
 
 # ------------------------------------------------------------------ what a sensor saw
@@ -392,6 +434,8 @@ MESSAGES: dict[str, Message] = {
     "sensor_msgs/msg/PointCloud2": Message("points", seen=cloud),
     "sensor_msgs/msg/Range": Message("range", seen=one_range),
     "sensor_msgs/msg/CameraInfo": Message("camera", camera=camera),
+    "sensor_msgs/msg/Image": Message("images", image=image),
+    "sensor_msgs/msg/CompressedImage": Message("images", image=compressed_image),
     "vision_msgs/msg/Detection2DArray": Message("detections in an image", seen=boxes),
     "vision_msgs/msg/Detection3DArray": Message("detections in space", seen=boxes_of_space),
     "visualization_msgs/msg/MarkerArray": Message("markers", seen=lambda m, scan: markers(m.markers, scan)),

@@ -20,7 +20,6 @@ from kalmark.logs.table import Refused
 
 GAP = 5.0  # an interval longer than so many usual ones is a gap
 FLAT_M, FLAT_RAD = 0.05, 0.05  # height and tilt of a path of the plane vary by less
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")  # counted, and not read
 STILL = 1e-3  # m, m/s, rad/s: what moves by less stands still
 
 
@@ -155,7 +154,7 @@ def survey(path: Path) -> Survey:
 
 def _summary(name: str, kind: str, count: int) -> TopicSummary:
     known = MESSAGES.get(kind)
-    return TopicSummary(name, kind, count, known.what if known else "images, not read" if kind in IMAGES else "")
+    return TopicSummary(name, kind, count, known.what if known else "")
 
 
 def _rates(bag: Bag, summaries: dict[str, TopicSummary]) -> tuple[float, float]:

@@ -184,6 +184,18 @@ class Scans(Carried):
         return named.get(tag, self.size_m)
 
 
+@register("topic", "images")
+class Images(Carried):
+    """Images of a camera: Image, CompressedImage; its calibration is that of the CameraInfo beside it."""
+
+    wants: ClassVar[tuple[str, ...]] = ("image",)
+
+    sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
+    info: Annotated[
+        str | None, "The topic of its CameraInfo; if absent `camera_info` beside it, as ROS names them."
+    ] = None
+
+
 @declared
 class Sparse(Carried):
     """Readings of which only some are taken."""
