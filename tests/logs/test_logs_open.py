@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kalmark.config import open_run
 from kalmark.errors import LogError
-from kalmark.events import Scan
+from kalmark.events import Control, Scan
 from kalmark.logs import Trajectory, open_log
 from kalmark.logs.source import records_of
 
@@ -145,3 +147,55 @@ def test_quaternions_turn_steadily_about_one_axis(angle: float, a: float, flip: 
 def test_a_trajectory_that_is_none_is_refused(t_ns: list[int], poses: list[list[float]], message: str) -> None:
     with pytest.raises(LogError, match=message):
         Trajectory(np.array(t_ns), np.array(poses))
+
+
+def folder_of(path: Path) -> Path:
+    """Write a log with controls and scans of two robots, and return its folder."""
+    (path / "controls.csv").write_text("t_s,robot,v_mps,w_radps\n0,a,1,10\n0,b,1,10\n2,a,1,20\n")
+    (path / "scans.csv").write_text(
+        "t_s,robot,sensor,id,range_m,bearing_rad,cov_00,cov_01,cov_11\n"
+        "1,a,laser,1,2000,0.5,100,0.2,0.01\n1,b,laser,1,2000,0.5,100,0.2,0.01\n1,a,sonar,1,3000,0.25,100,0.2,0.01\n"
+    )
+    return path
+
+
+def test_factors_and_shifts_correct_columns_and_times_of_robots_and_sensors(tmp_path: Path) -> None:
+    path = folder_of(tmp_path)
+    factors = {"range_m": 1e-3, "a": {"w_radps": 0.1, "laser": {"bearing_rad": -1.0}}}
+    log = open_log(path, factors=factors, shift_s={"laser": 0.25, "b": {"laser": 0.5}})
+    scans = {(e.robot, e.sensor): e for e in log if isinstance(e, Scan)}
+    np.testing.assert_allclose(scans["a", "laser"].y, [[2.0, -0.5]])
+    np.testing.assert_allclose(scans["b", "laser"].y, [[2.0, 0.5]])
+    np.testing.assert_allclose(scans["a", "sonar"].y, [[3.0, 0.25]])
+    assert scans["a", "laser"].cov is not None
+    np.testing.assert_allclose(scans["a", "laser"].cov[..., 0, :], [[1e-4, -2e-4]])
+    assert [scans[key].t_s for key in (("a", "laser"), ("b", "laser"), ("a", "sonar"))] == [1.25, 1.75, 1.0]
+    controls = [(e.robot, *e.u) for e in log if isinstance(e, Control)]
+    assert controls == [("a", 1.0, 1.0), ("b", 1.0, 10.0), ("a", 1.0, 2.0)]
+    assert open_log(path, factors={"t_s": 1e-3}).events[-1].t_ns == 2_000_000
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        ({"factors": {"bearing_deg": 2.0}}, "factors.bearing_deg is of nothing in this log.*bearing_rad"),
+        ({"factors": {"c": {"range_m": 2.0}}}, "factors.c.range_m is of nothing"),
+        ({"factors": {"range_m": 0.0}}, "expected factors that are not zero"),
+        ({"shift_s": {"lasr": 2.0}}, "shift_s.lasr is of nothing in this log.*did you mean 'laser'"),
+        ({"shift_s": {"laser": "soon"}}, "shift_s.laser is 'soon', expected a finite number"),
+    ],
+)
+def test_a_correction_of_nothing_is_refused(tmp_path: Path, option: dict[str, Any], told: str) -> None:
+    with pytest.raises(LogError, match=told):
+        open_log(folder_of(tmp_path), **option)
+
+
+def test_an_override_for_one_robot_is_laid_over_each_of_the_file(tmp_path: Path) -> None:
+    folder_of(tmp_path)
+    config = tmp_path / "run.yaml"
+    sensor = "{type: range_bearing, sigma_range_m: 5}"
+    config.write_text(f"log: {{path: .}}\nrobots: {{each: {{sensors: {{laser: {sensor}, sonar: {sensor}}}}}}}\n")
+    made, _ = open_run(config, None, ["robots.b.sensors.laser.sigma_range_m=7", "robots.b.gaps=ignore"])
+    assert made.robots["b"].sensors["laser"].sigma_range_m == 7  # type: ignore[union-attr]
+    assert made.robots["b"].sensors["sonar"] == made.robots["each"].sensors["sonar"]
+    assert made.robots["each"].sensors["laser"].sigma_range_m == 5  # type: ignore[union-attr]

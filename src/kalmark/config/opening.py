@@ -36,6 +36,7 @@ def open_run(
     alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
     log = open_config_log(alone, progress=progress)
     refuse_idle(tree, log)
+    for_each(tree, log)
     config = config_of(laid_over(tree, log), path)
     found = {"known": str(known_path(config))} if config.map.known not in (None, TRUTH) else {}
     return config.model_copy(update={"log": alone.log, "map": config.map.model_copy(update=found)}), log
@@ -177,6 +178,22 @@ def laid_over(tree: Tree, log: Log) -> Tree:
     out.values = merged(below, above)
     _place(out, out.values, (), str(log.path or log.name))
     return out
+
+
+def for_each(tree: Tree, log: Log) -> None:
+    """Lay what the command line sets for a robot that the file does not name over the file's `each`, in place."""
+    robots: Any = tree.values.get("robots")
+    each = robots.get(EACH) if isinstance(robots, dict) else None
+    for name in log.robots if isinstance(each, dict) else ():
+        places = [at for path, at in tree.places.items() if path[:2] == ("robots", name)]
+        if isinstance(robots.get(name), dict) and all(at.startswith(OVERRIDE) for at in places):
+            robots[name] = merged(deepcopy(each), robots[name])
+            for table in (tree.keys, tree.places):
+                table |= {
+                    ("robots", name, *path[2:]): at
+                    for path, at in table.items()
+                    if path[:2] == ("robots", EACH) and ("robots", name, *path[2:]) not in table
+                }
 
 
 def _place(tree: Tree, values: dict[str, Any], path: tuple[str, ...], log: str) -> None:

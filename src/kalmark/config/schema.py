@@ -305,7 +305,9 @@ def _three(sigma: float | tuple[float, ...]) -> Array:
     return np.broadcast_to(np.asarray(sigma, dtype=np.float64), 3)
 
 
-COMMON = ("robots", "from_s", "to_s", "on_error", "ids", "truth", "fixes", "sigma_fixes_m")  # of logs of any format
+# keys of logs of any format
+COMMON = ("robots", "from_s", "to_s", "on_error", "ids", "truth", "fixes", "sigma_fixes_m", "factors", "shift_s")
+BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]
 
 
 class LogConfig(Section):
@@ -331,6 +333,10 @@ class LogConfig(Section):
     """The same, of positions that the filter is given, as fixes."""
     sigma_fixes_m: Positive | None = None
     """Noise of each coordinate of `fixes`."""
+    factors: BySensor | None = None
+    """Factors of columns, also of one robot or sensor: `{w_radps: -1, laser: {range_m: .001}}`; `t_s`: of all times."""
+    shift_s: BySensor | None = None
+    """Added to the times of the scans of a sensor, by its name; of one robot: `{rover: {laser: .1}}`."""
     vertices: Literal["none", "truth"] | None = None
     """g2o: `truth` takes the vertices as true poses and landmarks (none if absent)."""
     r_max: Positive | None = None

@@ -32,7 +32,8 @@ LOOKED_AT = 20  # landmarks
 MOST_CONDITION = 1e12
 SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the end
 SLOW_S = 1e-3
-MOST_STEPS, FAR_STEPS = 0.9, 3.0  # share of steps without a jump; and times a long step is one that is no driving
+MOST_STEPS = 0.9  # share of steps without a jump
+FAR_STEPS, FAR_S = 3.0, 5.0  # no driving: farther than so many long steps, and than it drives in this time
 SELDOM = 1e-3
 MOST_RHO = 0.999
 MOST_SCALE = 0.25  # beyond it the problem is not linear
@@ -366,7 +367,8 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     """Return the step of the motion that fits best if any motion may be there, and what jump that is.
 
     Only the steps of the largest errors are looked at, and how each robot comes to its start.  A jump farther than
-    landmarks are apart and than steps are long is "kidnapped", else it is the odometry that jumps.  `p` counts it in
+    steps are long, and than landmarks are apart or a robot drives in some seconds, is "kidnapped", else it is the
+    odometry that jumps.  `p` counts it in
     the chi-square of steps all over the run, which is larger where errors of a sensor last, or where noise is.
     """
     e = linear.errors_of(linear.residuals)
@@ -381,11 +383,13 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     starts = [*{robot: k for k, robot in reversed([*enumerate(linear.problem.robots)])}.values()]
     nodes = [*np.argsort(-squares)[: min(LOOKED_AT, int((squares > 0).sum()))].tolist(), *starts]
     found: list[Finding] = []
+    usual_s = float(np.median(np.diff(np.unique(t_s)))) if len(t_s) > 1 else 0.0
     for node, (chi2, step, W) in zip(nodes, _free_steps(linear, nodes), strict=True):
         if chi2 <= 0:
             continue
         size, robot = math.sqrt(chi2), linear.problem.robots[node]
-        far = np.linalg.norm(step[: linear.state.d]) > max(linear.spacing, FAR_STEPS * linear.step)
+        driven = linear.step * FAR_S / usual_s if usual_s > 0 else np.inf
+        far = np.linalg.norm(step[: linear.state.d]) > max(min(linear.spacing, driven), FAR_STEPS * linear.step)
         name = "start" if node in starts else "kidnapped" if far else "odometry_jump"
         errors, none = np.where((owner == node) & counts, OUT, 1.0), np.zeros(len(linear.at.z))
         found.append(Finding(

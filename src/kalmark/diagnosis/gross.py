@@ -6,7 +6,7 @@ A mistake is named where the log fits the filter as it should once the mistake i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -18,9 +18,10 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
+from kalmark.diagnosis.mistakes import Mistake, mistakes, section_of, with_value
 from kalmark.diagnosis.words import UNKNOWN_IDS
 from kalmark.errors import KalmarkError
-from kalmark.events import Control, Event, Fix, Scan
+from kalmark.events import Event, Fix, Scan
 from kalmark.logs.log import Log
 from kalmark.results.history import Start
 from kalmark.results.measures import Rigid, rigid, rigid_robust
@@ -29,36 +30,21 @@ from kalmark.results.run import Run
 from kalmark.results.words import figure
 
 SCANS, OBSERVATIONS = 400, 3000  # of the log are filtered again
+FEW_SCANS = 80  # of them at first: a log that does not fit shows it soon
+FEW_SKIPPED = 0.02  # of the events may be refused in a log that fits
 MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
 FITS = 2.0  # below which a log fits
 MUCH = 3.0  # times better is the log without the mistake
+ALIKE = 0.98  # of what the likeliest mistake explains: the log does not tell them apart
+BETTER = 1.5  # times better it fits without the mistake
+LOST = 9.0  # what an observation without an id counts that is of no landmark in the map: as one at the gate
 MOST = 25.0  # that one observation counts, and what counts one that was left out
-TURNS_DEG = (180, 90, -90)
 REJECTED = 0.5  # of the fixes, from which on their robot is not where it should be
 LEAST_FIXES = 5
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
 IN_A_ROW = 8  # sightings of a landmark that do not fit: its id may mean another one from there on
 SAME = 0.25  # of the distance to the next landmark, within which two places are one
 COMMON = 4  # landmarks, of which most are where they were
-
-Change = Callable[[Event], Event]
-
-
-class Mistake(NamedTuple):
-    """What may have been done wrongly: its name, what it is, its cure, and the configuration and log without it.
-
-    `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
-    `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.
-    """
-
-    name: str
-    evidence: str
-    cure: str
-    config: Mapping[str, Any]
-    change: Change | None = None
-    gain: float = 0.0
-    since_s: float = 0.0
-    share: float = 1.0
 
 
 class Fit(NamedTuple):
@@ -86,10 +72,14 @@ REFUSED = Fit(np.zeros(0), np.zeros(0))
 
 
 def fit(run: Run) -> Fit:
-    """Return how the observations of a run fit: what fits nothing counts `MOST`."""
+    """Return how the observations of a run fit: what fits nothing counts `MOST`.
+
+    What has no id counts `LOST` where it is of a new landmark: a filter that is lost makes new ones all the time.
+    """
     history = run.history
     dof = np.maximum(np.isfinite(history.z).sum(axis=1), 1)
     d2 = np.minimum(np.nan_to_num(history.d2, nan=0.0) / dof, MOST)
+    d2 = np.where((history.id == "") & (history.outcome != "associated"), LOST, d2)
     return Fit(np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2), dof)
 
 
@@ -107,16 +97,73 @@ def gross(run: Run, log: Log) -> Mistake | None:
     if found is not None:
         return found
     now = fit(run)
+    first = misfits_from(now)
     if now.mean < MISFIT and not run.stopped:
-        return exchanged(run, log, now)
-    events = beginning(log)
-    as_it_is = fit_of(run.config, log, events)
-    made = []
-    for mistake in mistakes(run.config, log) if as_it_is.mean >= MISFIT else ():
-        after = fit_of(mistake.config, log, [*map(mistake.change, events)] if mistake.change else events)
-        if after.mean < FITS and MUCH * after.mean < as_it_is.mean:
+        found = exchanged(run, log, now)
+    else:
+        found = likeliest(run, log, beginning(log), run.config) or exchanged(run, log, now)
+        found = found or (None if first is None else kidnapped(run, log, now, first))
+    return found or (None if first is None else later(run, log, first))
+
+
+def likeliest(run: Run, log: Log, events: list[Event], config: Mapping[str, Any]) -> Mistake | None:
+    """Return the mistake without which events fit best, None if they fit as they are or without none."""
+    as_it_is = fit_of(config, log, events)
+    if as_it_is.mean < MISFIT:
+        return None
+    few, made = beginning(events, FEW_SCANS), []
+    for mistake in mistakes(config, run):
+        if fit_without(mistake, log, few).mean >= MISFIT:
+            continue
+        after = fit_without(mistake, log, events)
+        if after.mean < FITS and BETTER * after.mean < as_it_is.mean:
             made.append(mistake._replace(gain=explained(as_it_is, after), since_s=events[0].t_s))
-    return max(made, key=lambda f: f.gain, default=None) or exchanged(run, log, now) or kidnapped(run, log, now)
+    if not made:
+        return None
+    most = max(mistake.gain for mistake in made)
+    first, *alike = [mistake for mistake in made if mistake.gain > ALIKE * most]
+    others = "; or: ".join(mistake.evidence for mistake in alike)
+    told = f"; the log cannot tell this from: {others}" if others else ""
+    return first._replace(evidence=f"{first.evidence}{told}")
+
+
+def later(run: Run, log: Log, first: int) -> Mistake | None:
+    """Return the mistake from the observation `first` on: a sensor that was turned, a source that was exchanged.
+
+    The log is filtered anew from there, from where the robots are.
+    """
+    t_ns, _, rest = _from(run, log, first)
+    config = run.config
+    for robot in run.history.robots if not run.history.in_space else ():
+        before = np.flatnonzero((run.history.robot == robot) & (run.history.t_ns < t_ns))
+        if len(before):
+            x, y, theta = run.history.poses[before[-1]].tolist()
+            path = ("robots", section_of(config, robot))
+            section = {**config["robots"][path[1]], "start": {"x_m": x, "y_m": y, "theta_rad": theta}}
+            config = with_value(config, ("robots", robot), section)
+    found = likeliest(run, log, rest, config)
+    if found is None:
+        return None
+    evidence = f"from t={t_ns * 1e-9:.1f} s on {found.evidence}"
+    return found._replace(evidence=evidence, cure=until(run, log, t_ns))
+
+
+def until(run: Run, log: Log, t_ns: int) -> str:
+    """Return the line that ends a log before a time."""
+    begin_s = float((run.config.get("log") or {}).get("from_s") or 0.0)
+    return f"--set log.to_s={max(begin_s + (t_ns - log.events[0].t_ns) * 1e-9 - 0.05, 0.0):.1f}"
+
+
+def misfits_from(now: Fit) -> int | None:
+    """Return the observation from which on a run does not fit any more, that fitted before; None if there is none."""
+    values = now.values
+    if len(values) < 4 * WINDOW:
+        return None
+    bad = np.convolve(values, np.full(WINDOW, 1.0 / WINDOW), mode="valid") > MUCH * FITS
+    first = int(np.argmax(bad)) + WINDOW if bad.any() else 0
+    if not WINDOW < first < len(values) - WINDOW or values[: first - WINDOW].mean() > FITS:
+        return None
+    return first if values[first:].mean() > MISFIT else None
 
 
 def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
@@ -154,7 +201,7 @@ def _started_at(config: Mapping[str, Any], start: Start, onto: Rigid) -> tuple[d
     theta = math.remainder(start.mean[2] + math.atan2(onto.rotation[1, 0], onto.rotation[0, 0]), 2 * math.pi)
     key = start.robot if start.robot in config["robots"] else "each"
     moved = {"x_m": x, "y_m": y, "theta_rad": theta}
-    changed = _with(config, ("robots", key, "start"), {**(config["robots"][key].get("start") or {}), **moved})
+    changed = with_value(config, ("robots", key, "start"), {**(config["robots"][key].get("start") or {}), **moved})
     was, now = (
         f"at ({figure(float(a))}, {figure(float(b))}) m with a heading of {math.degrees(c):.0f} deg"
         for a, b, c in (start.mean[:3], (x, y, theta))
@@ -171,15 +218,8 @@ def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:
     return Fit(np.minimum(d2, MOST), np.array([len(f.z) for f in fixes]))
 
 
-def kidnapped(run: Run, log: Log, now: Fit) -> Mistake | None:
-    """Return that the robot was moved, if the run fits before some time, does not after it, and a new one would."""
-    values = now.values
-    if len(values) < 4 * WINDOW:
-        return None
-    bad = np.convolve(values, np.full(WINDOW, 1.0 / WINDOW), mode="valid") > MUCH * FITS
-    first = int(np.argmax(bad)) + WINDOW if bad.any() else 0
-    if not WINDOW < first < len(values) - WINDOW or values[: first - WINDOW].mean() > FITS:
-        return None
+def kidnapped(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
+    """Return that the robot was moved, if the run does not fit from the observation `first` on, and a new one would."""
     t_ns, robot, rest = _from(run, log, first)
     after, before = fit_of(run.config, log, rest), now.of(slice(first, None))
     if after.mean > FITS or MUCH * after.mean > before.mean:
@@ -188,7 +228,7 @@ def kidnapped(run: Run, log: Log, now: Fit) -> Mistake | None:
         f"{robot} was elsewhere from t={t_ns * 1e-9:.1f} s on: the log before and after it fits, but not together"
     )
     gain = explained(before.of(slice(len(after.values))), after)
-    return Mistake("kidnapped", evidence, "", run.config, None, gain, t_ns * 1e-9)
+    return Mistake("kidnapped", evidence, until(run, log, t_ns), run.config, None, gain, t_ns * 1e-9)
 
 
 def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
@@ -258,15 +298,20 @@ def _from(run: Run, log: Log, row: int) -> tuple[int, str, list[Event]]:
     return t_ns, str(run.history.robot[step]), beginning([e for e in log.events if e.t_ns >= t_ns])
 
 
-def beginning(events: Log | list[Event]) -> list[Event]:
+def beginning(events: Log | list[Event], most: int = SCANS) -> list[Event]:
     """Return the first events with so many scans and observations."""
     scans = observations = 0
     for n, event in enumerate(events):
         if isinstance(event, Scan):
             scans, observations = scans + 1, observations + len(event.y)
-            if scans >= SCANS or observations >= OBSERVATIONS:
+            if scans >= most or observations >= OBSERVATIONS:
                 return list(events)[: n + 1]
     return list(events)
+
+
+def fit_without(mistake: Mistake, log: Log, events: list[Event]) -> Fit:
+    """Return how events fit without a mistake."""
+    return fit_of(mistake.config, log, [*map(mistake.change, events)] if mistake.change else events)
 
 
 def fit_of(config: Mapping[str, Any], log: Log, events: list[Event]) -> Fit:
@@ -283,71 +328,4 @@ def _filtered(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run |
         run = record(build_slam(made, part), part, progress=False, on_error="skip")
     except (KalmarkError, np.linalg.LinAlgError):
         return None
-    return None if run.stopped else run
-
-
-# ------------------------------------------------------------------ what may have been done wrongly
-def mistakes(config: Mapping[str, Any], log: Log) -> Iterator[Mistake]:
-    """Yield the mistakes that a log of such columns may have."""
-    sensors = {
-        (name, sensor): section
-        for name, robot in config["robots"].items()
-        for sensor, section in (robot.get("sensors") or {}).items()
-        if not section.get("detector")
-    }
-    kinds = {str(section.get("type")) for section in sensors.values()}
-    angles = any("bearing" in kind for kind in kinds)
-    if angles:
-        column = -1 if kinds <= {"range_bearing", "bearing"} else 1
-        yield Mistake("bearing_sign", "bearings fit only with their sign changed: the sensor counts them clockwise",
-                      "multiply bearing_rad by -1", config, _scan(lambda y: _times(y, column, -1.0)))  # fmt: skip
-        yield Mistake("units", "bearings fit only if they are degrees", "multiply bearing_rad by pi / 180",
-                      config, _scan(lambda y: _times(y, column, math.pi / 180)))  # fmt: skip
-        yield Mistake("units", "turns of the controls fit only if they are degrees", "multiply them by pi / 180",
-                      config, _control(lambda u: _times(u, -1, math.pi / 180)))  # fmt: skip
-    if kinds == {"range_bearing"}:
-        yield Mistake("swapped_columns", "range and bearing are swapped", "swap the columns range_m and bearing_rad",
-                      config, _scan(lambda y: y[:, ::-1]))  # fmt: skip
-    yield Mistake("units", "ranges fit only if they are millimetres", "multiply range_m by .001",
-                  config, _scan(lambda y: _times(y, 0, 1e-3)))  # fmt: skip
-    for (robot, sensor), section in sensors.items() if angles else ():
-        theta = float((section.get("mount") or {}).get("theta_rad", 0.0))
-        for turn in TURNS_DEG:
-            evidence = f"the sensor {robot}.{sensor} looks {turn} deg away from where its mount says"
-            angle = math.remainder(theta + math.radians(turn), 2 * math.pi)
-            key = f"robots.{robot}.sensors.{sensor}.mount.theta_rad"
-            changed = _with(config, ("robots", robot, "sensors", sensor, "mount", "theta_rad"), angle)
-            yield Mistake("mount", evidence, f"--set {key}={angle:.4f}", changed)
-
-
-def _with(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> dict[str, Any]:
-    changed = deepcopy(dict(config))
-    section: Any = changed
-    for key in path[:-1]:
-        if section.get(key) is None:
-            section[key] = {}
-        section = section[key]
-    section[path[-1]] = value
-    return changed
-
-
-def _times(y: Array, column: int, factor: float) -> Array:
-    y = np.array(y)
-    y[..., column] *= factor
-    return y
-
-
-def _scan(change: Callable[[Array], Array]) -> Change:
-    def changed(e: Event) -> Event:
-        if not isinstance(e, Scan) or not len(e.y):
-            return e
-        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=change(e.y), ids=e.ids, cov=e.cov)
-
-    return changed
-
-
-def _control(change: Callable[[Array], Array]) -> Change:
-    def changed(e: Event) -> Event:
-        return Control(t_ns=e.t_ns, robot=e.robot, u=change(e.u), cov=e.cov) if isinstance(e, Control) else e
-
-    return changed
+    return None if run.stopped or len(run.skipped) > FEW_SKIPPED * len(events) else run

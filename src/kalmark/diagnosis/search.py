@@ -31,7 +31,8 @@ LOOKED_AT = 200  # outliers whose landmarks are looked for
 def best(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
-    Surveys that are off go before outliers and noise that would take them up, which are one for all of them.
+    Surveys that are off go before outliers and noise that would take them up, which are one for all of them, and noise
+    of several columns before outliers that explain no more: these would be one for all columns.
     A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
     as much, one in the sensors goes before one in the controls.
     """
@@ -40,6 +41,9 @@ def best(sure: list[Finding]) -> list[Finding]:
     spread = first.name == "outliers" or first.unit == causes.TIMES
     if surveys and spread and sum(f.gain for f in surveys) > TAKEN_UP * first.gain:
         return [max(surveys, key=lambda f: f.gain)]
+    noisy = [f for f in sure if f.unit == causes.TIMES and f.noise is not None]
+    if first.name == "outliers" and sum(f.gain for f in noisy) >= first.gain:
+        first = max(noisy, key=lambda f: f.gain)
     jump = [f for f in sure if f.at is not None and f.gain > TAKEN_UP * first.gain]
     if jump and first.unit == causes.TIMES:
         return jump

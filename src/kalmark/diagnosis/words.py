@@ -89,6 +89,16 @@ def _set(robot: str, path: str, value: float) -> str:
     return f"--set robots.{robot}.{path}={figure(value)}"
 
 
+def corrected(config: Mapping[str, Any], option: str, path: tuple[str, ...], by: float) -> str:
+    """Return the line that adds to the times of a sensor (`shift_s`), or multiplies a column (`factors`), of a log."""
+    now = (config.get("log") or {}).get(option)
+    for name in path:
+        now = now.get(name) if isinstance(now, Mapping) else None
+    neutral = 0.0 if option == "shift_s" else 1.0
+    old = now if isinstance(now, float | int) else neutral
+    return f"--set log.{option}.{'.'.join(path)}={figure(old + by if option == 'shift_s' else old * by, 6)}"
+
+
 def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, sensor, _ = finding.of
     scale = _current(config, robot, "sensors", sensor, "scale") or 1.0
@@ -113,10 +123,9 @@ def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 
 def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
-    early = "later" if finding.value > 0 else "earlier"
-    by = f"{figure(abs(finding.value))} s"
+    early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
     evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say ({_sure(finding)})"
-    return evidence, f"stamp the scans {by} {early}"
+    return evidence, corrected(config, "shift_s", finding.of[:2], finding.value)
 
 
 def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:

@@ -14,6 +14,7 @@ from kalmark.errors import LogError
 from kalmark.events import Event, Fix, Scan, order, shown
 from kalmark.logs.bag.importer import BAG
 from kalmark.logs.carmen import CARMEN
+from kalmark.logs.corrections import corrected
 from kalmark.logs.download import find_data
 from kalmark.logs.graph import G2O
 from kalmark.logs.images.euroc import EUROC
@@ -51,6 +52,8 @@ def open_log(
     truth: Path | str | Mapping[str, Path | str] | None = None,
     fixes: Path | str | Mapping[str, Path | str] | None = None,
     sigma_fixes_m: float | None = None,
+    factors: Mapping[str, Any] | None = None,
+    shift_s: Mapping[str, Any] | None = None,
     progress: bool = False,
     **options: Any,
 ) -> Log:
@@ -61,6 +64,7 @@ def open_log(
     `ids="hidden"` no scan says which landmark is which; `log.true_ids` does.
     `truth` and `fixes` are files of poses in the formats of TUM or KITTI, by robot if there are several: true poses to
     score against, and positions for the filter with the noise `sigma_fixes_m`.
+    `factors` of columns and `shift_s` of sensors correct units, signs and stamps (`kalmark.logs.corrections`).
     With `progress` tables that take longer than two seconds show a bar on standard error.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
     Raises LogError, with ``file:line:`` for a bad row.
@@ -71,7 +75,7 @@ def open_log(
             wanted = f"{', '.join(entry.options) or 'none'}{nearest(name, entry.options)}"
             raise LogError(f"log option {name!r} is unknown to {entry.name}, expected {wanted}")
     request = requested(robot_names(robots, entry.robot_prefix), on_error, progress)
-    log = entry.read(found, request, **options)
+    log = corrected(entry.read(found, request, **options), factors, shift_s)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m)
     return selected(log, request, from_s, to_s, ids)
 

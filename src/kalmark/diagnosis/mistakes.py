@@ -1,0 +1,210 @@
+"""What may have been done wrongly with a log or its configuration: units, signs, columns, mounts, times.
+
+Each mistake has the log and the configuration without it, so that the filter can be asked whether they fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from copy import deepcopy
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.diagnosis.words import corrected
+from kalmark.events import Control, Event, Fix, Scan
+from kalmark.results.run import Run
+from kalmark.slam.robot import Robot
+
+TURNS_DEG = (180, 90, -90)
+DEGREE = math.pi / 180
+LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
+TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6}
+TURNS = ("w_radps", "dtheta_rad", "steering_rad")  # of controls of the plane, to the left
+WHEELS = ("left_rad", "right_rad")
+OPTICAL = {"roll_deg": -90.0, "yaw_deg": -90.0}  # from the axes of a robot to those of a camera
+
+Change = Callable[[Event], Event]
+Where = tuple[str, str]  # robot and sensor
+
+
+class Mistake(NamedTuple):
+    """What may have been done wrongly: its name, what it is, its cure, and the configuration and log without it.
+
+    `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
+    `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.
+    """
+
+    name: str
+    evidence: str
+    cure: str
+    config: Mapping[str, Any]
+    change: Change | None = None
+    gain: float = 0.0
+    since_s: float = 0.0
+    share: float = 1.0
+
+
+def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
+    """Yield the mistakes that a log with the sensors and controls of a run may have.  Those in the sensors first.
+
+    Each is one of a single sensor, or of all that measure such columns.
+    """
+    robots = run.final_slam().robots
+    columns = {(r.name, s): tuple(m.sensor.columns) for r in robots.values() for s, m in r.sensors.items()}
+    plain = {of: names for of, names in columns.items() if robots[of[0]].sensors[of[1]].detector is None}
+    for sensors in _groups(plain):
+        yield from _of_columns(config, sensors)
+    for robot in robots.values():
+        yield from _of_mounts(config, robot)
+    for robot in robots.values():
+        yield from _of_controls(config, robot)
+    if any(column.endswith("ps") for robot in robots.values() for column in robot.motion.columns):
+        for unit, factor in TIMES.items():
+            cure = corrected(config, "factors", ("t_s",), factor)
+            yield Mistake("units", f"times fit only if they are {unit}", cure, config, _at(factor))
+
+
+def _groups(columns: Mapping[Where, tuple[str, ...]]) -> Iterator[dict[Where, tuple[str, ...]]]:
+    """Yield all sensors of a kind together, and each of them alone."""
+    by_kind: dict[tuple[str, ...], dict[Where, tuple[str, ...]]] = {}
+    for of, names in columns.items():
+        by_kind.setdefault(names, {})[of] = names
+    for together in by_kind.values():
+        yield together
+        if len(together) > 1:
+            yield from ({of: names} for of, names in together.items())
+
+
+def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]) -> Iterator[Mistake]:
+    """Yield the mistakes in what sensors of one kind measure."""
+    names = next(iter(sensors.values()))
+    of = ", ".join(".".join(where) for where in sensors)
+    turned = [name for name in names if name.startswith(("bearing", "azimuth"))]
+    angles = turned + [name for name in names if name.startswith("elevation")]
+    lengths = [name for name in names if name == "range_m" or name in ("x_m", "y_m", "z_m")]
+
+    def made(name: str, evidence: str, which: list[str], factor: float) -> Mistake:
+        cures = (corrected(config, "factors", (*where, column), factor) for where in sensors for column in which)
+        by = np.array([factor if column in which else 1.0 for column in names])
+        return Mistake(name, evidence, " ".join(cures), config, _measured({*sensors}, lambda y: y * by))
+
+    if turned or names[:2] == ("x_m", "y_m"):
+        evidence = f"directions of {of} fit only with their sign changed: clockwise, or upside down"
+        yield made("bearing_sign", evidence, turned or ["y_m"], -1.0)
+    if angles:
+        yield made("units", f"angles of {of} fit only if they are degrees", angles, DEGREE)
+    if names == ("range_m", "bearing_rad"):
+        evidence = f"range and bearing of {of} are swapped"
+        cure = "swap the columns range_m and bearing_rad"
+        yield Mistake("swapped_columns", evidence, cure, config, _measured({*sensors}, lambda y: y[:, ::-1]))
+    for unit, factor in LENGTHS.items() if lengths else ():
+        yield made("units", f"distances of {of} fit only if they are {unit}", lengths, factor)
+
+
+def _of_mounts(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
+    """Yield other directions in which the sensors of a robot may look."""
+    space = robot.motion.space.axes > 1
+    for sensor, mount in robot.sensors.items():
+        names = tuple(mount.sensor.columns)
+        camera = any(name.endswith("_px") for name in names)
+        looks = camera or mount.detector is not None or names[:2] == ("x_m", "y_m")
+        if not looks and not any(name.startswith(("bearing", "azimuth")) for name in names):
+            continue
+        of, path = f"{robot.name}.{sensor}", ("robots", section_of(config, robot.name), "sensors", sensor, "mount")
+        key, now = ".".join(("robots", robot.name, *path[2:])), stated(config, path) or {}
+        if camera:
+            if space and not any(now.get(name) for name in ("roll_deg", "pitch_deg", "yaw_deg")):
+                evidence = f"{of} fits only with its optical axis forward: its mount lacks that turn"
+                cure = " ".join(f"--set {key}.{name}={value:g}" for name, value in OPTICAL.items())
+                yield Mistake("mount", evidence, cure, with_value(config, path, {**now, **OPTICAL}))
+            continue
+        name = "yaw_deg" if space else "theta_rad"
+        for turn in TURNS_DEG:
+            old = float(now.get(name) or 0.0)
+            angle = math.remainder(old + turn, 360.0) if space else math.remainder(old + turn * DEGREE, 2 * math.pi)
+            evidence = f"the sensor {of} looks {turn} deg away from where its mount says"
+            yield Mistake(
+                "mount", evidence, f"--set {key}.{name}={angle:.4f}", with_value(config, (*path, name), angle)
+            )
+
+
+def _of_controls(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
+    """Yield the mistakes in the controls of a robot."""
+    names, of = tuple(robot.motion.columns), robot.name
+
+    def made(name: str, evidence: str, which: list[str], factor: float) -> Mistake:
+        cure = " ".join(corrected(config, "factors", (of, column), factor) for column in which)
+        by = np.array([factor if column in which else 1.0 for column in names])
+        return Mistake(name, evidence, cure, config, _controlled(of, lambda u: u * by))
+
+    if any(name in TURNS for name in names):
+        evidence = f"turns of {of} fit only with their sign changed: its controls count them clockwise"
+        yield made("control_sign", evidence, [name for name in names if name in TURNS], -1.0)
+    if names == WHEELS:
+        evidence, cure = f"the wheels of {of} fit only with left and right exchanged", f"swap {' and '.join(WHEELS)}"
+        yield Mistake("swapped_columns", evidence, cure, config, _controlled(of, lambda u: u[::-1]))
+    angles = [name for name in names if name.endswith(("_rad", "_radps"))]
+    if angles:
+        yield made("units", f"angles of the controls of {of} fit only if they are degrees", angles, DEGREE)
+    lengths = [name for name in names if name.endswith(("_m", "_mps"))]
+    for unit, factor in LENGTHS.items() if lengths else ():
+        yield made("units", f"ways of the controls of {of} fit only if they are {unit}", lengths, factor)
+
+
+# ------------------------------------------------------------------ configurations and events without them
+def section_of(config: Mapping[str, Any], robot: str) -> str:
+    """Return the name of the section of a robot."""
+    return robot if robot in config["robots"] else "each"
+
+
+def stated(config: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+    """Return what a configuration has at a path, None for nothing."""
+    section: Any = config
+    for key in path:
+        section = section.get(key) if isinstance(section, Mapping) else None
+    return section
+
+
+def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> dict[str, Any]:
+    """Return a configuration with another value at a path."""
+    changed = deepcopy(dict(config))
+    section: Any = changed
+    for key in path[:-1]:
+        if section.get(key) is None:
+            section[key] = {}
+        section = section[key]
+    section[path[-1]] = value
+    return changed
+
+
+def _measured(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
+    def changed(e: Event) -> Event:
+        if not isinstance(e, Scan) or not len(e.y) or (e.robot, e.sensor) not in sensors:
+            return e
+        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=change(e.y), ids=e.ids, cov=e.cov)
+
+    return changed
+
+
+def _controlled(robot: str, change: Callable[[Array], Array]) -> Change:
+    def changed(e: Event) -> Event:
+        if not isinstance(e, Control) or e.robot != robot:
+            return e
+        return Control(t_ns=e.t_ns, robot=e.robot, u=change(e.u), cov=e.cov)
+
+    return changed
+
+
+def _at(factor: float) -> Change:
+    def changed(e: Event) -> Event:
+        t_ns = round(e.t_ns * factor)
+        if isinstance(e, Scan):
+            return Scan(t_ns=t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=e.ids, cov=e.cov)
+        if isinstance(e, Fix):
+            return Fix(t_ns=t_ns, robot=e.robot, y=e.y, cov=e.cov)
+        return Control(t_ns=t_ns, robot=e.robot, u=e.u, cov=e.cov)
+
+    return changed

@@ -1,0 +1,87 @@
+"""Corrections of a log that a configuration asks for: factors of its columns, and times of its sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import LogError
+from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.logs.log import Log
+from kalmark.logs.source import nearest, quantity
+
+TIME = "t_s"
+
+Path_ = tuple[str, ...]
+
+
+def corrected(log: Log, factors: Mapping[str, Any] | None, shift_s: Mapping[str, Any] | None) -> Log:
+    """Return a log with its columns times `factors` and the scans of its sensors `shift_s` seconds later.
+
+    Both may be nested by robot and sensor: ``{range_m: .001}`` is for all sensors, ``{laser: {range_m: .001}}`` for
+    one.  The factor of ``t_s`` is that of all times.  Raises LogError for what the log does not have.
+    """
+    by, shifts = dict(_flat(factors or {}, "factors")), dict(_flat(shift_s or {}, "shift_s"))
+    if not by and not shifts:
+        return log
+    if any(value == 0 for value in by.values()):
+        raise LogError("log option factors has a 0, expected factors that are not zero")
+    columns: dict[Path_, tuple[str, ...]] = {(robot,): names for robot, names in log.control_columns.items()}
+    columns |= log.sensor_columns
+    _refuse_idle("factors", by, [(*path, name) for path, names in columns.items() for name in names] + [(TIME,)])
+    _refuse_idle("shift_s", shifts, list(log.sensor_columns))
+    of = {path: np.array([_product(by, (*path, name)) for name in names]) for path, names in columns.items()}
+    late = {path: sum(s for name, s in shifts.items() if {*name} <= {*path}) for path in log.sensor_columns}
+    times = by.get((TIME,), 1.0)
+    events = [_event(event, of, late, times) for event in log]
+    truth = {robot: replace(path, t_ns=_scaled(path.t_ns, times)) for robot, path in log.truth.items()}
+    gps = {robot: replace(path, t_ns=_scaled(path.t_ns, times)) for robot, path in log.gps.items()}
+    return replace(log, events=sorted(events, key=order), truth=truth, gps=gps)
+
+
+def _flat(values: Mapping[str, Any], option: str, path: Path_ = ()) -> Iterator[tuple[Path_, float]]:
+    """Yield the numbers of a nested mapping with their paths."""
+    for name, value in values.items():
+        here = (*path, str(name))
+        if isinstance(value, Mapping):
+            yield from _flat(value, option, here)
+        else:
+            yield here, quantity(value, ".".join((option, *here)))
+
+
+def _refuse_idle(option: str, given: Mapping[Path_, float], known: list[Path_]) -> None:
+    """Refuse a path that is of nothing in the log.  Raises LogError."""
+    for path in given:
+        if not any(path[-1] in of[-1:] + (of if option == "shift_s" else ()) and {*path} <= {*of} for of in known):
+            names = [*dict.fromkeys(of[-1] for of in known)]
+            wanted = f"{', '.join(names) or 'none'}{nearest(path[-1], names)}"
+            told = f"{option}.{'.'.join(path)} is of nothing in this log"
+            raise LogError(f"log option {told}, expected robots and sensors of the log and one of {wanted}")
+
+
+def _product(factors: Mapping[Path_, float], path: Path_) -> float:
+    """Return the factor of a column: the product of all that are of it."""
+    mine = (value for name, value in factors.items() if name[-1] == path[-1] and {*name} <= {*path})
+    return float(np.prod([1.0, *mine]))
+
+
+def _event(event: Event, factors: Mapping[Path_, Array], late: Mapping[Path_, float], times: float) -> Event:
+    t_ns = event.t_ns if times == 1.0 else round(event.t_ns * times)
+    if isinstance(event, Fix):
+        return Fix(t_ns=t_ns, robot=event.robot, y=event.y, cov=event.cov)
+    path = (event.robot,) if isinstance(event, Control) else (event.robot, event.sensor)
+    by = factors.get(path, np.ones(1))
+    cov = None if event.cov is None else event.cov * np.outer(by, by)
+    if isinstance(event, Control):
+        return Control(t_ns=t_ns, robot=event.robot, u=event.u * by, cov=cov)
+    t_ns += round(late.get(path, 0.0) * 1e9)
+    y = event.y * by if len(event.y) else event.y
+    return Scan(t_ns=t_ns, robot=event.robot, sensor=event.sensor, y=y, ids=event.ids, cov=cov)
+
+
+def _scaled(t_ns: Any, times: float) -> Any:
+    return t_ns if times == 1.0 else np.round(t_ns * times).astype(np.int64)

@@ -1,0 +1,122 @@
+"""Are mistakes with units, signs, mounts and times named, from when on, and do the lines that cure them do so?"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.config import build_slam, config_dict
+from kalmark.config.tree import parse_value
+from kalmark.diagnosis.gross import FITS, fit, gross
+from kalmark.diagnosis.mistakes import Mistake
+from kalmark.events import Control, Event, Scan
+from kalmark.logs.corrections import corrected
+from kalmark.logs.log import Log
+from kalmark.results.run import Run
+from kalmark.simulate import load_world, simulate
+
+FIELD = ("world.count=16", "world.size_m=16", "steps=160", "robots.rover.start={x_m: 8, y_m: 8, theta_rad: 0}",
+         "robots.rover.sensors.lidar.fov_rad=6.2832")  # fmt: skip
+CORNERS = ("world={type: list, points_m: [[2, 2], [13, 3], [14, 12], [3, 14]]}",)
+Change = Callable[[Event], Event]
+
+
+def run_of(log: Log, settings: tuple[str, ...] = ()) -> Run:
+    config = load_world("random_field", [*FIELD, *settings]).config()
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config), on_error="skip")
+
+
+def log_of(change: Change, settings: tuple[str, ...] = ()) -> Log:
+    log = simulate(load_world("random_field", [*FIELD, *settings]), 4)
+    return replace(log, events=[*map(change, log.events)], truth={})
+
+
+def measuring(change: Callable[[Any], Any], from_s: float = 0.0) -> Change:
+    def changed(e: Event) -> Event:
+        if not isinstance(e, Scan) or e.t_s < from_s:
+            return e
+        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=change(e.y), ids=e.ids)
+
+    return changed
+
+
+def controlling(factors: tuple[float, float], times: float = 1.0) -> Change:
+    def changed(e: Event) -> Event:
+        t_ns = round(e.t_ns * times)
+        if isinstance(e, Control):
+            return Control(t_ns=t_ns, robot=e.robot, u=e.u * factors)
+        assert isinstance(e, Scan)
+        return Scan(t_ns=t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=e.ids)
+
+    return changed
+
+
+def cured(log: Log, mistake: Mistake) -> Log:
+    """Return a log as it is read with the line of a cure."""
+    options: dict[str, Any] = {"factors": {}, "shift_s": {}}
+    for line in mistake.cure.split("--set ")[1:]:
+        path, _, value = line.strip().partition("=")
+        _, option, *names = path.split(".")
+        section = options[option]
+        for name in names[:-1]:
+            section = section.setdefault(name, {})
+        section[names[-1]] = parse_value(value, "cure")
+    return corrected(log, **options)
+
+
+CASES: dict[str, tuple[Change, str, str]] = {
+    "mirrored": (measuring(lambda y: y * [1.0, -1.0]), "bearing_sign", "clockwise.*cannot tell.*turns of rover"),
+    "turns": (controlling((1.0, -1.0)), "bearing_sign", "cannot tell.*turns of rover"),
+    "degrees": (measuring(lambda y: y * [1.0, 180 / np.pi]), "units", "rover.lidar.*degrees"),
+    "millimetres": (measuring(lambda y: y * [1e3, 1.0]), "units", "rover.lidar.*millimetres"),
+    "ways": (controlling((1e3, 1.0)), "units", "controls of rover.*millimetres"),
+    "times": (controlling((1.0, 1.0), 1e3), "units", "times.*milliseconds"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_mistake_is_named_and_its_cure_makes_the_log_fit(case: str) -> None:
+    change, name, told = CASES[case]
+    log = log_of(change)
+    mistake = gross(run_of(log), log)
+    assert mistake is not None
+    assert mistake.name == name
+    assert re.search(told, mistake.evidence), mistake.evidence
+    assert fit(run_of(cured(log, mistake))).mean < FITS
+
+
+def test_a_sensor_that_is_turned_over_later_is_named_with_the_time() -> None:
+    log = log_of(measuring(lambda y: y * [1.0, -1.0], from_s=16.0))
+    mistake = gross(run_of(log), log)
+    assert mistake is not None
+    assert (mistake.name, mistake.since_s) == ("bearing_sign", pytest.approx(16.0, abs=1.0))
+    to_s = float(mistake.cure.removeprefix("--set log.to_s="))
+    before = replace(log, events=[e for e in log.events if e.t_s - log.events[0].t_s <= to_s])
+    assert fit(run_of(before)).mean < FITS
+
+
+def test_what_most_of_a_log_is_refused_with_does_not_fit_it() -> None:
+    """With range and bearing swapped negative bearings would be refused, and few observations fit anything."""
+    log = log_of(measuring(lambda y: y * [1.0, -1.0]), CORNERS)
+    mistake = gross(run_of(log, CORNERS), log)
+    assert mistake is not None and mistake.name == "bearing_sign"
+
+
+def test_without_ids_a_filter_that_makes_new_landmarks_all_the_time_does_not_fit() -> None:
+    settings = ("filter.association={type: auto}",)
+    log = log_of(measuring(lambda y: y * [1e3, 1.0]), settings)
+    events = [replace_ids(e) for e in log.events]
+    log = replace(log, events=events)
+    run = run_of(log, settings)
+    mistake = gross(run, log)
+    assert mistake is not None and mistake.name == "units" and "millimetres" in mistake.evidence
+
+
+def replace_ids(e: Event) -> Event:
+    return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y) if isinstance(e, Scan) else e
