@@ -183,7 +183,7 @@ def laid_over(tree: Tree, log: Log) -> Tree:
 def for_each(tree: Tree, log: Log) -> None:
     """Lay what the command line sets for a robot that the file does not name over the file's `each`, in place."""
     robots: Any = tree.values.get("robots")
-    each = robots.get(EACH) if isinstance(robots, dict) else None
+    each: Any = robots.get(EACH) if isinstance(robots, dict) else None
     for name in log.robots if isinstance(each, dict) else ():
         places = [at for path, at in tree.places.items() if path[:2] == ("robots", name)]
         if isinstance(robots.get(name), dict) and all(at.startswith(OVERRIDE) for at in places):

@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.diagnosis.words import corrected
-from kalmark.events import Control, Event, Fix, Scan
+from kalmark.events import Control, Event, Scan
 from kalmark.results.run import Run
 from kalmark.slam.robot import Robot
 
@@ -182,29 +183,16 @@ def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> 
 
 def _measured(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
     def changed(e: Event) -> Event:
-        if not isinstance(e, Scan) or not len(e.y) or (e.robot, e.sensor) not in sensors:
-            return e
-        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=change(e.y), ids=e.ids, cov=e.cov)
+        if isinstance(e, Scan) and len(e.y) and (e.robot, e.sensor) in sensors:
+            return replace(e, y=change(e.y))
+        return e
 
     return changed
 
 
 def _controlled(robot: str, change: Callable[[Array], Array]) -> Change:
-    def changed(e: Event) -> Event:
-        if not isinstance(e, Control) or e.robot != robot:
-            return e
-        return Control(t_ns=e.t_ns, robot=e.robot, u=change(e.u), cov=e.cov)
-
-    return changed
+    return lambda e: replace(e, u=change(e.u)) if isinstance(e, Control) and e.robot == robot else e
 
 
 def _at(factor: float) -> Change:
-    def changed(e: Event) -> Event:
-        t_ns = round(e.t_ns * factor)
-        if isinstance(e, Scan):
-            return Scan(t_ns=t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=e.ids, cov=e.cov)
-        if isinstance(e, Fix):
-            return Fix(t_ns=t_ns, robot=e.robot, y=e.y, cov=e.cov)
-        return Control(t_ns=t_ns, robot=e.robot, u=e.u, cov=e.cov)
-
-    return changed
+    return lambda e: replace(e, t_ns=round(e.t_ns * factor))

@@ -13,9 +13,10 @@ from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis.causes import JUMPS, TIMES, Finding, Where
-from kalmark.diagnosis.gross import Mistake, gross
+from kalmark.diagnosis.gross import gross
 from kalmark.diagnosis.jumps import OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
+from kalmark.diagnosis.mistakes import Mistake
 from kalmark.diagnosis.search import LEAST_GAIN, Search
 from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.events import Control, Event, Fix, Frame, order
 from kalmark.logs.log import Log
 from kalmark.logs.source import nearest, quantity
 
@@ -30,12 +31,12 @@ def corrected(log: Log, factors: Mapping[str, Any] | None, shift_s: Mapping[str,
         return log
     if any(value == 0 for value in by.values()):
         raise LogError("log option factors has a 0, expected factors that are not zero")
-    columns: dict[Path_, tuple[str, ...]] = {(robot,): names for robot, names in log.control_columns.items()}
-    columns |= log.sensor_columns
+    sensors: dict[Path_, tuple[str, ...]] = {path: names for path, names in log.sensor_columns.items()}  # noqa: C416
+    columns = {(robot,): names for robot, names in log.control_columns.items()} | sensors
     _refuse_idle("factors", by, [(*path, name) for path, names in columns.items() for name in names] + [(TIME,)])
-    _refuse_idle("shift_s", shifts, list(log.sensor_columns))
+    _refuse_idle("shift_s", shifts, list(sensors))
     of = {path: np.array([_product(by, (*path, name)) for name in names]) for path, names in columns.items()}
-    late = {path: sum(s for name, s in shifts.items() if {*name} <= {*path}) for path in log.sensor_columns}
+    late = {path: math.fsum(s for name, s in shifts.items() if {*name} <= {*path}) for path in sensors}
     times = by.get((TIME,), 1.0)
     events = [_event(event, of, late, times) for event in log]
     truth = {robot: replace(path, t_ns=_scaled(path.t_ns, times)) for robot, path in log.truth.items()}
@@ -72,15 +73,16 @@ def _product(factors: Mapping[Path_, float], path: Path_) -> float:
 def _event(event: Event, factors: Mapping[Path_, Array], late: Mapping[Path_, float], times: float) -> Event:
     t_ns = event.t_ns if times == 1.0 else round(event.t_ns * times)
     if isinstance(event, Fix):
-        return Fix(t_ns=t_ns, robot=event.robot, y=event.y, cov=event.cov)
+        return replace(event, t_ns=t_ns)
     path = (event.robot,) if isinstance(event, Control) else (event.robot, event.sensor)
+    t_ns += round(late.get(path, 0.0) * 1e9)
+    if isinstance(event, Frame):
+        return replace(event, t_ns=t_ns)
     by = factors.get(path, np.ones(1))
     cov = None if event.cov is None else event.cov * np.outer(by, by)
     if isinstance(event, Control):
-        return Control(t_ns=t_ns, robot=event.robot, u=event.u * by, cov=cov)
-    t_ns += round(late.get(path, 0.0) * 1e9)
-    y = event.y * by if len(event.y) else event.y
-    return Scan(t_ns=t_ns, robot=event.robot, sensor=event.sensor, y=y, ids=event.ids, cov=cov)
+        return replace(event, t_ns=t_ns, u=event.u * by, cov=cov)
+    return replace(event, t_ns=t_ns, y=event.y * by if len(event.y) else event.y, cov=cov)
 
 
 def _scaled(t_ns: Any, times: float) -> Any:
