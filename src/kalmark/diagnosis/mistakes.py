@@ -16,6 +16,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.diagnosis.words import corrected
 from kalmark.events import Control, Event, Scan
+from kalmark.logs.corrections import at_time
 from kalmark.results.run import Run
 from kalmark.slam.robot import Robot
 
@@ -184,7 +185,7 @@ def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> 
 def _measured(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
     def changed(e: Event) -> Event:
         if isinstance(e, Scan) and len(e.y) and (e.robot, e.sensor) in sensors:
-            return replace(e, y=change(e.y))
+            return at_time(e, e.t_ns, change(e.y))
         return e
 
     return changed
@@ -195,4 +196,4 @@ def _controlled(robot: str, change: Callable[[Array], Array]) -> Change:
 
 
 def _at(factor: float) -> Change:
-    return lambda e: replace(e, t_ns=round(e.t_ns * factor))
+    return lambda e: at_time(e, round(e.t_ns * factor))

@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, order
+from kalmark.events import Control, Event, Fix, Frame, Scan, order
 from kalmark.logs.log import Log
 from kalmark.logs.source import nearest, quantity
 
@@ -31,7 +31,7 @@ def corrected(log: Log, factors: Mapping[str, Any] | None, shift_s: Mapping[str,
         return log
     if any(value == 0 for value in by.values()):
         raise LogError("log option factors has a 0, expected factors that are not zero")
-    sensors: dict[Path_, tuple[str, ...]] = {path: names for path, names in log.sensor_columns.items()}  # noqa: C416
+    sensors: dict[Path_, tuple[str, ...]] = {path: names for path, names in log.sensor_columns.items()}
     columns = {(robot,): names for robot, names in log.control_columns.items()} | sensors
     _refuse_idle("factors", by, [(*path, name) for path, names in columns.items() for name in names] + [(TIME,)])
     _refuse_idle("shift_s", shifts, list(sensors))
@@ -70,19 +70,27 @@ def _product(factors: Mapping[Path_, float], path: Path_) -> float:
     return float(np.prod([1.0, *mine]))
 
 
+def at_time(event: Event, t_ns: int, y: Array | None = None, cov: Array | None = None) -> Event:
+    """Return an event at another time, and a scan with other measurements and noise, if these are given."""
+    if not isinstance(event, Scan):
+        return replace(event, t_ns=t_ns)
+    y, cov = event.y if y is None else y, event.cov if cov is None else cov
+    return Scan(t_ns=t_ns, robot=event.robot, sensor=event.sensor, y=y, ids=event.ids, cov=cov)
+
+
 def _event(event: Event, factors: Mapping[Path_, Array], late: Mapping[Path_, float], times: float) -> Event:
     t_ns = event.t_ns if times == 1.0 else round(event.t_ns * times)
     if isinstance(event, Fix):
-        return replace(event, t_ns=t_ns)
+        return at_time(event, t_ns)
     path = (event.robot,) if isinstance(event, Control) else (event.robot, event.sensor)
     t_ns += round(late.get(path, 0.0) * 1e9)
     if isinstance(event, Frame):
-        return replace(event, t_ns=t_ns)
+        return at_time(event, t_ns)
     by = factors.get(path, np.ones(1))
     cov = None if event.cov is None else event.cov * np.outer(by, by)
     if isinstance(event, Control):
         return replace(event, t_ns=t_ns, u=event.u * by, cov=cov)
-    return replace(event, t_ns=t_ns, y=event.y * by if len(event.y) else event.y, cov=cov)
+    return at_time(event, t_ns, event.y * by if len(event.y) else None, cov)
 
 
 def _scaled(t_ns: Any, times: float) -> Any:
