@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.config import build_slam
+from kalmark.errors import ConfigError
+from kalmark.events import Frame
+from kalmark.geometry import frames3d
 from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, to_frame_many
+from kalmark.logs import write_native
 from kalmark.models import cameras
+from kalmark.simulate import load_world, simulate
 from kalmark.simulate.layouts import TexturedPlanes, TexturedRoom
 from kalmark.simulate.rendering import SKY, Plane, Renderer, texture
 
@@ -93,3 +100,43 @@ def test_textures_and_noise_are_those_of_the_seed_and_noise_has_its_sigma() -> N
     assert (depth == 2).all()
     assert image.std() == pytest.approx(3, rel=0.03)
     assert image.mean() == pytest.approx(100, abs=0.1)
+
+
+ROOM = ["world.pixel_m=0.02", "steps=12", "robots.robot.sensing.camera.depth=true"]
+
+
+def test_a_simulated_camera_gives_images_of_its_true_poses_from_the_start_on(tmp_path: Path) -> None:
+    world = load_world("textured_room", ROOM)
+    log, again, other = simulate(world, 3), simulate(world, 3), simulate(world, 4)
+    frames = [event for event in log if isinstance(event, Frame)]
+    assert [f.t_ns for f in frames] == [0, *world.times()]
+    pictures = [f.pixels() for f in frames]
+    for others, same in ((again, True), (other, False)):
+        assert (pictures[5] == [e for e in others if isinstance(e, Frame)][5].pixels()).all() == same
+    assert (pictures[5] == frames[5].pixels()).all()  # however often it is asked
+    camera = build_slam(world.config(), log).state.robots["robot"].sensors["camera"]
+    truth = [frames3d.compose(log.truth["robot"].at(f.t_ns), np.array(camera.at))[0] for f in frames]
+    y = np.array([[60.0, 150.0], [200.0, 130.0], [300.0, 200.0]])
+    depths = frames[0].depths()
+    assert depths is not None
+    z = depths[y[:, 1].astype(int), y[:, 0].astype(int)]
+    rays = cameras.back_project(camera.sensor.code, y, np.array(camera.sensor.parameters))[0]
+    points = from_frame_many(truth[0], rays * (z / rays[:, 2])[:, None])[0]
+    found = pixels(camera.sensor, truth[-1], points)  # of the first image's points, where the last one has them
+    assert np.abs(found - y).max() > 3
+    patches = [pictures[0][v - 6 : v + 7, u - 6 : u + 7].astype(float).ravel() for u, v in y.astype(int)]
+    moved = [pictures[-1][v - 6 : v + 7, u - 6 : u + 7].astype(float).ravel() for u, v in np.rint(found).astype(int)]
+    assert np.median([np.corrcoef(a, b)[0, 1] for a, b in zip(patches, moved, strict=True)]) > 0.8
+    folder = write_native(log, tmp_path / "room")
+    back = [event for event in km.open_log(folder) if isinstance(event, Frame)]
+    assert all((a.pixels() == b.pixels()).all() for a, b in zip(back, frames, strict=True))
+    assert np.array_equal(np.rint(back[0].depths() * 5000), np.rint(depths * 5000))
+
+
+def test_images_want_a_world_of_textures_and_a_camera() -> None:
+    room = "world={type: random_box}"
+    with pytest.raises(ConfigError, match="expected images in a world of textures, textured_room or textured_planes"):
+        load_world("textured_room", [room])
+    stereo = "robots.robot.sensors.camera={type: stereo, mount: {roll_deg: -90}}"
+    with pytest.raises(ConfigError, match="expected images of pinhole or omnidirectional, not of 'camera', a stereo"):
+        load_world("textured_room", [stereo])

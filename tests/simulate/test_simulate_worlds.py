@@ -18,11 +18,14 @@ from kalmark.simulate.layouts import (
     Cloister,
     House,
     Listed,
+    ListedPlane,
     ListedTag,
     Loop,
     RandomBox,
     RandomField,
     TagRoom,
+    TexturedPlanes,
+    TexturedRoom,
     ThickCloister,
 )
 from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control
@@ -212,7 +215,17 @@ def test_the_page_about_worlds_names_every_world_key_and_figure() -> None:
 
     page = PAGE.read_text(encoding="utf-8")
     sections = (World, Cloister, Loop, RandomField, Listed, Constant, Waypoints, Wander, Lanes, Sensing)
-    sections += (ThickCloister, House, RandomBox, TagRoom, ListedTag, SimulatedRobot)
+    sections += (
+        ThickCloister,
+        House,
+        RandomBox,
+        TagRoom,
+        ListedTag,
+        SimulatedRobot,
+        TexturedPlanes,
+        TexturedRoom,
+        ListedPlane,
+    )
     keys = {key for section in sections for key in section.model_fields} - {"type"}
     assert not [key for key in [*keys, *shipped_worlds()] if f"`{key}`" not in page]
     figures = run_campaign(load_world("cloister", ["steps=2"]), 1, jobs=1).summary()["estimators"]["invariant"]

@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.rotations import matrix
+from kalmark.logs.images.pictures import DEPTH_SCALE
 from kalmark.models import cameras
 
 Bytes = np.ndarray[Any, np.dtype[np.uint8]]
@@ -107,6 +108,17 @@ class Renderer:
         if noise:
             image = image + noise * rng.standard_normal(image.shape, dtype=np.float32)
         return np.clip(np.rint(image), 0, 255).astype(np.uint8), depth
+
+
+def rendered(renderer: Renderer, T: Array, seed: int, noise: float, blur_px: float) -> Bytes:
+    """Return the image (H, W) from the camera's pose T (7,), its noise by a seed."""
+    return renderer.taken(T, np.random.default_rng(seed), noise, blur_px)[0]
+
+
+def rendered_depth(renderer: Renderer, T: Array) -> Array:
+    """Return the depth (H, W) in m from the camera's pose T (7,), to 1 / DEPTH_SCALE m as in files; 0: no plane."""
+    depth = renderer.render(T)[1].astype(np.float64)
+    return np.rint(np.where(np.isfinite(depth), depth, 0.0) * DEPTH_SCALE) / DEPTH_SCALE
 
 
 def pyramid(texture: Bytes) -> list[Bytes]:

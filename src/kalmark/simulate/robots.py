@@ -9,7 +9,9 @@ biases, scales, radii.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +21,7 @@ from numpy.random import Generator, SeedSequence
 from kalmark.arrays import Array
 from kalmark.config.building import build_robot
 from kalmark.detect.scan import RAW, Laser
-from kalmark.events import Control, Event, Id, Scan, order
+from kalmark.events import Control, Event, Frame, Id, Scan, order
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
@@ -45,6 +47,7 @@ from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
 from kalmark.simulate.layouts import Scenery
+from kalmark.simulate.rendering import Plane, Renderer, rendered, rendered_depth
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
 from kalmark.simulate.worlds import World
@@ -57,12 +60,16 @@ WILD = 30.0  # by so many of its own errors an outlier of a sensor of the state 
 
 @dataclass
 class SimSensor:
-    """A sensor, where it truly sits, and what is wrong with it; `laser` is the detector of one whose scans are raw."""
+    """A sensor, where it truly sits, and what is wrong with it; `laser` is the detector of one whose scans are raw.
+
+    `renderer` makes the images of a camera that gives images.
+    """
 
     sensor: Any
     at: Array
     sensing: Sensing
     laser: Laser | None = None
+    renderer: Renderer | None = None
     last: tuple[int, Array] | None = None  # step and robot's pose of the last reading or scan
 
     @property
@@ -128,13 +135,13 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
     scenery = world.world.scenery(chance.layout)
     things = things_in(world, scenery, chance.layout)
     area = area_of(scenery, things)
-    robots = [sim_robot(world, name, area, chance) for name in world.robots]
+    robots = [sim_robot(world, name, area, chance, scenery.planes) for name in world.robots]
     times = [round(k * world.dt_s * 1e9) for k in range(world.steps + 1)]
     events: list[Event] = []
     origins: dict[Key, tuple[Id | None, ...]] = {}
     for robot in robots:
         if coasts(robot.motion) and robot.sensors:  # it moves from the first event on: the start
-            events.append(Scan(t_ns=0, robot=robot.name, sensor=next(iter(robot.sensors))))
+            events.append(begun(robot, next(iter(robot.sensors)), chance))
     for k, (before, now) in enumerate(pairwise(times), 1):
         for robot in robots:
             u = step(robot, world, chance.control)
@@ -143,6 +150,7 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
             for scan, real in scans(robot, robots, things, world, k, now, chance):
                 events.append(scan)
                 origins[now, scan.robot, scan.sensor] = real
+            events += frames(robot, k, now, chance)
     states = {r.name: np.array([*r.states, r.state]) for r in robots}
     log = Log(
         world.name, tuple(world.robots), sorted(events, key=order), "simulated",
@@ -186,10 +194,10 @@ def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
     return {i: row.copy() for s, t in things.items() for i, row in enumerate(rows[s], t.first)}
 
 
-def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
+def sim_robot(world: World, name: str, area: Array, chance: Chance, planes: Sequence[Plane] = ()) -> SimRobot:
     """Put a robot at its start and its sensors on their mounts, drawn around configured values with sigmas.
 
-    `area` (2, D) has the lower and the upper corner of the world.
+    `area` (2, D) has the lower and the upper corner of the world, `planes` are those of which images are rendered.
     """
     simulated = world.robots[name]
     robot = build_robot(world.models(), name)
@@ -198,7 +206,8 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance) -> SimRobot:
     for key, mount in robot.sensors.items():
         sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
         raw = mount.detector if isinstance(mount.detector, Laser) else None
-        sensors[key] = SimSensor(*drawn_mount(mount, chance.mounts), sensing, raw)
+        true, at = drawn_mount(mount, chance.mounts)
+        sensors[key] = SimSensor(true, at, sensing, raw, Renderer(planes, true) if sensing.images else None)
     driver = simulated.route.driver(robot.motion, world.dt_s, area, chance.route)
     model = calibrating(robot.motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
@@ -278,7 +287,9 @@ def scans(
     """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
     found: list[tuple[Scan, tuple[Id | None, ...]]] = []
     for name, carried in robot.sensors.items():
-        if not carried.sensing.scans_at(k) or isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
+        if carried.renderer is not None or not carried.sensing.scans_at(k):
+            continue
+        if isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
             continue
         if carried.laser is not None:
             y = laser.beams(carried.laser, carried.sensing, composed(robot.pose, carried.at)[0], things, chance.sight)
@@ -306,6 +317,31 @@ def scans(
             carried.last = k, robot.pose.copy()
             found.append((scan, tuple(real[i] for i in kept)))
     return found
+
+
+def frames(robot: SimRobot, k: int, t_ns: int, chance: Chance) -> list[Frame]:
+    """Return the frames of a robot's cameras that give images, from its true pose at step k."""
+    return [
+        taken(robot, name, carried, carried.renderer, t_ns, chance)
+        for name, carried in robot.sensors.items()
+        if carried.renderer is not None and carried.sensing.scans_at(k)
+    ]
+
+
+def taken(robot: SimRobot, name: str, carried: SimSensor, renderer: Renderer, t_ns: int, chance: Chance) -> Frame:
+    """Return the frame of a camera from its robot's true pose, rendered when its pixels are needed."""
+    T, sensing, seed = composed(robot.pose, carried.at)[0], carried.sensing, int(chance.sight.integers(2**62))
+    image = partial(rendered, renderer, T, seed, sensing.noise_grey, sensing.blur_px)
+    depth = partial(rendered_depth, renderer, T) if sensing.depth else None
+    return Frame(t_ns=t_ns, robot=robot.name, sensor=name, image=image, depth=depth)
+
+
+def begun(robot: SimRobot, name: str, chance: Chance) -> Event:
+    """Return the first event of a robot that moves without controls: an empty scan of a sensor, or its first image."""
+    carried = robot.sensors[name]
+    if carried.renderer is None:
+        return Scan(t_ns=0, robot=robot.name, sensor=name)
+    return taken(robot, name, carried, carried.renderer, 0, chance)
 
 
 def moving_at(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from kalmark import presets
 from kalmark.arrays import Array, Flags, Index
-from kalmark.config.sections import Section
+from kalmark.config.sections import NotNegative, Section
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import matrix
@@ -67,6 +67,14 @@ class Sensing(Section):
     """Beams of a scan, where the sensor has the detector of a laser: then its scans are raw."""
     beams_fov_deg: Annotated[float, Field(gt=0, le=360)] = 270.0
     """Angle between the first and the last of them."""
+    images: bool = False
+    """A camera in a world of textures: give its images instead of what it sees."""
+    depth: bool = False
+    """With the depth of every pixel."""
+    noise_grey: NotNegative = 2.0
+    """Noise of a pixel of the images, grey values."""
+    blur_px: NotNegative = 0.5
+    """Blur of the images: standard deviation of a Gaussian."""
     dropouts: Share | None = None
     """Probability that something seen is not reported: 0, or as the sensor's `preset` says."""
     outliers: Share = 0.0

@@ -27,11 +27,12 @@ from kalmark.config.schema import (
 )  # fmt: skip
 from kalmark.config.sections import Positive, Section, expected, model_of
 from kalmark.config.tree import Tree, name_of, read_tree
-from kalmark.simulate.layouts import Layout
+from kalmark.simulate.layouts import Layout, TexturedPlanes, TexturedRoom
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import Sensing
 
 Count = Annotated[int, Field(ge=1)]
+IMAGING = ("pinhole", "omnidirectional")  # the types of sensors whose images can be rendered
 EACH = "robots.each."  # how an override begins that is meant for all robots of a world
 
 
@@ -53,6 +54,8 @@ class _Underway(Section):
         for name in self.sensing:
             if name not in robot.sensors:
                 raise expected(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
+            if self.sensing[name].images and robot.sensors[name].type not in IMAGING:
+                raise expected(f"images of {' or '.join(IMAGING)}, not of {name!r}, a {robot.sensors[name].type}")
         return self
 
 
@@ -113,6 +116,9 @@ class World(Section):
             raise expected("sight_robots false where a sensor measures signatures: robots have none")
         if len({type(robot) for robot in self.robots.values()}) > 1:
             raise expected("robots that all move in the plane, or all in space")
+        pictures = any(sensing.images for robot in self.robots.values() for sensing in robot.sensing.values())
+        if pictures and not isinstance(self.world, TexturedPlanes | TexturedRoom):
+            raise expected("images in a world of textures, textured_room or textured_planes")
         if self.dimensions == 2 and self.world.scenery(np.random.default_rng(0)).of_space:
             raise expected("robots of space, or a world of the plane: its landmarks are in space")
         return self
