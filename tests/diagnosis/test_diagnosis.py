@@ -276,6 +276,59 @@ def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:
         assert verdict.causes[0].name == "start" and " 3" in verdict.causes[0].evidence  # some 34 deg
 
 
+def recorded(log: Log, *settings: str) -> Run:
+    config = world_of(*settings).config()
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+
+
+def test_observations_that_have_the_id_of_another_landmark_are_named() -> None:
+    log, rng = simulate(world_of(), 3), np.random.default_rng(3)
+    events: list[Event] = []
+    for e in log.events:
+        event = e
+        if isinstance(event, Scan) and event.ids is not None and len(event.ids) > 1 and rng.random() < 0.05:
+            event = Scan(t_ns=e.t_ns, robot=event.robot, sensor=event.sensor, y=event.y,
+                         ids=[event.ids[1], event.ids[0], *event.ids[2:]])  # fmt: skip
+        events.append(event)
+    assert km.diagnose(recorded(replace(log, events=events))).causes[0].name == "wrong_ids"
+
+
+def test_ranges_that_are_off_among_near_landmarks_do_not_have_wrong_ids() -> None:
+    near = ("world.count=60", "world.size_m=12", f"{SIGMA}=0.3", "robots.rover.sensors.lidar.sigma_bearing_rad=0.06",
+            "robots.rover.start={x_m: 6, y_m: 6, theta_rad: 0}")  # fmt: skip
+    log, rng = simulate(world_of(*near), 3), np.random.default_rng(3)
+
+    def off(e: Event) -> Event:
+        if not isinstance(e, Scan) or not len(e.y):
+            return e
+        bad = rng.random(len(e.y)) < 0.02
+        return seen(e, y=e.y + np.column_stack([np.where(bad, rng.choice([2.0, 2.5], len(bad)), 0.0), 0.0 * bad]))
+
+    names = [cause.name for cause in km.diagnose(recorded(replace(log, events=[*map(off, log.events)]), *near)).causes]
+    assert "outliers" in names
+    assert "wrong_ids" not in names
+
+
+def test_errors_that_last_under_a_noise_that_is_stated_too_large_are_no_systematic_errors() -> None:
+    log, rng, last = simulate(world_of(), 3), np.random.default_rng(3), dict[Any, Any]()
+
+    def lasting(e: Event) -> Event:
+        if not isinstance(e, Scan) or e.ids is None or not len(e.y):
+            return e
+        for i in e.ids:
+            last[i] = 0.95 * last.get(i, np.zeros(2)) + rng.normal(size=2) * (0.1, 0.02) * np.sqrt(1.0 - 0.95**2)
+        return seen(e, y=e.y + np.array([last[i] for i in e.ids]), t_ns=e.t_ns + 100_000_000)
+
+    wide = (f"{SIGMA}=0.4", "robots.rover.sensors.lidar.sigma_bearing_rad=0.08")
+    log = replace(log, events=sorted(map(lasting, log.events), key=order))
+    verdict = km.diagnose(recorded(log, *wide))
+    assert verdict.search is not None
+    found = {f.name: f for f in verdict.search.found}
+    assert found["time_offset"].value == pytest.approx(-0.1, abs=3 * found["time_offset"].sigma)
+    assert {*found} == {"time_offset", "correlated_noise", "range_sigma", "bearing_sigma"}
+    assert all(not c.cure for c in verdict.causes if c.harmless)
+
+
 def test_the_first_line_of_a_verdict_names_the_cause() -> None:
     verdict = km.diagnose(run_of(*MISTAKES["bearing_sign"])).as_dict()
     assert next(verdict_lines(verdict)) == "the map is wrong because of bearing_sign"

@@ -73,6 +73,11 @@ class Finding:
     moved_m: float | None = None
     at: Array | None = None
 
+    @property
+    def overstated(self) -> bool:
+        """Whether it is a noise that is smaller than stated."""
+        return self.unit == TIMES and self.value < 1.0
+
 
 class Column(NamedTuple):
     """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,)."""

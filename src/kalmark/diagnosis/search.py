@@ -8,7 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.special import bdtrc
 
+from kalmark.arrays import Array, Flags
 from kalmark.batch.state import LANDMARKS, looked
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import Finding, Where
@@ -25,7 +27,8 @@ TAKEN_UP, ALIKE = 0.5, 0.85
 ORDER = ("steering_offset", "odometry_scale", "odometry_turn", "odometry_offset")
 SCALINGS, SCALED = 5, 0.03
 NEAR = 9.0  # d2 of a landmark that an observation may well be of
-LOOKED_AT = 200  # outliers whose landmarks are looked for
+LOOKED_AT, DRAWS = 200, 40  # outliers whose landmarks are looked for, and draws of their errors
+MANY = 0.3  # of the outliers, beyond chance, are of another landmark: it pulls its scan, and what is right is off, too
 
 
 def best(sure: list[Finding]) -> list[Finding]:
@@ -76,21 +79,31 @@ class Search:
         self.simulated = linear.simulated(causes.SETS)
 
     def run(self, progress: bool = False) -> list[Finding]:
-        """Return all causes, the one that explains most first."""
-        rounds = ROUNDS + MORE
+        """Return all causes, the one that explains most first.
+
+        Noise that is stated too large does no harm, and hides none of the others: it is taken out when all of them
+        are.  Where errors last it ends the search.  What is new in each sighting is then smaller than the error: a
+        weight by that would make systematic errors of what lasts.
+        """
+        rounds, lasting = ROUNDS + MORE, False
         for n in track(range(rounds), "causes, one after the other", rounds, show=progress):
             candidates = self.candidates()
             least = max(LEAST_GAIN, SHARE * sum(f.gain for f in self.found) if n >= ROUNDS else 0.0)
             sure = [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > least]
-            if not sure:
+            harmful = [] if lasting else [f for f in sure if not f.overstated]
+            lasting = lasting or not harmful and bool(self.correlated())
+            if not sure or (lasting and not any(f.overstated for f in sure)):
                 break
-            first, *alike = best(sure)
+            first, *alike = best(harmful or [f for f in sure if f.overstated])
             self.take(replace(first, alike=tuple(alike)))
-        rest = causes.correlations(self.linear, self.simulated, self.sensors, self.t_s)
-        for finding in rest:
-            if finding.p * len(rest) < ALPHA and finding.gain > LEAST_GAIN:
-                self.take(finding)
+        for finding in self.correlated():
+            self.take(finding)
         return sorted(self.found, key=lambda f: -f.gain)
+
+    def correlated(self) -> list[Finding]:
+        """Return the errors that last from sighting to sighting."""
+        found = causes.correlations(self.linear, self.simulated, self.sensors, self.t_s)
+        return [f for f in found if f.p * len(found) < ALPHA and f.gain > LEAST_GAIN]
 
     def candidates(self) -> list[Finding]:
         """Return all that may explain what is left."""
@@ -136,21 +149,41 @@ class Search:
         self.simulated = self.linear.simulated(causes.SETS)
 
     def _outliers(self, far: Any) -> str:
-        """Return "wrong_ids" if most of the observations that are `far` off fit another landmark, else "outliers"."""
-        problem, fits, number, first, begin = self.linear.problem, 0, 0, 0, 0
-        poses, places, *_ = self.linear.moved().groups
+        """Return "wrong_ids" if many of the observations that are `far` off are of another landmark, else "outliers".
+
+        Where landmarks are close together an observation that is off fits another one by chance.  How often is
+        counted with the errors of other such observations in the place of its own, with random signs.
+        """
+        problem, number, fits, by_chance, first, begin = self.linear.problem, 0, 0, 0.0, 0, 0
+        (poses, places, *_), rng = self.linear.moved().groups, np.random.default_rng(0)
         for factor in problem.factors:
             k, p, _ = factor.R.shape
             noise = self.linear.noise[begin : begin + k * p].reshape(k, p) / OUT  # that of outliers
             begin += k * p
             blocks = factor.term.blocks
-            mine = np.flatnonzero(far[first : first + k])
+            mine = np.flatnonzero(far[first : first + k])[:LOOKED_AT]
             first += k
-            if blocks[-1].group != LANDMARKS or not factor.sensor[1] or len(blocks) != 2:
+            if blocks[-1].group != LANDMARKS or not factor.sensor[1] or len(blocks) != 2 or not len(mine):
                 continue
-            for row in mine[:LOOKED_AT].tolist():
-                rows = np.full(len(places), row)
-                z, _ = looked(factor.view, poses[blocks[0].rows[rows]], places, factor.y[rows])
-                d2 = np.einsum("ki,ij,kj->k", z, np.linalg.inv(factor.R[row] * np.outer(noise[row], noise[row])), z)
-                number, fits = number + 1, fits + bool(np.nanmin(d2) < NEAR)
-        return "wrong_ids" if 2 * fits > number else "outliers"
+            own = blocks[-1].rows[mine]
+            z = np.empty((len(mine), len(places), p))  # of all landmarks, whitened as of the own one
+            for i, row in enumerate(mine.tolist()):
+                rows, R = np.full(len(places), row), factor.R[row] * np.outer(noise[row], noise[row])
+                off, _ = looked(factor.view, poses[blocks[0].rows[rows]], places, factor.y[rows])
+                z[i] = np.linalg.solve(np.linalg.cholesky(R), off.T).T
+            error = z[np.arange(len(mine)), own].copy()
+            z[np.arange(len(mine)), own] = np.nan
+            number, fits = number + len(mine), fits + int(_near(z).sum())
+            for _ in range(DRAWS):
+                drawn = rng.permutation(error) * rng.choice([-1.0, 1.0], error.shape)
+                by_chance += float(_near(z + (drawn - error)[:, None]).sum()) / DRAWS
+        if not number or fits <= by_chance:
+            return "outliers"
+        chance = by_chance / number
+        surely = bdtrc(fits - 1, number, chance) < ALPHA
+        return "wrong_ids" if surely and fits - by_chance > MANY * (number - by_chance) else "outliers"
+
+
+def _near(z: Array) -> Flags:
+    """Return which observations (K,) fit any landmark, by their whitened innovations z (K, n, p)."""
+    return np.asarray((np.nan_to_num(np.sum(z**2, axis=2), nan=np.inf) < NEAR).any(axis=1))

@@ -12,7 +12,7 @@ from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS
-from kalmark.diagnosis.causes import JUMPS, TIMES, Finding, Where
+from kalmark.diagnosis.causes import JUMPS, Finding, Where
 from kalmark.diagnosis.gross import gross
 from kalmark.diagnosis.jumps import OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
@@ -214,13 +214,18 @@ def thinned(run: Run, given: Given, most: int) -> Given:
 
 # ------------------------------------------------------------------ the causes
 def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None = None) -> list[Cause]:
-    """Return the causes that a search found; a landmark that moves by less than the map's accuracy does not matter."""
+    """Return the causes that a search found; a landmark that moves by less than the map's accuracy does not matter.
+
+    A noise that is stated too large has no cure where its errors last: with it the filter would be too sure.
+    """
     matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
-    return [_cause(run, f, log) for f in joined(matter, begin_s(run))]
+    lasting = {f.of for f in matter if f.name == "correlated_noise"}
+    causes = [(f, _cause(run, f, log)) for f in joined(matter, begin_s(run))]
+    return [replace(c, cure="") if f.overstated and f.of in lasting else c for f, c in causes]
 
 
 def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
-    since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.unit == TIMES and finding.value < 1.0
+    since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.overstated
     odd = _odd(run, log, finding, since_s) if finding.name in JUMPS and log is not None else None
     name, told = finding.name, words(finding, run.config)
     if odd is not None:

@@ -191,7 +191,8 @@ def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 
 def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
-    evidence = f"{finding.value:.1%} of the observations are far off where their landmark is, and fit another one"
+    off = f"{finding.value:.1%} of the observations are far off where their landmark is"
+    evidence = f"{off}, and fit another one far more often than by chance"
     return evidence, UNKNOWN_IDS
 
 
