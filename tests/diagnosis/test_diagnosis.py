@@ -276,11 +276,6 @@ def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:
         assert verdict.causes[0].name == "start" and " 3" in verdict.causes[0].evidence  # some 34 deg
 
 
-def recorded(log: Log, *settings: str) -> Run:
-    config = world_of(*settings).config()
-    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
-
-
 def test_observations_that_have_the_id_of_another_landmark_are_named() -> None:
     log, rng = simulate(world_of(), 3), np.random.default_rng(3)
     events: list[Event] = []

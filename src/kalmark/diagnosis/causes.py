@@ -88,6 +88,11 @@ class Column(NamedTuple):
     Z: Array
     W: Array
 
+    @property
+    def group(self) -> tuple[str, ...]:
+        """Robot, sensor and column, or robot and column of its controls: what else may be wrong with it has the same."""
+        return self.of[:2] if self.W.any() else self.of
+
 
 def columns_of(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: Array) -> list[Column]:
     """Return the systematic errors that data may have.
@@ -191,6 +196,15 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
             )
         )
     return found
+
+
+def together(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
+    """Return the systematic errors s (K,), all estimated at once, and their information (K, K); scales are small."""
+    Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
+    have, left = linear.residuals, linear.left(Z, W)
+    I = Z.T @ left.r + W.T @ left.m
+    prior = np.diag([0.0 if c.unit else MOST_SCALE**-2 for c in columns])
+    return np.linalg.lstsq(I + prior, Z.T @ have.r + W.T @ have.m)[0], I
 
 
 def stretches(linear: Linear, left: Left, s: Array) -> Array:

@@ -91,7 +91,7 @@ class Search:
             least = max(LEAST_GAIN, SHARE * sum(f.gain for f in self.found) if n >= ROUNDS else 0.0)
             sure = [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > least]
             harmful = [] if lasting else [f for f in sure if not f.overstated]
-            lasting = lasting or not harmful and bool(self.correlated())
+            lasting = lasting or (not harmful and bool(self.correlated()))
             if not sure or (lasting and not any(f.overstated for f in sure)):
                 break
             first, *alike = best(harmful or [f for f in sure if f.overstated])
@@ -123,6 +123,8 @@ class Search:
             self.linear = self.linear.without(finding.Z * finding.value, finding.W * finding.value)
             if finding.errors is not None:
                 self._scale(finding)
+            else:
+                finding = self._beside(finding)
         elif finding.unit == causes.TIMES:
             finding = self._scaled(finding)
         else:
@@ -131,6 +133,26 @@ class Search:
             finding = replace(finding, name=self._outliers(finding.rows))
         same = [f for f in self.found if (f.name, f.of) == (finding.name, finding.of) and f.unit == finding.unit]
         self.found = [f for f in self.found if f not in same] + [_joined([*same, finding])]
+
+    def _beside(self, finding: Finding) -> Finding:
+        """Return a systematic error as it is beside the others of its column, and take these out of the data.
+
+        One that is no cause by itself may still do the opposite: of a speed that is .94 v + .02 m/s the offset alone
+        would move the map.  Those that the data cannot tell from it are left.
+        """
+        every = causes.columns_of(self.linear, self.sensors, self.rates)
+        mine = next((c for c in every if (c.name, c.of) == (finding.name, finding.of)), None)
+        same = [c for c in every if mine and c is not mine and c.group == mine.group]
+        if mine is None or not same:
+            return finding
+        s, I = causes.together(self.linear, [mine, *same])
+        size = np.sqrt(np.diag(I))
+        told = [0, *(k for k in range(1, len(size)) if abs(I[0, k]) < ALIKE * size[0] * size[k])]
+        s, _ = causes.together(self.linear, [(mine, *same)[k] for k in told])
+        for k, value in zip(told, s, strict=True):
+            column = (mine, *same)[k]
+            self.linear = self.linear.without(column.Z * value, column.W * value)
+        return replace(finding, value=finding.value + float(s[0]))
 
     def _scaled(self, finding: Finding) -> Finding:
         """Make a noise as large as it is, which takes a few rounds: other noise was taken for it, or it for other."""
