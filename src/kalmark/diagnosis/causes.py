@@ -90,7 +90,7 @@ class Column(NamedTuple):
 
     @property
     def group(self) -> tuple[str, ...]:
-        """Robot, sensor and column, or robot and column of its controls: what else may be wrong with it has the same."""
+        """Robot, sensor and column, or robot and column of its controls: errors of the same column share it."""
         return self.of[:2] if self.W.any() else self.of
 
 
