@@ -24,6 +24,7 @@ from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.verdict import Verdict, causes_of
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.frames import compose, inverse
+from kalmark.geometry.spaces import SE3
 from kalmark.logs.log import Log
 from kalmark.results.batch import given_by
 from kalmark.results.run import Run
@@ -192,6 +193,32 @@ def test_a_control_that_jumps_is_named_and_its_cure_leaves_it_out() -> None:
     verdict = km.diagnose(cured)
     assert [(c.name, c.harmless) for c in verdict.causes] == [("odometry_jump", True)]
     assert "left out" in verdict.causes[0].evidence
+
+
+def test_controls_that_jump_among_surveyed_tags_are_named_without_a_batch_solution() -> None:
+    rng, start = np.random.default_rng(5), np.array([0.0, 0, 0, 0, 0, 0, 1])
+    tags = [np.array([*rng.uniform(-6, 6, 2), 1.0, 0, 0, 0, 1]) for _ in range(12)]
+    robot = km.Robot(
+        "cam", km.motion.Odometry3D(0.01, 0.01, 0.01, 0.005), start, {"eye": km.Mount(km.sensors.TagPose())}
+    )
+    slam = km.Slam(robot, km.association.ByIdentity())
+    for i, tag in enumerate(tags):
+        slam.add_landmark(i, tag, np.diag([1e-8] * 3 + [1e-10] * 3), km.landmarks.Tag())
+    pose, events = np.zeros(3), list[Event]()
+    for k in range(1, 200):
+        u = np.array([0.1, 0.0, 0.03])
+        pose = compose(pose, u)[0]
+        u = u + rng.normal(size=3) * (0.01, 0.01, 0.005) + (0.7 * (k in (80, 140)), 0.0, 0.0)
+        events.append(Control(t_s=0.2 * k, robot="cam", u=np.array([u[0], u[1], 0, 0, 0, u[2]])))
+        at = np.array([*pose[:2], 0.0, 0, 0, np.sin(pose[2] / 2), np.cos(pose[2] / 2)])
+        y = km.landmarks.Tag().seen_from(at, np.array(tags))[0][: 4 + k % 8]
+        y = np.array([SE3.plus(one, 0.02 * rng.normal(size=6)) for one in y])
+        events.append(Scan(t_s=0.2 * k, robot="cam", sensor="eye", y=y, ids=range(len(y))))
+    verdict = km.diagnose(km.record(slam, Log("tags", ("cam",), events), progress=False))
+    assert verdict.map == "doubtful" and "no batch solution" in verdict.checked
+    first = verdict.causes[0]
+    assert first.name == "odometry_jump" and first.since_s == pytest.approx(16.0)
+    assert "dx_m" in first.evidence and "1 more at t=28.0 s" in first.evidence and "max_speed_mps" in first.cure
 
 
 def test_control_noise_and_gaps_are_no_jumps() -> None:

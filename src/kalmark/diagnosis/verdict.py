@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import chdtrc
 
 from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis.causes import JUMPS, Finding, Where
-from kalmark.diagnosis.gross import gross
+from kalmark.diagnosis.gross import fit, gross
 from kalmark.diagnosis.jumps import OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import Mistake
@@ -42,6 +43,7 @@ FEW = 0.01  # of the landmarks: a mistake about no more than these is weighed by
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
+SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         found = _searched(run, log, most, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
+        signs = [*(odd_controls(run, log) if signs else ()), *signs]
         why = str(error).removeprefix("batch solution: ")
         checked = f"innovations alone, no batch solution: {why}"
         return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
@@ -226,16 +229,35 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
 
 def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.overstated
-    odd = _odd(run, log, finding, since_s) if finding.name in JUMPS and log is not None else None
+    odd = _odd(run, log, finding.of[0], since_s) if finding.name in JUMPS and log is not None else None
     name, told = finding.name, words(finding, run.config)
     if odd is not None:
         name, told = "odometry_jump", of_odd_control(finding, odd)
     return Cause(name, since_s, finding.gain, *told, harmless)
 
 
-def _odd(run: Run, log: Log, finding: Finding, t_s: float) -> OddControl | None:
-    robot = finding.of[0]
+def _odd(run: Run, log: Log, robot: str, t_s: float) -> OddControl | None:
     return odd_control(log, tuple(run.final_slam().robots[robot].motion.columns), robot, t_s)
+
+
+def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
+    """Yield the controls of each robot that jump themselves, by innovations: scans do not fit right after them.
+
+    The score is half of the chi-square of these scans.
+    """
+    h, now = run.history, fit(run)
+    chi2 = np.bincount(h.step, now.values * now.dof, len(h.t_ns))
+    dof = np.bincount(h.step, now.dof, len(h.t_ns))
+    for robot in dict.fromkeys(h.robot.tolist()):
+        bad = np.flatnonzero((h.robot == robot) & (chdtrc(np.maximum(dof, 1), chi2) * len(dof) < SELDOM))
+        worst = bad[np.argsort(-chi2[bad])][:WORST].tolist()
+        odd = {o.t_s: (o, k) for k in worst if (o := _odd(run, log, robot, h.t_ns[k] * 1e-9)) is not None}
+        if odd:
+            most, _ = max(odd.values(), key=lambda of: of[0].times)
+            at = [f"{t_s:.1f}" for t_s in sorted(odd) if t_s != most.t_s]
+            finding = Finding("odometry_jump", (robot, "", *at), 0.0, 0.0, 0.0)
+            score = 0.5 * float(sum(chi2[k] for _, k in odd.values()))
+            yield Cause("odometry_jump", min(odd), score, *of_odd_control(finding, most))
 
 
 def misplaced(run: Run, finding: Finding) -> bool:

@@ -162,6 +162,8 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
         if name not in started and name not in beforehand and name not in robots:
             mean, covariance = landmarks.get(name, (None, np.ones(1)))
             if covariance.any():
+                if str(name) in {prior.landmark for prior in history.priors}:
+                    raise KalmarkError(f"batch solution: landmark {str(name)!r} was surveyed, expected a point")
                 what = f"landmark {str(name)!r} was in the map beforehand"
                 raise KalmarkError(f"batch solution: {what}, expected its mean and covariance in `known`")
             beforehand[name] = (mean, None)
