@@ -204,7 +204,8 @@ def together(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
     have, left = linear.residuals, linear.left(Z, W)
     I = Z.T @ left.r + W.T @ left.m
     prior = np.diag([0.0 if c.unit else MOST_SCALE**-2 for c in columns])
-    return np.linalg.lstsq(I + prior, Z.T @ have.r + W.T @ have.m)[0], I
+    s = np.linalg.lstsq(I + prior, Z.T @ have.r + W.T @ have.m)[0]
+    return np.asarray(s, dtype=np.float64), np.asarray(I, dtype=np.float64)
 
 
 def stretches(linear: Linear, left: Left, s: Array) -> Array:

@@ -83,7 +83,8 @@ class Search:
 
         Noise that is stated too large does no harm, and hides none of the others: it is taken out when all of them
         are.  Where errors last it ends the search.  What is new in each sighting is then smaller than the error: a
-        weight by that would make systematic errors of what lasts.
+        weight by that would make systematic errors of what lasts, and a map that is too sure.  So the problem is left
+        with noise that is not below the one stated.
         """
         rounds, lasting = ROUNDS + MORE, False
         for n in track(range(rounds), "causes, one after the other", rounds, show=progress):
@@ -98,6 +99,10 @@ class Search:
             self.take(replace(first, alike=tuple(alike)))
         for finding in self.correlated():
             self.take(finding)
+        if lasting:
+            self.linear = self.linear.scaled(
+                *(np.maximum(1.0, 1.0 / a) for a in (self.linear.noise, self.linear.errors))
+            )
         return sorted(self.found, key=lambda f: -f.gain)
 
     def correlated(self) -> list[Finding]:

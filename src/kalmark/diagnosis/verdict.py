@@ -128,6 +128,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
     effect = effect_of(run, found)
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
+    if found.given.segments is not None and not any(c.name in JUMPS for c in causes):  # between these it is not looked
+        causes += odd_controls(run, log)
     causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
     causes = sorted([*first, *causes], key=lambda c: c.harmless)
     if effect.status == "ok" and any(misplaced(run, f) for f in found.search.found):
