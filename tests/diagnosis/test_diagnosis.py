@@ -195,6 +195,21 @@ def test_a_control_that_jumps_is_named_and_its_cure_leaves_it_out() -> None:
     assert "left out" in verdict.causes[0].evidence
 
 
+def test_a_slip_while_there_are_no_scans_is_found_by_a_part_of_the_observations() -> None:
+    log = simulate(world_of(), 3)
+    middle, fast = log.events[len(log.events) // 2].t_ns, np.array([6.0, 1.5])
+    within = [e for e in log.events if not isinstance(e, Scan) or not middle <= e.t_ns < middle + 8_000_000_000]
+    slips = [
+        Control(t_ns=e.t_ns, robot=e.robot, u=e.u + fast)
+        if isinstance(e, Control) and middle <= e.t_ns < middle + 1_000_000_000
+        else e
+        for e in within
+    ]
+    cause = km.diagnose(recorded(replace(log, events=slips)), 800).causes[0]
+    assert cause.name in ("odometry_jump", "kidnapped")
+    assert cause.since_s == pytest.approx((middle + 8_000_000_000) * 1e-9, abs=1.0)
+
+
 def test_controls_that_jump_among_surveyed_tags_are_named_without_a_batch_solution() -> None:
     rng, start = np.random.default_rng(5), np.array([0.0, 0, 0, 0, 0, 0, 1])
     tags = [np.array([*rng.uniform(-6, 6, 2), 1.0, 0, 0, 0, 1]) for _ in range(12)]

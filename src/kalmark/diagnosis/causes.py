@@ -236,6 +236,8 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
     Variance components: the sum of squares of what is left of a group, over what it is in data as configured.
     """
     rows, factors, found = linear.rows, linear.problem.factors, []
+    have, Q = linear.residuals, linear.root @ linear.root.T
+    most = 0.5 * float(have.r @ have.r + have.m @ (Q @ have.m))  # is all that a noise can explain
     r2, simulated2 = linear.residuals.r**2, simulated.r**2
     for f, factor in enumerate(factors):
         names = sensors.get(factor.sensor, ())
@@ -255,7 +257,7 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
         if factor_of is not None:
             name = "start" if kind == START else "control_sigma"
             found.append(_noise(name, tuple(kind.split(".")), *factor_of, errors=mine))
-    return found
+    return [replace(f, gain=min(f.gain, most)) if f.value > 1.0 else f for f in found]
 
 
 def _ratio(value: float, simulated: Array) -> tuple[float, float] | None:

@@ -73,8 +73,9 @@ class Search:
         self.first = self.linear = linear
         self.sensors = sensors
         self.rates = causes.rates_of(linear, robot, t_ns)
-        self.t_s = np.zeros(len(linear.problem.robots))
-        self.t_s[linear.problem.nodes] = (t_ns - t_ns[:1].sum()) * 1e-9
+        order, poses = np.argsort(linear.problem.nodes, kind="stable"), np.arange(len(linear.problem.robots))
+        at = np.searchsorted(linear.problem.nodes[order], poses)  # a pose at a fix has the time of the next scan
+        self.t_s = ((t_ns - t_ns[:1].sum()) * 1e-9)[order[np.minimum(at, len(order) - 1)]]
         self.found: list[Finding] = []
         self.simulated = linear.simulated(causes.SETS)
 

@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
-from kalmark.batch.state import LANDMARKS
+from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.diagnosis.causes import JUMPS, Finding, Where
 from kalmark.diagnosis.gross import fit, gross
 from kalmark.diagnosis.jumps import OddControl, joined, odd_control
@@ -44,6 +44,7 @@ SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
+LOOKED_INTO = 3  # segments with the worst scans
 
 
 @dataclass(frozen=True)
@@ -197,15 +198,24 @@ def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
 
 
 def thinned(run: Run, given: Given, most: int) -> Given:
-    """Return about `most` of the observations: segments of successive scans, evenly over the run."""
+    """Return about `most` of the observations: segments of successive scans, evenly over the run.
+
+    Those with the scans that fit least are among them, if these do not fit by chance: a jump is a single step.
+    """
     used, t_ns = given.associations, given.t_ns
     events = len(t_ns) + sum(controls.number for controls in run.history.controls.values())
     share = most / max(len(used.landmark), events / EVENTS, 1)
     if share >= 1.0:
         return given
     number = max(len(t_ns) // SEGMENT, 2)
-    first = np.unique(np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)) * SEGMENT
-    segments = np.stack([t_ns[first], t_ns[np.minimum(first + SEGMENT, len(t_ns)) - 1]], axis=1)
+    even = np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)
+    worst = misfits(run)[1]
+    with_worst = [*dict.fromkeys(np.minimum(worst // SEGMENT, number - 1).tolist())][:LOOKED_INTO]
+    first = np.unique([*even, *with_worst]) * SEGMENT
+    last = np.minimum(first + SEGMENT, len(t_ns)) - 1
+    begins = np.maximum(first - np.isin(first, worst), 0)  # with the scan before, or there is no step
+    last[:-1] = np.minimum(last[:-1], begins[1:] - 1)
+    segments = np.stack([t_ns[begins], t_ns[last]], axis=1)
     segments[0, 0] = np.iinfo(np.int64).min  # the motion before the first scan leads from the start to it
     within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
     kept = (within >= 0) & (t_ns <= segments[within, 1])
@@ -247,19 +257,24 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
 
     The score is half of the chi-square of these scans.
     """
-    h, now = run.history, fit(run)
-    chi2 = np.bincount(h.step, now.values * now.dof, len(h.t_ns))
-    dof = np.bincount(h.step, now.dof, len(h.t_ns))
+    h, (chi2, worst) = run.history, misfits(run)
     for robot in dict.fromkeys(h.robot.tolist()):
-        bad = np.flatnonzero((h.robot == robot) & (chdtrc(np.maximum(dof, 1), chi2) * len(dof) < SELDOM))
-        worst = bad[np.argsort(-chi2[bad])][:WORST].tolist()
-        odd = {o.t_s: (o, k) for k in worst if (o := _odd(run, log, robot, h.t_ns[k] * 1e-9)) is not None}
+        bad = [k for k in worst.tolist() if h.robot[k] == robot][:WORST]
+        odd = {o.t_s: (o, k) for k in bad if (o := _odd(run, log, robot, h.t_ns[k] * 1e-9)) is not None}
         if odd:
             most, _ = max(odd.values(), key=lambda of: of[0].times)
             at = [f"{t_s:.1f}" for t_s in sorted(odd) if t_s != most.t_s]
             finding = Finding("odometry_jump", (robot, "", *at), 0.0, 0.0, 0.0)
             score = 0.5 * float(sum(chi2[k] for _, k in odd.values()))
             yield Cause("odometry_jump", min(odd), score, *of_odd_control(finding, most))
+
+
+def misfits(run: Run) -> tuple[Array, Ints]:
+    """Return the chi-square (S,) of each scan, and those that do not fit by chance, the worst first."""
+    h, now = run.history, fit(run)
+    chi2, dof = (np.bincount(h.step, of, len(h.t_ns)) for of in (now.values * now.dof, now.dof))
+    bad = np.flatnonzero(chdtrc(np.maximum(dof, 1), chi2) * len(dof) < SELDOM)
+    return chi2, bad[np.argsort(-chi2[bad])]
 
 
 def misplaced(run: Run, finding: Finding) -> bool:
