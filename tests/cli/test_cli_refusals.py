@@ -187,7 +187,9 @@ def test_a_misspelt_robot_in_one_line_is_refused_or_left_out(
         (["convert", "nowhere", "x"], "log 'nowhere' not found"),
         (["data", "fetch", "mrclm"], "dataset 'mrclm' is unknown, expected one of"),
         (["nonsense"], "No such command 'nonsense'"),
-        *[([verb, "x"], f"{verb} is not available yet") for verb in ("view", "live")],
+        (["view", "nowhere"], "summary.json: no such file, expected the folder of a complete run"),
+        (["live", "nowhere.yaml"], "nowhere.yaml"),
+        (["live", "map.kmk", "--set", "a.b=1"], "--set changes a configuration, and a saved map has its own"),
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(

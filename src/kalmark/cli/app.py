@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import entry_points, version
 from typing import Annotated
 
@@ -14,27 +14,15 @@ from kalmark.cli.campaign import campaign
 from kalmark.cli.check import check
 from kalmark.cli.convert import convert
 from kalmark.cli.diagnose import diagnose
-from kalmark.cli.folders import evaluate, explain, report
+from kalmark.cli.folders import compare, evaluate, explain, report, view
+from kalmark.cli.live import live
 from kalmark.cli.logs import config, data, simulate
 from kalmark.cli.run import demo, run, warm_up
 from kalmark.cli.tune import tune
 from kalmark.errors import KalmarkError
 
-COMING = {  # verbs that are not there yet: not in the help, but they say so when they are called
-    "view": "replay a run interactively",
-    "live": "take events as JSON lines, give estimates",
-}
 USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
 INTERRUPTED = 130
-
-
-def coming(name: str, what: str) -> Callable[..., None]:
-    """Return the command that says it is not available yet."""
-
-    def command(arguments: Annotated[list[str] | None, typer.Argument(hidden=True)] = None) -> None:
-        raise KalmarkError(f"{name} is not available yet ({what})")
-
-    return command
 
 
 app = typer.Typer(
@@ -53,6 +41,8 @@ for verb in (
     diagnose,
     tune,
     report,
+    view,
+    compare,
     explain,
     campaign,
     config,
@@ -60,11 +50,10 @@ for verb in (
     convert,
     check,
     warm_up,
+    live,
 ):
     app.command()(verb)
 app.add_typer(data, name="data")
-for name, what in COMING.items():
-    app.command(name, hidden=True, context_settings={"ignore_unknown_options": True})(coming(name, what))
 for other in entry_points(group="kalmark.verbs"):  # of other packages; one that cannot be loaded stops no other verb
     try:
         app.command(other.name)(other.load())

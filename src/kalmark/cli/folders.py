@@ -1,4 +1,4 @@
-"""What reads a run folder: `kalmark evaluate`, `report` and `explain`."""
+"""What reads run folders: `kalmark evaluate`, `report`, `view`, `compare` and `explain`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from kalmark.cli.shared import RunFolder, computing, print_summary
+from kalmark.cli.shared import RunFolder, computing, print_summary, print_table, writable
 
 
 def evaluate(
@@ -62,6 +62,46 @@ def report(
         from kalmark.results.video import write_video
 
         typer.echo(str(write_video(loaded, run / "video.mp4", fps)))
+
+
+def view(
+    run: RunFolder,
+    open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
+) -> None:
+    """Replay a run: its page, with a slider through time, a map that turns, errors and associations."""
+    import webbrowser
+
+    from kalmark.results.run import Run
+
+    page = run / "report.html"
+    if not page.is_file() or not (run / "summary.json").is_file():
+        Run.load(run).report(run)
+    shown = open_ and webbrowser.open(page.resolve().as_uri())
+    typer.echo(f"{page}{'' if shown or not open_ else ': no browser was found, open it yourself'}")
+
+
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Two folders or more that `kalmark run` wrote.")],
+    out: Annotated[Path, typer.Option(metavar="PNG", help="The picture to write.")] = Path("out/compare.png"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
+) -> None:
+    """Put runs side by side: their figures, what differs in their configurations, and a picture of their maps."""
+    from kalmark.results.compare import compare as compared
+    from kalmark.results.compare import draw_comparison
+    from kalmark.results.plot import save_figure
+    from kalmark.results.recording import replace_file
+    from kalmark.results.run import Run
+
+    writable(out.parent)
+    told = compared({str(run): Run.load(run) for run in runs})
+    if as_json:
+        typer.echo(json.dumps(told.figures, indent=2))
+    else:
+        for title, rows in told.tables():
+            print_table(title, ("", *told.names), rows, align="<" + ">" * len(told.names))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(out, lambda temporary: save_figure(draw_comparison(told), temporary))
+    typer.echo(str(out), err=as_json)
 
 
 def explain(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, computing, print_summary, writable
+from kalmark.cli.shared import Overrides, computing, print_summary, slam_of, writable
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
@@ -82,13 +82,8 @@ def warm_up(
     overrides: Overrides = None,
 ) -> None:
     """Compile beforehand all that runs of a configuration need."""
-    from kalmark import config as cfg
-
     with computing():
-        made = cfg.load_config(config, overrides or ())
-        with_log = made.log.path is not None
-        slam = cfg.build_slam(*cfg.open_run(config, None, overrides or ())) if with_log else cfg.build_slam(made)
-        slam.warm_up()
+        slam_of(config, overrides or ()).warm_up()
     typer.echo("compiled: no event of such a run waits for it")
 
 

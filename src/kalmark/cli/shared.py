@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +20,9 @@ from kalmark.results.words import (
     header,
     in_words,
 )
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
 
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
@@ -40,6 +43,14 @@ def computing() -> Iterator[None]:
 
     with threadpool_limits(1):
         yield
+
+
+def slam_of(config: str, overrides: Sequence[str]) -> Slam:
+    """Return the filter of a configuration, with the robots and sensors of the log that it names, if it names one."""
+    from kalmark import config as cfg
+
+    made = cfg.load_config(config, overrides)
+    return cfg.build_slam(made) if made.log.path is None else cfg.build_slam(*cfg.open_run(config, None, overrides))
 
 
 def announce_compilation_elsewhere() -> None:
