@@ -272,7 +272,7 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
 def misfits(run: Run) -> tuple[Array, Ints]:
     """Return the chi-square (S,) of each scan, and those that do not fit by chance, the worst first."""
     h, now = run.history, fit(run)
-    chi2, dof = (np.bincount(h.step, of, len(h.t_ns)) for of in (now.values * now.dof, now.dof))
+    chi2, dof = (np.bincount(h.step, of, len(h.t_ns)).astype(np.float64) for of in (now.values * now.dof, now.dof))
     bad = np.flatnonzero(chdtrc(np.maximum(dof, 1), chi2) * len(dof) < SELDOM)
     return chi2, bad[np.argsort(-chi2[bad])]
 
