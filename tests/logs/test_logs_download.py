@@ -91,7 +91,7 @@ def test_a_family_of_datasets_is_fetched_by_its_common_name(mirror: Server, tmp_
 def test_a_name_that_is_nearly_one_is_answered_with_the_right_ones() -> None:
     for name, meant in (
         ("plaza", "'plaza1'"),
-        ("Kitti", "'kitti_stereo_features'"),
+        ("Kitti", "'kitti_stereo_features' or 'kitti_odometry'"),
         ("mrclam/MRCLAM_Data", " or ".join(f"'mrclam/MRCLAM_Dataset{n}'" for n in (6, 8, 9))),
         ("dlrr", "'dlr'"),
         ("stary_nigth", "'starry_night'"),
@@ -99,7 +99,7 @@ def test_a_name_that_is_nearly_one_is_answered_with_the_right_ones() -> None:
         with pytest.raises(DataError, match=f"'{name}' is unknown, expected one of .*, or, .* plaza1, .*; did") as no:
             fetch(name)
         assert str(no.value).endswith(f"; did you mean {meant}?")
-    with pytest.raises(DataError, match=r"slamtb$"):
+    with pytest.raises(DataError, match=r"kitti_odometry$"):
         fetch("zzz")
 
 

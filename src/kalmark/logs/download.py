@@ -81,6 +81,14 @@ OWN_COPIES = (
             "vincentive_dataset3.mat into KALMARK_DATA/starry_night (docs/datasets3d.md says where it is from)"),
     OwnCopy("slamtb", "recordings of the Matlab SLAM toolbox: cameras seeing points or segments, its own figures",
             "NAME.json.gz and NAME.npz into KALMARK_ORACLE (docs/datasets3d.md)"),
+    OwnCopy("tum_rgbd", "a colour and depth camera held by hand, true poses (CC BY 4.0)",
+            "rgbd_dataset_freiburg1_xyz of https://cvg.cit.tum.de/data/datasets/rgbd-dataset anywhere: --log FOLDER"),
+    OwnCopy("euroc", "a drone with cameras and an inertial unit, true states",
+            "V1_01_easy of https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets anywhere: "
+            "--log FOLDER"),
+    OwnCopy("kitti_odometry", "a car with cameras in towns, true poses (CC BY-NC-SA 3.0)",
+            "its images, calibration and poses of https://www.cvlibs.net/datasets/kitti/eval_odometry.php anywhere: "
+            "--log FOLDER"),
 )  # fmt: skip
 
 
