@@ -3,8 +3,9 @@
     KALMARK_DATA=... KALMARK_ORACLE=... python benchmarks/outcomes.py be0e13e      # a commit, or a folder
 
 A line a log: observations, how many have another outcome or another landmark, the largest relative difference of d2,
-and the figure of the summary that differs most.  `--only WORD` takes the logs whose names have the word.  Runs that
-are there already, below `--out`, are not repeated.
+and the figure of the summary that differs most.  `--only WORD` takes the logs whose names have the word.  Runs of the
+same commits that are there already, below `--out`, are not repeated.  A log that has not run says why; if none has, the
+exit status is 1.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +44,22 @@ RUNS: dict[str, tuple[str, ...]] = {
 TIMES = ("_us", "us_", "wall", "compile", "real_time")  # parts of the names of figures that are times
 
 
-def run(place: Path, name: str, out: Path) -> Path:
-    """Run a log through a checkout unless that is done; return the run folder."""
-    if not (out / "summary.json").exists():
-        environment = os.environ | {"PYTHONPATH": str(place / "src"), "OPENBLAS_NUM_THREADS": "1"}
-        command = [sys.executable, "-m", "kalmark", "run", *RUNS[name], "--out", str(out)]
-        subprocess.run(command, env=environment, capture_output=True, check=False)
-    return out
+def run(place: Path, name: str, out: Path) -> str:
+    """Run a log through a checkout unless that is done; return why there is no run, or nothing."""
+    if (out / "summary.json").exists():
+        return ""
+    environment = os.environ | {"PYTHONPATH": str(place / "src"), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "kalmark", "run", *RUNS[name], "--out", str(out)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if (out / "summary.json").exists():
+        return ""
+    return next(reversed(done.stderr.splitlines()), f"exit status {done.returncode}")
+
+
+def commit_of(place: Path) -> str:
+    """Return the commit that is checked out in a folder, with a mark if files of it were changed."""
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    return subprocess.run(command, cwd=place, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -86,15 +97,20 @@ def main() -> None:
     parser.add_argument("--only", default="", metavar="WORD")
     parser.add_argument("--out", type=Path, default=Path("out/outcomes"))
     options = parser.parse_args()
-    checkouts, total, different = {"mine": HERE, "other": checkout(options.other)}, 0, 0
+    places, total, different = (HERE, checkout(options.other)), 0, 0
+    commits = [commit_of(place) for place in places]
     for name in (name for name in RUNS if options.only in name):
-        mine, other = (run(place, name, options.out / which / name) for which, place in checkouts.items())
-        if all((each / "summary.json").exists() for each in (mine, other)):
+        mine, other = folders = [options.out / commit / name for commit in commits]
+        with ThreadPoolExecutor(2) as both:
+            failures = list(filter(None, both.map(run, places, (name, name), folders)))
+        if failures:
+            line = f"has not run in both: {failures[0]}"
+        else:
             count, differ, line = compared(mine, other)
             total, different = total + count, different + differ
-        else:
-            line = "has not run in both"
         print(f"{name:<28}{line}", flush=True)
+    if not total:
+        sys.exit("no log was compared")
     print(f"all logs: {total} observations, {different} differ")
 
 
