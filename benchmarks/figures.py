@@ -523,7 +523,7 @@ def speed() -> Iterator[Figure]:
                      command, row(f"{count} ", "{1} s / {3} ms / {5} us, {7} us / {9}, {11}, {13} ms"))  # fmt: skip
     for pace, wanted in (("slow", "45 s / 1.3 ms a step"), ("quick", "45 s, 20 ms worst")):
         yield Figure(section, f"{pace} mission with 10,000 landmarks: total / a step, median, mean, worst", wanted,
-                     command, row(f"{pace}, 10,000 ", "{1} s / {9} / {12} / {15} ms"))  # fmt: skip
+                     f"{command} --pace {pace}", row(f"{pace}, 10,000 ", "{1} s / {9} / {12} / {15} ms"))  # fmt: skip
     yield Figure(
         section,
         "mission with 10,000 landmarks: dense filter over compressed map",

@@ -1,6 +1,7 @@
 """What a step costs as the map grows: whole lawn-mower missions up to 10,000 landmarks, one thread.
 
     make bench-growth      or      python benchmarks/map_growth.py [--sides 7 32 100] [--out out/map_growth]
+    python benchmarks/map_growth.py --pace quick           # that mission alone, in the largest of the fields; or slow
 
 A field of side x side landmarks, 2 m apart, is mowed in lanes 6 m apart by a robot that sees 4 m: a third of what it
 sees in a lane it knows from the last one.  The quick robot moves .7 m a step instead of .2 m, in lanes 3 m apart, and
@@ -44,6 +45,7 @@ from kalmark.filter.compressed.map import CompressedMap
 GIB = 2.0**30
 QUICK = {"lane_m": 3.0, "reach_m": 3.2}
 QUICK_STEP_M = 0.7
+PACES: dict[str, tuple[dict[str, float], float]] = {"slow": ({}, STEP_M), "quick": (QUICK, QUICK_STEP_M)}
 
 
 def take(slam: km.Slam, steps: Iterable[Step]) -> np.ndarray:
@@ -199,6 +201,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sides", type=int, nargs="+", default=[7, 32, 100], help="landmarks along a side")
     parser.add_argument("--out", type=Path, default=Path("out/map_growth"))
+    parser.add_argument("--pace", choices=PACES, help="only these missions, in the largest field")
     parser.add_argument("--memory", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.memory:
@@ -214,6 +217,11 @@ def main() -> None:
     mpl.use("Agg")
     with kernels.one_thread():
         compressed(10)  # loads the compiled code
+        if options.pace:
+            lanes, step_m = PACES[options.pace]
+            side = max(options.sides)
+            print(line(options.pace, mission(Field(side, side, **lanes), step_m)[0]))
+            return
         for side in options.sides:
             row, field, slam = compressed(side)
             if side == max(options.sides) and isinstance(slam.map, CompressedMap):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Sequence
 from importlib.metadata import entry_points, version
@@ -23,6 +24,7 @@ from kalmark.errors import KalmarkError
 
 USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
 INTERRUPTED = 130
+GARBAGE = 10_000  # objects between two collections of garbage: at Python's 700 they take an eighth of a short run
 
 
 app = typer.Typer(
@@ -78,6 +80,7 @@ def _root(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
+    gc.set_threshold(GARBAGE)
     try:
         return int(
             app(args=None if arguments is None else list(arguments), prog_name="kalmark", standalone_mode=False) or 0
