@@ -10,13 +10,14 @@ import numpy as np
 
 from kalmark.errors import MapError
 from kalmark.events import Id
-from kalmark.filter.estimators import Update
+from kalmark.filter.estimators import Correction, Update
 from kalmark.management import merge, walls
 from kalmark.management import repeats as of_map
 from kalmark.models.protocols import Joining
 from kalmark.report import Repeat
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
+from kalmark.tracks.channel import Channel
 from kalmark.tracks.scan import ScanContext, Start
 
 
@@ -58,18 +59,12 @@ def _merge_pairs(state: State, scan: ScanContext, found: merge.Merge) -> list[tu
     In a full map nothing is merged, nor where their difference has no covariance.
     """
     try:
-        starts = [_difference(state, pair) for pair in found.pairs]
-        slots = state.add_all(starts)
+        done, merged = make_equal(state, scan.channel, scan.robot, found.pairs), list[tuple[Id, Id, str]]()
     except MapError:
         return []
-    n, count = starts[0].space.size, len(slots)
-    model, R = merge.ZeroDifference(scan.channel.at, n), np.tile(merge.EQUAL_M**2 * np.eye(n), (count, 1, 1))
-    update = Update(model, scan.robot, scan.channel.mount, np.array(slots), n, np.zeros((count, n)), R)
-    done, merged = state.estimator.correct(state.map, update), []
-    others = f", with {count - 1} others" if count > 1 else ""
+    others = f", with {len(found.pairs) - 1} others" if len(found.pairs) > 1 else ""
     ordered = merge.order(state.tracks, found.pairs)
-    for slot, (kept, gone), d2, fused in zip(slots, ordered, done.d2.tolist(), done.fused.tolist(), strict=True):
-        state.map.remove(slot)
+    for (kept, gone), d2, fused in zip(ordered, done.d2.tolist(), done.fused.tolist(), strict=True):
         if not fused:
             continue
         one, other = state.tracks.confirmed[kept], state.tracks.confirmed[gone]
@@ -80,6 +75,22 @@ def _merge_pairs(state: State, scan: ScanContext, found: merge.Merge) -> list[tu
         why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
         merged.append((gone, kept, why))
     return merged
+
+
+def make_equal(state: State, channel: Channel, robot: int, pairs: Sequence[tuple[Id, Id]]) -> Correction:
+    """Observe that the difference of each pair of landmarks is zero, by a sensor of the robot on a slot.
+
+    Raises MapError where the map is full.
+    """
+    starts = [_difference(state, pair) for pair in pairs]
+    slots = state.add_all(starts)
+    n, count = starts[0].space.size, len(slots)
+    model, R = merge.ZeroDifference(channel.at, n), np.tile(merge.EQUAL_M**2 * np.eye(n), (count, 1, 1))
+    update = Update(model, robot, channel.mount, np.array(slots), n, np.zeros((count, n)), R)
+    done = state.estimator.correct(state.map, update)
+    for slot in slots:
+        state.map.remove(slot)
+    return done
 
 
 def _difference(state: State, pair: tuple[Id, Id]) -> Start:

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.association import ByIdentity
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.state import NUMBERS
+from kalmark.filter.compressed.storage import Triangle
+from kalmark.filter.map import StochasticMap
 from kalmark.geometry import frames, frames3d
+from kalmark.geometry.spaces import VECTOR, VECTOR3
 from kalmark.models.check import views
 from kalmark.models.protocols import (
     TWIST,
@@ -22,14 +27,19 @@ from kalmark.models.protocols import (
     SeesVelocity,
     SegmentVisible,
     image_size,
+    range_limit,
 )
-from kalmark.models.sensors import Spatial
+from kalmark.models.sensors import Spatial, Wall
 from kalmark.slam.estimate import Estimate
+from kalmark.slam.merging import make_equal
 from kalmark.slam.robot import IDENTITY, Mount, Robot
 
 ROUNDS = 12  # of a control and scans: enough for whatever waits for several
 SEEN = 3  # observations in a scan
 STEP_S = 0.5
+INTERVAL = 5  # events in a compression interval
+REPEATS = 4  # scans of one landmark, while all others are inactive
+POINTS = ((VECTOR,), (VECTOR3,))
 MOVING = 0.5  # each number of a control
 LOST_PIXELS = 0.2  # of an image, at its border
 
@@ -42,8 +52,26 @@ def without_detectors(robots: Iterable[Robot]) -> list[Robot]:
     ]
 
 
-def rehearse(twin: Estimate, process: Callable[[Event], object]) -> list[tuple[Id, Array, Landmark]]:
-    """Let a twin of a Slam take made-up events by `process`, and use all that they lead to.
+@runtime_checkable
+class Compiling(Protocol):
+    """A detector that compiles what it needs before its first scan."""
+
+    def warm_up(self) -> None:
+        """Compile it."""
+
+
+def warm_up_detectors(robots: Iterable[Robot]) -> None:
+    """Let the detectors of robots compile what they need."""
+    for robot in robots:
+        for mount in robot.sensors.values():
+            if isinstance(mount.detector, Compiling):
+                mount.detector.warm_up()
+
+
+def rehearse(
+    twin: Estimate, process: Callable[[Event], object], add: Callable[..., None]
+) -> list[tuple[Id, Array, Landmark]]:
+    """Let a twin of a Slam take made-up events by `process`, and use all that they lead to; `add` adds landmarks.
 
     Return the landmarks that it has then: name, mean and model.
     """
@@ -52,9 +80,14 @@ def rehearse(twin: Estimate, process: Callable[[Event], object]) -> list[tuple[I
         channel, slot = twin.state.channels.get((robot, sensor)), twin.state.moving[robot].slot
         return twin.map.mean(slot) if channel is None else channel.pose(twin.map, slot)
 
-    for event in rehearsal(twin.robots.values(), pose):
+    for k, event in enumerate(rehearsal(twin.robots.values(), pose)):
         with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
             process(event)
+        if k % INTERVAL == INTERVAL - 1 and isinstance(twin.map, CompressedMap):
+            twin.map.full_update()  # what comes next activates some blocks again, not all
+    _add_points(twin, pose, add)
+    _observe_all(twin, process)
+    _merge(twin)
     tracks = [*twin.tracks.confirmed.values()]
     twin.covariance(*twin.robots, *twin.tracks.confirmed)
     found = [(track.id, twin.mean(track.id), track.model) for track in tracks]
@@ -65,7 +98,48 @@ def rehearse(twin: Estimate, process: Callable[[Event], object]) -> list[tuple[I
         twin.map.remove(track.slot)
     if isinstance(twin.map, CompressedMap):
         twin.map.finish()
+    elif isinstance(twin.map, StochasticMap):  # it may grow
+        CompressedMap.from_dense(twin.map, Triangle(NUMBERS[twin.state.settings.numbers]))
     return found
+
+
+def _add_points(twin: Estimate, pose: Callable[[str, str], Array], add: Callable[..., None]) -> None:
+    """Add points, where a sensor sees such: landmarks that others have begun become points, too."""
+    for key, channel in [*twin.state.channels.items()]:
+        places = _Scene(twin.robots[key[0]].sensors[key[1]], pose(*key)).points
+        for kind, model in channel.models.items():
+            if model.landmark.space.kinds in POINTS and places is not None:
+                for k, place in enumerate(places):
+                    with suppress(Exception):
+                        add(f"{key} {kind} {k}", place, 0.01 * np.eye(len(place)), model.landmark)
+
+
+def _observe_all(twin: Estimate, process: Callable[[Event], object]) -> None:
+    """Let each sensor observe what it can, of what others have begun, too, as it is expected.
+
+    First one landmark again and again, while the others are inactive, then all; then all twice in a scan without ids,
+    so that an association has to decide.
+    """
+    for key in [*twin.state.channels]:
+        for k in range(REPEATS + 2):
+            with suppress(Exception):
+                asked = twin.expect(*key)
+                rows = np.flatnonzero(np.isfinite(asked.e).all(axis=1))
+                rows = rows[:1] if k < REPEATS else rows if k == REPEATS else np.repeat(rows, 2)
+                ids = [asked.names[i] for i in rows] if k <= REPEATS else None
+                process(Scan(t_ns=(twin.t_ns or 0) + 1, robot=key[0], sensor=key[1], y=asked.e[rows], ids=ids))
+            if k % 2 and isinstance(twin.map, CompressedMap):
+                twin.map.full_update()
+
+
+def _merge(twin: Estimate) -> None:
+    """Make two landmarks equal, as where observations have no ids: through a model in Python."""
+    for (robot, sensor), policy in twin.state.policies.items():
+        channel = twin.state.channels[robot, sensor]
+        mine = [track.id for track in twin.tracks.confirmed.values() if track.model.kind == channel.landmark.kind]
+        if not isinstance(policy.association, ByIdentity) and policy.upkeep.merge and len(mine) > 1:
+            with suppress(Exception):
+                make_equal(twin.state, channel, twin.state.moving[robot].slot, [(mine[0], mine[1])])
 
 
 def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
@@ -107,15 +181,23 @@ class _Scene:
     def __init__(self, mount: Mount, T: Array) -> None:
         self.sensor, rng = mount.sensor, np.random.default_rng(0)
         self.fixed: Array | None = None
+        self.places: Array | None = None  # where the points are that stay, (SEEN, 2 or 3),
+        self.points: Array | None = None  # and others that it sees
         if isinstance(self.sensor, SegmentVisible) and (size := image_size(self.sensor)) is not None:
             inside = rng.uniform(LOST_PIXELS, 1.0 - LOST_PIXELS, (SEEN, len(self.sensor.columns)))
             self.fixed = inside * [*size, *size]
             return
+        if isinstance(self.sensor, Wall):
+            distance = min(range_limit(self.sensor), 10.0) / 4.0
+            self.fixed = np.array([[distance, 0.4 * k, -distance, distance] for k in range(SEEN)])
+            return
         self.v = views(self.sensor, rng)[0][:SEEN].copy()
-        self.places = None
-        if len(T) == 3 or self.v.shape[1] == 3 or isinstance(self.sensor, SeesVelocity):
-            here = frames.from_frame_many if len(T) == 3 else frames3d.from_frame_many
-            self.places = here(T, np.ascontiguousarray(self.v[:, : 2 if len(T) == 3 else 3]))[0]
+        d, numbers = 2 if len(T) == 3 else 3, self.v.shape[1]
+        if d == 2 or numbers in (3, 4) or isinstance(self.sensor, SeesVelocity):
+            here, rays = frames.from_frame_many if d == 2 else frames3d.from_frame_many, numbers == d + 1 == 4
+            v = self.v[:, :d] / self.v[:, 3:] if rays else self.v[:, :d]
+            self.points = here(T, np.ascontiguousarray(v))[0]
+            self.places = None if rays else self.points
 
     def measured(self, T: Array) -> Array:
         """Return the measurements (SEEN, m) from T."""

@@ -308,18 +308,19 @@ class Slam(Estimate):
 
         Its state stays as it is: twins of it take made-up events, as `kalmark.slam.rehearsal` has them.
         """
-        from kalmark.slam.rehearsal import rehearse, without_detectors
+        from kalmark.slam.rehearsal import rehearse, warm_up_detectors, without_detectors
 
+        warm_up_detectors(self.robots.values())
         robots, settings = without_detectors(self.robots.values()), self.state.settings
         kinds = ("dense", "postponed") if self.state.may_grow else (settings.map,)
         for kind in kinds:
             twin = Slam(robots, **vars(replace(settings, map=kind)))
-            surveyed = rehearse(twin, twin.process)
+            surveyed = rehearse(twin, twin.process, twin.add_landmark)
         if self.tracks.known:
             twin = Slam(robots, **vars(replace(settings, map=kinds[0])))
             for name, mean, model in surveyed:
                 twin.add_landmark(name, mean, None, model)
-            rehearse(twin, twin.process)
+            rehearse(twin, twin.process, twin.add_landmark)
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:

@@ -226,4 +226,4 @@ def at_pose(
     else:
         T = composed(*channel.split(observer)[:2])[0]
         R = channel.noise_at(model.landmark.seen_from(T, l)[0])
-    return e, E_h, E_l, np.ascontiguousarray(np.broadcast_to(R, (len(l), z.shape[1], z.shape[1])))
+    return e, E_h, E_l, np.array(np.broadcast_to(R, (len(l), z.shape[1], z.shape[1])))
