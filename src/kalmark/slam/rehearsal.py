@@ -33,6 +33,7 @@ from kalmark.models.sensors import Spatial, Wall
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.merging import make_equal
 from kalmark.slam.robot import IDENTITY, Mount, Robot
+from kalmark.tracks.track import ChannelKey
 
 ROUNDS = 12  # of a control and scans: enough for whatever waits for several
 SEEN = 3  # observations in a scan
@@ -85,7 +86,7 @@ def rehearse(
             process(event)
         if k % INTERVAL == INTERVAL - 1 and isinstance(twin.map, CompressedMap):
             twin.map.full_update()  # what comes next activates some blocks again, not all
-    _add_points(twin, pose, add)
+    _add_landmarks(twin, process, pose, add)
     _observe_all(twin, process)
     _merge(twin)
     tracks = [*twin.tracks.confirmed.values()]
@@ -103,13 +104,18 @@ def rehearse(
     return found
 
 
-def _add_points(twin: Estimate, pose: Callable[[str, str], Array], add: Callable[..., None]) -> None:
-    """Add points, where a sensor sees such: landmarks that others have begun become points, too."""
+def _add_landmarks(
+    twin: Estimate, process: Callable[[Event], object], pose: Callable[[str, str], Array], add: Callable[..., None]
+) -> None:  # fmt: skip
+    """Let each sensor begin landmarks where it is now, and add points where it sees such: others become points, too."""
     for key, channel in [*twin.state.channels.items()]:
-        places = _Scene(twin.robots[key[0]].sensors[key[1]], pose(*key)).points
+        scene = _Scene(twin.robots[key[0]].sensors[key[1]], pose(*key))
+        with suppress(Exception):
+            y = scene.measured(pose(*key))
+            process(_scan(twin, key, y, [f"{key} {k}" for k in range(len(y))]))
         for kind, model in channel.models.items():
-            if model.landmark.space.kinds in POINTS and places is not None:
-                for k, place in enumerate(places):
+            if model.landmark.space.kinds in POINTS and scene.points is not None:
+                for k, place in enumerate(scene.points):
                     with suppress(Exception):
                         add(f"{key} {kind} {k}", place, 0.01 * np.eye(len(place)), model.landmark)
 
@@ -124,12 +130,17 @@ def _observe_all(twin: Estimate, process: Callable[[Event], object]) -> None:
         for k in range(REPEATS + 2):
             with suppress(Exception):
                 asked = twin.expect(*key)
-                rows = np.flatnonzero(np.isfinite(asked.e).all(axis=1))
+                finite = np.isfinite(asked.e).all(axis=1)
+                rows = np.flatnonzero(finite & asked.in_view if (finite & asked.in_view).any() else finite)
                 rows = rows[:1] if k < REPEATS else rows if k == REPEATS else np.repeat(rows, 2)
-                ids = [asked.names[i] for i in rows] if k <= REPEATS else None
-                process(Scan(t_ns=(twin.t_ns or 0) + 1, robot=key[0], sensor=key[1], y=asked.e[rows], ids=ids))
+                process(_scan(twin, key, asked.e[rows], [asked.names[i] for i in rows] if k <= REPEATS else None))
             if k % 2 and isinstance(twin.map, CompressedMap):
                 twin.map.full_update()
+
+
+def _scan(twin: Estimate, key: ChannelKey, y: Array, ids: list[Id] | None) -> Scan:
+    """Return a scan of a robot's sensor that comes next."""
+    return Scan(t_ns=(twin.t_ns or 0) + 1, robot=key[0], sensor=key[1], y=y, ids=ids)
 
 
 def _merge(twin: Estimate) -> None:
