@@ -16,7 +16,7 @@ from kalmark.errors import KalmarkError
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian_inverse
-from kalmark.geometry.spaces import SE2, SE3, Space, Table, retract
+from kalmark.geometry.spaces import SE2, SE3, Space, Table, retract, retract_plane
 from kalmark.models.observe import linearize
 
 Ints = Index
@@ -80,7 +80,8 @@ class State(NamedTuple):
 
 def plus(space: Space, x: Array, d: Array, turns: Array) -> Array:
     """Return rows x of a space moved by the errors d (k, dof), along the exponential for turns (k, axes) if any."""
-    return _plus(space.atoms, *(np.ascontiguousarray(a) for a in (x, d, turns)))
+    run = _plus if space.world == "space" else _plus_in_plane
+    return run(space.atoms, *(np.ascontiguousarray(a) for a in (x, d, turns)))
 
 
 def looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
@@ -101,6 +102,14 @@ def _plus(atoms: Table, x: Array, d: Array, turns: Array) -> Array:
 
 
 @compiled
+def _plus_in_plane(atoms: Table, x: Array, d: Array, turns: Array) -> Array:
+    moved = x.copy()
+    for i in range(len(x)):
+        retract_plane(atoms, moved[i], d[i], turns[i])
+    return moved
+
+
+@compiled
 def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
     _, z_0, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
     k, h = len(y), H_0.shape[2]
@@ -111,23 +120,36 @@ def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
     return z, E
 
 
-@compiled
 def beyond(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
     """Return what the poses b after a imply beyond the steps: w (n, q) in the frames a, W (n, q, 2 q) by a and b."""
-    n, size = a.shape
-    q = 3 if size == 3 else 6
-    w, W = np.empty((n, q)), np.empty((n, q, 2 * q))
+    return (_beyond_in_plane if a.shape[1] == 3 else _beyond_in_space)(a, b, step)
+
+
+@compiled
+def _beyond_in_plane(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
+    n = len(a)
+    w, W = np.empty((n, 3)), np.empty((n, 3, 6))
     for i in range(n):
-        if size == 3:
-            back, B_a = frames.inverse(a[i])
-            d, D_back, D_b = frames.compose(back, b[i])
-            w[i] = d - step[i]
-            w[i, 2] = wrap(w[i, 2])
-        else:
-            back, B_a = frames3d.inverse(a[i])
-            d, D_back, D_b = frames3d.compose(back, b[i])
-            w[i] = frames3d.minus(d, step[i])
-        W[i, :, :q], W[i, :, q:] = D_back @ B_a, D_b
-        if size == 7:
-            W[i, 3:] = left_jacobian_inverse(w[i, 3:]) @ W[i, 3:].copy()
+        back, B_a = frames.inverse(a[i])
+        d, D_back, D_b = frames.compose(back, b[i])
+        for j in range(3):
+            w[i, j] = d[j] - step[i, j]
+            for c in range(3):
+                W[i, j, c], W[i, j, 3 + c] = 0.0, D_b[j, c]
+                for m in range(3):
+                    W[i, j, c] += D_back[j, m] * B_a[m, c]
+        w[i, 2] = wrap(w[i, 2])
+    return w, W
+
+
+@compiled
+def _beyond_in_space(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
+    n = len(a)
+    w, W = np.empty((n, 6)), np.empty((n, 6, 12))
+    for i in range(n):
+        back, B_a = frames3d.inverse(a[i])
+        d, D_back, D_b = frames3d.compose(back, b[i])
+        w[i] = frames3d.minus(d, step[i])
+        W[i, :, :6], W[i, :, 6:] = D_back @ B_a, D_b
+        W[i, 3:] = left_jacobian_inverse(w[i, 3:]) @ W[i, 3:].copy()
     return w, W

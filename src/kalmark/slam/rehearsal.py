@@ -87,7 +87,8 @@ def rehearse(
         if k % INTERVAL == INTERVAL - 1 and isinstance(twin.map, CompressedMap):
             twin.map.full_update()  # what comes next activates some blocks again, not all
     _add_landmarks(twin, process, pose, add)
-    _observe_all(twin, process)
+    with suppress(Exception):
+        _observe_all(twin, process)
     _merge(twin)
     tracks = [*twin.tracks.confirmed.values()]
     twin.covariance(*twin.robots, *twin.tracks.confirmed)
@@ -123,17 +124,18 @@ def _add_landmarks(
 def _observe_all(twin: Estimate, process: Callable[[Event], object]) -> None:
     """Let each sensor observe what it can, of what others have begun, too, as it is expected.
 
-    First one landmark again and again, while the others are inactive, then all; then all twice in a scan without ids,
-    so that an association has to decide.
+    First one landmark in view again and again, while the others are inactive, then all of them together, then twice in
+    a scan without ids, so that an association has to decide; then each alone, in view or not.
     """
     for key in [*twin.state.channels]:
-        for k in range(REPEATS + 2):
+        asked = twin.expect(*key)
+        finite = np.isfinite(asked.e).all(axis=1)
+        seen = np.flatnonzero(finite & asked.in_view)
+        scans = [seen[:1]] * REPEATS + [seen, np.repeat(seen, 2), *np.flatnonzero(finite)[:, None]]
+        for k, rows in enumerate(scans):
+            ids = None if k == REPEATS + 1 else [asked.names[i] for i in rows]
             with suppress(Exception):
-                asked = twin.expect(*key)
-                finite = np.isfinite(asked.e).all(axis=1)
-                rows = np.flatnonzero(finite & asked.in_view if (finite & asked.in_view).any() else finite)
-                rows = rows[:1] if k < REPEATS else rows if k == REPEATS else np.repeat(rows, 2)
-                process(_scan(twin, key, asked.e[rows], [asked.names[i] for i in rows] if k <= REPEATS else None))
+                process(_scan(twin, key, asked.e[rows], ids))
             if k % 2 and isinstance(twin.map, CompressedMap):
                 twin.map.full_update()
 
