@@ -11,6 +11,7 @@ from kalmark.errors import EventError, ModelError
 from kalmark.events import Scan, when
 from kalmark.filter.estimators import Estimator, Iterating, Update
 from kalmark.filter.map import Map
+from kalmark.geometry.gaussian import gate
 from kalmark.models import protocols
 from kalmark.models.protocols import POSE, Motion, OfState
 from kalmark.models.state_view import sees_state, state_view_of
@@ -41,14 +42,9 @@ class Reader:
             name, wanted = type(sensor).__name__, "a positive number for each component"
             raise ModelError(f"{name}: the noise of one reading is 0, expected {wanted}: the state has the velocity")
         self.check = sensor.check if isinstance(sensor, protocols.Checked) else None
-        self.gate = self._gate()
+        self.gate = gate(self.sensor.pass_share, protocols.innovation_size(sensor))
         self.t_ns: int | None = None  # of its last reading
         self._view: Any = None
-
-    def _gate(self) -> float:
-        from scipy.stats import chi2
-
-        return float(chi2.ppf(self.sensor.pass_share, protocols.innovation_size(self.sensor)))
 
     @property
     def view(self) -> Any:

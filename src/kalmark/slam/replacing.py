@@ -17,6 +17,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry.angles import rotation, wrap
+from kalmark.geometry.gaussian import gate
 from kalmark.geometry.rotations import exp, multiply
 
 NEEDED, KEPT = 5, 30  # fixes that must agree, and the last so many that are compared
@@ -42,8 +43,6 @@ class Replaced(NamedTuple):
 
 def replaced(pose: Array, P: Array, left_out: Sequence[LeftOut]) -> Replaced | None:
     """Return where a robot is that is believed at `pose`, with the covariance P; None where fixes do not tell."""
-    from scipy.stats import chi2
-
     if len(left_out) < NEEDED:
         return None
     y, p = (np.array([getattr(one, name) for one in left_out]) for name in ("y", "p"))
@@ -56,7 +55,7 @@ def replaced(pose: Array, P: Array, left_out: Sequence[LeftOut]) -> Replaced | N
     yaw = float(np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b)))
     turned = np.column_stack([a @ rotation(yaw).T, p[:, 2:] - p0[2:]])
     residuals = y - y0 - turned
-    if np.einsum("ki,ij,kj->", residuals, np.linalg.inv(R), residuals) > chi2.ppf(SHARE, d * len(y) - d - 1):
+    if np.einsum("ki,ij,kj->", residuals, np.linalg.inv(R), residuals) > gate(SHARE, d * len(y) - d - 1):
         return None
     new, cov = pose.copy(), P.copy()
     arm = rotation(yaw) @ (pose[:2] - p0[:2])

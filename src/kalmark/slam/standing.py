@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import ModelError
 from kalmark.events import Control, Event, Frame, Scan
+from kalmark.geometry.gaussian import gate
 from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState, TimedNoise, coasts
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.slam.robot import Robot
@@ -178,7 +179,7 @@ class Standing:
         of = [source.means(partial(constants, self.robot)) for source in self.sources.values()]
         means = [mean for each in of for mean in each]
         deviations, free = sum(m.deviations for m in means), sum(m.free for m in means)
-        if free and deviations > largest(self.sensor.pass_share, free):
+        if free and deviations > gate(self.sensor.pass_share, free):
             return False
         rates = [m for m in means if m.column not in SHAKEN]
         if any(abs(m.mean) > self._many * m.sigma for m in rates):
@@ -193,14 +194,6 @@ class Standing:
     def _refutes(self, m: Mean, slowest: float) -> bool:
         """Return whether a mean refutes the slowest motion that counts."""
         return abs(m.mean) <= slowest - self._sure * m.sigma
-
-
-@lru_cache
-def largest(share: float, free: int) -> float:
-    """Return what this share of chi-squares of so many degrees of freedom is below."""
-    from scipy.stats import chi2
-
-    return float(chi2.ppf(share, free))
 
 
 def sources_of(robot: Robot) -> list[Source]:
