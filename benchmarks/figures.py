@@ -489,6 +489,8 @@ def speed() -> Iterator[Figure]:
                  row("kalmark, Slam.process", "{0} / {2} / {4} / {6} / {8} us"))  # fmt: skip
     yield Figure(section, "iSAM2 with joint marginals over `Slam.process`, same maps", "- / 10 / - / 20 / 3", peers,
                  row("GTSAM iSAM2, update and marginals", "{0} / {1} / {2} / {3} / {4}"))  # fmt: skip
+    yield Figure(section, "iSAM2 with joint marginals over `Slam.process`, 100 / 1,000 landmarks, median of five runs", "10 / 20",
+                 f"{peers} --landmarks 100 1000 --ways iSAM2 --runs 5", row("GTSAM iSAM2, update and marginals", "{0} / {1}"))  # fmt: skip
     for name in ("textbook as printed, NumPy", "MRPT kf-slam, number by number"):
         yield Figure(
             section,

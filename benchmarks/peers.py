@@ -137,6 +137,14 @@ def measure(count: int, steps: int, before: dict[str, Row]) -> dict[str, Row]:
     return rows
 
 
+def medians(runs: list[dict[str, Row]]) -> dict[str, Row]:
+    """Return the rows of the last run with the medians of the ratios of all."""
+    for name, last in runs[-1].items():
+        if "ratio" in last:
+            last["ratio"] = float(np.median([run[name]["ratio"] for run in runs if "ratio" in run[name]]))
+    return runs[-1]
+
+
 def timed(spent: Any) -> Any:
     """Leave out the warm-up: a round less the two of the probe, or half of what a slow way has taken."""
     return spent[min(WARM_UP - 2, len(spent) // 2) :]
@@ -201,6 +209,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--landmarks", type=int, nargs="+", default=list(SHAPES))
     parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--runs", type=int, default=1, help="of each map: the summary has the medians of their ratios")
     parser.add_argument("--ways", nargs="+", default=[""], help="words of the ways to take besides Slam.process")
     parser.add_argument("--out", type=Path, default=Path("out/peers"))
     options = parser.parse_args()
@@ -211,7 +220,7 @@ def main() -> None:
     where = conditions()
     with kernels.one_thread():
         for count in sorted(options.landmarks):
-            found[count] = measure(count, options.steps, before)
+            found[count] = medians([measure(count, options.steps, before) for _ in range(options.runs)])
             before |= found[count]
         summary(found)
         floor = dense_floor(options.steps)

@@ -121,6 +121,9 @@ def known_field(map_: str) -> tuple[Field, km.Slam]:
     if isinstance(slam.map, CompressedMap):
         slam.map.full_update()
         slam.map.finish()
+    else:
+        while slam.map.prepare():  # the larger buffer, which else comes bit by bit with the first hundred steps
+            pass
     return field, slam
 
 

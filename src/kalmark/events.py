@@ -103,6 +103,13 @@ def _nanoseconds(t_s: Any, t_ns: Any) -> int:
 
 def finite(value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkError] = EventError) -> Array:
     """Return a copy of `value` as a float array (..., n); raise `error` if it is not finite or larger than `limit`."""
+    return measured(value, what, limit, error)[0]
+
+
+def measured(
+    value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkError] = EventError
+) -> tuple[Array, float]:
+    """Return what `finite` does, and the largest magnitude in it."""
     try:
         array = np.array(value, order="C")
     except (TypeError, ValueError):
@@ -119,7 +126,7 @@ def finite(value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkE
     worst = max(map(abs, values), default=0.0)
     if worst > limit:
         raise error(f"{what} holds {worst:.3g}, expected at most {limit:.0e}")
-    return array
+    return array, worst
 
 
 def checked_id(value: Any, what: str) -> Id:
@@ -177,12 +184,14 @@ class Control:
     """A robot's control: a velocity held from `t_s` on, or an increment that ended at `t_s`.
 
     `u` has the motion model's shape and units; `cov` (same size, squared) overrides the model's own noise.
+    `largest` is the largest magnitude in `u`.
     """
 
     t_ns: int
     robot: str
     u: Array
     cov: Array | None
+    largest: float = field(init=False, repr=False)
 
     def __init__(
         self, t_s: float | None = None, robot: str = "", u: Any = (), cov: Any = None, *, t_ns: int | None = None
@@ -192,7 +201,9 @@ class Control:
         try:
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
-            set_(self, "u", finite(u, "u", MOST_OTHER))
+            u, largest = measured(u, "u", MOST_OTHER)
+            set_(self, "u", u)
+            set_(self, "largest", largest)
             set_(self, "cov", None if cov is None else finite(cov, "cov", MOST_OTHER**2))
         except EventError as error:
             raise EventError(f"control of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
@@ -209,7 +220,7 @@ class Scan:
 
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
     overrides the noise of the sensor model.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
-    `width` is the m it was given, 0 for ().
+    `width` is the m it was given, 0 for (), `largest` the largest magnitude in `y`.
     """
 
     t_ns: int
@@ -218,7 +229,8 @@ class Scan:
     y: Array
     ids: tuple[Id | None, ...] | None
     cov: Array | None
-    width: int = field(repr=False)
+    width: int = field(init=False, repr=False)
+    largest: float = field(init=False, repr=False)
 
     def __init__(
         self,
@@ -234,7 +246,9 @@ class Scan:
         set_ = object.__setattr__
         t_ns = nanoseconds(t_s, t_ns, "scan", robot)
         try:
-            y = _rows(finite(y, "y", MOST_OTHER))
+            y, largest = measured(y, "y", MOST_OTHER)
+            y = _rows(y)
+            set_(self, "largest", largest)
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
             set_(self, "sensor", _text(sensor, "sensor"))

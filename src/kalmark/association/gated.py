@@ -51,23 +51,29 @@ class Gated:
             return answers
         pairs, reasons, mixed, known = self.match(query, open_, names, d2, gate)
         mixture = None if mixed is None else Mixture(open_, names, mixed)
-        nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
-        for row, (k, pair, d) in enumerate(zip(open_.tolist(), pairs.tolist(), least.tolist(), strict=True)):
+        told, strange = 0, 0  # of landmarks of the map, and beyond all of them
+        for row, (k, pair) in enumerate(zip(open_.tolist(), pairs.tolist(), strict=True)):
             if pair >= 0:
                 answers[k] = (names[pair], reasons.get(row, ""))
-            elif pair == Answer.MIXTURE.value and mixture is not None:
+                told += 1
+                continue
+            nearest = int(d2[row].argmin())
+            d = float(d2[row, nearest])
+            strange += d > far
+            if pair == Answer.MIXTURE.value and mixture is not None:
                 answers[k] = (mixture, reasons[row])
             elif pair < Answer.NONE.value:
                 answers[k] = (Answer(pair), reasons[row])
             elif d <= gate:
-                why = f"its nearest landmark {names[nearest[row]]!r} is another observation's"
+                why = f"its nearest landmark {names[nearest]!r} is another observation's"
                 answers[k] = (None, reasons.get(row, why))
             elif d <= far:
-                answers[k] = (None, f"between {names[nearest[row]]!r} and a new landmark: d2 {d:.1f}")
+                answers[k] = (None, f"between {names[nearest]!r} and a new landmark: d2 {d:.1f}")
         if known is None:
-            known = np.where(pairs >= 0, 1.0, np.where(least > far, 0.0, np.nan))
-        told = known[~np.isnan(known)]
-        query.learn(float(told.sum()), float((1.0 - told).sum()))
+            query.learn(float(told), float(strange))
+        else:
+            certain = known[~np.isnan(known)]
+            query.learn(float(certain.sum()), float((1.0 - certain).sum()))
         return answers
 
     def near(self, query: Query, open_: Index, gate: float, nearest: int = 0) -> tuple[list[Id], Array]:
@@ -102,10 +108,11 @@ class NearestNeighbour(Gated):
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair greedily by d2 (K, L); an observation whose nearest landmark is taken gets none."""
-        nearest, least = d2.argmin(axis=1).tolist(), d2.min(axis=1)
+        columns = d2.argmin(axis=1)
+        nearest, least = columns.tolist(), d2[np.arange(len(d2)), columns]
         fits = (least <= gate).tolist()
         if all(fits) and len(set(nearest)) == len(nearest):
-            return Matched(np.array(nearest), {})
+            return Matched(columns, {})
         pairs, reasons, taken = np.full(len(d2), -1), {}, set()
         for row in np.argsort(least, kind="stable").tolist():
             column = nearest[row]

@@ -130,7 +130,9 @@ class Query:
                 out[some] = self.scan.predict(model, pairs.slots[l], k)[1]
             else:
                 m, robot, mount, here = pairs.marginal
-                R = self.scan.noise_of(model, m.means(here[l], model.d), k)
+                R = self.scan.R[k]
+                if self.scan.noise_varies:
+                    R = self.scan.noise_of(model, m.means(here[l], model.d), k)
                 out[some] = model.predict(m, robot, mount, here[l], self.y[k], R)[1]
             if self.scan.channel.joins:
                 tracks = [self.scan.tracks.confirmed[names[i]] for i in l.tolist()]

@@ -24,6 +24,7 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter import parallax
 from kalmark.filter.kernels import (
+    RAISED,
     add_square,
     cholesky_inverse,
     downdate,
@@ -192,22 +193,29 @@ def _compiled_iterated(
 
 
 @compiled
-def gain(
-    P: Array, n: int, index: Index, H: Array, M: Array, v: Array, sizes: tuple[int, int]
-) -> tuple[Array, Array]:  # fmt: skip
-    """Return V = L^-1 H P, M = L^-1, of which P loses V' V, and the mean's correction K v (n,).  [S] (28)-(30).
-
-    `sizes`: the columns of the head in H, and how many observations there are.
-    """
-    V = lower_product(M, sparse_product(H, rows_of(P, index, n), sizes[0], sizes[1]))
-    correction = np.zeros(n)
+def gain(HP: Array, M: Array, v: Array) -> tuple[Array, Array]:
+    """Return V = L^-1 H P, M = L^-1, of which P loses V' V, and the mean's correction K v (n,).  [S] (28)-(30)."""
+    V = lower_product(M, HP)
+    correction = np.zeros(V.shape[1])
     for i in range(len(M)):
         w = 0.0
         for j in range(i + 1):
             w += M[i, j] * v[j]
-        for j in range(n):
+        for j in range(V.shape[1]):
             correction[j] += w * V[i, j]
     return V, correction
+
+
+@compiled
+def take_off(HP: Array, H: Array, V: Array, index: Index, count: int) -> None:
+    """HP <- H (P - V' V) of HP = H P (p, n), for the first `count` rows of V; H (p, m) is of the rows `index`."""
+    for a in range(len(HP)):
+        for b in range(count):
+            s = 0.0
+            for c in range(len(index)):
+                s += H[a, c] * V[b, index[c]]
+            for j in range(HP.shape[1]):
+                HP[a, j] -= s * V[b, j]
 
 
 def invariant(
@@ -241,14 +249,15 @@ def invariant(
     H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return e, z, Z, d2, within(d2, -1.0)[0], False
-    origin, x_before = mean[:3].copy(), x.copy()
+    origin = mean[:3].copy()
     before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    V, correction = gain(P, n, index, H, M, v, (h, count))
+    V, correction = gain(sparse_product(H, rows_of(P, index, n), h, count), M, v)
     depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
-    rows, baselines = index[:h], (depths, s, S, s)
+    rows, baselines, x_before = index[:h], (depths, s, S, s), x
     if len(depths):
         s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
+        x_before = x.copy()
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
     d_head = np.empty(h)
     for i in range(h):
@@ -363,7 +372,7 @@ def averaged(
         H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
         if not positive:
             return d2, False
-        V_i, D[:, i] = gain(P, n, index, H, M, v, (E_r.shape[2], len(rows)))
+        V_i, D[:, i] = gain(sparse_product(H, rows_of(P, index, n), E_r.shape[2], len(rows)), M, v)
         V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
         used += len(V_i)
     index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
@@ -384,24 +393,40 @@ def averaged(
 def textbook(
     model: Any, map_: Map, scan: Scan, _: None
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
-    """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3."""
+    """Correct with one landmark after the other, each at the state the last one left.  [S] (26)-(30), C.3.
+
+    P is corrected once, at the end: until then it is P - V' V, V (K p, n) the gain rows so far.
+    """
     x, P, n, blocks, atoms, _axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
     k, p = len(y), R.shape[1]
     e, z, Z, d2 = np.empty((k, y.shape[1])), np.empty((k, p)), np.empty((k, p, p)), np.empty(k)
     near, valid, head = np.zeros(k, np.bool_), True, head_sizes(blocks, atoms, robot, mount)[1]
+    V = np.zeros((k * p, n))
     for i in range(k):
         one = slice(i, i + 1)
         index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots[one], d)
         e[one], z[one], E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(1, d), y[one])
-        Z[one], d2[one], positive = innovation(P, index, E_r, E_l, R[one], z[one])
+        H = stacked(E_r, E_l)
+        HP = sparse_product(H, rows_of(P, index, n), E_r.shape[2], 1)
+        take_off(HP, H, V, index, i * p)
+        for a in range(p):
+            for b in range(p):
+                Z[i, a, b] = R[i, a, b]
+                for c in range(len(index)):
+                    Z[i, a, b] += HP[a, index[c]] * H[b, c]
+            Z[i, a, a] *= 1.0 + RAISED
+        d2[one], positive = squared_distances(Z[one], z[one])
         valid = valid and positive
         near[i] = d2[i] < gate
         if near[i]:
             M, _positive = cholesky_inverse(Z[i])  # which gives d2, too
-            V, correction = gain(P, n, index, stacked(E_r, E_l), M, z[i].copy(), (E_r.shape[2], 1))
-            downdate(P, V)
+            V_i, correction = gain(HP, M, z[i])
+            for a in range(p):
+                for b in range(n):
+                    V[i * p + a, b] = V_i[a, b]
             call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
+    downdate(P, V)
     return e, z, Z, d2, near, valid
 
 
@@ -422,11 +447,10 @@ def first_estimates(
         return e, z, Z, d2, near, valid
     index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
     H = stacked(E_r[near], E_l[near])
-    sizes = E_r.shape[2], count
-    M, positive = cholesky_inverse(joint_innovation(H, submatrix(P, index), R[near], sizes[0])[1])
+    M, positive = cholesky_inverse(joint_innovation(H, submatrix(P, index), R[near], E_r.shape[2])[1])
     if not positive:
         return e, z, Z, d2, within(d2, -1.0)[0], False
-    V, correction = gain(P, n, index, H, M, z[near].ravel(), sizes)
+    V, correction = gain(sparse_product(H, rows_of(P, index, n), E_r.shape[2], count), M, z[near].ravel())
     downdate(P, V)
     call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
     return e, z, Z, d2, near, valid

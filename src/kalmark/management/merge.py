@@ -65,7 +65,7 @@ class Search:
     """Which landmarks to compare after a scan: those observed in it, and what is covisible with merged ones."""
 
     def __init__(self, tracks: Tracks, observed: Sequence[Id]) -> None:
-        self._tracks, self._observed = tracks, list(observed)
+        self._tracks, self._observed = tracks, iter(observed)
         self._merged: list[Id] = []
         self._around: list[Id] = []
         self._tried: set[Id] | None = None
@@ -73,8 +73,7 @@ class Search:
     def next(self) -> Id | None:
         """Return the next landmark to compare, None at the end."""
         tracks = self._tracks
-        while self._observed:
-            name = self._observed.pop(0)
+        for name in self._observed:
             if name in tracks.confirmed and (self._merged or self._is_due(name)) and self._fits(name):
                 return name
         if self._tried is None:

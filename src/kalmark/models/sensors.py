@@ -138,7 +138,11 @@ class _Sensor:
 
     def noise(self, y: Array) -> Array:
         """Return the noise R (K, p, p) of the innovations of measurements y (K, m)."""
-        return constant(tuple(vars(self)[name] ** 2 for name in self.sigmas), len(y))
+        return constant(self._variances, len(y))
+
+    @cached_property
+    def _variances(self) -> tuple[float, ...]:
+        return tuple(vars(self)[name] ** 2 for name in self.sigmas)
 
 
 # ---------------------------------------------------------------------- of the plane
@@ -233,6 +237,8 @@ class _Ranging(_Planar):
     def points(self, y: Array) -> tuple[Array, Array]:
         """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
         seen = y[:, :2].copy()
+        if self.scale == 1.0 and self.bias_m == 0.0:
+            return inv_scan_many(seen)
         seen[:, 0] = self.distances(y)
         p, P_y = inv_scan_many(seen)
         P_y[:, :, 0] /= self.scale

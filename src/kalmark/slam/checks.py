@@ -100,11 +100,6 @@ def numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -> Arra
 SMALLEST_BOUND = min(MOST.values())
 
 
-def largest(values: Array) -> float:
-    """Return the largest magnitude of an event's numbers."""
-    return max(map(abs, values.ravel().tolist()), default=0.0)
-
-
 def refuse_vague(cov: Array, columns: tuple[str, ...], what: str) -> None:
     """Refuse covariances (..., m, m) of these columns, of which a standard deviation is larger than means anything."""
     if cov.size and cov.max() > SMALLEST_BOUND**2 and cov.shape[-1] == len(columns):
@@ -116,7 +111,7 @@ def refuse_bad_control(event: Control, columns: tuple[str, ...]) -> None:
     """Refuse a control that is not of these components, or whose own noise is no covariance."""
     if event.u.shape != (len(columns),):
         raise EventError(f"{when(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
-    if largest(event.u) > SMALLEST_BOUND:
+    if event.largest > SMALLEST_BOUND:
         refuse_huge(event.u, columns, when(event))
     if event.cov is not None:
         covariance(event.cov, len(columns), f"{when(event)}: cov", definite=False)
@@ -140,7 +135,7 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
     if event.width != m and (count or event.width):
         expected = f"expected {m}: {', '.join(sensor.columns)}"
         raise EventError(f"{when(event)}: y has {event.width} columns, {expected}")
-    if count and largest(event.y) > SMALLEST_BOUND:
+    if count and event.largest > SMALLEST_BOUND:
         refuse_huge(event.y, sensor.columns, when(event))
     if check is not None and count:
         try:

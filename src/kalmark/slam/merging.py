@@ -28,8 +28,8 @@ def merge_seen(state: State, scan: ScanContext, policy: Policy) -> None:
     state.tracks.note_scan(names)
     if not policy.upkeep.merge:
         return
-    unnamed: list[Any] = [o.landmark for o in scan.report.observations if o.id is None]
-    search = merge.Search(state.tracks, [name for name in unnamed if name in names])
+    unnamed = {o.landmark for o in scan.report.observations if o.id is None}
+    search = merge.Search(state.tracks, [name for name in names if name in unnamed])
     while (name := search.next()) is not None:
         track = state.tracks.confirmed[name]
         if search.is_first_pass:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 
 import numpy as np
 
@@ -14,19 +14,26 @@ from kalmark.report import Gap
 from kalmark.slam.motion import Part
 from kalmark.slam.state import State
 
+Moves = tuple[tuple[str, Part], ...]  # parts of their controls, by the names of robots
 
-def advance(state: State, *names: str) -> tuple[Gap, ...]:
-    """Move robots up to now by the controls they hold, all or none of them; return gaps in their controls."""
+
+def advance(state: State, name: str, *others: str, before: Moves = ()) -> tuple[Gap, ...]:
+    """Move robots up to now by the controls they hold, all or none of them; return gaps in their controls.
+
+    `before` are those that move with these: an error puts back the clocks of all.
+    """
     assert state.t_ns is not None
-    with ExitStack() as clocks:
-        helds = [clocks.enter_context(state.moving[name].held) for name in names]
-        moves = [(name, held.advance(state.t_ns)) for name, held in zip(names, helds, strict=True)]
-        for name, part in moves if len(moves) > 1 else ():
-            refuse_nowhere(state, name, [] if part is None else [part])
-        for name, part in moves:
-            if part is not None:
-                move(state, name, part)
-        return tuple(gap for held in helds for gap in held.noticed())
+    with state.moving[name].held as held:
+        part = held.advance(state.t_ns)
+        moves = before if part is None else (*before, (name, part))
+        if others:
+            gaps = advance(state, *others, before=moves)
+            return (*held.noticed(), *gaps)
+        for moved, part in moves if len(moves) > 1 else ():
+            refuse_nowhere(state, moved, [part])
+        for moved, part in moves:
+            move(state, moved, part)
+        return held.noticed()
 
 
 def refuse_nowhere(state: State, name: str, parts: Sequence[Part]) -> None:

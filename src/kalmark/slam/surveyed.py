@@ -24,10 +24,12 @@ SURE_RAD = 0.3  # a sigma of the heading above which nothing can be expected
 
 def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
     """Return the gate of sightings of surveyed landmarks; infinite while the heading of their robot is not known."""
+    least = policy.association.threshold(scan.channel.dof, gate(SURVEYED, scan.channel.dof))
+    if least == math.inf:
+        return least
     turns = slice(2, 3) if scan.dimensions == 2 else slice(3, 6)
-    if state.map.covariance([scan.robot]).diagonal()[turns].max() > SURE_RAD**2:
-        return math.inf
-    return policy.association.threshold(scan.channel.dof, gate(SURVEYED, scan.channel.dof))
+    sure = state.map.covariance([scan.robot]).diagonal()[turns].max() <= SURE_RAD**2
+    return least if sure else math.inf
 
 
 def is_tried(state: State, scan: ScanContext, names: Sequence[Any]) -> bool:
@@ -44,9 +46,9 @@ def corrected(
 
     They are taken all the same if it is the robot that is elsewhere.
     """
-    done = state.corrected(update._replace(gate=min(update.gate, least)), scan.event, estimator)
     if least == math.inf:
-        return done
+        return state.corrected(update, scan.event, estimator)
+    done = state.corrected(update._replace(gate=min(update.gate, least)), scan.event, estimator)
     trial, known = state.surveys.trial, state.tracks.known
     beyond = np.flatnonzero(~done.fused & (done.d2 <= update.gate)).tolist()
     tried = [name in trial or name in known for name in names]

@@ -70,6 +70,11 @@ class ScanContext:
         return self.event.cov is not None
 
     @property
+    def noise_varies(self) -> bool:
+        """Whether the noise of an observation depends on where its landmark is."""
+        return self.channel.noise_at is not None and self.event.cov is None
+
+    @property
     def dimensions(self) -> int:
         """2 in the plane, 3 in space."""
         return self.channel.dimensions

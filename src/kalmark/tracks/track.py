@@ -277,7 +277,8 @@ class Tracks:
 
     def any_by_model(self, channel: Channel, names: Sequence[Any]) -> list[tuple[ObservationModel, list[int]]]:
         """Return the same of names in the map or known exactly."""
-        return self._by_model(channel, names, list(map(self.sort, names)), "")
+        sort = self.sort if len(self.known) else self.sorts.get
+        return self._by_model(channel, names, list(map(sort, names)), "")
 
     def sort(self, name: Any) -> str | None:
         """Return the kind of a landmark, in the map or known exactly, ROBOT of a robot, None of none."""

@@ -72,7 +72,7 @@ def test_corrections_applied_to_all_blocks_inactive_are_the_dense_filters(
     monkeypatch.setattr(Schedule, "due", lambda *_: 1e300)  # each full update is over by the next correction
     dense, spaces = a_map(stepped, 0.1, 0.1)
     compressed = CompressedMap.from_dense(a_map(stepped, 0.1, 0.1)[0])
-    compressed._far = lambda robot: True  # type: ignore[method-assign]
+    compressed._far = lambda robot, s: True  # type: ignore[method-assign]
     Q = np.diag([0.02] * 3 + [0.01] * 3) ** 2
     for slots, y in scans(dense, 12, 0.1, range(1, 1 + POINTS)):
         for m in (dense, compressed):
@@ -93,7 +93,7 @@ def test_a_block_that_moves_with_the_whole_pose_may_come_after_immediate_correct
     monkeypatch.setattr(Schedule, "due", lambda *_: 1e300)
     dense, spaces = a_map(False, 0.1, 0.1)
     compressed = CompressedMap.from_dense(a_map(False, 0.1, 0.1)[0])
-    compressed._far = lambda robot: True  # type: ignore[method-assign]
+    compressed._far = lambda robot, s: True  # type: ignore[method-assign]
     spaces.append(km.landmarks.Homogeneous().space)
     G = 0.1 * np.random.default_rng(6).normal(size=(spaces[-1].dof, 6))
     for i, (slots, y) in enumerate(scans(dense, 12, 0.1, range(1, 1 + POINTS))):
@@ -117,7 +117,7 @@ def test_a_standing_robot_learns_nothing_of_its_orientation_from_any_block_inact
     prior = np.radians(20)
     before, spaces = a_map(stepped, prior, 0.05)
     m = CompressedMap.from_dense(before, most=90)
-    m._far = lambda robot: False  # type: ignore[method-assign]
+    m._far = lambda robot, s: False  # type: ignore[method-assign]
     for slots, y in scans(before, 60, 0.05, range(1, 1 + POINTS)):
         correct(m, slots, y)
     P = m.covariance(range(len(spaces)))

@@ -45,9 +45,9 @@ class Watch(NamedTuple):
 @compiled
 def is_farther(
     P: Array, turn: Index, clones: Index, x: Array, clones_x: Index, at: Index, frozen: Array, first: Index,
-    size: Index, G: Array, s: Array, per_sigma: Array, tau: float,
+    size: Index, G: Array, s: Array, left: Array, per_sigma: Array, tau: float,
 ) -> bool:  # fmt: skip
-    """Return whether a number is more than so many sigmas from where it was: of standing blocks, or among G s.
+    """Return whether a number is more than so many sigmas from where it was: of standing blocks, or among G (s - left).
 
     The limit is tau over the uncertainty and the correction of the robot's turn since it was cloned: `turn` and
     `clones` are rows of P, `clones_x` the numbers of the clones.
@@ -65,7 +65,7 @@ def is_farther(
     for i in range(len(per_sigma)):
         moved = 0.0
         for j in range(len(s)):
-            moved += G[i, j] * s[j]
+            moved += G[i, j] * (s[j] - left[j] if j < len(left) else s[j])
         if abs(moved) * per_sigma[i] > limit:
             return True
     return False
@@ -75,7 +75,7 @@ class Drift:
     """Watches the blocks that have entered."""
 
     def __init__(self) -> None:
-        self._standing: dict[int, Watch] = {}
+        self.standing: dict[int, Watch] = {}
         self._stored: dict[int, Array] = {}  # one over the sigmas that they had at the full update
         self._all: Watch | None = None
         self.moving: list[int] = []  # the blocks that move by themselves,
@@ -99,19 +99,18 @@ class Drift:
                 sigmas += [math.sqrt(max(0.0, variances[row : row + size].sum()))] * count
         if where:
             index = np.array(where)
-            self._standing[slot] = Watch(index + at, frozen[index], np.array(rows), np.array(sizes))
+            self.standing[slot] = Watch(index + at, frozen[index], np.array(rows), np.array(sizes))
             self._stored[slot] = np.array([1.0 / sigma if sigma > 0 else 0.0 for sigma in sigmas])
             self._all = None
 
     def forget(self, slot: int) -> None:
         """Stop watching a block."""
-        if self._standing.pop(slot, None) is not None:
+        if self.standing.pop(slot, None) is not None:
             self._all = None
 
     def moves(self, slot: int, rows: Index) -> None:
         """Take note that a block, if it is watched, moves by itself: of use is only its stored position, those rows."""
-        watch = self._standing.get(slot)
-        if watch is not None:
+        if slot in self.standing:
             self.forget(slot)
             self.moving.append(slot)
             self._rows = np.concatenate([self._rows, rows])
@@ -120,8 +119,8 @@ class Drift:
 
     def leave(self, x: Array, s: Array) -> None:
         """Take note that the coordinates are left at x of the active map and the auxiliary states' mean s."""
-        for slot, watch in self._standing.items():
-            self._standing[slot] = watch._replace(frozen=x[watch.at])
+        for slot, watch in self.standing.items():
+            self.standing[slot] = watch._replace(frozen=x[watch.at])
         self._all, self._left = None, s
 
     def is_beyond(
@@ -135,15 +134,14 @@ class Drift:
         the rows of the whole map; `read` returns the stored covariance of rows with those of A0 from a first one on.
         """
         if self._all is None:
-            parts = zip(*self._standing.values(), strict=True)
+            parts = zip(*self.standing.values(), strict=True)
             self._all = (
-                Watch(*map(np.concatenate, parts)) if self._standing else Watch(NO_ROWS, NO_NUMBERS, NO_ROWS, NO_ROWS)
+                Watch(*map(np.concatenate, parts)) if self.standing else Watch(NO_ROWS, NO_NUMBERS, NO_ROWS, NO_ROWS)
             )
         if self._rest is None:
             self._rest = read(self._rows, 0)
         elif self._rest.shape[1] < len(s):
             self._rest = np.hstack([self._rest, read(self._rows, self._rest.shape[1])])
-        if len(self._left):
-            s = s.copy()
-            s[: len(self._left)] -= self._left
-        return bool(is_farther(P, turn, clones, x, clones_x, *self._all, self._rest, s, self._per_sigma, tolerance(n)))
+        at, frozen, first, size = self._all
+        G, left, tau = self._rest, self._left, tolerance(n)
+        return bool(is_farther(P, turn, clones, x, clones_x, at, frozen, first, size, G, s, left, self._per_sigma, tau))

@@ -19,7 +19,17 @@ from kalmark.filter.layout import P_AT
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import conjugate, left_jacobian, log, multiply
-from kalmark.geometry.spaces import NO_TURN, VECTOR, VECTOR3, Rn, Table, generator, retract
+from kalmark.geometry.spaces import (
+    NO_TURN,
+    VECTOR,
+    VECTOR3,
+    Rn,
+    Table,
+    generator,
+    generator_plane,
+    retract,
+    retract_plane,
+)
 
 TAU = 0.05  # of the least sigma of a point as seen from the robot: how far a correction may move it from inactive ones
 MOST = 40  # rows of clones in a compression interval,
@@ -174,6 +184,23 @@ def _since(before: Array, now: Array, done: Array) -> Array:
 
 
 @compiled
+def turning(atoms: Table, x: Array, n: int, axes: int, origin: Array) -> Array:
+    """Return the `generator` (n, axes) of blocks, of none or one axis, in the plane, without what is of space."""
+    if axes > 1:
+        return generator(atoms, x, n, axes, origin)
+    return generator_plane(atoms, x, n, axes, origin) if axes == 1 else np.zeros((n, 0))
+
+
+@compiled
+def move(atoms: Table, x: Array, d: Array, turn: Array, axes: int) -> None:
+    """`retract` blocks, of one axis, in the plane, without what is of space."""
+    if axes == 1:
+        retract_plane(atoms, x, d, turn)
+    else:
+        retract(atoms, x, d, turn)
+
+
+@compiled
 def carried(
     atoms: Table, x: Array, G: Array, S: Array, U: Array, robots: Index, turn: Array, turns: Array, origins: Array,
     axes: int,
@@ -187,15 +214,15 @@ def carried(
     n = len(D)
     a = np.zeros((n, len(U) + axes * (D.shape[1] - robots[:, 0].sum() - len(robots))))
     column = kept = turned_by = stood = 0
-    x, x_left = x.copy(), x
-    turned = generator(atoms, x, n, axes, origins[0]) if axes > 0 else np.zeros((n, 0))
+    x, x_left, d = x.copy(), x, np.empty(n)
+    turned = turning(atoms, x, n, axes, origins[0])
     for k in range(len(robots) + 1):
         immediate = k < len(robots)
         count = robots[k, 0] if immediate else D.shape[1] - column
         width = count * axes
         for c in range(count + immediate):
-            d = D[:, column + c].copy()
             for i in range(n):
+                d[i] = D[i, column + c]
                 for j in range(kept):
                     d[i] += a[i, j] * U[j, column + c]
             robot, by = c, NO_TURN
@@ -206,12 +233,13 @@ def carried(
                         d[i] += a[i, kept + j] * turns[turned_by + j]
             own = kept + robot * axes
             if axes == 6:
-                turned = generator(atoms, x, n, axes, origins[stood + robot])
-            a[:, own : own + axes] -= turned
-            retract(atoms, x, d, by)
-            if axes > 0:
-                turned = generator(atoms, x, n, axes, origins[stood + robot])
-                a[:, own : own + axes] += turned
+                turned = turning(atoms, x, n, axes, origins[stood + robot])
+            move(atoms, x, d, by, axes)
+            now = turning(atoms, x, n, axes, origins[stood + robot])
+            for i in range(n):
+                for j in range(axes):
+                    a[i, own + j] += now[i, j] - turned[i, j]
+            turned = now
         if immediate:
             column, kept, turned_by, stood = column + count + 1, kept + width, turned_by + width, stood + count
             x_left = x.copy()

@@ -73,7 +73,8 @@ class CompressedMap(Layout):
         self.auxiliary: dict[int, int] = {}  # slots of auxiliary states in the active map, by slot: in the order of A0
         self.A0: Index = NO_ROWS  # rows of the storage that have auxiliary states,
         self._s: Index = NO_ROWS  # the rows of these in the active map,
-        self._s_x: Index = NO_ROWS  # and their numbers
+        self._s_x: Index = NO_ROWS  # and their numbers, first without and then with those of the clones
+        self._displaced_x: Index = NO_ROWS
         self.departed: list[tuple[int, Space]] = []  # removed blocks that still have auxiliary states
         self.displaced: dict[int, Array] = {}  # the part of each robot's corrections in these states and the clones
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of the turn of the world in them
@@ -228,7 +229,7 @@ class CompressedMap(Layout):
 
         An index from before holds no longer.
         """
-        if self._full():
+        if self._full(self._progress()):
             self.full_update()
         mean = np.asarray(mean, dtype=np.float64)
         slot = self._place(space, mean)
@@ -239,7 +240,7 @@ class CompressedMap(Layout):
         """Add a block computed from the rows `index`: P_Lx = G P_x, P_LL = G P G' + Q.  [S] (35)-(38)."""
         slot = self._place(space, mean)
         self.activate(slot, self.active.augment(space, mean, index, G, Q))
-        if self._full():
+        if self._full(self._progress()):
             self.full_update()
         return slot
 
@@ -326,28 +327,28 @@ class CompressedMap(Layout):
             for slot in slots.tolist():
                 self._enter(slot)
             at = self._at[slots]
-        self._before = {r: self.active.mean(self.entered[r]) for r in dict.fromkeys((*self.displaced, robot))}
+        self._before = {r: self.active.mean(self.entered[r]) for r in {robot, *self.displaced}}
         return Marginal(self.active, self.entered[robot], self.entered.get(mount, -1), at)
 
     def corrected(self, robot: int, transports: bool) -> None:
         """Complete the correction of what `opened` returned: correct inactive blocks if need be, go on with a job."""
         m = self.active
         if transports and len(self.A0):
-            s, before = m.x[np.concatenate([self._s_x, self._immediate.numbers])], self.displaced.get(robot, 0.0)
+            s, before = m.x[self._displaced_x], self.displaced.get(robot, 0.0)
             others = [displaced for other, displaced in self.displaced.items() if other != robot]
             self.displaced[robot] = now = s - sum(others) if others else s
             some = len(self.entered) < self.used
-            if some and (self._far(robot) or self._points.parted(m, self.entered[robot], self._before[robot])):
+            if some and (self._far(robot, s) or self._points.parted(m, self.entered[robot], self._before[robot])):
                 self.correct_all(robot, now - before)
             if len(self._immediate.rows) >= immediate.most(self.n):
                 self._advance(SLICE)
                 if self._job is None:
                     self.full_update()
         self.schedule.count(m.n)
-        used = m.prepare() or self.storage.prefault.some()
+        used, progress = m.prepare() or self.storage.prefault.some(), self._progress()
         if (job := self._job) is not None:
-            self._advance(self.schedule.due(self._progress(), job.spent, job.work) - PREFAULT * used)
-        if self._full():  # now, since the next correction begins with the work of a new interval
+            self._advance(self.schedule.due(progress, job.spent, job.work) - PREFAULT * used)
+        if self._full(progress):  # now, since the next correction begins with the work of a new interval
             self.full_update()
 
     def _enter(self, slot: int) -> None:
@@ -376,6 +377,7 @@ class CompressedMap(Layout):
         self.A0 = np.concatenate([self.A0, self.rows(slot)])
         self._s = np.concatenate([self._s, self.active.rows(at)])
         self._s_x = np.concatenate([self._s_x, np.arange(where.start, where.stop)])
+        self._displaced_x = np.concatenate([self._s_x, self._immediate.numbers])
 
     def watch(self, slot: int, left: Array) -> None:
         """Watch how far an active block goes from the mean at which its inactive error coordinates were left."""
@@ -388,16 +390,24 @@ class CompressedMap(Layout):
 
     def take_as_moving(self, slot: int) -> None:
         """Take note that an active block moves by itself."""
-        self.drift.moves(slot, self.rows(slot)[: 2 if self.axes == 1 else 3])
+        if slot in self.drift.standing:
+            self.drift.moves(slot, self.rows(slot)[: 2 if self.axes == 1 else 3])
 
-    def _far(self, robot: int) -> bool:
-        """Return whether inactive blocks are too far from where their error coordinates were left."""
-        if robot not in self._immediate.last:
+    def _far(self, robot: int, s: Array) -> bool:
+        """Return whether inactive blocks are too far from where their error coordinates were left.
+
+        s is the mean of auxiliary states and clones.
+        """
+        last = self._immediate.last.get(robot)
+        if last is None:
             return True
-        m, (clones, clones_x) = self.active, self._immediate.last[robot]
-        s, turn = m.x[self._s_x], self._turn_rows(robot)[-len(clones) :]
-        read = lambda rows, i: self._read(rows, self.A0[i:])  # noqa: E731
-        return self.drift.is_beyond(m.P, turn, clones, m.x, clones_x, s, self.n, read)
+        m, (clones, clones_x) = self.active, last
+        turn = self._turn_rows(robot)[-len(clones) :]
+        return self.drift.is_beyond(m.P, turn, clones, m.x, clones_x, s[: len(self.A0)], self.n, self._read_with)
+
+    def _read_with(self, rows: Index, first: int) -> Array:
+        """Return the stored covariance of rows with those that have auxiliary states, from the `first` of these on."""
+        return self._read(rows, self.A0[first:])
 
     def correct_all(self, robot: int, displaced: Array) -> None:
         """Apply the last correction to all inactive blocks as a dense filter does.
@@ -413,6 +423,7 @@ class CompressedMap(Layout):
         turns = immediate.turns_of(robot, moved, self._axes)
         self._immediate.add(robots.index(robot), S, U, displaced[:count], displaced[count:], *turns, self._origins())
         k = self._immediate.clone(self.active, {r: self._turn_rows(r) for r in robots})
+        self._displaced_x = np.concatenate([self._s_x, self._immediate.numbers])
         self.displaced = {r: np.concatenate([D, np.zeros(k)]) for r, D in self.displaced.items()}
         self.drift.leave(self.active.x, self.active.x[self._s_x])
 
@@ -420,8 +431,8 @@ class CompressedMap(Layout):
     def _progress(self) -> float:
         return self.schedule.progress(self.active.n, len(self.A0), self.n)
 
-    def _full(self) -> bool:
-        return bool(self.entered) and self._progress() > (1.0 if self._job is None else 2.0)
+    def _full(self, progress: float) -> bool:
+        return bool(self.entered) and progress > (1.0 if self._job is None else 2.0)
 
     def finish(self) -> None:
         """Finish a full update that is under way and free its memory.  A saved map begins from here."""

@@ -27,21 +27,27 @@ def near_in_region(
 
     And whether the region has all of these.  `at` (by slot) is negative for inactive blocks.
     """
-    here = np.empty(len(slots), np.int64)
+    here, d = np.empty(len(slots), np.int64), p.shape[1]
+    low, high = np.full(d, np.inf), np.full(d, -np.inf)  # what is outside this box is near none
+    for k in range(len(p)):
+        for j in range(d):
+            low[j], high[j] = min(low[j], p[k, j] - limit[k]), max(high[j], p[k, j] + limit[k])
     n, inside = 0, True
     for i in range(len(slots)):
-        if at[slots[i]] < 0 and sorts[1][sorts[0][slots[i]]]:
+        near_some = at[slots[i]] < 0 and sorts[1][sorts[0][slots[i]]]
+        for j in range(d):
+            near_some = near_some and low[j] <= places[i, j] <= high[j]
+        if near_some:
             here[n] = i
             n += 1
     found, near, gaps = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(n)
     for k in range(len(p)):
         count, far = 0, limit[k]
         for i in range(n):
-            if abs(p[k, 0] - places[here[i], 0]) <= far:
-                gap = distance(p[k], places[here[i]])
-                if gap <= far:
-                    near[count], gaps[count] = i, gap
-                    count += 1
+            gap = distance(p[k], places[here[i]])
+            if gap <= far:
+                near[count], gaps[count] = i, gap
+                count += 1
         if count >= most:
             far = least(gaps[:count], most)
         for i in range(count):
