@@ -5,7 +5,7 @@
 MRCLAM 6 against its truth: the odometry's error over windows of T seconds, divided by sqrt(T), which is constant for a
 diffusion; range and bearing residuals by range.  Victoria Park against the batch optimum of the log, as its GPS is no
 truth: 1.48 times the median absolute residual of range and bearing, and of the speed and steering that the optimal path
-asks for.
+asks for.  Of MRCLAM 6 and Lost in the Woods also the shifts of bearings and odometry in time that fit the truth best.
 """
 
 from __future__ import annotations
@@ -73,6 +73,41 @@ def mrclam() -> None:
         print(f"{low:>5} to {low + 2}{len(near):>9}{np.std(near[:, 1]):>14.3f}{np.std(near[:, 2]):>18.4f}")
 
 
+def shifts(config: str, *overrides: str) -> None:
+    """Print by how much the stamps of scans and of controls are late, and what the turns of the controls are times.
+
+    The bearings, and the turns in half a second, fit the truth best when they are taken as so much older.
+    """
+    loaded = load_config(config, [*overrides])
+    log = open_config_log(loaded)
+    for name, robot in build_slam(loaded, log).robots.items():
+        truth, mine = log.truth[name], [e for e in log.events if e.robot == name]
+        t, heading = truth.t_ns * 1e-9, np.unwrap(truth.poses[:, 2])
+        mount = next(iter(robot.sensors.values())).at
+        seen = [(e.t_s, y[-1], log.landmarks[i]) for e in mine if isinstance(e, Scan)
+                for y, i in zip(e.y, e.ids or (), strict=True) if i in log.landmarks]  # fmt: skip
+        stamps, bearings, places = (np.array(column) for column in zip(*seen, strict=True))
+        places = places[:, :2]
+        controls_ = [e for e in mine if isinstance(e, Control)]
+        at, w = np.array([e.t_s for e in controls_]), np.array([e.u[1] for e in controls_])
+        turned = np.concatenate([[0.0], np.cumsum(w[:-1] * np.diff(at))])
+        grid = np.arange(max(t[0], at[0]) + 1, min(t[-1], at[-1]) - 1, 0.5)
+        true = np.diff(np.interp(grid, t, heading))
+        of_scans, of_controls = [], []
+        for late in np.arange(-0.3, 0.31, 0.01):
+            theta = np.interp(stamps - late, t, heading)
+            ahead = np.column_stack([np.cos(theta), np.sin(theta)]) * mount[0]
+            away = places - ahead - np.column_stack([np.interp(stamps - late, t, c) for c in truth.poses[:, :2].T])
+            e = wrap(bearings - np.arctan2(away[:, 1], away[:, 0]) + theta)
+            of_scans.append((np.std(e[np.abs(e) < 0.2]), late))
+            said = np.diff(np.interp(grid + late, at, turned))
+            good = np.abs(said - true) < 0.5
+            scale = said[good] @ true[good] / (said[good] @ said[good])
+            of_controls.append((np.std(true[good] - scale * said[good]), late, scale))
+        (_, scans), (_, odometry, scale) = min(of_scans), min(of_controls)
+        print(f"{config} {name}: stamps late: scans {scans:+.2f} s, controls {odometry:+.2f} s; true turns {scale:.3f}")
+
+
 def victoria_park() -> None:
     """Print the laser's residuals about the batch optimum."""
     config = load_config("victoria_park_known")
@@ -121,5 +156,7 @@ def controls(calibration: str) -> np.ndarray:
 
 if __name__ == "__main__":
     mrclam()
+    shifts("mrclam", "log.robots=[1, 2, 3, 4, 5]", "log.bearing_shift_s=0")
+    shifts("lost_in_the_woods")
     victoria_park()
     steering()
