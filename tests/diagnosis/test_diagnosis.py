@@ -318,6 +318,23 @@ def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:
         assert verdict.causes[0].name == "start" and " 3" in verdict.causes[0].evidence  # some 34 deg
 
 
+def test_a_landmark_that_began_with_an_outlier_is_named_where_the_gate_leaves_out_the_rest() -> None:
+    log, begun = simulate(world_of(), 3), set[Any]()
+
+    def first_off(e: Event) -> Event:
+        if not isinstance(e, Scan) or e.ids is None or not len(e.y):
+            return e
+        off = [4.0 if i in (3, 8) and i not in begun else 0.0 for i in e.ids]
+        begun.update(e.ids)
+        return seen(e, y=e.y + np.column_stack([off, np.zeros(len(off))]))
+
+    gated = "filter.association={type: identity, gate: 0.9999}"
+    assert km.diagnose(recorded(log, gated)).map == "ok"
+    verdict = km.diagnose(recorded(replace(log, events=[*map(first_off, log.events)]), gated))
+    assert (verdict.map, verdict.causes[0].name) == ("doubtful", "misplaced_landmark")
+    assert "(3, 8)" in verdict.causes[0].evidence
+
+
 def test_observations_that_have_the_id_of_another_landmark_are_named() -> None:
     log, rng = simulate(world_of(), 3), np.random.default_rng(3)
     events: list[Event] = []

@@ -15,7 +15,7 @@ from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.diagnosis.causes import JUMPS, Finding, Where
 from kalmark.diagnosis.gross import fit, gross
-from kalmark.diagnosis.jumps import OddControl, joined, odd_control
+from kalmark.diagnosis.jumps import LISTED, OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import Mistake
 from kalmark.diagnosis.search import LEAST_GAIN, Search
@@ -28,10 +28,11 @@ from kalmark.results.gaps import RULED_OUT, left_out, matters
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.warnings import window_warnings
-from kalmark.results.words import figure
+from kalmark.results.words import count, figure
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
 from kalmark.slam.surveyed import ELSEWHERE
+from kalmark.tracks.surveys import MISFITS
 
 NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
@@ -133,7 +134,10 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         causes += odd_controls(run, log)
     causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
     causes = sorted([*first, *causes], key=lambda c: c.harmless)
-    if effect.status == "ok" and any(misplaced(run, f) for f in found.search.found):
+    wrong = any(misplaced(run, f) for f in found.search.found) or any(
+        c.name == "misplaced_landmark" and not c.harmless for c in first
+    )
+    if effect.status == "ok" and wrong:
         effect = replace(effect, status="doubtful")
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
@@ -289,7 +293,33 @@ def misplaced(run: Run, finding: Finding) -> bool:
 
 def _structural(run: Run) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
-    return [*repeats(run.summary), *gaps(run.summary), *given_up(run)]
+    return [*repeats(run.summary), *misplaced_landmarks(run), *gaps(run.summary), *given_up(run)]
+
+
+def misplaced_landmarks(run: Run) -> list[Cause]:
+    """Return the landmarks, known by their ids, of which the gate leaves out more sightings than it passes.
+
+    What is left out is in no batch solution.  Surveys have a cause of their own.
+    """
+    h, now = run.history, fit(run)
+    surveyed, mapped = {prior.landmark for prior in h.priors}, {str(id_) for id_ in run.landmarks.ids}
+    with_id, out, used = h.id != "", h.outcome == "rejected", h.outcome == "associated"
+    rows: list[int] = []
+    names: list[str] = []
+    for name in np.unique(h.landmark[with_id & out]).tolist():
+        mine = with_id & (h.landmark == name)
+        left = np.flatnonzero(mine & out)
+        if name in mapped - surveyed and len(left) >= MISFITS and len(left) > (mine & used).sum():
+            rows, names = [*rows, *left.tolist()], [*names, name]
+    if not names:
+        return []
+    score, since_s = 0.5 * float(now.values[rows] @ now.dof[rows]), float(h.t_ns[h.step[rows]].min()) * 1e-9
+    some = ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
+    some = f"{count(len(names), 'landmark')} of {len(mapped)} ({some}) not where the map says"
+    more = f"{len(rows)} sightings are outside the gate, more than within"
+    evidence = f"{some}: {more}. An outlier at first sight, or an id that means another place"
+    cure = "leave out their first sightings, or use robust: huber instead of a gate"
+    return [Cause("misplaced_landmark", since_s, score, evidence, cure, len(names) <= FEW * len(mapped))]
 
 
 def given_up(run: Run) -> list[Cause]:
