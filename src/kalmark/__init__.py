@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
-    from kalmark import association, detect, geometry
+    from kalmark import association, detect, geometry, vision
     from kalmark.declare import register
     from kalmark.diagnosis.verdict import Verdict, diagnose
     from kalmark.events import Control, Fix, Frame, Scan
@@ -40,7 +40,7 @@ __all__ = [
     "Attention", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount", "Observation",
     "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators",
     "geometry", "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record",
-    "register", "sensors", "stream_log",
+    "register", "sensors", "stream_log", "vision",
 ]  # fmt: skip
 
 _MODULES = {
@@ -53,6 +53,7 @@ _MODULES = {
     "motion": "kalmark.models.motion",
     "presets": "kalmark.presets",
     "sensors": "kalmark.models.sensors",
+    "vision": "kalmark.vision",
 }
 _NAMES = {
     "kalmark.declare": ("register",),

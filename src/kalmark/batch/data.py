@@ -25,8 +25,8 @@ from kalmark.geometry.spaces import mount_space
 from kalmark.models.observe import inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor
 from kalmark.slam.checks import measurements
-from kalmark.slam.policy import FrameDetector
 from kalmark.tracks.channel import huber_length
+from kalmark.tracks.front_ends import FrameDetector
 
 if TYPE_CHECKING:
     from kalmark.slam.robot import Robot

@@ -22,7 +22,8 @@ import kalmark.management.initialization
 import kalmark.management.upkeep
 import kalmark.models.landmarks
 import kalmark.models.motion
-import kalmark.models.sensors  # noqa: F401 - all of these register their models
+import kalmark.models.sensors
+import kalmark.vision  # noqa: F401 - all of these register their models
 from kalmark.declare import (
     Parameter,
     class_of,

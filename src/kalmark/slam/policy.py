@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Association, averages, weighs
 from kalmark.errors import ModelError
-from kalmark.events import Frame, Scan
+from kalmark.events import Scan
 from kalmark.filter.estimators import Estimator
 from kalmark.management.attention import Attention
 from kalmark.management.delayed import Delayed
@@ -29,15 +28,6 @@ from kalmark.models.protocols import (
 )
 from kalmark.slam.robot import Mount, Robot
 from kalmark.tracks.channel import Channel, default_landmark
-
-
-@runtime_checkable
-class FrameDetector(Protocol):
-    """A detector that finds landmarks in images."""
-
-    def scan_of(self, frame: Frame) -> Scan:
-        """Return the scan of what is found in a frame.  Raises EventError."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

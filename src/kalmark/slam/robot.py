@@ -23,6 +23,7 @@ from kalmark.models.protocols import Landmark, Motion, OfState, Sensor, paramete
 from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
 from kalmark.slam.gaps import ACTIONS, Gaps
 from kalmark.tracks.channel import ROBUST
+from kalmark.tracks.front_ends import SearchingDetector
 
 INFINITE = math.inf
 IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
@@ -80,7 +81,9 @@ class Mount:
         if self.association is not None:
             refuse_odd_association(self.association, "Mount: association")
         if self.detector is not None:
-            able(self.detector, ("__call__",), "Mount: detector", "an object like km.detect.Trunks(), or a function")
+            searches = isinstance(self.detector, SearchingDetector)
+            one = "an object like km.detect.Trunks(), or a function"
+            able(self.detector, ("front_end" if searches else "__call__",), "Mount: detector", one)
         instance(self.attention, Attention, "Mount: attention", "an Attention")
         if self.upkeep is not None:
             instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")

@@ -129,6 +129,7 @@ def _state(state: State) -> Description:
             [*key, reader.t_ns, None if reader.standing is None else reader.standing.state()]
             for key, reader in state.readers.items()
         ],
+        "front_ends": [[*key, front_end.state()] for key, front_end in state.front_ends.items()],
         "surveys": {
             "trial": [[_id(name), count] for name, count in state.surveys.trial.items()],
             "misfits": [
@@ -178,6 +179,9 @@ def _arrays(state: State) -> Iterator[tuple[str, Array]]:
     yield from state.map.arrays()
     for i, of in enumerate(state.tracks.known.of_kind.values()):
         yield f"known{i}", of.values
+    for i, front_end in enumerate(state.front_ends.values()):
+        for name, array in front_end.arrays().items():
+            yield f"{name}{i}", array
     for i, moving in enumerate(state.moving.values()):
         if moving.held.u is not None and moving.held.N is not None:
             yield f"u{i}", moving.held.u
@@ -253,6 +257,12 @@ class Saved:
             reader.t_ns = _time(t_ns)
             if reader.standing is not None:
                 reader.standing.restore(window)
+        for i, (robot, sensor, seen) in enumerate(s.get("front_ends", ())):
+
+            def read(name: str, shape: tuple[int, ...], i: int = i) -> Array:
+                return _array(self._members, f"{name}{i}", shape)
+
+            state.front_ends[robot, sensor].restore(seen, read)
         carried: dict[ChannelKey, Channel | Reader] = {**state.channels, **state.readers}
         for key, channel in carried.items():
             channel.mount = tracks.slots.get(mount_name(*key), -1)

@@ -42,10 +42,12 @@ from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_c
 from kalmark.slam.checks import numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
-from kalmark.slam.policy import FrameDetector, Policy, refuse_other_world
+from kalmark.slam.policy import Policy, refuse_other_world
 from kalmark.slam.robot import Robot, robots_given
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import CURE, Settings, State
+from kalmark.tracks.front_ends import FrameDetector, FrontEnd, SearchingDetector
+from kalmark.tracks.prospect import Prospect
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track
 
@@ -149,10 +151,26 @@ class Slam(Estimate):
         return self._found(event if policy.detector is None else policy.detector(event))
 
     def _frame(self, event: Frame) -> Report:
-        detector = self._policy(event).detector
+        state, detector = self.state, self._policy(event).detector
+        if isinstance(detector, SearchingDetector):
+            return self._searched(event, state.front_ends[event.robot, event.sensor])
         if not isinstance(detector, FrameDetector):
             raise EventError(f"{when(event)}: {event.sensor!r} has no detector for images, expected one")
         return self._found(detector.scan_of(event))
+
+    def _searched(self, event: Frame, front_end: FrontEnd) -> Report:
+        """Search a frame for the landmarks that are expected in it.  [S] 2.4."""
+        state, channel, image = self.state, self.state.channels[event.robot, event.sensor], event.grey()
+        state.t_ns = event.t_ns
+        gaps = moves.advance(state, event.robot)
+        scan, removed = front_end.search(event, image, Prospect(state.map, state.tracks, channel, event.robot))
+        for name, _ in removed:
+            state.remove(name)
+        report = self._found(scan)
+        report.gaps += gaps
+        report.removed = (*removed, *report.removed)
+        front_end.learn(report, channel.pose(state.map, state.moving[event.robot].slot))
+        return report
 
     def _policy(self, event: Scan | Frame) -> Policy:
         """Return the policy for what a sensor of landmarks saw.  Raises EventError."""

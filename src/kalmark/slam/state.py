@@ -25,6 +25,7 @@ from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.standing import standing_of
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
+from kalmark.tracks.front_ends import FrontEnd, SearchingDetector
 from kalmark.tracks.scan import Start
 from kalmark.tracks.surveys import Surveys
 from kalmark.tracks.track import ChannelKey, Tracks
@@ -61,6 +62,7 @@ class State:
         self.moving: dict[str, Moving] = {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
+        self.front_ends: dict[ChannelKey, FrontEnd] = {}
         self.readers: dict[ChannelKey, Reader] = {}
         self.standing: dict[str, str] = {}
         self.inner = {bias_name(name) for name in robots}
@@ -105,6 +107,8 @@ class State:
                 self.robots, robot, mount, mount_slot, settings.landmarks, association, self.estimator
             )  # fmt: skip
             self.channels[robot.name, name] = channel
+            if isinstance(mount.detector, SearchingDetector):
+                self.front_ends[robot.name, name] = mount.detector.front_end(mount.sensor)
             upkeep = mount.upkeep or settings.upkeep
             self.policies[robot.name, name] = policy_of(mount, channel, association, upkeep, settings.reparametrize)
 

@@ -1,0 +1,53 @@
+"""What makes scans of images: detectors that look at each by itself, and front ends that search where it is expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+from kalmark.arrays import Array
+from kalmark.events import Frame, Id, Scan
+from kalmark.report import Report
+from kalmark.tracks.prospect import Prospect
+
+
+@runtime_checkable
+class FrameDetector(Protocol):
+    """A detector that finds landmarks in images."""
+
+    def scan_of(self, frame: Frame) -> Scan:
+        """Return the scan of what is found in a frame.  Raises EventError."""
+        ...
+
+
+class FrontEnd(Protocol):
+    """Searches the frames of one sensor for the landmarks that it should see."""
+
+    def search(self, frame: Frame, image: Any, prospect: Prospect) -> tuple[Scan, list[tuple[Id, str]]]:
+        """Return what was found in an image (H, W), and the landmarks that are given up, each with the reason."""
+        ...
+
+    def learn(self, report: Report, T: Array) -> None:
+        """Learn what became of the last frame, its sensor being at T (7,)."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Return what is to be saved with the map, in words of JSON."""
+        ...
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the arrays that are to be saved with the map."""
+        ...
+
+    def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
+        """Take over what was saved; `read` gives an array by its name and shape."""
+        ...
+
+
+@runtime_checkable
+class SearchingDetector(Protocol):
+    """A detector that searches images for landmarks where they are expected."""
+
+    def front_end(self, sensor: Any) -> FrontEnd:
+        """Return what searches the frames of a sensor."""
+        ...

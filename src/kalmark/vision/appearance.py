@@ -1,0 +1,111 @@
+"""How a landmark looked, and how it must look from elsewhere: patches warped by the homography of their plane.
+
+The landmark at p lies on a plane whose normal points to the camera at c from which a patch was taken: n = (c - p)/|c - p|.
+A corner of the patch, seen along the unit ray m, is at X = m (x.x)/(m.x) in that camera's frame, x = p in it.  From
+where the camera is now the four corners appear at four pixels, which determine the homography, whatever the lens.  The
+centre of the patch is the landmark, wherever the estimate has it by now: the pixels count from where the centre appears.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array, Index
+from kalmark.geometry.rotations import matrix
+
+MOST_SCALE = 2.0  # a patch is not enlarged or reduced by more
+LEAST_COSINE = 0.5  # of the angle between the directions of view, then and now: 60 deg
+ANOTHER_COSINE, ANOTHER_SCALE = 0.94, 1.4  # a view is taken where the best one differs by more: 20 deg
+MOST_VIEWS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A patch (2 q + 1, 2 q + 1) of an image, taken from the pose T (7,); `rays` (5, 3) of its corners and its centre."""
+
+    patch: Any
+    T: Array
+    rays: Array
+
+
+class Looks(NamedTuple):
+    """How K landmarks must look: `templates` (K, s, s), which of them can be `told` (n,), and how well known they are.
+
+    `likeness` (K, 2) is the cosine of the angle between the directions of view and the scale, of the best view of each.
+    """
+
+    templates: Any
+    told: Index
+    likeness: Array
+
+
+def corners(y: Array, q: float) -> Array:
+    """Return the corners of a patch about the pixel y (2,), clockwise from above left, and its centre: (5, 2)."""
+    return y + q * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [0.0, 0.0]])
+
+
+def taken(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int) -> View | None:
+    """Return the view of what is at the pixel y (2,) of an image taken from T, None too near to its border."""
+    height, width = image.shape
+    if not (q <= y[0] <= width - 1 - q and q <= y[1] <= height - 1 - q):
+        return None
+    patch = cv2.getRectSubPix(image, (2 * q + 1, 2 * q + 1), (float(y[0]), float(y[1])))
+    rays = sensor.invert(corners(y, q))[0]
+    return View(patch, T.copy(), rays) if np.isfinite(rays).all() else None
+
+
+def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[View | None], Array]:
+    """Return for each landmark the view most like that from T, and (K, 2) the cosine of the angle between and the scale."""
+    best: list[View | None] = []
+    likeness = np.zeros((len(views), 2))
+    for k, own in enumerate(views):
+        chosen, score = None, -np.inf
+        now = T[:3] - places[k]
+        near = np.sqrt(now @ now)
+        for view in own:
+            then = view.T[:3] - places[k]
+            far = np.sqrt(then @ then)
+            cosine, scale = float(then @ now / max(far * near, 1e-12)), float(far / max(near, 1e-12))
+            if cosine - 0.3 * abs(np.log(max(scale, 1e-6))) > score:
+                chosen, score = view, cosine - 0.3 * abs(np.log(max(scale, 1e-6)))
+                likeness[k] = cosine, scale
+        best.append(chosen)
+    return best, likeness
+
+
+def predicted(cv2: Any, views: list[list[View]], places: Array, T: Array, sensor: Any, h: int) -> Looks:
+    """Return how landmarks at `places` (K, 3) must look from T: templates of half width h."""
+    best, likeness = best_views(views, places, T)
+    templates, done = np.zeros((len(best), 2 * h + 1, 2 * h + 1), np.uint8), []
+    told = [
+        k for k, view in enumerate(best)
+        if view is not None and likeness[k, 0] > LEAST_COSINE and 1 / MOST_SCALE < likeness[k, 1] < MOST_SCALE
+    ]  # fmt: skip
+    if not told:
+        return Looks(templates, np.zeros(0, np.int64), likeness)
+    X = np.empty((len(told), 5, 3))
+    for i, k in enumerate(told):
+        view = best[k]
+        assert view is not None
+        turn = matrix(view.T[3:])
+        x = (places[k] - view.T[:3]) @ turn
+        along = view.rays @ x
+        X[i] = view.T[:3] + (view.rays * (x @ x / along)[:, None]) @ turn.T
+    seen = (X.reshape(-1, 3) - T[:3]) @ matrix(T[3:])
+    pixels = sensor.expect(np.ascontiguousarray(seen))[0].reshape(-1, 5, 2)
+    for i, k in enumerate(told):
+        view = best[k]
+        assert view is not None
+        to = pixels[i, :4] - pixels[i, 4] + h
+        if not np.isfinite(to).all():
+            continue
+        size = view.patch.shape[0] - 1.0
+        source = np.array([[0.0, 0.0], [size, 0.0], [size, size], [0.0, size]], dtype=np.float32)
+        warp = cv2.getPerspectiveTransform(source, to.astype(np.float32))
+        flags, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+        done.append(k)
+        templates[k] = cv2.warpPerspective(view.patch, warp, (2 * h + 1, 2 * h + 1), flags=flags, borderMode=border)
+    return Looks(templates, np.array(done, dtype=np.int64), likeness)

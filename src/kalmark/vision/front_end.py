@@ -1,0 +1,239 @@
+"""From images to landmarks: a detector that asks where landmarks must appear, and searches only there.  [S] 1.1, 2.4.
+
+For each frame: the expectations of all landmarks in view (`Prospect`), how they must look from there (`appearance`), a
+search that believes what agrees (`selection`), new landmarks in empty cells (`features`).  What is found is a scan with
+ids, which the filter fuses like any other.  What became of it is learnt afterwards: patches of new landmarks and of old
+ones from another side, and which landmarks are not worth their place any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.declare import Count, Positive, Within, register
+from kalmark.errors import ModelError
+from kalmark.events import Frame, Id, Scan
+from kalmark.models.sensors import PinHole
+from kalmark.report import Report
+from kalmark.tracks.prospect import Prospect
+from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
+from kalmark.vision.features import Cells
+from kalmark.vision.matching import Searcher
+from kalmark.vision.selection import Search, Selection
+
+PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
+TRIAL = 10  # searches after which a landmark may be given up
+LEAST_SHARE = 0.5  # of its searches in which one is found and fits; fewer: it is given up
+
+
+def opencv() -> Any:
+    """Return OpenCV, on one thread.  Raises ModelError."""
+    try:
+        import cv2
+    except ImportError:
+        raise ModelError("ActiveSearch: OpenCV is not installed, expected it: pip install 'kalmark[opencv]'") from None
+    cv2.setNumThreads(1)
+    return cv2
+
+
+@register("detector", "active_search")
+class ActiveSearch:
+    """Points of an image, found where the filter expects them: normalised correlation with their patches.
+
+    Each frame, `in_view` landmarks are kept in view, at most `starts` new ones from corners with a gradient of at least
+    `contrast` grey values a pixel; a match correlates by `accept` at least.  `keep` says which landmarks stay:
+    "global" all that are found in half of the searches for them, "local" of these the `most` best, "odometry" only
+    those in view.  The search begins with a random landmark, by `seed`: the same seed, the same result.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = PinHole.columns
+
+    in_view: Annotated[Count, "So many landmarks are wanted in view."] = 60
+    starts: Annotated[int, Within(ge=0), "At most so many new ones in a frame."] = 10
+    updates: Annotated[Count, "At most so many landmarks are matched in a frame."] = 100
+    most: Annotated[Count, "At most so many landmarks in the map: the least useful out of view make room."] = 300
+    keep: Annotated[Literal["global", "odometry"], "Keep landmarks that are out of view, or not."] = "global"
+    accept: Annotated[float, Within(gt=0, lt=1), "Correlation of a match, at least."] = 0.85
+    contrast: Annotated[
+        Positive, "Gradient of a corner in the direction of least change, RMS, grey values a pixel."
+    ] = 4.0
+    seed: Annotated[int, Within(ge=0), "Of what is chosen at random."] = 0
+
+    def front_end(self, sensor: Any) -> FrontEnd:
+        """Return what searches the frames of one sensor."""
+        return FrontEnd(self, sensor)
+
+
+@dataclass
+class Look:
+    """How a landmark looked, and how often it was searched, found, and fitted."""
+
+    views: list[View] = field(default_factory=list)
+    searched: int = 0
+    found: int = 0
+    fitted: int = 0
+    missed: int = 0  # searches since it last fitted
+    seen: int = -1  # frame of the last
+
+
+class Sighting(NamedTuple):
+    """What a frame showed: a scan, and the landmarks that are given up, each with the reason."""
+
+    scan: Scan
+    removed: list[tuple[Id, str]]
+
+
+class FrontEnd:
+    """Searches the frames of one sensor; `looks` has how each landmark looked, `times` what the parts took, s."""
+
+    def __init__(self, settings: ActiveSearch, sensor: Any) -> None:
+        self.settings, self.sensor, self.cv2 = settings, sensor, opencv()
+        self.random = np.random.default_rng(settings.seed)
+        width = sensor.image[0]
+        across = max(4, round(np.sqrt(1.6 * settings.in_view * width / sensor.image[1])))
+        self.cells = Cells(self.cv2, across, TEMPLATE, settings.contrast)
+        self.looks: dict[Id, Look] = {}
+        self.frame = self.named = 0
+        self.found: Selection | None = None
+        self.prospect: Prospect | None = None
+        self.image: Any = None
+        self.times: dict[str, float] = dict.fromkeys(("predict", "search", "match", "start", "learn"), 0.0)
+
+    def search(self, frame: Frame, image: Any, prospect: Prospect) -> Sighting:
+        """Search an image (H, W) for the landmarks of a prospect, and for new ones."""
+        t0 = perf_counter()
+        settings, cv2 = self.settings, self.cv2
+        self.frame += 1
+        self.image, self.prospect = image, prospect
+        views = [self._views(name) for name in prospect.names]
+        looks = predicted(cv2, views, prospect.places, prospect.T, prospect.sensor, TEMPLATE)
+        self.likeness = looks.likeness
+        t1 = perf_counter()
+        searcher = Searcher(cv2, image, looks.templates, settings.accept)
+        found = self.found = Search(prospect, looks.told, searcher, settings.updates).run(self.random)
+        removed = self._count(prospect, found)
+        t2 = perf_counter()
+        rows = np.flatnonzero(found.matched).tolist()
+        y = found.y[rows]
+        ids: list[Id] = [prospect.names[k] for k in rows]
+        new = self._new(image, found, prospect, len(rows))
+        ids += [self._name() for _ in new]
+        removed += self._room(len(new), {name for name, _ in removed}, prospect)
+        y = np.concatenate([y, new])
+        t3 = perf_counter()
+        for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", t3 - t2)):
+            self.times[part] += spent
+        scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None)
+        return Sighting(scan, removed)
+
+    def learn(self, report: Report, T: Array) -> None:
+        """Learn from what became of a frame, its sensor at T (7,) now: patches, and which landmarks fitted."""
+        t0 = perf_counter()
+        assert self.prospect is not None
+        at = {name: k for k, name in enumerate(self.prospect.names)}
+        for o in report.observations:
+            name = o.landmark
+            if name is None:
+                continue
+            if o.outcome == "new":
+                view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH)
+                if view is not None:
+                    self.looks[name] = Look([view], seen=self.frame)
+            elif o.outcome == "associated":
+                look = self.looks[name]
+                look.fitted, look.missed, look.seen = look.fitted + 1, 0, self.frame
+                cosine, scale = self.likeness[at[name]]
+                other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
+                if other and len(look.views) < MOST_VIEWS:
+                    view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH)
+                    look.views += [view] if view is not None else []
+        for name, _ in report.removed:
+            self.looks.pop(name, None)
+        self.times["learn"] += perf_counter() - t0
+
+    # ------------------------------------------------------------------ files
+    def state(self) -> dict[str, Any]:
+        """Return what is to be saved with the map, but for `arrays`."""
+        looks = [
+            [name, len(of.views), of.searched, of.found, of.fitted, of.missed, of.seen]
+            for name, of in self.looks.items()
+        ]
+        failed = [[*place, frame] for place, frame in self.cells.failed.items()]
+        random = self.random.bit_generator.state
+        return {"frame": self.frame, "named": self.named, "random": random, "looks": looks, "failed": failed}
+
+    def arrays(self) -> dict[str, Array]:
+        """Return patches, poses and rays of all views, landmark after landmark."""
+        views, side = [view for look in self.looks.values() for view in look.views], 2 * PATCH + 1
+        return {
+            "patches": np.array([view.patch for view in views], dtype=np.float64).reshape(-1, side, side),
+            "poses": np.array([view.T for view in views]).reshape(-1, 7),
+            "rays": np.array([view.rays for view in views]).reshape(-1, 5, 3),
+        }
+
+    def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
+        """Take over what was saved; `read` gives an array by its name and shape."""
+        side, count = 2 * PATCH + 1, sum(int(look[1]) for look in state["looks"])
+        patches = read("patches", (count, side, side)).astype(np.uint8)
+        views = list(map(View, patches, read("poses", (count, 7)), read("rays", (count, 5, 3))))
+        self.looks, at = {}, 0
+        for name, own, *counts in state["looks"]:
+            self.looks[name] = Look(views[at : at + own], *map(int, counts))
+            at += own
+        self.frame, self.named = int(state["frame"]), int(state["named"])
+        self.random.bit_generator.state = state["random"]
+        self.cells.failed = {(int(i), int(j)): int(frame) for i, j, frame in state["failed"]}
+
+    # ------------------------------------------------------------------ landmarks
+    def _views(self, name: Id) -> list[View]:
+        look = self.looks.get(name)
+        return [] if look is None else look.views
+
+    def _name(self) -> Id:
+        self.named += 1
+        return self.named
+
+    def _new(self, image: Any, found: Selection, prospect: Prospect, count: int) -> Array:
+        """Return the pixels (n, 2) of new landmarks."""
+        wanted = min(self.settings.in_view - count, self.settings.starts if len(self.looks) else self.settings.in_view)
+        if wanted <= 0:
+            return np.zeros((0, 2))
+        e = np.where(found.matched[:, None], found.y, found.belief.e)
+        return self.cells.corners(image, e[np.isfinite(e).all(axis=1)], wanted, PATCH + 1, self.frame, self.random)
+
+    def _count(self, prospect: Prospect, found: Selection) -> list[tuple[Id, str]]:
+        """Count searches; return the landmarks that are given up, each with the reason."""
+        removed: list[tuple[Id, str]] = []
+        for k in np.flatnonzero(found.searched).tolist():
+            name = prospect.names[k]
+            look = self.looks[name]
+            look.searched, look.missed = look.searched + 1, look.missed + 1
+            if found.matched[k]:
+                look.found += 1
+                continue
+            if look.searched >= TRIAL and look.fitted < LEAST_SHARE * look.searched:
+                removed.append((name, f"fitted in {look.fitted} of {look.searched} searches"))
+            elif look.searched < TRIAL and look.missed >= 3:
+                removed.append((name, f"not found in {look.missed} searches, {look.fitted} before"))
+        if self.settings.keep == "odometry":
+            gone = {name for name, _ in removed}
+            view = set(prospect.names)
+            removed += [(name, "out of view") for name in self.looks if name not in view and name not in gone]
+        return removed
+
+    def _room(self, new: int, gone: set[Id], prospect: Prospect) -> list[tuple[Id, str]]:
+        """Return the landmarks that make room for new ones: out of view, least fitted first."""
+        over = len(self.looks) - len(gone) + new - self.settings.most
+        if over <= 0:
+            return []
+        view = {*prospect.names, *gone}
+        out = sorted(
+            (look.fitted, look.seen, k, name) for k, (name, look) in enumerate(self.looks.items()) if name not in view
+        )
+        return [(name, "made room") for *_, name in out[:over]]
