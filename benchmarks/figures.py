@@ -413,6 +413,20 @@ def bags() -> Iterator[Figure]:
                      row(f"mcap, {name}:", "{0} / {7} {8} / {10} {11}"))  # fmt: skip
 
 
+def images() -> Iterator[Figure]:
+    """Yield one camera on recorded images."""
+    shown = "{0} {1} {2} {3} {4} m / {6} % / {10} / {11} ms"
+    sequences = (
+        ("fr1_xyz", "fr1_xyz, 320 x 240, 798 frames, 8.0 m", "0.015 m each / 2 %"),
+        ("tsukuba", "tsukuba, 640 x 480, 150 frames, 3.8 m", "0.04 m each / -"),
+    )
+    for name, label, wanted in sequences:
+        yield Figure("Images", f"one camera, {label}: ATE of five seeds, aligned by similarity / scale drift / matched a frame / a frame",
+                     wanted, f"python benchmarks/vision.py {name}", row(name, shown))  # fmt: skip
+    yield Figure("Images", "one camera, desk video, 640 x 480: end off the start, share of the path, largest of five seeds / a frame",
+                 "1 % / -", "python benchmarks/vision.py desk", row("desk", "{8} % / {11} ms"))  # fmt: skip
+
+
 def partial_measurements() -> Iterator[Figure]:
     """Yield the figures of ranges alone and bearings alone."""
     section, command = "Ranges alone", "python benchmarks/range_only.py"
@@ -611,6 +625,7 @@ def figures() -> list[Figure]:
         space,
         commands,
         bags,
+        images,
         speed,
         structure,
     )

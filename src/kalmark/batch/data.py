@@ -187,7 +187,8 @@ class Replay:
         if isinstance(event, Scan):
             return event if detector is None else detector(event)
         if not isinstance(detector, FrameDetector):
-            raise unsolved(f"{when(event)}: {event.sensor!r} has no detector for images")
+            why = f"{event.sensor!r} searched its images where the filter expected landmarks"
+            raise unsolved(f"{when(event)}: {why}, expected scans, or a detector that looks at each image by itself")
         return detector.scan_of(event)
 
     def _scan(self, scan: Scan, rows: list[int]) -> None:

@@ -257,17 +257,21 @@ class Saved:
             reader.t_ns = _time(t_ns)
             if reader.standing is not None:
                 reader.standing.restore(window)
-        for i, (robot, sensor, seen) in enumerate(s.get("front_ends", ())):
-
-            def read(name: str, shape: tuple[int, ...], i: int = i) -> Array:
-                return _array(self._members, f"{name}{i}", shape)
-
-            state.front_ends[robot, sensor].restore(seen, read)
+        self._fill_front_ends(state)
         carried: dict[ChannelKey, Channel | Reader] = {**state.channels, **state.readers}
         for key, channel in carried.items():
             channel.mount = tracks.slots.get(mount_name(*key), -1)
         _check_owners(state)
         _check_measurements(state)
+
+    def _fill_front_ends(self, state: State) -> None:
+        """Fill in how landmarks looked."""
+        for i, (robot, sensor, seen) in enumerate(self._state.get("front_ends", ())):
+
+            def read(name: str, shape: tuple[int, ...], i: int = i) -> Array:
+                return _array(self._members, f"{name}{i}", shape)
+
+            state.front_ends[robot, sensor].restore(seen, read)
 
     def _fill_moving(self, state: State) -> None:
         """Fill in how the robots move."""

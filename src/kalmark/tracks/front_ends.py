@@ -1,4 +1,4 @@
-"""What makes scans of images: detectors that look at each by itself, and front ends that search where it is expected."""
+"""What makes scans of images: detectors that look at each by itself, front ends that search where they expect."""
 
 from __future__ import annotations
 

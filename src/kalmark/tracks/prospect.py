@@ -110,7 +110,7 @@ class Prospect:
 
     def _linearized(self, model: ObservationModel, head: Array, l: Array) -> tuple[Array, Array, Array, Array]:
         y = np.zeros((len(l), len(self.channel.sensor.columns)))
-        return linearize(model.model, np.ascontiguousarray(head), np.ascontiguousarray(l), y)  # type: ignore[return-value]
+        return linearize(model.model, np.ascontiguousarray(head), np.ascontiguousarray(l), y)
 
     def _noise(self, parts: list[Any]) -> Array:
         m = len(self.channel.sensor.columns)
@@ -175,7 +175,8 @@ class Prospect:
     def _gain(self, belief: Belief, rows: Sequence[int] | Index) -> Array:
         p = belief.e.shape[1]
         flat = (p * np.asarray(rows)[:, None] + np.arange(p)).ravel()
-        return np.linalg.solve(self._innovation(belief, rows), belief.C[:, flat].T).T
+        K = np.linalg.solve(self._innovation(belief, rows), belief.C[:, flat].T).T
+        return np.asarray(K, dtype=np.float64)
 
 
 def _places(model: ObservationModel, l: Array) -> Array:

@@ -1,9 +1,9 @@
 """How a landmark looked, and how it must look from elsewhere: patches warped by the homography of their plane.
 
-The landmark at p lies on a plane whose normal points to the camera at c from which a patch was taken: n = (c - p)/|c - p|.
+The landmark at p lies on a plane whose normal points to the camera at c from which a patch was taken, (c - p)/|c - p|.
 A corner of the patch, seen along the unit ray m, is at X = m (x.x)/(m.x) in that camera's frame, x = p in it.  From
 where the camera is now the four corners appear at four pixels, which determine the homography, whatever the lens.  The
-centre of the patch is the landmark, wherever the estimate has it by now: the pixels count from where the centre appears.
+centre of the patch is the landmark, wherever the estimate has it by now: pixels count from where the centre appears.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MOST_VIEWS = 4
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A patch (2 q + 1, 2 q + 1) of an image, taken from the pose T (7,); `rays` (5, 3) of its corners and its centre."""
+    """A patch (2 q + 1, 2 q + 1) of an image taken from the pose T (7,); `rays` (5, 3) of its corners, its centre."""
 
     patch: Any
     T: Array
@@ -32,7 +32,7 @@ class View:
 
 
 class Looks(NamedTuple):
-    """How K landmarks must look: `templates` (K, s, s), which of them can be `told` (n,), and how well known they are.
+    """How K landmarks must look: `templates` (K, s, s), of which those `told` (n,) hold.
 
     `likeness` (K, 2) is the cosine of the angle between the directions of view and the scale, of the best view of each.
     """
@@ -58,7 +58,7 @@ def taken(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int) -> View
 
 
 def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[View | None], Array]:
-    """Return for each landmark the view most like that from T, and (K, 2) the cosine of the angle between and the scale."""
+    """Return for each landmark the view most like that from T, and cosine of the angle between and scale (K, 2)."""
     best: list[View | None] = []
     likeness = np.zeros((len(views), 2))
     for k, own in enumerate(views):

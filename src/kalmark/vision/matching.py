@@ -22,7 +22,7 @@ OUTSIDE = -2.0  # the score of what is not in the image
 
 
 class Searcher:
-    """Searches in one image (H, W) for templates (K, s, s) of s = 4 n + 1 pixels, whose centres half the resolution keeps.
+    """Searches one image (H, W) for templates (K, s, s) of s = 4 n + 1 pixels, whose centres half the resolution keeps.
 
     `accept` is the least score of a match.
     """
@@ -32,21 +32,22 @@ class Searcher:
         self._half: Any = None
 
     def in_ellipses(self, which: Index, e: Array, Z: Array, d2: float) -> tuple[Array, Array]:
-        """Return where the templates `which` (k,) are found, (k, 2), in (y - e)' Z^-1 (y - e) <= d2, and their scores (k,).
+        """Return where templates `which` (k,) are found in (y - e)' Z^-1 (y - e) <= d2, (k, 2), and their scores (k,).
 
         The score of what is not found is below `accept`.
         """
-        r = np.sqrt(d2 * np.diagonal(Z, axis1=1, axis2=2))
+        r: Array = np.sqrt(d2 * np.diagonal(Z, axis1=1, axis2=2))
         large = np.flatnonzero(r.max(axis=1, initial=0.0) > COARSE_PX).tolist()
         limit = np.full(len(which), d2)
         limit[large] = -1.0
-        y, scores = best_matches(self.image, self.templates, which, e, np.linalg.inv(Z), r, limit, self.accept)
+        W = np.ascontiguousarray(np.linalg.inv(Z))
+        y, scores = best_matches(self.image, self.templates, which, e, W, r, limit, self.accept)
         for k in large:
             y[k], scores[k] = self._coarse_to_fine(int(which[k]), e[k], Z[k], d2, r[k])
         return y, scores
 
     def in_discs(self, which: Index, e: Array, radius: Array) -> tuple[Array, Array]:
-        """Return where the templates `which` (k,) are found, (k, 2), within a radius (k,) of e, and their scores (k,)."""
+        """Return where templates `which` (k,) are found within a radius (k,) of e, (k, 2), and their scores (k,)."""
         W = np.broadcast_to(np.eye(2), (len(which), 2, 2)).copy()
         r = np.column_stack([radius, radius])
         return best_matches(self.image, self.templates, which, e, W, r, radius * radius, self.accept)
@@ -110,7 +111,7 @@ def best_matches(
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return for each template `which` (k,) the best place (k, 2) in (y - e)' W (y - e) <= limit and its score (k,).
 
-    `r` (k, 2) is half the size of a box about that.  The pixel nearest to e always counts, unless the limit is negative.
+    `r` (k, 2) is half the size of a box about that.  The pixel nearest to e always counts; with a negative limit none.
     """
     k = len(which)
     found, scores = e.copy(), np.full(k, -2.0)

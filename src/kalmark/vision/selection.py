@@ -113,6 +113,7 @@ class Search:
     def _active(self) -> None:
         """Search for the rest, those that tell most first."""
         found = self.found
+        found.searched[:] = found.matched  # what did not agree is searched again, in a smaller ellipse
         for _ in range(ONE_BY_ONE):
             pending, radii = self._pending()
             if not len(pending) or radii[0] < WORTH_PX:
@@ -126,7 +127,7 @@ class Search:
             self._take(pending[good], y[good])
 
     def _pending(self) -> tuple[Index, Array]:
-        """Return the landmarks yet to be searched, the largest ellipses first, and their radii: mean of both axes, px."""
+        """Return the landmarks yet to be searched, the largest ellipses first, and their mean radii in px."""
         found = self.found
         left = self.told[~found.searched[self.told]]
         Z = self.prospect.innovations(found.belief, left)
