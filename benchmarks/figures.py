@@ -332,6 +332,8 @@ def storms() -> Iterator[Figure]:
                  "all / 0", "python benchmarks/fuzz.py --seconds 600", row("total", "{0} / {2}"))  # fmt: skip
     yield Figure("Bad events", "A log of 1,000,000 rows of CSV: time / memory / bytes a row", "- / that of its events / -",
                  "python benchmarks/tables.py --rows 1000000", row("1000000 rows,", "{6} s / {8} MB / {10}"))  # fmt: skip
+    yield Figure("Bad events", "Of 10,000,000 rows, event by event (`stream_log`): time / growth of the memory", "- / bounded",
+                 "python benchmarks/tables.py --rows 10000000 --stream", row("10000000 rows,", "{6} s / {8} MB"))  # fmt: skip
 
 
 def gaps() -> Iterator[Figure]:

@@ -1,9 +1,9 @@
 """How much time and memory a long native log takes to read.
 
-    python benchmarks/tables.py [--rows 1000000] [--parquet]
+    python benchmarks/tables.py [--rows 1000000] [--parquet] [--stream]
 
 Half of the rows are controls, half observations, five a scan.  Memory is the growth of the largest resident set while
-`open_log` reads: the events of the log; a file is read row by row.
+`open_log` reads: the events of the log; a file is read row by row.  --stream: `stream_log` yields them and keeps none.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kalmark.logs import open_log, write_native
+from kalmark.logs import open_log, stream_log, write_native
 
 
 def most_mb() -> float:
@@ -48,10 +48,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--parquet", action="store_true")
+    parser.add_argument("--stream", action="store_true")
     parser.add_argument("--read", type=Path, help="read this log only")
     asked = parser.parse_args()
     if asked.read is not None:
-        read(asked.read, asked.rows)
+        read(asked.read, asked.rows, asked.stream)
         return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "csv"
@@ -59,24 +60,25 @@ def main() -> None:
         write(folder, asked.rows)
         if asked.parquet:
             folder = write_native(open_log(folder), Path(name) / "parquet", parquet=True)
-        read_alone(folder, asked.rows)
+        read_alone(folder, asked.rows, asked.stream)
 
 
-def read_alone(folder: Path, rows: int) -> None:
+def read_alone(folder: Path, rows: int, streamed: bool) -> None:
     """Read in a process of its own, whose memory nothing else has grown."""
     import subprocess
 
-    subprocess.run([sys.executable, __file__, "--read", folder, "--rows", str(rows)], check=True)
+    how = ["--stream"] if streamed else []
+    subprocess.run([sys.executable, __file__, "--read", folder, "--rows", str(rows), *how], check=True)
 
 
-def read(folder: Path, rows: int) -> None:
+def read(folder: Path, rows: int, streamed: bool) -> None:
     """Read a log, and print what that took."""
     size = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
     before, begin = most_mb(), time.perf_counter()
-    log = open_log(folder, progress=True)
+    count = sum(1 for _ in stream_log(folder, progress=True)) if streamed else len(open_log(folder, progress=True))
     took = time.perf_counter() - begin
     grown = most_mb() - before
-    print(f"{rows} rows, {size:.0f} MB of files, {len(log)} events: {took:.1f} s, {grown:.0f} MB, ", end="")
+    print(f"{rows} rows, {size:.0f} MB of files, {count} events: {took:.1f} s, {grown:.0f} MB, ", end="")
     print(f"{grown * 1e6 / rows:.0f} bytes a row")
 
 

@@ -9,7 +9,9 @@ import math
 import operator
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass, field
+from itertools import groupby
 from numbers import Real
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -394,3 +396,14 @@ def order(event: Event) -> tuple[int, int, str, str]:
     A stable sort keeps arrival.
     """
     return event.t_ns, _RANK[type(event)], event.robot, event.sensor if isinstance(event, Scan | Frame) else ""
+
+
+def in_order(events: list[Event]) -> list[Event]:
+    """Return events by `order`: of a long log in the memory of a list, where keys take some 200 bytes an event."""
+    t_ns = np.fromiter((event.t_ns for event in events), np.int64, len(events))
+    by_time = (events[k] for k in np.argsort(t_ns, kind="stable"))
+    out: list[Event] = []
+    for _, same in groupby(by_time, key=attrgetter("t_ns")):
+        first, *others = same
+        out += sorted((first, *others), key=order) if others else (first,)
+    return out

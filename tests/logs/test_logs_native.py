@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.events import Control, Event, Fix, Scan, in_order, order
 from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
 from kalmark.logs.source import nanoseconds, seconds
 from native_logs import GOOD, HEAD, native
@@ -284,3 +284,18 @@ def test_what_would_not_come_back_is_not_written(events: list[Event], message: s
     with pytest.raises(LogError, match=message):
         write_native(Log("bad", ("r",), events, sensor_columns=columns), tmp_path / "log")
     assert not (tmp_path / "log").exists()
+
+
+def test_events_are_put_in_order_as_a_sort_with_keys_does() -> None:
+    random = np.random.default_rng(3)
+    events: list[Event] = []
+    for k in range(400):
+        t_ns, robot = int(random.integers(0, 60)), str(random.choice(["a", "b"]))
+        kind = k % 3
+        if kind == 0:
+            events.append(Control(t_ns=t_ns, robot=robot, u=[float(k)]))
+        elif kind == 1:
+            events.append(Scan(t_ns=t_ns, robot=robot, sensor=str(random.choice(["x", "y"])), y=[[float(k)]]))
+        else:
+            events.append(Fix(t_ns=t_ns, robot=robot, y=[float(k), 0.0], cov=np.eye(2)))
+    assert [*map(id, in_order(events))] == [*map(id, sorted(events, key=order))] and in_order([]) == []

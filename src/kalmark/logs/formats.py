@@ -82,7 +82,7 @@ def open_log(
 
 def stream_log(
     path: Path | str, *, robots: Sequence[str | int] | str | int | None = None,
-    on_error: Literal["raise", "skip"] = "raise",
+    on_error: Literal["raise", "skip"] = "raise", progress: bool = False,
 ) -> Iterator[Event]:  # fmt: skip
     """Yield the events of a native log one by one, in the order of `open_log`, in memory that does not grow with it.
 
@@ -90,7 +90,7 @@ def stream_log(
     bad row when it is reached.
     """
     _, found = recognise(find_data(path), NATIVE.name)
-    request = requested(robot_names(robots), on_error)
+    request = requested(robot_names(robots), on_error, progress)
     return (event for event in stream(found, request) if request.wants(event.robot))
 
 

@@ -32,7 +32,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, order, shown
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, in_order, order, shown
 from kalmark.logs.images.pictures import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
@@ -92,11 +92,11 @@ def of_tables(
     seen = {name for event in reader.events if isinstance(event, Scan) for name in event.ids or ()}
     known = {*reader.truth, *describes.get("robots", ()), *map(str, seen)}
     strays = refuse_misspelt(reader.places, known, request)
-    events = [event for event in reader.events if event.robot not in strays]
+    events = [event for event in reader.events if event.robot not in strays] if strays else reader.events
     columns = {key: names for key, names in reader.columns.items() if key[0] not in strays}
     return Log(
         name=called, path=path, robots=tuple(dict.fromkeys(event.robot for event in events)),
-        events=sorted(events, key=order), truth=reader.truth, landmarks=reader.landmarks, gps=reader.gps,
+        events=in_order(events), truth=reader.truth, landmarks=reader.landmarks, gps=reader.gps,
         skipped=request.skipped, describes=describes,
         control_columns={robot: names for (robot, sensor), names in columns.items() if not sensor},
         sensor_columns={key: names for key, names in columns.items() if key[1]},

@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from sys import intern
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -362,7 +363,7 @@ class Row:
         except ValueError:
             wanted = "a finite number of seconds, within 292 years of 0"
             raise Refused(f"{table.name('t_s')} is {shown(text)}, expected {wanted}") from None
-        self.robot, self.sensor = self.text("robot"), self.text("sensor") if with_sensor else ""
+        self.robot, self.sensor = intern(self.text("robot")), intern(self.text("sensor")) if with_sensor else ""
         if not self.robot or (with_sensor and not self.sensor):
             raise Refused(f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
 
