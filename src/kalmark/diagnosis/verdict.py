@@ -40,7 +40,7 @@ EVENTS = 4  # times as many as observations are taken
 SEGMENT = 30  # successive scans that are taken together where not all are
 MORE = 4  # times as many are taken if the segments do not determine the map
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
-FEW = 0.01  # of the landmarks: a mistake about no more than these is weighed by what it does to the map
+FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
@@ -319,7 +319,8 @@ def misplaced_landmarks(run: Run) -> list[Cause]:
     more = f"{len(rows)} sightings are outside the gate, more than within"
     evidence = f"{some}: {more}. An outlier at first sight, or an id that means another place"
     cure = "leave out their first sightings, or use robust: huber instead of a gate"
-    return [Cause("misplaced_landmark", since_s, score, evidence, cure, len(names) <= FEW * len(mapped))]
+    few = len(names) <= FEW * len(mapped) or len(rows) <= FEW * len(h.id)
+    return [Cause("misplaced_landmark", since_s, score, evidence, cure, few)]
 
 
 def given_up(run: Run) -> list[Cause]:
