@@ -19,9 +19,11 @@ from kalmark.cli.app import main
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.breakdown import breakdown, nees_parts
 from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.copies import copied
 from kalmark.diagnosis.gross import elsewhere, fit
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.verdict import Verdict, causes_of
+from kalmark.diagnosis.words import words
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import SE3
@@ -520,3 +522,40 @@ def test_a_hall_that_is_mapped_twice_after_a_gap_is_wrong_and_its_wheel_is_named
     assert "sigma_turn_rad_per_m" in bridged.causes[0].cure
     assert "estimator" not in [cause.name for cause in bridged.causes]
     assert [cause.harmless for cause in bridged.causes if cause.name == "gap"] == [True]
+
+
+def test_scans_that_come_twice_are_named_and_count_once() -> None:
+    log = simulate(world_of("steps=200"), 3)
+    again = [seen(e, t_ns=e.t_ns + 1_000_000) for e in log.events if isinstance(e, Scan)]
+    log = replace(log, events=sorted([*log.events, *again], key=order))
+    verdict = km.diagnose(recorded(log))
+    assert [cause.name for cause in verdict.causes] == ["copies"]
+    assert "199 of 398" in verdict.causes[0].evidence or "200 of 400" in verdict.causes[0].evidence
+    assert 1.04 < (verdict.sigma_factor or 0.0) < np.sqrt(2)
+
+
+def test_copies_come_in_pairs_and_a_sensor_that_repeats_itself_for_long_has_none() -> None:
+    noise = [np.array([float(k)]) for k in range(1, 21)]
+    assert copied([a for value in noise for a in (value, value)]).sum() == 20
+    assert not copied(noise).any()
+    assert not copied([np.ones(2)] * 40).any()
+    assert not copied([np.zeros(2), np.ones(2)] * 40).any()
+    assert not copied([]).any()
+
+
+def test_noise_of_several_columns_is_no_outliers() -> None:
+    settings = ("range_m", "azimuth_rad", "elevation_rad")
+    stated = (0.04, 0.007, 0.007)
+    overrides = [f"filter.robots.robot.sensors.lidar.sigma_{c}={s}" for c, s in zip(settings, stated, strict=True)]
+    world = load_world("thick_cloister", ["steps=120", *overrides])
+    log, config = simulate(world, 2), world.config()
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    assert {cause.name for cause in verdict.causes[:3]} == {"range_sigma", "azimuth_sigma", "elevation_sigma"}
+    assert verdict.map == "ok"
+
+
+def test_the_cure_of_a_control_noise_names_the_key_of_its_column() -> None:
+    config = {"robots": {"a": {"motion": {"sigma_theta_rad": 0.01, "sigma_x_m": 0.02}}}}
+    finding = Finding("control_sigma", ("a", "dtheta_rad"), 10.0, 0.0, 3.0, 0.1, "times")
+    assert words(finding, config)[1] == "--set robots.a.motion.sigma_theta_rad=0.03"
+    assert words(replace(finding, of=("a", "dx_m")), config)[1] == "--set robots.a.motion.sigma_x_m=0.06"

@@ -13,6 +13,7 @@ from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, Ints
+from kalmark.diagnosis import copies
 from kalmark.diagnosis.causes import JUMPS, Finding, Where
 from kalmark.diagnosis.gross import fit, gross
 from kalmark.diagnosis.jumps import LISTED, OddControl, joined, odd_control
@@ -44,6 +45,7 @@ FEW = 0.01  # of landmarks or observations: a mistake about no more than these i
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
+COPIES = "copies"  # the cause that events come twice
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
 LOOKED_INTO = 3  # segments with the worst scans
 
@@ -101,7 +103,7 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     mistake = gross(run, log)
     if mistake is not None and mistake.share > FEW:
         verdict = Verdict(
-            "wrong", (_of_mistake(mistake), *_structural(run)), "the log filtered again without the mistake"
+            "wrong", (_of_mistake(mistake), *_structural(run, log)), "the log filtered again without the mistake"
         )
     else:
         verdict = _judged(run, log, most, progress)
@@ -119,7 +121,7 @@ def _of_mistake(mistake: Mistake) -> Cause:
 
 def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first = _structural(run)
+    first = _structural(run, log)
     try:
         found = _searched(run, log, most, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
@@ -132,7 +134,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     if found.given.segments is not None and not any(c.name in JUMPS for c in causes):  # between these it is not looked
         causes += odd_controls(run, log)
-    causes = sorted([*causes, *_too_sure(run, effect)], key=lambda c: (c.harmless, -c.score))
+    twice = any(cause.name == COPIES for cause in first)  # then the filter is too sure for that
+    causes = sorted([*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, -c.score))
     causes = sorted([*first, *causes], key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(
         c.name == "misplaced_landmark" and not c.harmless for c in first
@@ -160,7 +163,7 @@ class Searched(NamedTuple):
 
 def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
     """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none."""
-    every = calibrated(run, given_by(run))
+    every = calibrated(run, once(run, given_by(run)))
     given = thinned(run, every, most)
     try:
         problem = replayed(given, log)
@@ -174,6 +177,19 @@ def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
     search = Search(Linear.of(problem, batch.state), sensors_of(run), given.robot, given.t_ns)
     search.run(progress)
     return Searched(search, batch, given)
+
+
+def once(run: Run, given: Given) -> Given:
+    """Return it without the scans that are copies of the one before."""
+    twice = np.unique(run.history.step[copies.of_scans(run)])
+    used = given.associations
+    rows = np.flatnonzero(~np.isin(used.scan, twice))
+    return given if len(rows) == len(used.scan) else replace(given, associations=_rows(used, rows))
+
+
+def _rows(used: Associations, rows: Array) -> Associations:
+    names = [used.landmark[k] for k in rows.tolist()]
+    return Associations(used.scan[rows], used.sensor[rows], used.index[rows], names, used.e[rows])
 
 
 def calibrated(run: Run, given: Given) -> Given:
@@ -224,8 +240,8 @@ def thinned(run: Run, given: Given, most: int) -> Given:
     within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
     kept = (within >= 0) & (t_ns <= segments[within, 1])
     renumbered, rows = np.cumsum(kept) - 1, np.flatnonzero(kept[used.scan])
-    names = [used.landmark[k] for k in rows.tolist()]
-    some = Associations(renumbered[used.scan[rows]], used.sensor[rows], used.index[rows], names, used.e[rows])
+    some = _rows(used, rows)
+    some = replace(some, scan=renumbered[some.scan])
     return replace(
         given, t_ns=t_ns[kept], robot=given.robot[kept], poses=given.poses[kept], associations=some, segments=segments
     )
@@ -291,9 +307,9 @@ def misplaced(run: Run, finding: Finding) -> bool:
     return bool(np.linalg.norm(off) > SIGMAS * np.hypot(finding.sigma, np.sqrt(np.trace(P))))
 
 
-def _structural(run: Run) -> list[Cause]:
+def _structural(run: Run, log: Log) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
-    return [*repeats(run.summary), *misplaced_landmarks(run), *gaps(run.summary), *given_up(run)]
+    return [*repeats(run.summary), *misplaced_landmarks(run), *gaps(run.summary), *given_up(run), *_copied(run, log)]
 
 
 def misplaced_landmarks(run: Run) -> list[Cause]:
@@ -321,6 +337,16 @@ def misplaced_landmarks(run: Run) -> list[Cause]:
     cure = "leave out their first sightings, or use robust: huber instead of a gate"
     few = len(names) <= FEW * len(mapped) or len(rows) <= FEW * len(h.id)
     return [Cause("misplaced_landmark", since_s, score, evidence, cure, few)]
+
+
+def _copied(run: Run, log: Log) -> list[Cause]:
+    """Return the streams of the log that come twice."""
+    found = []
+    for robot, sensor, number, of, since_s in copies.copies(run, log):
+        what = f"scans of {robot}.{sensor}" if sensor else f"controls of {robot}"
+        evidence = f"{number} of {of} {what} repeat the one before to the last bit: the log has them twice"
+        found.append(Cause(COPIES, since_s, float(number), evidence, "leave out every second of them"))
+    return found
 
 
 def given_up(run: Run) -> list[Cause]:
@@ -413,7 +439,8 @@ def effect_of(run: Run, found: Searched) -> Effect:
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     comparable = found.given.segments is None and not waited  # what waited is not in the batch solution
     claimed = float(np.median(ratio)) if comparable else None
-    over = 1.0 / claimed if claimed is not None and claimed < TOO_SURE else 1.0
+    twice = copies.of_scans(run).any()
+    over = 1.0 / claimed if claimed is not None and (claimed < TOO_SURE or twice) else 1.0
     factors = np.hypot(honest[free] / stated[free] * over, shift_m / filtered[free])
     accuracy_m = float(np.median(factors * filtered[free]))
     return Effect(status, float(np.median(factors)), accuracy_m, shift_m, claimed, d * int(free.sum()))

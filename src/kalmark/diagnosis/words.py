@@ -31,6 +31,10 @@ CALIBRATIONS = {  # the keys that put an error of a column of the controls into 
 }
 
 
+# the keys of noises that are not called as their columns
+SIGMAS = {f"d{name}": f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "theta_rad")}
+SIGMAS |= dict.fromkeys(("rx_rad", "ry_rad", "rz_rad"), "sigma_rotation_rad")
+SIGMAS |= dict.fromkeys(("left_rad", "right_rad"), "sigma_way_m_per_sqrt_m")
 LIMITS = {
     "v_mps": "max_speed_mps",
     "dx_m": "max_speed_mps",
@@ -147,14 +151,19 @@ def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
             return f"{robot} does not start where it is said to: it is {_jump(finding)} from there", ""
         return f"the start is {figure(finding.value, 2)} times as uncertain as stated", ""
     if finding.name == "control_sigma":
-        what, path = f"the noise of {robot}'s {of[0] or 'motion'}", ["motion", f"sigma_{of[0]}"]
+        what, path = f"the noise of {robot}'s {of[0] or 'motion'}", ["motion", _sigma_of(of[0])]
     else:
-        what, path = f"the noise of {robot}.{of[0]} {of[1]}", ["sensors", of[0], f"sigma_{of[1]}"]
+        what, path = f"the noise of {robot}.{of[0]} {of[1]}", ["sensors", of[0], _sigma_of(of[1])]
     now = _current(config, robot, *path)
     low, high = (max(finding.value + k * 2 * finding.sigma, 0.0) for k in (-1, 1))
     evidence = f"{what} is {figure(finding.value)} times as large as stated ({figure(low)} to {figure(high)})"
     cure = _set(robot, ".".join(path), now * finding.value) if isinstance(now, float) and now > 0 else ""
     return evidence, cure
+
+
+def _sigma_of(column: str) -> str:
+    """Return the key of the noise of a column."""
+    return SIGMAS.get(column) or ("sigma_px" if column.endswith("_px") else f"sigma_{column}")
 
 
 def _offset(finding: Finding, config: Mapping[str, Any]) -> Words:

@@ -225,10 +225,12 @@ def _in_the_end(history: History, rows: Index) -> list[str]:
 
 
 def _point(slam: Slam) -> Landmark:
-    """Return what the landmarks of a map are in the batch solution: points, with the numbers that all have besides."""
+    """Return what the landmarks of a map are in the batch solution: tags, or points with the numbers that all have."""
     space = any(robot.motion.space.axes > 1 for robot in slam.robots.values())
     models = {track.model.space.kinds: track.model for track in slam.tracks.confirmed.values()}
     models |= {of.model.space.kinds: of.model for of in slam.tracks.known.of_kind.values()}
+    if models and all(isinstance(model, Tag) for model in models.values()):
+        return Tag()
     kinds, model = next(iter(models.items()), ((), None))
     if (
         model is not None

@@ -1,0 +1,72 @@
+"""Scans and controls that a log has twice: recorded by two nodes, or merged from two files.
+
+A copy has the numbers of the one before to the last bit, which noise forbids.  Where a robot stands, coarse numbers may
+be the same for long; copies come in pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags
+from kalmark.events import Control
+from kalmark.logs.log import Log
+from kalmark.results.run import Run
+
+SHARE = 0.1  # of a stream that are copies
+PAIRS = 0.9  # of the copies that stand alone: neither the one before nor the one after is a copy
+LEAST = 10  # copies
+
+
+class Copies(NamedTuple):
+    """The copies in what a robot, or a `sensor` of it, wrote: how many of how many, and since when, s of the log."""
+
+    robot: str
+    sensor: str
+    number: int
+    of: int
+    since_s: float
+
+
+def copied(values: Sequence[Array]) -> Flags:
+    """Return which (N,) of successive measurements or controls are copies of the one before; none, if they are few."""
+    same = np.array([False, *(len(b) > 0 and np.array_equal(a, b) for a, b in pairwise(values))])[: len(values)]
+    zero = np.array([not np.any(value) for value in values], dtype=np.bool_)
+    same &= ~zero
+    alone = same[1:-1] & ~same[:-2] & ~same[2:]
+    enough = same.sum() >= max(LEAST, SHARE * len(values)) and alone.sum() >= PAIRS * same[1:-1].sum()
+    return same if enough else np.zeros_like(same)
+
+
+def of_scans(run: Run) -> Flags:
+    """Return which observations (O,) of a run are in a scan that is a copy of the one before."""
+    h, out = run.history, np.zeros(len(run.history.step), dtype=np.bool_)
+    robot = h.robot[h.step]
+    for key in sorted({*zip(robot.tolist(), h.sensor.tolist(), strict=True)}):
+        rows = np.flatnonzero((robot == key[0]) & (h.sensor == key[1]))
+        _, first = np.unique(h.step[rows], return_index=True)
+        scans = np.split(rows, first[1:])
+        for scan, same in zip(scans, copied([np.nan_to_num(h.y[scan]) for scan in scans]), strict=True):
+            out[scan] = same
+    return out
+
+
+def copies(run: Run, log: Log) -> list[Copies]:
+    """Return the streams of a log with copies: scans of sensors, and controls."""
+    h, found = run.history, []
+    same, robot = of_scans(run), run.history.robot[run.history.step]
+    for key in sorted({*zip(robot[same].tolist(), h.sensor[same].tolist(), strict=True)}):
+        mine = (robot == key[0]) & (h.sensor == key[1])
+        steps = np.unique(h.step[mine & same])
+        since_s = float(h.t_ns[steps[0]]) * 1e-9
+        found.append(Copies(*key, len(steps), len(np.unique(h.step[mine])), since_s))
+    for name in run.final_slam().robots:
+        mine_ = [e for e in log.events if isinstance(e, Control) and e.robot == name]
+        twice = np.flatnonzero(copied([e.u for e in mine_]))
+        if len(twice):
+            found.append(Copies(name, "", len(twice), len(mine_), mine_[twice[0]].t_s))
+    return found
