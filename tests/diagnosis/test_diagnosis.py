@@ -559,3 +559,13 @@ def test_the_cure_of_a_control_noise_names_the_key_of_its_column() -> None:
     finding = Finding("control_sigma", ("a", "dtheta_rad"), 10.0, 0.0, 3.0, 0.1, "times")
     assert words(finding, config)[1] == "--set robots.a.motion.sigma_theta_rad=0.03"
     assert words(replace(finding, of=("a", "dx_m")), config)[1] == "--set robots.a.motion.sigma_x_m=0.06"
+
+
+def test_a_map_of_tags_is_judged_by_its_batch_solution() -> None:
+    world = load_world("tags_room", ["steps=60", "filter.robots.rig.sensors.camera.sigma_px=0.25"])
+    log, config = simulate(world, 2), world.config()
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    assert verdict.checked.startswith("batch solution")
+    (cause,) = verdict.causes
+    assert cause.name == "measurement_sigma"
+    assert float(cause.cure.removeprefix("--set robots.rig.sensors.camera.sigma_px=")) == pytest.approx(0.5, rel=0.1)

@@ -241,11 +241,10 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
     r2, simulated2 = linear.residuals.r**2, simulated.r**2
     for f, factor in enumerate(factors):
         names = sensors.get(factor.sensor, ())
-        for c in range(factor.R.shape[1]) if factor.sensor[1] else ():
-            mine = (rows.factor == f) & (rows.column == c) & linear.kept
-            column = names[c] if len(names) == factor.R.shape[1] else ""
-            name = f"{column.rsplit('_', 1)[0]}_sigma" if column else "measurement_sigma"
-            of = (*factor.sensor, column or f"component {c}")
+        for column, of_it in _measured(names, factor.R.shape[1], rows.column) if factor.sensor[1] else ():
+            mine = (rows.factor == f) & of_it & linear.kept
+            name = f"{column.rsplit('_', 1)[0]}_sigma" if column in names else "measurement_sigma"
+            of = (*factor.sensor, column)
             factor_of = _ratio(r2[mine].sum(), simulated2[mine].sum(axis=0))
             if factor_of is not None:
                 found.append(_noise(name, of, *factor_of, noise=mine))
@@ -258,6 +257,18 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
             name = "start" if kind == START else "control_sigma"
             found.append(_noise(name, tuple(kind.split(".")), *factor_of, errors=mine))
     return [replace(f, gain=min(f.gain, most)) if f.value > 1.0 else f for f in found]
+
+
+def _measured(names: tuple[str, ...], p: int, column: Ints) -> Iterator[tuple[str, Flags]]:
+    """Yield what a sensor of p residuals measures, by name, and which rows with the numbers `column` (N,) are of it.
+
+    The corners of a tag have one noise, and its size, a column too, has none.
+    """
+    if len(names) != p and any(name.endswith("_px") for name in names):
+        yield "corners_px", column >= 0
+        return
+    for c in range(p):
+        yield names[c] if len(names) == p else f"component {c}", column == c
 
 
 def _ratio(value: float, simulated: Array) -> tuple[float, float] | None:

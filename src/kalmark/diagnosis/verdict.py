@@ -345,7 +345,8 @@ def _copied(run: Run, log: Log) -> list[Cause]:
     for robot, sensor, number, of, since_s in copies.copies(run, log):
         what = f"scans of {robot}.{sensor}" if sensor else f"controls of {robot}"
         evidence = f"{number} of {of} {what} repeat the one before to the last bit: the log has them twice"
-        found.append(Cause(COPIES, since_s, float(number), evidence, "leave out every second of them"))
+        harmless = not sensor and run.final_slam().robots[robot].motion.held  # the same velocity goes on
+        found.append(Cause(COPIES, since_s, float(number), evidence, "leave out every second of them", harmless))
     return found
 
 

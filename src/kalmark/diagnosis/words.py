@@ -157,6 +157,7 @@ def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
     now = _current(config, robot, *path)
     low, high = (max(finding.value + k * 2 * finding.sigma, 0.0) for k in (-1, 1))
     evidence = f"{what} is {figure(finding.value)} times as large as stated ({figure(low)} to {figure(high)})"
+    evidence += ", which does no harm" if finding.value < 1.0 else ""
     cure = _set(robot, ".".join(path), now * finding.value) if isinstance(now, float) and now > 0 else ""
     return evidence, cure
 
