@@ -187,7 +187,7 @@ def once(run: Run, given: Given) -> Given:
     return given if len(rows) == len(used.scan) else replace(given, associations=_rows(used, rows))
 
 
-def _rows(used: Associations, rows: Array) -> Associations:
+def _rows(used: Associations, rows: Ints) -> Associations:
     names = [used.landmark[k] for k in rows.tolist()]
     return Associations(used.scan[rows], used.sensor[rows], used.index[rows], names, used.e[rows])
 
