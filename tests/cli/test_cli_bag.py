@@ -10,6 +10,7 @@ import pytest
 
 from command_line import Kalmark
 from kalmark.config import load_config, open_run
+from kalmark.events import Control
 from kalmark.logs.bag.first_config import first_config
 from kalmark.logs.bag.survey import survey
 
@@ -291,12 +292,17 @@ def test_two_odometries_of_one_robot_are_not_two_robots(tmp_path: Path) -> None:
 def test_robots_whose_odometry_is_in_tf_alone_have_their_names_there(tmp_path: Path) -> None:
     messages = []
     for t in range(3):
-        messages += [tf("/tf", T0 + t, transform(f"{n}/odom", f"{n}/base_link", T0 + t, pose(t, 0, 0))) for n in "ab"]
+        messages += [
+            tf("/tf", T0 + t, transform(f"{n}/odom", f"{n}/base_link", T0 + t, pose(t * (1 + (n == "b")), 0, 0)))
+            for n in "ab"
+        ]
     text = config_of(tmp_path, [*messages, markers("b/base_link", topic="/b/seen")])
-    assert (
-        "frame: a/odom, child_frame: a/base_link, robot: a}" in text
-        and "sensor: b_seen, take: [x_m, y_m, z_m], robot: b" in text
-    )
+    assert "frame: a/odom, child_frame: a/base_link, robot: a}" in text
+    assert "'/tf of b': {topic: /tf, type: odometry_2d, frame: b/odom, child_frame: b/base_link, robot: b}" in text
+    assert "sensor: b_seen, take: [x_m, y_m], robot: b" in text
+    log = open_run(tmp_path / "config.yaml")[1]
+    moved = {(e.robot, e.u.tolist()[0]) for e in log.events if isinstance(e, Control)}
+    assert moved == {("a", 1.0), ("b", 2.0)} and log.robots == ("a", "b")
 
 
 @pytest.mark.parametrize("kind", ["all", "some"])

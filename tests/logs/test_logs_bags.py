@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from kalmark.config import build_slam, open_run
 from kalmark.errors import KalmarkError, LogError
@@ -38,6 +39,7 @@ from ros_bags import (
     odometry,
     pose,
     robot_among_posts,
+    same,
     same_logs,
     tf,
     transform,
@@ -429,6 +431,22 @@ def test_observations_are_scans(
     np.testing.assert_array_equal(scan.y, np.array(y).reshape(len(y), -1) if y else np.empty((0, 0)))
 
 
+def test_an_inertial_unit_moves_a_robot_whose_frame_is_its_own(tmp_path: Path) -> None:
+    mount = tf("/tf_static", T0, transform("base_link", "imu", T0, pose(1, 0, 0)))
+    camera = tf("/tf_static", T0, transform("base_link", "camera", T0, pose(3, 0, 0)))
+    units = [imu(T0 + k * 10**7, (0.1, 0.2, 0.3 + k), a=(0.0, 0.1, 9.8)) for k in range(3)]
+    seen = {"markers": [{"id": 4, "header": header(T0, "camera"), "pose": AT}]}
+    messages = [mount, camera, *units, units[2], Outgoing("/seen", "visualization_msgs/msg/MarkerArray", T0, seen)]
+    topics = {"/imu": {"type": "inertial"}, "level": {"type": "imu", "topic": "/imu", "gyro": "gyro"}}
+    log = open_log(bag_of(tmp_path, messages), topics=topics | {"/seen": {"type": "scan"}})
+    controls = [event for event in log.events if isinstance(event, Control)]
+    assert [control.u.tolist() for control in controls] == [[0.1, 0.2, 0.3 + k, 0, 0.1, 9.8] for k in range(3)]
+    assert log.describes["robots"]["robot"]["motion"] == {"type": "inertial"}
+    assert log.describes["robots"]["robot"]["sensors"]["seen"]["mount"]["x_m"] == 2.0
+    assert sum(isinstance(event, Scan) and event.sensor == "gyro" for event in log.events) == 3
+    assert any("/imu: 1 readings at the time of the one before" in line for line in log.skipped)
+
+
 def test_observations_are_left_out_by_their_ids_and_times(tmp_path: Path) -> None:
     t_ns = [T0 + 123_456_789, T0 + 223_456_789]
     listed = [{"id": k, "pose": AT} for k in (4, 5)]
@@ -595,3 +613,76 @@ def test_a_type_that_the_bag_does_not_define_gets_one_line(tmp_path: Path) -> No
     assert open_log(path, topics={"/odom": TOPICS["/odom"]}).events[0].u.tolist() == [1, 0, 0]
     with pytest.raises(LogError, match="/tags has messages of the type aruco_msgs/msg/MarkerArray, which the"):
         open_log(path, topics={"/tags": {"type": "scan"}})
+
+
+# ------------------------------------------------------------------ packed and split
+def events_of(path: Path) -> list[Any]:
+    return list(open_log(path, topics=TOPICS).events)
+
+
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_a_ros_1_bag_with_packed_chunks_is_the_same_log(
+    compression: str, bags: dict[str, Path], tmp_path: Path
+) -> None:
+    from rosbags.rosbag1 import Reader, Writer
+
+    path = tmp_path / "packed.bag"
+    writer = Writer(path)
+    writer.set_compression(Writer.CompressionFormat[compression])
+    with Reader(bags["ros1.bag"]) as reader, writer:
+        kept = {c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
+                for c in reader.connections}  # fmt: skip
+        for connection, t_ns, raw in reader.messages():
+            writer.write(kept[connection.id], t_ns, raw)
+    assert path.stat().st_size < 0.9 * bags["ros1.bag"].stat().st_size
+    assert all(map(same, events_of(path), events_of(bags["ros1.bag"])))
+
+
+def copied(source: Path, out: Path, mode: str, first: int = 0, last: int | None = None) -> Path:
+    """Copy the messages of a ROS 2 bag from one number to another, packed by file or by message, or not."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+
+    plugin = StoragePlugin.MCAP if source.name == "mcap" else StoragePlugin.SQLITE3
+    writer = Writer(out, version=9, storage_plugin=plugin)
+    if mode != "NONE":
+        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with Reader(source) as reader, writer:
+        kept = {c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
+                for c in reader.connections}  # fmt: skip
+        for connection, t_ns, raw in list(reader.messages())[first:last]:
+            writer.write(kept[connection.id], t_ns, raw)
+    return out
+
+
+@pytest.mark.parametrize(("kind", "mode"), [("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "MESSAGE")])
+def test_a_packed_ros_2_bag_is_the_same_log(kind: str, mode: str, bags: dict[str, Path], tmp_path: Path) -> None:
+    path = copied(bags[kind], tmp_path / "packed", mode)
+    assert all(map(same, events_of(path), events_of(bags[kind]))) and len(events_of(path))
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_a_ros_2_bag_split_into_files_is_the_same_log(kind: str, bags: dict[str, Path], tmp_path: Path) -> None:
+    """As `ros2 bag record` splits: several files, one metadata.yaml that lists them."""
+    halves = [
+        copied(bags[kind], tmp_path / f"half{k}", "NONE", *part) for k, part in enumerate(((0, 900), (900, None)))
+    ]
+    whole = tmp_path / "split"
+    whole.mkdir()
+    yaml, names = YAML(), []
+    for half in halves:
+        (file,) = (path for path in half.iterdir() if path.suffix in (".db3", ".mcap"))
+        (whole / file.name).write_bytes(file.read_bytes())
+        names.append(file.name)
+    metadata = yaml.load(halves[0] / "metadata.yaml")
+    metadata["rosbag2_bagfile_information"]["relative_file_paths"] = names
+    yaml.dump(metadata, whole / "metadata.yaml")
+    assert all(map(same, events_of(whole), events_of(bags[kind]))) and len(events_of(whole)) == len(
+        events_of(bags[kind])
+    )
+
+
+def test_a_log_of_a_bag_uses_its_inertial_unit_and_its_satellite_fixes(bags: dict[str, Path]) -> None:
+    """So the map that is the same from all containers is made of them, too."""
+    events = events_of(bags["mcap"])
+    kinds = [event.sensor if isinstance(event, Scan) else type(event).__name__ for event in events]
+    assert {kind: kinds.count(kind) for kind in ("gyro", "compass", "Fix")} == {"gyro": 398, "compass": 40, "Fix": 40}

@@ -112,12 +112,12 @@ class _Writer:
     def lines(self) -> _Lines:
         """Return what is to be written."""
         out = _Lines()
-        robots: dict[str, list[TopicSummary]] = {}
+        robots: dict[str, list[TopicSummary]] = {robot: [] for robot in self.spaces}
         for topic in self.usable:
             robots.setdefault(self.robot(topic), []).append(topic)
         for robot, topics in robots.items():
             self.one(robot, topics, out)
-        self.clock([self.found.named(name) for name in out.entries], out)
+        self.clock([self.found.named(entry.get("topic", name)) for name, (entry, _) in out.entries.items()], out)
         for name, (entry, why) in out.entries.items():
             out.topics.append(f"{quoted(name)}: {mapping(entry)}  # {why}")
         for topic in self.found.topics:
@@ -130,7 +130,7 @@ class _Writer:
         scans = [topic for topic in topics if topic.offers.seen is not None and not self.useless(topic)]
         control, kind = self.control(robot, topics, not any(map(_in_pixels, scans)))
         space = kind in SPACE if kind else not any(topic.columns[:2] == BEAM for topic in scans)
-        used = self.used(topics, scans, control, kind, space)
+        used = self.used(robot, topics, scans, control, kind, space)
         start = start_of(self.found, control, used, space)
         true = [self.found.named(name).poses.frames for name, (entry, _) in used.items() if entry["type"] == "truth"]
         ahead = start.at[2] if start is not None else yaw(true[0][0]) if true else 0.0
@@ -164,7 +164,13 @@ class _Writer:
             out.robots[robot] = lines
 
     def used(
-        self, topics: Sequence[TopicSummary], scans: Sequence[TopicSummary], control: Any, kind: str, space: bool
+        self,
+        robot: str,
+        topics: Sequence[TopicSummary],
+        scans: Sequence[TopicSummary],
+        control: Any,
+        kind: str,
+        space: bool,
     ) -> dict[str, tuple[dict[str, Any], str]]:
         """Return the entries of the topics that are used, each with the reason."""
         used: dict[str, tuple[dict[str, Any], str]] = {}
@@ -174,7 +180,9 @@ class _Writer:
             used[control.name] = (entry, self.of_control(control))
         elif control is not None:
             entry = {"type": kind, "frame": control[0], "child_frame": control[1]}
-            name = next(topic.name for topic in topics if _has_frames(topic))
+            name = next(topic.name for topic in (*topics, *self.usable) if _has_frames(topic))
+            if not any(topic.name == name for topic in topics):  # one topic has the frames of several robots
+                entry, name = {"topic": name} | entry, f"{name} of {robot}"
             used[name] = (entry, f"{GUESS} these two frames are the odometry's")
         for topic in topics:
             if topic.name not in used and (entry_and_why := self.place(topic)) is not None:
@@ -194,7 +202,7 @@ class _Writer:
             return topic, "odometry_2d" if flat and topic.poses.flat else "odometry_3d"
         for pair, poses in self.found.pairs.items():
             whose = pair[1].split("/")[0] == robot if self.spaces else True
-            if any(map(_has_frames, topics)) and _is_odometry(*pair) and whose:
+            if any(map(_has_frames, self.usable)) and _is_odometry(*pair) and whose:
                 return pair, "odometry_2d" if flat and poses.flat else "odometry_3d"
         for topic in (t for t in topics if t.offers.drive):
             return topic, "ackermann"
@@ -261,7 +269,7 @@ class _Writer:
         if jumped is not None:
             since = f"; {GUESS} the recorder's time, as that of {jumped.name} runs back by {jumped.back_s:.3g} s"
         for name, (entry, why) in out.entries.items():
-            if jumped is not None or (other and bare) or self.found.named(name).unset:
+            if jumped is not None or (other and bare) or self.found.named(entry.get("topic", name)).unset:
                 out.entries[name] = entry | {"time": "recorded"}, why + since
         if late is not None and jumped is None:
             why = f"the times of {late.name} run back by {late.back_s:.3g} s: such messages are left out"

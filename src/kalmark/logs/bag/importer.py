@@ -41,6 +41,7 @@ from kalmark.logs.bag.topics import (
     Fixes,
     Images,
     Imu,
+    InertialTopic,
     Moved,
     Noisy,
     Placed,
@@ -99,8 +100,9 @@ class _Importer:
 
     def __init__(self, bag: Bag, topics: Mapping[str, Topic], request: Request) -> None:
         self.bag, self.request = bag, request
-        self.topics = {bag.find(name): topic for name, topic in topics.items()}
-        self.offers = {name: offered(bag, name, topic) for name, topic in self.topics.items()}
+        self.topics = {name if topic.topic else bag.find(name): topic for name, topic in topics.items()}
+        self.named = {name: bag.find(topic.topic) if topic.topic else name for name, topic in self.topics.items()}
+        self.offers = {name: offered(bag, self.named[name], topic) for name, topic in self.topics.items()}
         self.columns = self._controls()
         for name, topic in self.topics.items():
             self._refuse_other_world(name, topic)
@@ -121,6 +123,10 @@ class _Importer:
         self.level: dict[str, tuple[Array, bool]] = {}
         self.rates: dict[tuple[str, str], dict[int, Array]] = {}
         self.read_ns: dict[tuple[str, str], int] = {}
+
+    def entries(self, received: Received) -> list[str]:
+        """Return the entries of the configuration that a message's topic has."""
+        return [name for name, topic in self.named.items() if topic == received.topic]
 
     def _controls(self) -> dict[str, tuple[str, ...]]:
         """Return the columns of each robot's controls.  Raises LogError if two topics are those of one robot."""
@@ -162,15 +168,19 @@ class _Importer:
             for name, topic in self.bag.topics.items()
             if topic.type in MESSAGES and MESSAGES[topic.type].transforms
         }
-        moves = {name for name, topic in self.topics.items() if isinstance(topic, Posed) and topic.columns}
-        for received in self.bag.messages(tf | scans | moves):
+        moves = {n for n, t in self.topics.items() if isinstance(t, Posed | InertialTopic) and t.columns}
+        for received in self.bag.messages(tf | {self.named[name] for name in scans | moves}):
             if received.topic in tf:
                 self.frames.take(MESSAGES[received.type].transforms(received.message))  # type: ignore[misc]
-            elif received.topic in scans and not self.of_sensor.get(received.topic):
-                self.of_sensor[received.topic] = frame_id(received.message)  # none in markers that list nothing
-            elif received.topic in moves:
-                robot = self.topics[received.topic].robot
-                self.base.setdefault(robot, getattr(received.message, "child_frame_id", ""))
+                continue
+            for name in self.entries(received):
+                topic = self.topics[name]
+                if name in scans and not self.of_sensor.get(name):
+                    self.of_sensor[name] = frame_id(received.message)  # none in markers that list nothing
+                elif isinstance(topic, InertialTopic):
+                    self.base.setdefault(topic.robot, frame_id(received.message))
+                elif name in moves:
+                    self.base.setdefault(topic.robot, getattr(received.message, "child_frame_id", ""))
         for name in sorted(scans):
             self._mount(name, self.topics[name])
 
@@ -188,7 +198,7 @@ class _Importer:
             return
         R = rotations.matrix(mount[3:])
         yaw = float(np.arctan2(R[1, 0], R[0, 0]))
-        raw = MESSAGES[self.bag.topics[name].type].seen is beams_of
+        raw = self.offers[name].seen is beams_of
         if raw and abs(R[2, 2]) < LEVEL:
             tilt = math.degrees(math.acos(min(1.0, abs(R[2, 2]))))
             self.request.skipped.append(f"{self.bag.path}: {name} is tilted by {tilt:.0f} deg in tf, taken as level")
@@ -201,14 +211,15 @@ class _Importer:
         """Return the log."""
         self.look_ahead()
         self.calibrate()
-        for received in self.bag.messages(self.topics):
-            self.take(received)
+        for received in self.bag.messages({*self.named.values()}):
+            for name in self.entries(received):
+                self.take(received._replace(topic=name))
         self.interpolated()
         self.averaged()
         for (name, reason), count in sorted(self.left_out.items()):
             self.request.leave_out(count, f"{self.bag.path}: {name}: {count} {reason}")
         for name in self.topics:
-            if not self.bag.topics[name].number:
+            if not self.bag.topics[self.named[name]].number:
                 raise LogError(f"{self.bag.path}: topic {name} has no messages, expected at least one")
         robots = tuple(dict.fromkeys(topic.robot for topic in self.topics.values()))
         return Log(
@@ -244,6 +255,8 @@ class _Importer:
                 self.scan(received, topic, offer, t_ns)
             elif isinstance(topic, Images):
                 self.image(received, topic, t_ns)
+            elif isinstance(topic, InertialTopic):
+                self.inertial(received, topic, offer, t_ns)
             elif isinstance(topic, Sparse):
                 self.of_robot(received, topic, offer, t_ns)
             elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
@@ -365,6 +378,21 @@ class _Importer:
             raise Refused(f"noise {cov.tolist()}, expected it positive semidefinite")
         self.events.append(Control(t_ns=t_ns, robot=topic.robot, u=u, cov=cov))
 
+    def inertial(self, received: Received, topic: InertialTopic, offer: Message, t_ns: int) -> None:
+        """Take rates and specific forces, held from now on; times must increase."""
+        w = self.measured(received, "rates", offer.rates(received.message))  # type: ignore[misc]
+        a = self.measured(received, "accelerations", offer.force(received.message))  # type: ignore[misc]
+        if w is None or a is None:
+            return
+        before = self.read_ns.get((topic.robot, ""), t_ns - 1)
+        if t_ns == before:
+            self.left_out[received.topic, "readings at the time of the one before"] += 1
+            return
+        if t_ns < before:
+            raise Refused(f"time after {seconds(before)} s, expected times that never run backwards")
+        self.read_ns[topic.robot, ""] = t_ns
+        self.control(topic, t_ns, np.concatenate([w, a]), None)
+
     def globe(self, received: Received, topic: Placed, place: Place | None, t_ns: int) -> None:
         """Take a position on the globe: as a fix, or to score only."""
         if place is None:
@@ -420,7 +448,7 @@ class _Importer:
         """Take an image, whose pixels are read from the bag when they are needed."""
         name = received.topic
         if name not in self.images:
-            self.images[name] = Forward(partial(images_of, self.bag.path, name))
+            self.images[name] = Forward(partial(images_of, self.bag.path, self.named[name]))
         read, sensor = partial(self.images[name].at, self.received[name] - 1), sensor_name(name, topic)
         self.events.append(Frame(t_ns=t_ns, robot=topic.robot, sensor=sensor, image=read))
 
@@ -429,7 +457,7 @@ class _Importer:
         for name, topic in self.topics.items():
             if not isinstance(topic, Images):
                 continue
-            parts = name.removesuffix("/compressed").rpartition("/")
+            parts = self.named[name].removesuffix("/compressed").rpartition("/")
             info = self.bag.find(topic.info) if topic.info else f"{parts[0]}{parts[1]}camera_info"
             known = MESSAGES.get(self.bag.topics[info].type) if info in self.bag.topics else None
             first = next(iter(self.bag.messages({info})), None) if known and known.camera else None

@@ -25,6 +25,9 @@ class Topic:
     space: ClassVar[bool] = False
 
     robot: Annotated[str, "Robot that it belongs to."] = "robot"
+    topic: Annotated[
+        str | None, "The topic, if the key is another name: for a second entry of one topic, such as tf of two robots."
+    ] = None
     time: Annotated[
         Literal["auto", "header", "recorded"],
         "Time of a message: in its header, or when it was recorded; auto: the header's, if it has one.",
@@ -101,6 +104,15 @@ class AckermannTopic(Topic):
 
     wants: ClassVar[tuple[str, ...]] = ("drive",)
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
+
+
+@register("topic", "inertial")
+class InertialTopic(Topic):
+    """Rates and specific forces of an Imu, held until the next one: controls of a robot whose frame is the Imu's."""
+
+    wants: ClassVar[tuple[str, ...]] = ("force",)
+    columns: ClassVar[tuple[str, ...]] = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
+    space: ClassVar[bool] = True
 
 
 @declared
