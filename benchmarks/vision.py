@@ -19,7 +19,11 @@ from kalmark.vision.front_end import FrontEnd
 
 SEQUENCES: dict[str, list[str]] = {
     "fr1_xyz": ["log.path=visual/tum_fr1_xyz"],
-    "tsukuba": ["log.path=visual/tsukuba150/dataset_images_matlab", "log.fps=30"],
+    "tsukuba": [
+        "log.path=visual/tsukuba150/dataset_images_matlab",
+        "log.fps=30",
+        *(f"robots.each.sensors.camera.{key}" for key in ("fx_px=615", "fy_px=615", "cx_px=320", "cy_px=240")),
+    ],
     "desk": ["log.path=visual/openekf_s3/escritorio_traslacion.mp4"],
 }
 

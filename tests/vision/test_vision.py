@@ -176,6 +176,9 @@ def test_a_camera_finds_its_way_in_a_rendered_room_twice_the_same_and_from_a_sav
         if k == 40:
             one.save(tmp_path / "map.kmk")
     assert sum(o.outcome == "associated" for o in report.observations) > 15
+    picture = km.vision.overlay(one.state.front_ends["camera", "eye"], report, scale=2)
+    assert picture.shape == (480, 640, 3)
+    assert (picture[:, :, 1] > picture[:, :, 0].astype(int) + 50).sum() > 15 * 12  # green dots, yellow ellipses
     p, q = np.array(way) - np.mean(way, axis=0), true[:, :3] - true[:, :3].mean(axis=0)
     U, s, V = np.linalg.svd(q.T @ p)
     aligned = p @ (U @ V).T * (s.sum() / np.sum(p * p))

@@ -1,5 +1,6 @@
 """Landmarks in images, searched where the filter expects them."""
 
 from kalmark.vision.front_end import ActiveSearch
+from kalmark.vision.overlay import overlay
 
-__all__ = ["ActiveSearch"]
+__all__ = ["ActiveSearch", "overlay"]

@@ -1,0 +1,44 @@
+"""The last frame as a picture: where landmarks were searched, where they were found, and the new ones."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from kalmark.report import Report
+from kalmark.vision.front_end import FrontEnd
+from kalmark.vision.selection import GATE
+
+FOUND, MISSED, MATCH, NEW, REJECTED = (0, 200, 255), (60, 60, 255), (60, 220, 60), (255, 120, 0), (255, 0, 255)
+FINE = 16  # parts of a pixel in which OpenCV draws
+
+
+def overlay(front_end: FrontEnd, report: Report, scale: int = 1) -> Any:
+    """Return the last frame (H, W, 3), blue, green and red, `scale` times as large, with what was searched and found.
+
+    Search ellipses of three sigmas in yellow where the landmark was found, in red where it was not; matches are green
+    dots, those that the filter rejected magenta; new landmarks are blue circles.  What agreed with the base of the
+    one-point RANSAC was not searched in an ellipse.
+    """
+    cv2, found = front_end.cv2, front_end.found
+    size = (front_end.image.shape[1] * scale, front_end.image.shape[0] * scale)
+    picture = cv2.cvtColor(cv2.resize(front_end.image, size), cv2.COLOR_GRAY2BGR)
+
+    def place(y: Any) -> tuple[int, int]:
+        u, v = np.rint(((np.asarray(y) + 0.5) * scale - 0.5) * FINE).astype(int).tolist()
+        return u, v
+
+    for k in np.flatnonzero(np.isfinite(found.regions).all(axis=(1, 2))).tolist() if found is not None else ():
+        assert found is not None
+        spread, axes = np.linalg.eigh(found.regions[k])
+        half = np.rint(np.sqrt(GATE * np.maximum(spread, 0.0)) * scale * FINE).astype(int).tolist()
+        angle = math.degrees(math.atan2(axes[1, 0], axes[0, 0]))
+        colour = FOUND if found.matched[k] else MISSED
+        cv2.ellipse(picture, place(found.centres[k]), half, angle, 0, 360, colour, 1, cv2.LINE_AA, 4)
+    for o in report.observations:
+        radius, filled = (4 * scale * FINE, 1) if o.outcome == "new" else (2 * scale * FINE, -1)
+        colour = {"new": NEW, "associated": MATCH}.get(o.outcome, REJECTED)
+        cv2.circle(picture, place(report.y[o.index]), radius, colour, filled, cv2.LINE_AA, 4)
+    return picture
