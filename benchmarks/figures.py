@@ -171,6 +171,9 @@ def motions() -> Iterator[Figure]:
         ("compass_and_gyro", 3, "invariant"),
         ("compass_and_gyro", 3, "ekf"),
         ("diver", 6, "invariant"),
+        ("radio", 3, "invariant"),
+        ("microphones", 3, "invariant"),
+        ("lever_arm", 3, "invariant"),
     ):
         text = (
             "{1} / {5} / {9} / {11} of {13}" if world == "diver" else "{1} / {5} / {7} / {9} of {11}"
@@ -221,6 +224,8 @@ def inertial() -> Iterator[Figure]:
         name = f"V1_01, readings of the unit, densities times {scale}, stereo points: position / attitude ANEES (3) / state ANEES (15)"
         yield Figure("Inertial", name, ".3 %", f"python benchmarks/inertial.py recorded --runs 2 --scale {scale}",
                      row("recorded stereo invariant:", "{3} % / {14} / {30}"))  # fmt: skip
+    yield Figure("Inertial", "V1_01, the truth: its turns in 1 s against those of the unit, RMS an axis / of the unit's noise", "",
+                 "python benchmarks/inertial.py truth", row("truth: turns", "{5} mrad / {12} mrad"))  # fmt: skip
     for estimator in ("invariant", "ekf"):
         wanted = "0 of 100" if estimator == "invariant" else ""
         yield Figure("Inertial", f"information about position and yaw, `{estimator}`: most, start 1 / runs that gain any", wanted,

@@ -1,7 +1,8 @@
 """An inertial unit and a camera along EuRoC's trajectory V1_01, with simulated readings and points; and at rest.
 
     python benchmarks/inertial.py path [--runs 20] [--sensor stereo] [--estimator invariant]
-    python benchmarks/inertial.py recorded [--runs 2] [--scale 10] [--estimator invariant]
+    python benchmarks/inertial.py recorded [--runs 2] [--scale 10] [--held] [--tilted] [--estimator invariant]
+    python benchmarks/inertial.py truth
     python benchmarks/inertial.py gauge [--runs 100] [--estimator invariant]
     python benchmarks/inertial.py still [--minutes 5] [--estimator invariant]
 
@@ -10,7 +11,12 @@ is known to 1 deg of roll and pitch, 0.01 rad/s and 0.05 m/s^2.  Printed: the po
 path, RMS over the runs, and the ANEES of attitude, position and state, with the share of scans in the 95 % band.
 
 `recorded`: the same with EuRoC's own readings and a start that is found at rest; the points are simulated still.  The
-densities of the data sheet are multiplied by `--scale`, as the drone shakes.
+densities of the data sheet are multiplied by `--scale`, as the drone shakes.  A reading counts for the interval around
+its time, and the truth is turned so that the mean of its accelerations less those that were read points down; `--held`
+and `--tilted` leave this out.
+
+`truth`: by how much its turns in a second differ from the integral of the rates that were read, less the mean of ten
+seconds, and what the density of the gyroscope's noise is in a second: the truth knows no attitude better than that.
 
 `gauge`: 10 s of it, from 20 s on, with an unknown start, 20 deg and 1 m.  `still`: one run at rest.  Both print how the
 information about the directions that nothing observes, shifts and turns about the gravity, compares with that of the
@@ -141,6 +147,7 @@ class Run:
         A = np.eye(UNIT.space.dof)
         A[6:9, 3:6] = UNIT.space.generator(start)[6:9]
         self.prior = A @ np.diag(np.square(sigmas)) @ A.T
+        self.lead_ns = 0
         mount = km.Mount(self.sensor, at=self.at)
         robot = km.Robot("unit", UNIT, start, {"camera": mount}, cov=self.prior)
         self.slam = km.Slam([robot], estimator=ESTIMATORS[estimator], landmarks=landmark)
@@ -149,9 +156,9 @@ class Run:
         """Yield the number of each reading that a scan follows, after the filter has taken both."""
         dt_ns = 1_000_000_000 // RATE_HZ
         for k, u in enumerate(self.u):
-            self.slam.process(km.Control(t_ns=k * dt_ns, robot="unit", u=u))
-            if (k + 1) % EVERY == 0 or k == 0:
-                n = k + 1 if k else 0
+            self.slam.process(km.Control(t_ns=k * dt_ns - self.lead_ns, robot="unit", u=u))
+            n = k if self.lead_ns or k == 0 else k + 1  # the last reading whose interval has begun
+            if n % EVERY == 0:
                 y, ids = self.seen(self.flight.states[n, :7])
                 self.slam.process(km.Scan(t_ns=n * dt_ns, robot="unit", sensor="camera", y=y, ids=ids))
                 yield n
@@ -195,31 +202,67 @@ class Run:
 class Recorded(Run):
     """A run with the readings of EuRoC's unit, from rest: at the true place, with a heading known to .5 deg."""
 
-    def __init__(self, sensor: str, estimator: str, seed: SeedSequence, scale: float) -> None:
+    def __init__(self, sensor: str, estimator: str, seed: SeedSequence, scale: float, held: bool, tilted: bool) -> None:
         t, rows = table("gt_V1_01_easy.csv")
         self.flight, self.rng, self.at = euroc(), np.random.default_rng(seed), CAMERA
         at = np.arange(len(self.flight.states)) / RATE_HZ
         self.flight.states[:, :3] = CubicSpline(t, rows[:, :3])(at)  # without the drift of an integral
+        self.lead_ns = 0 if held else 500_000_000 // RATE_HZ
         self.biases = np.column_stack([np.interp(at, t, column) for column in rows[:, 10:].T])
         self.u = table("mav0/imu0/data.csv.gz")[1][: len(at) - 1]
+        if not tilted:
+            turn = self.tilt()
+            self.flight.states = np.array([UNIT.space.rotated(state, turn) for state in self.flight.states])
         self.points = points(self.flight.states, POINTS, self.rng)
         self.sensor, landmark = SENSORS[sensor]
         unit = km.motion.Inertial(*(scale * UNIT.densities[[0, 6, 3, 9]]))
         sigmas = np.repeat([0.0, 0.0, 0.0, 0.1, 0.1], 3)
         sigmas[5] = math.radians(0.5)
         start = np.concatenate([self.flight.states[0, :7], np.zeros(9)])
-        rest = km.motion.at_rest(unit, at[:-1], self.u, start, np.diag(sigmas**2))
+        rest = km.motion.at_rest(unit, at[:-1] - self.lead_ns * 1e-9, self.u, start, np.diag(sigmas**2))
         until_ns = round(rest.until_s * 1e9)
         mount = km.Mount(self.sensor, at=self.at)
         robot = km.Robot("unit", unit, rest.start, {"camera": mount}, cov=rest.cov, rests_until_ns=until_ns)
         self.slam = km.Slam([robot], estimator=ESTIMATORS[estimator], landmarks=landmark)
+
+    def tilt(self) -> np.ndarray:
+        """Return the turn (3,) of the truth after which the gravity that was read points down."""
+        states, middle = self.flight.states, (self.u[1:] + self.u[:-1]) / 2
+        f = Rotation.from_quat(states[1:-1, 3:7]).apply(middle[:, 3:] - self.biases[1:-1, 3:])
+        g = np.mean((states[2:, 7:10] - states[:-2, 7:10]) * RATE_HZ / 2 - f, axis=0)
+        down = np.array([0.0, 0.0, -1.0])
+        axis = np.cross(g, down)
+        turn: np.ndarray = axis * math.asin(np.linalg.norm(axis) / np.linalg.norm(g)) / np.linalg.norm(axis)
+        return turn
+
+
+def turns() -> None:
+    """Print by how much the turns of the truth differ from those that were read."""
+    rows = table("gt_V1_01_easy.csv")[1]
+    u = table("mav0/imu0/data.csv.gz")[1]
+    every, q = RATE_HZ // 20, Rotation.from_quat(rows[:, [4, 5, 6, 3]])
+    odd = []
+    for k in range((len(u) - 1) // every):
+        if k + 1 == len(q):
+            break
+        part = (u[k * every : (k + 1) * every, :3] + u[k * every + 1 : (k + 1) * every + 1, :3]) / 2 - rows[k, 10:13]
+        turn = Rotation.identity()
+        for w in part:
+            turn *= Rotation.from_rotvec(w / RATE_HZ)
+        odd.append((turn.inv() * q[k].inv() * q[k + 1]).as_rotvec())
+    second = np.cumsum(odd, axis=0)
+    second = second[20:] - second[:-20]
+    kernel = np.ones(200) / 200
+    slow = np.column_stack([np.convolve(column, kernel, "same") for column in second.T])
+    rms = np.sqrt(np.mean((second - slow) ** 2))
+    print(f"truth: turns in 1 s off by {1e3 * rms:.2f} mrad RMS an axis, of noise {1e3 * UNIT.densities[0]:.2f} mrad")
 
 
 def path(seed: SeedSequence, given: argparse.Namespace) -> tuple[np.ndarray, float]:
     """Return of each scan the position error and the NEES of attitude, position and state (scans, 4), and the path."""
     pin()
     if given.what == "recorded":
-        run: Run = Recorded(given.sensor, given.estimator, seed, given.scale)
+        run: Run = Recorded(given.sensor, given.estimator, seed, given.scale, given.held, given.tilted)
     else:
         run = Run(euroc(given.seconds), given.sensor, given.estimator, seed)
     flight, found = run.flight, []
@@ -282,14 +325,19 @@ def still(given: argparse.Namespace) -> None:
 def main() -> None:
     """Print the row of one question."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["path", "recorded", "gauge", "still"])
+    parser.add_argument("what", choices=["path", "recorded", "truth", "gauge", "still"])
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--sensor", choices=[*SENSORS], default="stereo")
     parser.add_argument("--estimator", choices=[*ESTIMATORS], default="invariant")
     parser.add_argument("--scale", type=float, default=10.0)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--seconds", type=float, help="not the whole trajectory, but its beginning")
+    parser.add_argument("--held", action="store_true", help="a reading counts from its time on")
+    parser.add_argument("--tilted", action="store_true", help="the truth as it is")
     given = parser.parse_args()
+    if given.what == "truth":
+        turns()
+        return
     {"path": paths, "recorded": paths, "gauge": gauges, "still": still}[given.what](given)
 
 

@@ -4,9 +4,9 @@
 
 The runs are those of `kalmark campaign WORLD --runs 100`.  Printed for each: the mean pose ANEES (3) and how many steps
 are inside the 95 % band of so many runs; the ANEES of a state with more than a pose, by its degrees of freedom; at the
-end of the runs the mean NEES of the constants of controls and sensors (radii, track, biases, scales, declination) in
-the map, by their number, and how many runs are inside the 99.7 % bound; and by what factor the constants are known
-better than before.  With `--estimator ekf` by the textbook filter.
+end of the runs the mean NEES of the constants of controls and sensors (radii, track, biases, scales, declination, path
+loss, mounts) in the map, by their number, and how many runs are inside the 99.7 % bound; and by what factor the
+constants are known better than before.  With `--estimator ekf` by the textbook filter.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from ways import pin
 
 from kalmark.campaign.scoring import score
 from kalmark.config.building import build_slam
+from kalmark.geometry.spaces import mount_space
 from kalmark.models.protocols import calibrating, parameter_covariance
 from kalmark.results.measures import anees_interval
 from kalmark.simulate import load_world
@@ -30,7 +31,7 @@ from kalmark.slam.motion import bias_name
 
 WORLDS = (
     "differential_drive", "tricycle", "omnidirectional", "mecanum", "slipping_unicycle", "constant_velocity",
-    "constant_turn_rate", "compass_and_gyro", "diver", "radar", "radar_in_space",
+    "constant_turn_rate", "compass_and_gyro", "diver", "radar", "radar_in_space", "radio", "microphones", "lever_arm",
 )  # fmt: skip
 BOUND = 0.9973  # of three sigmas
 
@@ -61,12 +62,19 @@ def run(name: str, seed: SeedSequence, estimator: str) -> Scored:
             (slam.mean(block) - simulated.constants[robot.name], slam.covariance(block), model.calibration_cov)
         )
     for key, mount in robot.sensors.items():
-        if (prior := parameter_covariance(mount.sensor)) is not None:
-            truth, c = simulated.sensors[robot.name, key].parameters, len(prior)
-            mean, P = slam.mean(f"{robot.name}.{key}"), slam.covariance(f"{robot.name}.{key}")
-            open_ = np.diag(P)[-c:] > 0
-            pick = np.ix_(open_, open_)
-            found.append(((mean[-c:] - truth)[open_], P[-c:, -c:][pick], prior[pick]))
+        own, size = parameter_covariance(mount.sensor), len(mount.at) if len(mount.at) == 3 else 6
+        if own is None and mount.cov is None:
+            continue
+        name, space = f"{robot.name}.{key}", mount_space(len(mount.at), 0 if own is None else len(own))
+        truth = simulated.mounts[robot.name, key]
+        if own is not None:
+            truth = np.concatenate([truth, simulated.sensors[robot.name, key].parameters])
+        d, P, prior = space.minus(slam.mean(name), truth), slam.covariance(name), np.zeros((space.dof, space.dof))
+        prior[:size, :size] = 0.0 if mount.cov is None else mount.cov
+        prior[size:, size:] = 0.0 if own is None else own
+        open_ = np.diag(P) > 0
+        pick = np.ix_(open_, open_)
+        found.append((d[open_], P[pick], prior[pick]))
     value = sum(float(d @ np.linalg.solve(P, d)) for d, P, _ in found) if found else np.nan
     better = np.concatenate([np.sqrt(np.diag(C) / np.diag(P)) for _, P, C in found] or [np.zeros(0)])
     state = scores.series["state"][0] / scores.series["state_dof"][0]

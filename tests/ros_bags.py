@@ -10,8 +10,8 @@ import numpy as np
 
 from kalmark.events import Control, Event, Scan
 from kalmark.logs import Log
-from kalmark.logs.bag.geodesy import earth_centred
 from kalmark.logs.bag.write import Outgoing, Types, header
+from kalmark.logs.geodesy import earth_centred
 from laser_worlds import LaserWorld
 
 KINDS = ("ros1.bag", "sqlite3", "mcap")

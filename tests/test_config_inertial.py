@@ -104,6 +104,19 @@ def test_a_data_sheet_that_is_none_or_not_there_is_refused(tmp_path: Path) -> No
     assert "data_sheet: got an unknown key" in str(refused.value)
 
 
+@pytest.mark.parametrize("kind", ["inertial", "inertial_gravity"])
+def test_a_device_is_a_preset_of_the_motion(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text("robots: {each: {motion: {type: %s, preset: mems_imu, gravity_mps2: 9.8}}}\n" % kind)  # noqa: UP031
+    unit: Any = build_slam(load_config(path)).robots["robot"].motion
+    assert (unit.accelerometer_noise_density_mps_per_sqrt_s, unit.gravity_mps2) == (2.0e-3, 9.8)
+    assert unit.gyroscope_noise_density_rad_per_sqrt_s == 1.6968e-4
+    for preset in ("mems", 3, "rtk_receiver"):
+        path.write_text("robots: {each: {motion: {type: %s, preset: %s}}}\n" % (kind, preset))  # noqa: UP031
+        with pytest.raises(ConfigError, match=r"robots.each.motion.preset: got .*, expected one of mems_imu"):
+            load_config(path)
+
+
 def test_a_data_sheet_is_parameters_of_the_motion_in_python(tmp_path: Path) -> None:
     import kalmark as km
 

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from kalmark.models.inertial import Inertial
 from kalmark.models.sensors import Bearing, Gps2D, Gyro2D, Range, RangeBearing, Speed
 
 HOKUYO = "Hokuyo, Communication Protocol Specification for SCIP2.0, C-42-03320B"
@@ -39,7 +40,10 @@ MULTI_TAG = "Bolotnyy, Krize and Robins, The practicality of multi-tag RFID syst
 
 @dataclass(frozen=True)
 class Preset:
-    """A sensor as documented: `sensor`, its rate, its dropouts, and the source of each number that is not a default."""
+    """A sensor, or an inertial unit as a motion, as documented: `sensor`, its rate, its dropouts.
+
+    `sources` are those of each number that is not a default.
+    """
 
     sensor: Any
     rate_hz: float
@@ -161,6 +165,17 @@ MEMS_IMU = _preset(
 )
 """The gyroscope of a MEMS inertial unit: ADIS16448."""
 
+INERTIAL_UNIT = _preset(
+    Inertial,
+    gyroscope_noise_density_rad_per_sqrt_s=(1.6968e-4, f"{EUROC}: gyroscope_noise_density 1.6968e-04 rad/s/sqrt(Hz)"),
+    gyroscope_random_walk_radps_per_sqrt_s=(1.9393e-5, f"{EUROC}: gyroscope_random_walk 1.9393e-05 rad/s^2/sqrt(Hz)"),
+    accelerometer_noise_density_mps_per_sqrt_s=(2.0e-3, f"{EUROC}: accelerometer_noise_density 2.0e-3 m/s^2/sqrt(Hz)"),
+    accelerometer_random_walk_mps2_per_sqrt_s=(3.0e-3, f"{EUROC}: accelerometer_random_walk 3.0e-3 m/s^3/sqrt(Hz)"),
+    rate_hz=(200.0, f"{EUROC}: rate_hz 200"),
+    dropouts=(0.0, "assumption: none, it is read by wire"),
+)
+"""The same unit as a motion, `inertial`: its accelerometers, too."""
+
 F9P = "u-blox, ZED-F9P data sheet UBX-17051259"
 RTK_RECEIVER = _preset(
     Gps2D,
@@ -191,4 +206,6 @@ DEVICES = {
     "laser_scanner": LASER_SCANNER, "mems_imu": MEMS_IMU, "rtk_receiver": RTK_RECEIVER, "wheel_encoder": WHEEL_ENCODER,
 }  # fmt: skip
 """Common devices, by their data sheets."""
+MOTIONS = {"mems_imu": INERTIAL_UNIT}
+"""Devices that are a motion: `robots.NAME.motion.preset`."""
 ALL = TABLE_2 | DEVICES

@@ -67,8 +67,13 @@ class Written:
         B = np.eye(size)
         for space, x_at, p_at in self.blocks:
             if space.axes == 3:
-                B[p_at : p_at + space.dof, 3:6] -= space.generator(x[x_at : x_at + space.size])
+                turn = space.generator(x[x_at : x_at + space.size])
+                B[p_at : p_at + space.dof, 3:6] -= turn
+                if self.mounted:  # the map turns with the sensor: d_theta_r + R_r d_theta_s
+                    B[p_at : p_at + space.dof, 9:12] -= turn @ matrix(x[3:7])
         B[3:6] = np.eye(size)[3:6]
+        if self.mounted:
+            B[3:6, 9:12] = matrix(x[3:7])
         for (at, p, t, D), c2 in zip(self.depths(x), self.c2, strict=True):
             n = np.sqrt(t @ t + c2)
             B[p] = n * np.eye(size)[p] + x[at] / n * t @ D
@@ -84,7 +89,8 @@ class Written:
             elif kind == SCALAR:
                 x[at] += xi[p]
             elif kind == ROTATION:
-                x[at : at + 4] = multiply(exp(whole), x[at : at + 4])
+                own = exp(-matrix(x[at : at + 4]) @ xi[9:12] if self.mounted else np.zeros(3))
+                x[at : at + 4] = multiply(exp(whole), multiply(own, x[at : at + 4]))
             elif kind == TURNED:
                 x[at : at + 4] = multiply(exp(own), x[at : at + 4])
             elif kind == DIRECTION:

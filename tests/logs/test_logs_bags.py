@@ -16,8 +16,8 @@ from kalmark.config import build_slam, open_run
 from kalmark.errors import KalmarkError, LogError
 from kalmark.events import Control, Fix, Scan
 from kalmark.logs import open_log, write_native
-from kalmark.logs.bag.geodesy import A_M, E2, FLATTENING, earth_centred, local
 from kalmark.logs.bag.inertial import means
+from kalmark.logs.geodesy import A_M, E2, FLATTENING, earth_centred, local
 from kalmark.results.record import record
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")

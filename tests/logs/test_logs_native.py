@@ -299,3 +299,21 @@ def test_events_are_put_in_order_as_a_sort_with_keys_does() -> None:
         else:
             events.append(Fix(t_ns=t_ns, robot=robot, y=[float(k), 0.0], cov=np.eye(2)))
     assert [*map(id, in_order(events))] == [*map(id, sorted(events, key=order))] and in_order([]) == []
+
+
+def test_fitted_walls_are_read_beside_the_turns_of_wheels(tmp_path: Path) -> None:
+    (tmp_path / "scans.csv").write_text(
+        "t_s,robot,sensor,id,left_m,right_m,normal_deg,distance_cm\n1,r,laser,,2,-2,90,350\n"
+    )
+    (scan,) = open_log(tmp_path)
+    assert isinstance(scan, Scan)
+    np.testing.assert_allclose(scan.y, [[3.5, np.pi / 2, -2, 2]])
+
+
+def test_a_sensor_with_other_columns_in_another_file_is_refused_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "scans.csv").write_text("t_s,robot,sensor,id,range_m,bearing_rad\n1,r,laser,,2,0.1\n")
+    (tmp_path / "measurements.csv").write_text("t_s,robot,sensor,w_radps\n2,r,laser,0.1\n")
+    with pytest.raises(
+        LogError, match=r"measurements.csv:2: no column range_m, expected range_m, bearing_rad as r laser"
+    ):
+        open_log(tmp_path)

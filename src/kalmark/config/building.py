@@ -62,7 +62,7 @@ def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
             raise config.error(("map", "known"), "got truth, expected a log that has true landmarks")
         return [KnownLandmark(name, place, None) for name, place in log.landmarks.items()]
     try:
-        return read_known(known_path(config), exact)
+        return read_known(known_path(config), exact, None if log is None else log.origin)
     except LogError as error:
         raise config.error(("map", "known"), str(error)) from None
 
@@ -241,6 +241,8 @@ def _other_columns(
     missing = [name for name in columns if name not in given]
     meant = next(filter(None, (did_you_mean(name, missing) for name in given if name not in columns)), "")
     hint = f"; try --set robots.{key}.type={fitting[0]}" if fitting else meant
+    if given == (*columns, "z_m"):
+        hint = "; leave z_m out, on the globe height_m: the robot is in the plane"
     what = f"the scans of {robot} by {sensor}" if sensor else f"the controls of {robot}"
     return LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}{hint}")
 

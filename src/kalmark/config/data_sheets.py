@@ -1,4 +1,4 @@
-"""Files that a configuration names: a motion Kalibr's `imu.yaml`, as `data_sheet`; a camera its `calibration`."""
+"""What a configuration names: of a motion Kalibr's `imu.yaml` or a preset; of a camera its `calibration`."""
 
 from __future__ import annotations
 
@@ -70,10 +70,25 @@ def take_data_sheets(tree: Tree, path: Path | None) -> None:
     for name, robot in robots.items() if isinstance(robots, dict) else ():
         if not isinstance(robot, dict):
             continue
+        _take_preset(tree, ("robots", name, "motion"), robot.get("motion"))
         _take(tree, path, ("robots", name, "motion"), robot.get("motion"))
         sensors = robot.get("sensors")
         for sensor, section in sensors.items() if isinstance(sensors, dict) else ():
             _take(tree, path, ("robots", name, "sensors", sensor), section)
+
+
+def _take_preset(tree: Tree, where: tuple[str, ...], section: Any) -> None:
+    """Put the numbers of the device that a motion names as its `preset` in its place."""
+    if not isinstance(section, dict) or "preset" not in section or not _has_one(KEY, section.get("type")):
+        return
+    from kalmark.presets import MOTIONS
+
+    place, given = tree.place((*where, "preset")), section.pop("preset")
+    if not isinstance(given, str) or given not in MOTIONS:
+        told = f"{place}: {'.'.join((*where, 'preset'))}: got {show(given)}"
+        raise ConfigError(f"{told}, expected one of {', '.join(MOTIONS)}")
+    unit, names = MOTIONS[given].sensor, {own.name for own in parameters(class_of("motion", "inertial"))}
+    section |= {name: getattr(unit, name) for name in MOTIONS[given].sources if name in names} | section
 
 
 def _take(tree: Tree, path: Path | None, where: tuple[str, ...], section: Any) -> None:

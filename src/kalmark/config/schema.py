@@ -337,6 +337,8 @@ class LogConfig(Section):
     """Factors of columns, also of one robot or sensor: `{w_radps: -1, laser: {range_m: .001}}`; `t_s`: of all times."""
     shift_s: BySensor | None = None
     """Added to the times of the scans of a sensor, by its name; of one robot: `{rover: {laser: .1}}`."""
+    origin: list[Number] | None = None
+    """native: [latitude_deg, longitude_deg, height_m] of the origin of positions on the globe (the first if absent)."""
     vertices: Literal["none", "truth"] | None = None
     """g2o: `truth` takes the vertices as true poses and landmarks (none if absent)."""
     r_max: Positive | None = None

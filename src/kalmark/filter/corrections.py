@@ -53,7 +53,8 @@ from kalmark.filter.observed import (
     within,
 )
 from kalmark.filter.parallax import anchored
-from kalmark.geometry.spaces import Table, generator, generator_plane, retract, retract_plane
+from kalmark.geometry.rotations import matrix
+from kalmark.geometry.spaces import ANGLE, SCALAR, TURNED, Table, generator, generator_plane, retract, retract_plane
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
 Routines = tuple[int, int, int, int, int, int, int, int]  # addresses, see `routines`
@@ -72,6 +73,7 @@ TO_CORRECT = (  # all but the last argument
     "Tuple((i8, i8, i8[::1], i8, f8[:, ::1], f8[:, :, ::1], f8))"
 )
 ROUNDS, SETTLED = 20, 0.01  # of Huber's weights, and by how much these may still change
+BLIND = 1e-6  # of a Jacobian's largest number: what is smaller is zero, of a user's model by differences, too
 call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
 _RETRACT, _GENERATOR, _ITERATE, _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8)
 
@@ -101,18 +103,95 @@ def compile_correction(name: str, option: str, axes: int, inverse_depths: bool) 
 
 
 @compiled
-def gauge(mean: Array, correction: Array, pose: int, axes: int) -> Array:
-    """Return the motion of the gauge (axes,), d_theta or (xi_p, d_theta), in a correction of the robot's pose.
+def turning_rows(table: Table, pose: int, head: int, axes: int, H: Array) -> Index:
+    """Return the rows of the head that turn the map: of the pose (axes,), then of a mount that is in the map (1 or 3).
 
-    The observing robot's pose comes first in `mean` and in `correction`.
+    The map turns with the sensor that observes it, so with its mount (docs/invariant.md).  A second block that is no
+    mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation in H are zero.
     """
-    theta = (3 if pose == 3 else 6) - axes
-    turn = correction[theta : theta + axes].copy()
+    dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
+    mounted = head > pose and table[2, 0] == SCALAR and table[last, 0] == (ANGLE if pose == 3 else TURNED)
+    if mounted:
+        most = turning = 0.0
+        for i in range(len(H)):
+            for j in range(H.shape[1]):
+                most = max(most, abs(H[i, j]))
+                if 2 * dof - turns <= j < 2 * dof:
+                    turning = max(turning, abs(H[i, j]))
+        mounted = turning > BLIND * most
+    rows = np.empty(axes + turns if mounted else axes, np.int64)
+    for a in range(len(rows)):
+        rows[a] = dof - axes + a if a < axes else 2 * dof - turns + a - axes
+    return rows
+
+
+@compiled
+def frame_of(x: Array, at: int, size: int) -> Array:
+    """Return R_r (1, 1) or (3, 3) of the pose at this place of a mean x: a mount turns in the frame of its robot.
+
+    `size`: 3 for a mount of space.
+    """
+    if size < 3:
+        return np.eye(1)
+    q = np.empty(4)
+    for i in range(4):
+        q[i] = x[at + 3 + i]
+    return matrix(q)
+
+
+@compiled
+def turns_of(g: Array, R: Array, x: Array, at: int, last: int, columns: int) -> Array:
+    """Return a generator g (n, axes) with, up to so many columns, how a turn of the mount moves everything: g R.
+
+    R is R_r before the correction, the pose of the robot is at this place of the mean x now.  Its own rotation, whose
+    rows end with `last`, moves by -R_r: a correction leaves d_theta_r + R_r d_theta_s as it is, that of the sensor.
+    """
+    n, axes = g.shape
+    turns = columns - axes
+    if turns == 0:
+        return g
+    out = np.zeros((n, columns))
+    for i in range(n):
+        for a in range(axes):
+            out[i, a] = g[i, a]
+        for c in range(turns):
+            for a in range(turns):
+                out[i, axes + c] += g[i, axes - turns + a] * R[a, c]
+    now = frame_of(x, at, turns)
+    for a in range(turns):
+        for c in range(turns):
+            out[last + 1 - turns + a, axes + c] = -now[a, c]
+    return out
+
+
+@compiled
+def gauge(mean: Array, correction: Array, rows: Index, axes: int) -> Array:
+    """Return the motion of the gauge (axes,), d_theta or (xi_p, d_theta), in a correction of the head.
+
+    The observing robot's pose comes first in `mean` and in `correction`; `rows` are its `turning_rows`.
+    """
+    turn, turns = np.empty(axes), len(rows) - axes
+    for a in range(axes):
+        turn[a] = correction[rows[a]]
+    if turns > 0:  # of the sensor: d_theta + R_r d_theta_s
+        R = frame_of(mean, 0, turns)
+        for a in range(turns):
+            for c in range(turns):
+                turn[axes - turns + a] += R[a, c] * correction[rows[axes + c]]
     if axes == 6:  # xi_p = d_p - generator_p d_theta
         turn[0] += mean[1] * turn[5] - mean[2] * turn[4]
         turn[1] += mean[2] * turn[3] - mean[0] * turn[5]
         turn[2] += mean[0] * turn[4] - mean[1] * turn[3]
     return turn
+
+
+@compiled
+def picked(index: Index, rows: Index) -> Index:
+    """Return index[rows]."""
+    out = np.empty(len(rows), np.int64)
+    for i in range(len(rows)):
+        out[i] = index[rows[i]]
+    return out
 
 
 def iterate(
@@ -130,10 +209,12 @@ def iterate(
     """
     (pose, head, axes), (most, tolerance) = sizes, limits
     k = len(y)
-    theta = (3 if pose == 3 else 6) - axes
+    theta = turning_rows(table, pose, head, axes, linear[1])
     correction = np.zeros(len(P_ss))
     origin = mean[:3].copy()
+    last, R_r = theta[axes - 1], frame_of(mean, 0, len(theta) - axes)
     turned = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
+    turned = turns_of(turned, R_r, mean, 0, last, len(theta))
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
     depths = anchored(table if parallaxes else table[:0])
     v, H, HP, Z = linear
@@ -152,7 +233,7 @@ def iterate(
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            transport_rows(H, v, now, turned, theta, correction)
+            transport_rows(H, v, turns_of(now, R_r, x_j, 0, last, len(theta)), turned, theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, E_r.shape[2])
         M, positive = cholesky_inverse(Z)
         if not positive:
@@ -161,7 +242,7 @@ def iterate(
         if settled(table, correction, before, P_ss, tolerance):
             break
         x_j = mean.copy()
-        call_retract(ways[_RETRACT], (table, x_j, correction, gauge(mean, correction, pose, axes)))
+        call_retract(ways[_RETRACT], (table, x_j, correction, gauge(mean, correction, theta, axes)))
         if len(depths):
             s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
             d_head = correction[: S.shape[1]]
@@ -250,7 +331,9 @@ def invariant(
     if not positive:
         return e, z, Z, d2, within(d2, -1.0)[0], False
     origin = mean[:3].copy()
-    before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    theta, at = turning_rows(table, pose, head, axes, linear[1]), blocks[robot, 0]
+    last, R_r = index[theta[axes - 1]], frame_of(x, at, len(theta) - axes)
+    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
     V, correction = gain(sparse_product(H, rows_of(P, index, n), h, count), M, v)
     depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
@@ -262,12 +345,12 @@ def invariant(
     d_head = np.empty(h)
     for i in range(h):
         d_head[i] = correction[rows[i]]
-    call_retract(ways[_RETRACT], (atoms, x, correction, gauge(mean, d_head, pose, axes)))
-    now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    call_retract(ways[_RETRACT], (atoms, x, correction, gauge(mean, d_head, theta, axes)))
+    now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
     for i in range(n):
-        for a in range(axes):
+        for a in range(len(theta)):
             now[i, a] -= before[i, a]
-    downdate_and_transport(P, V, now, index[(3 if pose == 3 else 6) - axes])
+    downdate_and_transport(P, V, now, picked(index, theta))
     if len(depths):
         observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
         s, S = sensor_at(model, observer, ways[_SENSOR_AT])
@@ -357,7 +440,7 @@ def averaged(
     robot, mount, slots, d, y, R, _gate = scan
     pose, head = head_sizes(blocks, atoms, robot, mount)
     q = R.shape[1]
-    V, D = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs)))
+    V, D, H = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, head))
     d2, used = np.full(len(y), np.nan), 0
     for i in range(len(pairs)):
         rows = np.flatnonzero(pairs[i] >= 0)
@@ -375,18 +458,20 @@ def averaged(
         V_i, D[:, i] = gain(sparse_product(H, rows_of(P, index, n), E_r.shape[2], len(rows)), M, v)
         V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
         used += len(V_i)
-    index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
+    index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
+    theta, at = turning_rows(table, pose, head, axes, H), blocks[robot, 0]
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
     origin = mean[:3].copy()
-    before = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    turn = gauge(mean, correction[index], pose, axes) if transports else np.zeros(0)
+    last, R_r = index[theta[axes - 1]], frame_of(x, at, len(theta) - axes)
+    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
+    turn = gauge(mean, correction[index], theta, axes) if transports else np.zeros(0)
     call_retract(ways[_RETRACT], (atoms, x, correction, turn))
     downdate(P, V)
     add_square(P, spread)
     if transports:
-        theta = index[(3 if pose == 3 else 6) - axes]
-        transport(P, call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)) - before, theta)
+        now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
+        transport(P, now - before, picked(index, theta))
     return d2, True
 
 

@@ -252,13 +252,17 @@ def add_square(P: Array, D: Array) -> None:
 
 
 @compiled
-def transport(P: Array, a: Array, theta: int) -> None:
-    """P <- A P A' with A = I + a e_theta', a (n, 1 or 3): P += a w' + w a', w = P[:, theta] + a P[theta, theta] / 2."""
+def transport(P: Array, a: Array, theta: Index) -> None:
+    """P <- A P A' with A = I + a e_theta', a (n, axes), theta the rows of as many axes.
+
+    P += a w' + w a', w = P[:, theta] + a P[theta, theta] / 2.
+    """
     n, axes = a.shape
     a_T, w_T = np.empty((axes, n)), np.empty((axes, n))
     for c in range(axes):
+        t = theta[c]
         for j in range(n):
-            w_T[c, j] = P[theta + c, j] if j <= theta + c else P[j, theta + c]
+            w_T[c, j] = P[t, j] if j <= t else P[j, t]
             a_T[c, j] = a[j, c]
     half_turned(w_T, a_T, theta)
     for c in range(axes):
@@ -269,13 +273,13 @@ def transport(P: Array, a: Array, theta: int) -> None:
 
 
 @compiled
-def half_turned(w: Array, a: Array, theta: int) -> None:
+def half_turned(w: Array, a: Array, theta: Index) -> None:
     """Add half of P[theta, theta] a to the rows w = P[theta] (axes, n), in place."""
     axes, n = w.shape
     half = np.empty((axes, axes))
     for c in range(axes):
         for b in range(axes):
-            half[c, b] = 0.5 * w[c, theta + b]
+            half[c, b] = 0.5 * w[c, theta[b]]
     for c in range(axes):
         for b in range(axes):
             for j in range(n):
@@ -301,7 +305,7 @@ def subtract_outer(C: int, stride: int, L: int, rows: int, R: int, columns: int,
 
 
 @compiled
-def downdate_and_transport(P: Array, V: Array, a: Array, theta: int) -> None:
+def downdate_and_transport(P: Array, V: Array, a: Array, theta: Index) -> None:
     """Compute P (n, n) <- A (P - V' V) A', V (m, n): `downdate` and `transport` in one pass over a large P."""
     n, axes = a.shape
     if n <= CACHED:
@@ -312,10 +316,11 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: int) -> None:
     keep_some(P, V)
     w, a_T = np.empty((axes, n)), np.empty((axes, n))
     for c in range(axes):
+        t = theta[c]
         for j in range(n):
-            s = P[theta + c, j] if j <= theta + c else P[j, theta + c]
+            s = P[t, j] if j <= t else P[j, t]
             for i in range(q):
-                s -= V[i, theta + c] * V[i, j]
+                s -= V[i, t] * V[i, j]
             w[c, j], a_T[c, j] = s, a[j, c]
     half_turned(w, a_T, theta)
     L, R = np.empty((q + 2 * axes, n)), np.empty((q + 2 * axes, n))

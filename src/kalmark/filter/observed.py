@@ -245,7 +245,7 @@ def chosen(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[I
 
 
 @compiled
-def transport_rows(H: Array, v: Array, now: Array, then: Array, theta: int, correction: Array) -> None:
+def transport_rows(H: Array, v: Array, now: Array, then: Array, theta: Index, correction: Array) -> None:
     """Transport the rows of H from an iterate to the mean, H <- H (I + (now - then) e_theta'), then v += H correction.
 
     `now` and `then` (n, axes) are the generators there and here.
@@ -258,7 +258,7 @@ def transport_rows(H: Array, v: Array, now: Array, then: Array, theta: int, corr
             for c in range(n):
                 added[a] += H[r, c] * (now[c, a] - then[c, a])
         for a in range(axes):
-            H[r, theta + a] += added[a]
+            H[r, theta[a]] += added[a]
         for c in range(n):
             v[r] += H[r, c] * correction[c]
 

@@ -119,6 +119,11 @@ def carried(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: 
     table, s, S, c2 = baselines
     size, h = S.shape
     pose, C = 6 if size == 3 else 3, np.zeros((len(table), h + size + 1))
+    turns, turned = 3 if size == 3 else 1, np.zeros(3)
+    mounted = False  # but the state of a robot
+    if h >= 2 * pose:
+        for j in range(size):
+            mounted = mounted or S[j, pose] != 0.0
     for i in range(len(table)):
         at, a = table[i, RHO_X], table[i, ANCHOR_X]
         (g, n), (t, n_now) = baseline(s, before, a, c2[i]), baseline(s_now, x, a, c2[i])
@@ -128,9 +133,19 @@ def carried(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: 
             for c in range(h):
                 C[i, c] += g[j] * (S_now[j, c] if c < pose else S[j, c]) - g_now * S_now[j, c]
             C[i, h + j] = g_now - g[j]
-        for j in range(3 if size == 3 else 1):  # g x t; in the plane, its third component
+        for j in range(turns):  # g x t; in the plane, its third component
             k, l = ((j + 1) % 3, (j + 2) % 3) if size == 3 else (0, 1)
-            C[i, pose - (3 if size == 3 else 1) + j] += g[k] * t[l] - g[l] * t[k]
+            turned[j] = g[k] * t[l] - g[l] * t[k]
+            C[i, pose - turns + j] += turned[j]
+        if mounted:  # the map turns with it, too: corrections.turning_rows
+            for j in range(turns):
+                then = 0.0
+                for b in range(size):
+                    turned[j] += g[b] * S_now[b, pose - turns + j]
+                    then += g[b] * S[b, pose - turns + j]
+                for c in range(turns):  # S has R_r at the position of the mount
+                    now_jc, then_jc = (S_now[j, pose + c], S[j, pose + c]) if size == 3 else (1.0, 1.0)
+                    C[i, 2 * pose - turns + c] += turned[j] * now_jc - then * then_jc
         C[i, h + size] = n
         for c in range(h + size + 1):
             C[i, c] /= n_now

@@ -11,6 +11,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Id
+from kalmark.logs.geodesy import Globe
 from kalmark.logs.source import Request
 from kalmark.logs.table import Refused, Row, read_table
 
@@ -30,11 +31,12 @@ class KnownLandmark(NamedTuple):
     cov: Array | None
 
 
-def read_known(path: Path, exact: bool = False) -> list[KnownLandmark]:
+def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> list[KnownLandmark]:
     """Return the landmarks of a ``landmarks.csv``: id, x_m, y_m[, z_m][, signature | qx, qy, qz, qw], cov_xx, ...
 
-    Those with empty columns of the covariance, or with none, are known exactly; with `exact` all are.  Raises LogError
-    naming file and line.
+    Those with empty columns of the covariance, or with none, are known exactly; with `exact` all are.  Places on the
+    globe, lat_deg, lon_deg[, height_m], are counted from the `origin` of the log (3,).  Raises LogError naming file and
+    line.
     """
     found: dict[Id, KnownLandmark] = {}
 
@@ -52,7 +54,10 @@ def read_known(path: Path, exact: bool = False) -> list[KnownLandmark]:
     def refuse(line: str) -> None:
         raise LogError(line)
 
-    table = read_table(path, ("id", "x_m", "y_m"), allowed=("kind", "observations", "known", *PLACES[2:]))
+    allowed, globe = ("kind", "observations", "known", *PLACES[2:]), Globe(origin)
+    table = read_table(path, ("id", "x_m", "y_m"), allowed=allowed, globe=globe)
+    if table.globe is not None and origin is None:
+        raise LogError(f"{path}: lat_deg and lon_deg, but the log has no origin on the globe, expected log.origin")
     table.each(Request(None, refuse, []), take, timed=False)
     return [*found.values()]
 

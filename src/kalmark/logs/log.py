@@ -137,6 +137,7 @@ class Log:
     describes: dict[str, Any] = field(default_factory=dict)
     reference: dict[str, dict[str, float]] = field(default_factory=dict)
     true_ids: dict[Scan, tuple[Id | None, ...]] = field(default_factory=dict)
+    origin: Array | None = None
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self.events)

@@ -13,6 +13,9 @@
 
 A row of `scans.csv` whose id and values are all empty is a scan that saw nothing.
 
+Positions may be on the globe instead: `lat_deg, lon_deg[, height_m]` for `x_m, y_m[, z_m]` in any of these files; they
+become metres east, north and up of one origin (`geodesy.py`).
+
 Own noise is either a column `sigma_<column>` for each column, or the upper triangle `cov_00, cov_01, cov_11, ...`
 numbered in the order of the columns (`cov_xx, cov_xy, cov_yy, ...` where they are x_m, y_m[, z_m]).
 """
@@ -33,6 +36,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, in_order, order, shown
+from kalmark.logs.geodesy import Globe, origin_of
 from kalmark.logs.images.pictures import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
@@ -54,8 +58,12 @@ Places = dict[tuple[Path, str, str], int]
 NEAR = 0.65  # of difflib's ratio
 
 
-def read(path: Path, request: Request) -> Log:
-    """Return the native log in a folder.  Raises LogError with file and line."""
+def read(path: Path, request: Request, origin: Any = None) -> Log:
+    """Return the native log in a folder.  Raises LogError with file and line.
+
+    `origin`: latitude, longitude (deg) and height (m) of the map's origin, where positions are on the globe; their
+    first one if it is None.
+    """
     there = tables(path)
     if not {*EVENTS} & there.keys():
         raise LogError(
@@ -66,7 +74,8 @@ def read(path: Path, request: Request) -> Log:
         near = [] if name in there else get_close_matches(name, others, n=1, cutoff=0.85)
         if near:
             raise LogError(f"{path / near[0]}: a file of this name is not read, expected {name}")
-    return of_tables(there, request, path.name, path, read_rig(path / RIG) if (path / RIG).is_file() else {})
+    describes = read_rig(path / RIG) if (path / RIG).is_file() else {}
+    return of_tables(there, request, path.name, path, describes, Globe(origin_of(origin, "log option origin")))
 
 
 def tables(path: Path) -> dict[str, Path]:
@@ -82,10 +91,11 @@ def tables(path: Path) -> dict[str, Path]:
 
 
 def of_tables(
-    there: Mapping[str, Path | Sheet], request: Request, called: str, path: Path | None, describes: dict[str, Any]
-) -> Log:
+    there: Mapping[str, Path | Sheet], request: Request, called: str, path: Path | None, describes: dict[str, Any],
+    globe: Globe | None = None,
+) -> Log:  # fmt: skip
     """Return the log of tables, by the names of their CSV files.  Raises LogError with file and line."""
-    reader = _Reader(request)
+    reader = _Reader(request, globe=globe)
     for name, read_file in zip(FILES, reader.readers, strict=True):
         if name in there:
             reader.events += read_file(there[name]) or ()
@@ -101,6 +111,7 @@ def of_tables(
         control_columns={robot: names for (robot, sensor), names in columns.items() if not sensor},
         sensor_columns={key: names for key, names in columns.items() if key[1]},
         places={(robot, sensor): (file, line) for (file, robot, sensor), line in reversed(reader.places.items())},
+        origin=reader.globe.origin,
     )  # fmt: skip
 
 
@@ -133,11 +144,12 @@ class _Reader:
     """Reads the files of a log, one method each, and gathers what is in them.
 
     `columns` are those of each robot's controls (sensor "") and of each sensor, `places` where they begin.  `in_order`:
-    the rows of a file are in the order of time, whichever robot and sensor they are of.
+    the rows of a file are in the order of time, whichever robot and sensor they are of.  `globe` has the origin of
+    positions on it.
     """
 
-    def __init__(self, request: Request, in_order: bool = False) -> None:
-        self.request, self.in_order = request, in_order
+    def __init__(self, request: Request, in_order: bool = False, globe: Globe | None = None) -> None:
+        self.request, self.in_order, self.globe = request, in_order, globe or Globe()
         self.events: list[Event] = []
         self.columns: dict[tuple[str, str], tuple[str, ...]] = {}
         self.places: Places = {}
@@ -182,7 +194,9 @@ class _Reader:
                 self.request.refuse(f"{path}{row.table.content.word}{row.line}: {refused}")
             return done
 
-        table = read_table(path, ("t_s", "robot", "sensor", "id"), known=(*CONTROL, *OBSERVATION, *READING))
+        table = read_table(
+            path, ("t_s", "robot", "sensor", "id"), known=(*CONTROL, *OBSERVATION, *READING), globe=self.globe
+        )
         for done in table.made(self.request, make, by_sensor=True):
             yield from done
         for key, rows in scans.items():
@@ -228,7 +242,7 @@ class _Reader:
             cov = row.own_noise(self.columns[row.key], definite=True)
             return Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov)
 
-        table = read_table(path, ("t_s", "robot", "sensor"), known=(*CONTROL, *OBSERVATION, *READING))
+        table = read_table(path, ("t_s", "robot", "sensor"), known=(*CONTROL, *OBSERVATION, *READING), globe=self.globe)
         return table.made(self.request, make, by_sensor=True)
 
     def frames(self, path: Path | Sheet) -> Iterator[Event]:
@@ -249,7 +263,7 @@ class _Reader:
 
     def fixes(self, path: Path | Sheet) -> Iterator[Event]:
         """Yield the absolute positions of `fixes.csv`."""
-        table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",))
+        table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",), globe=self.globe)
         if not table.noise_columns:
             raise LogError(f"{path}:1: no column of noise, expected cov_xx, cov_xy, cov_yy or sigma_x_m, sigma_y_m")
         columns: dict[tuple[str, str], tuple[str, ...]] = {}
@@ -266,7 +280,7 @@ class _Reader:
 
     def read_truth(self, path: Path | Sheet) -> None:
         """Read `truth.csv`: the true trajectory of each robot."""
-        table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3))
+        table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3), globe=self.globe)
         if set(table.value_columns) not in (set(POSE2), set(POSE3)):
             odd = next((name for name in table.value_columns if name not in (*POSE2, *POSE3)), None)
             hint = nearest(odd, (*POSE2, *POSE3)) if odd else ""
@@ -299,7 +313,8 @@ class _Reader:
                 raise Refused(f"{', '.join(given)}, expected a point, both ends of a line or the pose of a tag")
             self.landmarks[name] = np.array(values)
 
-        read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:]).each(self.request, take, timed=False)
+        table = read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:], globe=self.globe)
+        table.each(self.request, take, timed=False)
 
     def read_gps(self, path: Path | Sheet) -> None:
         """Read `gps.csv`: position fixes that only score a run."""
@@ -314,7 +329,7 @@ class _Reader:
             times.append(row.t_ns)
             rows.append(values)
 
-        read_table(path, ("t_s", "robot", *columns), allowed=()).each(self.request, take)
+        read_table(path, ("t_s", "robot", *columns), allowed=(), globe=self.globe).each(self.request, take)
         for robot, (times, rows) in tracks.items():
             track = np.array(rows)
             self.gps[robot] = PositionTrack(np.array(times), track[:, :2], track[0, 2:])
@@ -381,4 +396,6 @@ def _letters(name: str) -> str:
 
 
 ANY = (*FILES, *(Path(name).with_suffix(PARQUET).name for name in FILES))
-NATIVE = Format("native", "a folder with controls.csv, scans.csv", lambda path: folder_of(path, ANY), read)
+NATIVE = Format(
+    "native", "a folder with controls.csv, scans.csv", lambda path: folder_of(path, ANY), read, options=("origin",)
+)

@@ -22,6 +22,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import MOST, Id, bound, most, shown
+from kalmark.logs import geodesy
+from kalmark.logs.geodesy import Globe
 from kalmark.logs.progress import track
 from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
 
@@ -36,6 +38,7 @@ CONTROL = (
 )  # fmt: skip
 OBSERVATION = (
     "range_m", "bearing_rad", "azimuth_rad", "elevation_rad", "signature",
+    "distance_m", "normal_rad", "right_m", "left_m",
     "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "x2_m", "y2_m", "z2_m",
     "u_px", "v_px", "ul_px", "vl_px", "ur_px", "vr_px",
     "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
@@ -62,6 +65,8 @@ FACTORS = {
     "dps": ("radps", math.pi / 180),
 }  # fmt: skip
 """Units of columns that are taken, too: each the unit that it becomes, and by what it is multiplied."""
+GLOBE = {"lat_deg": "x_m", "lon_deg": "y_m", "height_m": "z_m"}
+"""Columns of positions on the globe, and those of the tangent plane whose place in a row they take."""
 TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
 CSV, PARQUET = ".csv", ".parquet"
 BATCH = 65_536  # rows of Parquet at a time
@@ -101,7 +106,8 @@ class Content(NamedTuple):
 class Table:
     """Hold a table: its header by name, the columns that are values, those of noise, and its rows, to be read once.
 
-    `given` are the names of columns in other units, with their factors, and `unit_ns` that of times.
+    `given` are the names of columns in other units, with their factors, and `unit_ns` that of times.  With a `globe`
+    its positions are on that: the cells of x_m, y_m and z_m are latitude, longitude and height.
     """
 
     path: Path
@@ -111,6 +117,7 @@ class Table:
     content: Content
     given: dict[str, tuple[str, float]]
     unit_ns: int = TIMES["t_s"]
+    globe: Globe | None = None
 
     def name(self, column: str) -> str:
         """Return a column's name as the source has it."""
@@ -252,17 +259,21 @@ def _of_csv(path: Path, separator: str = ",") -> Content:
 
 def read_table(
     source: Path | Sheet, required: tuple[str, ...], allowed: tuple[str, ...] | None = None,
-    known: tuple[str, ...] = (),
+    known: tuple[str, ...] = (), globe: Globe | None = None,
 ) -> Table:  # fmt: skip
     """Return the table of a source, which must have the columns `required`.
 
     Other columns must be among `allowed` (None: any but those that are one of `known` in another unit or in none);
-    noise columns always may be there.  Columns in other units are renamed, and their numbers multiplied.  Raises
-    LogError if the source is missing or empty, or has a header that does not fit.
+    noise columns always may be there.  Columns in other units are renamed, and their numbers multiplied; those of
+    positions on a `globe` are taken for x_m, y_m and z_m, if one is given.  Raises LogError if the source is missing or
+    empty, or has a header that does not fit.
     """
     content = opened(source)
     where, known = content.where, (*required, *(allowed or ()), *known)
     header, given, unit_ns = in_units(content.header, known)
+    on_globe = globe is not None and any(name in header for name in ("lat_deg", "lon_deg"))
+    if on_globe:
+        header = in_plane(where, header, given)
     for name in header:
         refuse_unit(where, name, known)
     for name in required:
@@ -283,7 +294,22 @@ def read_table(
             raise LogError(f"{where}: column {name!r} is unknown, expected {wanted}")
     values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
     index = {name: i for i, name in enumerate(header)}
-    return Table(Path(str(source)), index, tuple(values), noise, content, given, unit_ns)
+    return Table(Path(str(source)), index, tuple(values), noise, content, given, unit_ns, globe if on_globe else None)
+
+
+def in_plane(where: str, header: list[str], given: dict[str, tuple[str, float]]) -> list[str]:
+    """Return a header with the columns of positions on the globe under their names in the tangent plane.
+
+    Notes in `given` what they were called.  Raises LogError where one is missing, or positions are there in both ways.
+    """
+    for name in ("lat_deg", "lon_deg"):
+        if name not in header:
+            raise LogError(f"{where}: no column {name}, expected lat_deg, lon_deg[, height_m]")
+    both = [name for name in GLOBE.values() if name in header]
+    if both:
+        raise LogError(f"{where}: columns lat_deg and {both[0]}, expected positions in one of both ways in a file")
+    given.update({GLOBE[name]: (name, 1.0) for name in header if name in GLOBE})
+    return [GLOBE.get(name, name) for name in header]
 
 
 def in_units(header: list[str], known: tuple[str, ...]) -> tuple[list[str], dict[str, tuple[str, float]], int]:
@@ -403,6 +429,21 @@ class Row:
                 raise Refused(f"{name(column)} is {shown(self.text(column))}, expected {wanted}")
             if values[-1] < 0 and column in NOT_NEGATIVE:
                 raise Refused(f"{name(column)} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
+        return values if self.table.globe is None else self._placed(self.table.globe, columns, values)
+
+    def _placed(self, globe: Globe, columns: tuple[str, ...], values: list[float]) -> list[float]:
+        """Return values in which a position on the globe is one in the tangent plane.  Raises Refused."""
+        at = [columns.index(name) for name in GLOBE.values() if name in columns]
+        if not at:
+            return values
+        for name in ("x_m", "y_m"):
+            if name not in columns:
+                raise Refused(f"{self.table.name(name)} is {shown(self.text(name))}, expected a finite number")
+        lla = [values[i] for i in at]
+        if wrong := geodesy.fault(lla):
+            raise Refused(wrong)
+        for i, place in zip(at, globe.local(lla).tolist(), strict=False):
+            values[i] = place
         return values
 
     def values(self, columns: dict[tuple[str, str], tuple[str, ...]]) -> list[float]:
@@ -411,6 +452,10 @@ class Row:
         if not used:
             names = ", ".join(self.table.value_columns) or "a column of values"
             raise Refused(f"no value in the row, expected numbers in {names}")
+        missing = [name for name in used if name not in self.table.index]
+        if missing:
+            who, names = " ".join(self.key).strip(), ", ".join(used)
+            raise Refused(f"no column {missing[0]}, expected {names} as {who} has in another file")
         values = self.numbers(used)
         for name in self.table.value_columns:
             if name not in used and self.text(name):

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from kalmark.logs.bag.first_words import GUESS
-from kalmark.logs.bag.geodesy import local
 from kalmark.logs.bag.survey import Poses, Survey, TopicSummary, yaw
+from kalmark.logs.geodesy import local
 
 NEAR_NS = 500_000_000
 LEAST_WAY_M = 2.0

@@ -20,7 +20,6 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag import tables
 from kalmark.logs.bag.frames import Frames
-from kalmark.logs.bag.geodesy import local
 from kalmark.logs.bag.inertial import GRAVITY, GYRO, HEADING, INCLINATION, heading_of, heading_of_field, means
 from kalmark.logs.bag.messages import (
     BEAM,
@@ -52,6 +51,7 @@ from kalmark.logs.bag.topics import (
     Truths,
     topic_of,
 )
+from kalmark.logs.geodesy import fault, local
 from kalmark.logs.images.pictures import Forward
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, placed, seconds
@@ -398,8 +398,8 @@ class _Importer:
         if place is None:
             self.left_out[received.topic, "messages without a fix"] += 1
             return
-        if not (np.isfinite(place.lla[:2]).all() and abs(place.lla[0]) <= 90 and abs(place.lla[1]) <= 360):
-            raise Refused(f"latitude and longitude are {place.lla[:2].tolist()}, expected degrees")
+        if wrong := fault(place.lla):
+            raise Refused(wrong)
         lla = np.where(np.isfinite(place.lla), place.lla, 0.0)  # a fix in two dimensions has no height
         origin = self.origins.setdefault("", lla if topic.origin is None else np.array(topic.origin, dtype=np.float64))
         enu = local(lla, origin)

@@ -12,11 +12,14 @@ receivers give neither.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.errors import LogError
+from kalmark.events import shown
 
 A_M = 6378137.0
 FLATTENING = 1 / 298.257223563
@@ -40,3 +43,41 @@ def local(lla: Any, origin: Any) -> Array:
     R = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
     enu: Array = (earth_centred(lla) - earth_centred(origin)) @ R.T
     return enu
+
+
+def fault(lla: Any) -> str:
+    """Return what is wrong with latitude and longitude (deg), "" if they are some."""
+    lat, lon = lla[0], lla[1]
+    if np.isfinite([lat, lon]).all() and abs(lat) <= 90 and abs(lon) <= 360:
+        return ""
+    return f"latitude and longitude are {[float(lat), float(lon)]}, expected degrees, of at most 90 and 360"
+
+
+def origin_of(given: Any, what: str) -> Array | None:
+    """Return the origin (3,) that a user gave, None for none.  Raises LogError."""
+    if given is None:
+        return None
+    try:
+        lla = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        lla = np.zeros(0)
+    if lla.shape not in ((2,), (3,)) or not np.isfinite(lla).all() or fault(lla):
+        raise LogError(f"{what} is {shown(given)}, expected [latitude_deg, longitude_deg, height_m]")
+    return np.append(lla, np.zeros(3 - len(lla)))
+
+
+@dataclass
+class Globe:
+    """Where the tangent plane touches the Earth: `origin` (3,), latitude, longitude (deg) and height (m).
+
+    None until it is known: then it is the first position that is asked for.
+    """
+
+    origin: Array | None = None
+
+    def local(self, lla: Any) -> Array:
+        """Return a position (2 or 3,) on the globe as east, north, up (3,) m; without a height, at the origin's."""
+        lla = np.array(lla, dtype=np.float64)
+        if self.origin is None:
+            self.origin = np.append(lla, np.zeros(3 - len(lla)))
+        return local(np.append(lla, self.origin[len(lla) :]), self.origin)
