@@ -434,6 +434,27 @@ def images() -> Iterator[Figure]:
                  "1 % / -", "python benchmarks/vision.py desk", row("desk", "{8} % / {11} ms"))  # fmt: skip
 
 
+def image_peers() -> Iterator[Figure]:
+    """Yield what others make of the images that kalmark reads: OpenCV's parts put together, and SVO."""
+    camera = "--set log.fps=30 --set 'robots.each.sensors.camera={type: pinhole, fx_px: 615, fy_px: 615, cx_px: 320, cy_px: 240}'"
+    for name, log in (
+        ("TUM fr1_xyz, 320 x 240, 798 frames", "visual/tum_fr1_xyz"),
+        ("Tsukuba, 640 x 480, 150 frames", f"visual/tsukuba150 {camera}"),
+        ("EuRoC V1_01, 752 x 480, 90 frames, no inertial unit", "visual/euroc_v101_micro"),
+    ):
+        command = f'python benchmarks/vision_peers.py {log} --svo "$SVO_PYTHON"'
+        rest = "ATE, similarity-aligned, cm / frames tracked, % / scale of both halves / a frame, ms"
+        yield Figure(
+            "Images",
+            f"OpenCV's tracks, essential matrix and PnP, {name}: {rest}",
+            "-",
+            command,
+            row("klt", "{0} / {1} / {2} / {3}"),
+        )
+        yield Figure("Images", f"SVO (svo-cpp), {name}, three runs: {rest}", "-", command,
+                     spread(["svo 0", "svo 1", "svo 2"], [0, 1, 2, 3]))  # fmt: skip
+
+
 def partial_measurements() -> Iterator[Figure]:
     """Yield the figures of ranges alone and bearings alone."""
     section, command = "Ranges alone", "python benchmarks/range_only.py"
@@ -633,6 +654,7 @@ def figures() -> list[Figure]:
         commands,
         bags,
         images,
+        image_peers,
         speed,
         structure,
     )

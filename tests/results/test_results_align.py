@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalmark.results.measures import identity, rigid, rigid_robust, rmse
+from kalmark.results.evaluate import scale_figures
+from kalmark.results.measures import identity, rigid, rigid_robust, rmse, similarity
 
 
 def rotation_2d(a: float) -> np.ndarray:
@@ -25,6 +26,31 @@ def test_an_exact_motion_is_recovered_in_2d_and_3d() -> None:
         assert np.allclose(fit.rotation, q, atol=1e-12)
         assert np.allclose(fit.shift, shift, atol=1e-12)
         assert np.allclose(fit.inverse()(fit(points)), points, atol=1e-12)
+
+
+def test_a_similarity_is_recovered_and_is_the_best_one() -> None:
+    rng = np.random.default_rng(3)
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    points, shift = rng.normal(size=(40, 3)), rng.normal(size=3)
+    fit, scale = similarity(points, 2.5 * points @ q.T + shift)
+    assert scale == pytest.approx(2.5)
+    assert np.allclose(fit.rotation, q)
+    assert np.allclose(fit.shift, shift)
+    target = points + 0.1 * rng.normal(size=points.shape)
+    fit, scale = similarity(points, target)
+    best = rmse(fit(scale * points) - target)
+    assert all(rmse(fit(s * points) - target) > best for s in (0.99 * scale, 1.01 * scale))
+    assert similarity(np.ones((3, 3)), np.zeros((3, 3)))[1] == 1.0
+
+
+def test_the_drift_of_the_scale_is_that_of_the_second_half_against_the_first() -> None:
+    t = np.linspace(0, 1, 100)
+    truth = np.column_stack([np.cos(9 * t), np.sin(9 * t), t])
+    path = np.concatenate([truth[:50] / 2, truth[50:] / 2.2])
+    figures = scale_figures(path, truth)
+    assert figures["scale_drift"] == pytest.approx(0.1)
+    assert 2 < figures["scale"] < 2.2
 
 
 def test_a_mirror_image_is_never_aligned_by_a_reflection() -> None:

@@ -16,7 +16,19 @@ from kalmark.results.gaps import gap_figures, gap_notes
 from kalmark.results.history import History, Ints
 from kalmark.results.landmarks import EUCLIDEAN, MapLandmarks
 from kalmark.results.matching import association_figures, best_known, by_position, no_ids
-from kalmark.results.measures import Rigid, diverged, identity, nees, nis, path_m, pose_error, rigid, rigid_robust, rmse
+from kalmark.results.measures import (
+    Rigid,
+    diverged,
+    identity,
+    nees,
+    nis,
+    path_m,
+    pose_error,
+    rigid,
+    rigid_robust,
+    rmse,
+    similarity,
+)
 from kalmark.results.recording import Recording
 from kalmark.results.repeats import repeat_figures, repeat_notes
 from kalmark.results.truth import Truth, fitted
@@ -134,6 +146,8 @@ def robot_figures(run: Recording, name: str) -> dict[str, Any]:
     known = np.isfinite(truth).all(axis=1)
     if known.any():
         figures |= pose_figures(mean[known], P[known], truth[known], run.coordinates)
+        if any(isinstance(s, dict) and s.get("detector") for s in run.sections(name).values()) and mean.shape[1] == 7:
+            figures |= scale_figures(mean[known, :3], truth[known, :3])
     elif name in run.truth.fixes:
         figures |= fix_figures(fix_distances(run, name))
     return figures
@@ -157,6 +171,20 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
         "path_m": path_m(truth[:, :d]),
         "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, truth[:, :d]),
     }
+
+
+def scale_figures(path: Array, truth: Array) -> dict[str, float]:
+    """Return the error of a path (N, 3) whose scale is free, and its scale: the true length over the estimated one.
+
+    `scale_drift` compares the scales of both halves.
+    """
+    if len(path) < 4:
+        return {}
+    fit, scale = similarity(path, truth)
+    halves = np.array_split(np.arange(len(path)), 2)
+    first, second = (similarity(path[half], truth[half])[1] for half in halves)
+    drift = abs(second / first - 1.0) if first > 0.0 else float("nan")
+    return {"ate_similarity_m": rmse(fit(scale * path) - truth), "scale": scale, "scale_drift": drift}
 
 
 def known_landmarks(run: Recording) -> MapLandmarks:

@@ -71,6 +71,18 @@ def rigid(source: Array, target: Array, weights: Array | None = None) -> Rigid:
     return Rigid(rotation, mean_t - rotation @ mean_s)
 
 
+def similarity(source: Array, target: Array) -> tuple[Rigid, float]:
+    """Fit the scale s, then the rotation and shift, that take `source` (N, d) onto `target` (N, d).  Umeyama 1991.
+
+    The result takes points p to rotation (s p) + shift.  Points in one place give the scale 1.
+    """
+    fit = rigid(source, target)
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    spread = float(np.sum(a * a))
+    scale = float(np.sum(b * (a @ fit.rotation.T))) / spread if spread > 0.0 else 1.0
+    return Rigid(fit.rotation, target.mean(axis=0) - scale * fit.rotation @ source.mean(axis=0)), scale
+
+
 def rigid_robust(source: Array, target: Array, floor_m: float = 0.1, iterations: int = 200) -> Rigid:
     """Fit the alignment of points (N, d) that minimises the sum of the *distances*, which limits outliers.
 

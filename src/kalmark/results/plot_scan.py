@@ -18,6 +18,7 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.results.explain import Explanation, Fate
 from kalmark.results.history import Camera, Measuring
+from kalmark.results.pictures import Pictures
 from kalmark.results.plot_measured import draw_measured, measuring
 from kalmark.results.recording import Recording
 from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
@@ -30,6 +31,8 @@ OUTCOME = {
 FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
 PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
+ON_IMAGE = "#ffd400"  # of what was measured, over a picture
+MOST_NAMES = 30  # of landmarks in an image
 PAPER = 490.0  # width of the axes in points, about
 MARK = 6.0  # half a cross or a square, in points
 ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
@@ -196,8 +199,9 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     width = 9.0 if len(seen) == 1 else 14.0
     figure = Figure(figsize=(width, (width - 1.0) / len(seen) * shape + 1.5), layout="constrained", facecolor="white")
     grid = figure.subplots(1, len(seen), squeeze=False)[0]
+    picture = Pictures(run).at(camera, int(steps[-1]))
     for axes, image in zip(grid, seen, strict=True):
-        draw_image(axes, image, camera.size)
+        draw_image(axes, image, camera.size, picture)
     outcomes = Counter(s.outcome for s in seen[0].sightings)
     said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
     title = f"{robot} · {sensor} · t = {history.t_s[steps[-1]]:.3f} s · {said}"
@@ -206,8 +210,12 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     return figure
 
 
-def draw_image(axes: Axes, image: Image, size: tuple[float, float]) -> None:
-    """Draw what one image of a camera shows of a scan: u to the right, v down."""
+def draw_image(axes: Axes, image: Image, size: tuple[float, float], picture: Any = None) -> None:
+    """Draw what one image of a camera shows of a scan, over its `picture` (H, W) if there is one: u right, v down."""
+    if picture is not None:
+        height, width = picture.shape
+        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+        axes.imshow(picture, cmap="gray", vmin=0, vmax=255, extent=extent, zorder=0)
     axes.set_xlim(0, size[0])
     axes.set_ylim(size[1], 0)
     axes.set_aspect("equal", adjustable="box")
@@ -216,11 +224,12 @@ def draw_image(axes: Axes, image: Image, size: tuple[float, float]) -> None:
     axes.tick_params(colors="#555b66", labelsize=8)
     if image.side:
         axes.set_title(f"{image.side} image", fontsize=10, color="#555b66")
+    named, measured = len(image.sightings) <= MOST_NAMES, MEASURED if picture is None else ON_IMAGE
     for sighting in image.sightings:
-        _draw(axes, sighting, size)
+        _draw(axes, sighting, size, named, measured)
 
 
-def _draw(axes: Axes, s: Sighting, size: tuple[float, float]) -> None:
+def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, measured: str) -> None:
     colour, _ = colour_of(s)
     expected, single = np.isfinite(s.expected).all(), len(s.expected) == 1
     closed = np.vstack([s.measured, s.measured[:1]]) if len(s.measured) > 2 else s.measured
@@ -228,7 +237,7 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float]) -> None:
     if not len(s.measured):
         pass
     elif single:
-        axes.plot(*s.measured.T, "+", color=MEASURED, markersize=8, markeredgewidth=1.1, zorder=3)
+        axes.plot(*s.measured.T, "+", color=measured, markersize=8, markeredgewidth=1.1, zorder=3)
     else:
         axes.plot(*closed.T, "-", color="#3a68c8" if not new else MEASURED, linewidth=3.0, alpha=0.55, zorder=2)
     if new:
@@ -237,7 +246,7 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float]) -> None:
         axes.plot(*s.measured.T, "x", color=INK, markersize=8, markeredgewidth=1.4, zorder=6)
     if expected:
         _draw_expected(axes, s, size, colour, rejected)
-    if s.outcome != "ignored" and s.name:
+    if named and s.outcome != "ignored" and s.name:
         at = s.expected.mean(axis=0) if expected and (single or not len(s.measured)) else s.measured.mean(axis=0)
         text: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 7, "color": NAME, "clip_on": True}
         axes.text(at[0], at[1] - 15.0, s.name, zorder=7, **text)

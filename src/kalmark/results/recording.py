@@ -187,9 +187,15 @@ class Recording:
 
     def section(self, robot: str, sensor: str) -> dict[str, Any]:
         """Return the configuration of a robot's sensor, {} if it has none."""
+        return self.sections(robot).get(sensor) or {}
+
+    def sections(self, robot: str) -> dict[str, Any]:
+        """Return the configuration of a robot's sensors by name."""
         robots = self.config.get("robots") or {}
-        sections = (((robots.get(name) or {}).get("sensors") or {}).get(sensor) for name in (robot, "each"))
-        return next(filter(None, sections), {})
+        found: dict[str, Any] = {}
+        for name in ("each", robot):
+            found |= (robots.get(name) or {}).get("sensors") or {}
+        return found
 
     def with_truth(self, log: Log) -> Self:
         """Return the run judged by another log's truth."""

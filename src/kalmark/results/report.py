@@ -25,6 +25,7 @@ from kalmark.results.explain import Explanation, Fate, explained
 from kalmark.results.history import Camera, Change, History, Ints, MapSnapshot
 from kalmark.results.landmarks import shapes
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
+from kalmark.results.pictures import Pictures
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
     Scene,
@@ -175,7 +176,7 @@ def _resource(name: str) -> str:
 
 def series(run: Recording) -> dict[str, Any]:
     """Return all that the pictures of a report need; times in seconds since the first step."""
-    scene, t = Scene.of(run), run.history.t_s
+    scene, t, pictures = Scene.of(run), run.history.t_s, Pictures(run)
     dof, maps = (3, 6)[scene.d - 2], run.history.maps
     stride = max(1, -(-sum(len(m.ids) for m in maps) // LANDMARKS))  # the page stays of a size to open
     maps = maps[::-1][::stride][::-1]  # the last among them
@@ -190,7 +191,7 @@ def series(run: Recording) -> dict[str, Any]:
         "repeats": xy(scene.repeats),
         "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.used.items()},
         "bodies": {robot: xy(joined(scene.body(robot))) for robot in scene.paths if scene.d == 3},
-        "cameras": [_camera(run, camera, maps, t) for camera in run.history.cameras],
+        "cameras": [_camera(run, camera, maps, t, pictures) for camera in run.history.cameras],
         "robots": [_robot(run, scene, robot, t) for robot in scene.paths],
         "innovations": _innovations(run, scene),
         "nis": _nis(run, t),
@@ -210,7 +211,9 @@ def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
     return {**head, "count": len(m.ids), **lines, **tags, **gaussians(drawn.means, drawn.covariances)}
 
 
-def _camera(run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array) -> dict[str, Any]:
+def _camera(
+    run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array, pictures: Pictures
+) -> dict[str, Any]:  # fmt: skip
     """Return what a camera saw last at each of the maps: `frames` are indices of its `scans`, None before the first."""
     steps = steps_of(run.history, camera)
     last = np.searchsorted(steps, [m.step for m in maps], side="right") - 1
@@ -219,7 +222,8 @@ def _camera(run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Arra
     for step in steps[used].tolist():
         sides = images(run.history, camera, step)
         seen = [{"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]} for image in sides]
-        scans.append({"t": round(float(t[step]), 3), "images": seen})
+        picture = pictures.uri(camera, step)
+        scans.append({"t": round(float(t[step]), 3), "images": seen} | ({"picture": picture} if picture else {}))
     frames = [int(np.searchsorted(used, k)) if k >= 0 else None for k in last]
     size = [float(side) for side in camera.size]
     return {"name": f"{camera.robot} · {camera.sensor}", "size": size, "scans": scans, "frames": frames}

@@ -17,6 +17,7 @@ from PIL import Image
 from kalmark.errors import RunError
 from kalmark.logs.progress import track
 from kalmark.results.evaluate import headline
+from kalmark.results.pictures import Pictures
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_scan import draw_image
 from kalmark.results.recording import Recording, replace_file
@@ -79,38 +80,43 @@ def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool) 
     """Yield one figure again and again, drawn anew after each of the steps."""
     figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    t_s, title = run.history.t_s, headline(run)[0]
+    t_s, title, pictures = run.history.t_s, headline(run)[0], Pictures(run)
     for k, step in enumerate(track(steps, "video", len(steps), show=progress)):
         figure.clear()
-        _draw(figure, run, step, orbit_deg * k / max(len(steps) - 1, 1))
+        _draw(figure, run, step, orbit_deg * k / max(len(steps) - 1, 1), pictures)
         figure.text(0.02, 0.955, title, fontsize=12, fontweight="bold", color=INK)
         figure.text(0.98, 0.955, f"{t_s[step]:.1f} s", fontsize=12, ha="right", color=INK)
         yield figure
 
 
-def _draw(figure: Figure, run: Recording, step: int, turned: float) -> None:
+def _draw(figure: Figure, run: Recording, step: int, turned: float, pictures: Pictures) -> None:
     scene = Scene.of(run, step)
     if scene.d == 2:
         draw_plan(figure.add_axes((0.07, 0.09, 0.9, 0.84)), scene)
         return
     elevation, azimuth = VIEWS["normal"]
     projection = Projection.of(scene, (elevation, azimuth + turned))
-    draw_space(figure.add_axes((0.0, 0.02, 0.6, 0.92)), scene, projection)
-    seen = _last_images(run, step)
+    seen = _last_images(run, step, pictures)
+    left = 0.5 if any(picture is not None for *_, picture in seen) else 0.6  # the images are larger than their marks
+    draw_space(figure.add_axes((0.0, 0.02, left, 0.92)), scene, projection)
     if not seen:
         draw_plan(figure.add_axes((0.65, 0.12, 0.33, 0.76)), scene)
     height = 0.9 / max(len(seen), 1)
-    for k, (title, image, size) in enumerate(seen):
-        axes = figure.add_axes((0.64, 0.94 - (k + 1) * height + 0.06, 0.35, height - 0.1))
-        draw_image(axes, image, size)
+    for k, (title, image, size, picture) in enumerate(seen):
+        axes = figure.add_axes((left + 0.04, 0.94 - (k + 1) * height + 0.06, 0.95 - left, height - 0.1))
+        draw_image(axes, image, size, picture)
         axes.set_title(title, fontsize=9, color="#555b66")
 
 
-def _last_images(run: Recording, step: int) -> list[tuple[str, Any, tuple[float, float]]]:
-    """Return the images of what each camera saw last up to a step, with titles."""
-    out: list[tuple[str, Any, tuple[float, float]]] = []
+def _last_images(run: Recording, step: int, pictures: Pictures) -> list[tuple[str, Any, tuple[float, float], Any]]:
+    """Return titles, what each camera saw last up to a step, the size of its image, and the image if there is one."""
+    out: list[tuple[str, Any, tuple[float, float], Any]] = []
     for camera in run.history.cameras:
         steps = steps_of(run.history, camera)
-        last = images(run.history, camera, int(steps[steps <= step][-1])) if (steps <= step).any() else []
-        out += [(f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size) for image in last]
+        if not (steps <= step).any():
+            continue
+        at = int(steps[steps <= step][-1])
+        picture = pictures.at(camera, at)
+        last = images(run.history, camera, at)
+        out += [(f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size, picture) for image in last]
     return out[:MOST_IMAGES]

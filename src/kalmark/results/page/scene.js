@@ -211,7 +211,7 @@ function drawImage(id, camera, scan, image) {
       const e = contours({x: [s.e[0][0]], y: [s.e[0][1]], pxx: [s.Z[0]], pxy: [s.Z[1]], pyy: [s.Z[2]]}, [0], 32, "xy");
       add(s.colour, s.meaning, dash, 1.4, e.x.slice(0, -1).map((x, k) => [x, e.y[k]]));
     } else if (s.e) add(s.colour, s.meaning, dash, 1.4, s.e.length === 2 ? trimmed(s.e, size) : close(s.e));
-    if (s.name && s.outcome !== "ignored") {
+    if (s.name && s.outcome !== "ignored" && image.seen.length <= 30) {
       const at = s.e && single ? s.e : s.y, mean = a => at.reduce((sum, p) => sum + p[a], 0) / at.length;
       names.x.push(mean(0)); names.y.push(mean(1) - 15); names.text.push(s.name);
     }
@@ -219,13 +219,16 @@ function drawImage(id, camera, scan, image) {
   const dots = (points, name, marker) => ({x: points.map(p => p[0]), y: points.map(p => p[1]), text: points.map(p => p[2]), name,
     mode: "markers", marker, hovertemplate: `%{text} ${name}: %{x:.1f}, %{y:.1f}<extra></extra>`, showlegend: points.length > 0});
   const high = (el(id).clientWidth || 500) * size[1] / size[0];  /* below the image its ticks, then a legend of two rows at most */
+  const picture = scan?.picture ? [{source: scan.picture, xref: "x", yref: "y", x: -0.5, y: -0.5, sizex: size[0], sizey: size[1],
+    sizing: "stretch", layer: "below"}] : [];
   const title = `${camera.name}${image.side ? " · " + image.side : ""}${scan ? ` · ${scan.t.toFixed(2)} s` : ""}`;
   Plotly.react(id, [
-    dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: MEASURED, width: 1.3}}), ...lines.values(),
+    dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: scan?.picture ? "#ffd400" : MEASURED, width: 1.3}}), ...lines.values(),
     dots(marks.new, "new", {symbol: "square-open", size: 10, color: "#1e4d2b"}),
     dots(marks.rejected, "rejected", {symbol: "x-thin", size: 9, line: {color: INK, width: 1.6}}),
     {...names, mode: "text", textfont: {size: 10, color: "#1e4d2b"}, hoverinfo: "skip", showlegend: false}],
     layout({height: high + 100, title: {text: title, x: 0.01, font: {size: 13}}, margin: {l: 44, r: 10, t: 30, b: 70},
+            images: picture,
             xaxis: {...axis(""), range: [0, size[0]], constrain: "domain", mirror: true, showline: true},
             yaxis: {...axis(""), range: [size[1], 0], scaleanchor: "x", constrain: "domain", mirror: true, showline: true},
             showlegend: true, legend: {orientation: "h", y: -24 / high, yanchor: "top", x: 0, font: {size: 11}}}), {...CONFIG, displayModeBar: false});

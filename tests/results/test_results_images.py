@@ -1,0 +1,70 @@
+"""The images of a run: under what its cameras saw, in the figure, the report and the video, also of a loaded run."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from kalmark.config import build_slam, config_dict, open_run
+from kalmark.events import Frame
+from kalmark.logs import Log, write_native
+from kalmark.results.pictures import Pictures
+from kalmark.results.record import record
+from kalmark.results.report import report_html
+from kalmark.results.run import Run
+from kalmark.results.video import write_video
+from kalmark.simulate import load_world, simulate
+
+CONFIG = """
+log: {path: log}
+robots:
+  each:
+    motion: {type: constant_velocity_3d, sigma_v_mps_per_sqrt_s: 0.1, sigma_w_radps_per_sqrt_s: 0.1}
+    sensors:
+      camera: {type: tag_corners, fx_px: 300, fy_px: 300, cx_px: 159.5, cy_px: 119.5, width_px: 320, height_px: 240,
+               detector: {type: tags, size_m: 0.2}}
+landmarks: {type: tag}
+"""
+
+
+def tag_at(left: int) -> np.ndarray:
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    image = np.full((240, 320), 255, np.uint8)
+    image[80:160, left : left + 80] = cv2.aruco.generateImageMarker(family, 7, 80)
+    return image
+
+
+def test_a_run_shows_the_images_of_its_log_also_when_it_is_loaded(tmp_path: Path) -> None:
+    images = [tag_at(100 + 2 * k) for k in range(4)]
+    frames = [Frame(t_s=0.1 * k, robot="robot", sensor="camera", image=image) for k, image in enumerate(images)]
+    write_native(Log("log", ("robot",), frames), tmp_path / "log")
+    (tmp_path / "config.yaml").write_text(CONFIG, encoding="utf-8")
+    config, log = open_run(tmp_path / "config.yaml")
+    run = record(build_slam(config, log), log, progress=False, config=config_dict(config))
+    run.save(tmp_path / "run")
+    camera = run.history.cameras[0]
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg;base64,") == 4
+    loaded = Run.load(tmp_path / "run")
+    for one in (run, loaded):
+        pictures = Pictures(one)
+        assert all((pictures.at(camera, step) == images[step]).all() for step in range(4))
+    video = write_video(loaded, tmp_path / "video.gif", fps=5, progress=False)
+    with Image.open(video) as film:
+        assert film.n_frames == 4
+        shown = np.asarray(film.convert("L"), dtype=np.float64)
+    assert (shown[:, shown.shape[1] // 2 :] < 60).mean() > 0.03  # the black of the tag
+    shutil.rmtree(tmp_path / "log")
+    assert Pictures(loaded).at(camera, 1) is None
+    assert "data:image/jpeg;base64," not in report_html(loaded)
+
+
+def test_a_run_without_images_has_no_pictures() -> None:
+    world = load_world("thick_cloister_pinhole", ["steps=3"])
+    log = simulate(world, 1)
+    run = record(build_slam(world.config(), log), log, progress=False)
+    assert Pictures(run).at(run.history.cameras[0], 1) is None
