@@ -44,7 +44,9 @@ def refused(path: Path, **options: Any) -> str:
 
 
 def camera(log: Log, sensor: str = "camera") -> dict[str, Any]:
-    return log.describes["robots"]["robot"]["sensors"][sensor]
+    """Return the section of a camera without how its landmarks are found."""
+    section = log.describes["robots"]["robot"]["sensors"][sensor]
+    return {key: value for key, value in section.items() if key not in ("detector", "landmark")}
 
 
 def cut(path: Path) -> None:

@@ -78,7 +78,7 @@ def read(path: Path, request: Request, cameras: Any = ("cam0",), imu: Any = "aut
     controls = [Control(t_ns=t, robot=ROBOT, u=u) for t, u in zip(times.tolist(), readings.rows[kept], strict=True)]
     motion = {"type": "inertial"} | data_sheet(path / "imu0" / "sensor.yaml")
     return camera_log("euroc", path, request, [*frames, *controls], sections, motion, READING, name=name, truth=truth,
-                      start={"start": dict(AT_REST) if start is None else start})  # fmt: skip
+                      start=AT_REST if start is None else start)  # fmt: skip
 
 
 class Table(NamedTuple):

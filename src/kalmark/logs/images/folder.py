@@ -25,6 +25,7 @@ from kalmark.logs.source import Format, Request, frame, nanoseconds, number, qua
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ogv")
 TIMES = "times.txt"
 TRUE_POSES = "groundtruth.txt", "poses.txt", "cam_traj_truth.txt"
+NEW_TSUKUBA = {"fx_px": 615.0, "fy_px": 615.0, "cx_px": 320.0, "cy_px": 240.0, "width_px": 640, "height_px": 480}
 _NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
 UNITS_NS = {10: 1_000_000_000, 13: 1_000_000, 16: 1_000, 19: 1}  # of a time since 1970, by its digits
 
@@ -79,6 +80,7 @@ def _log(format: str, path: Path, request: Request, frames: list[Frame], t_ns: l
     known = next(filter(None, map(calibration_beside, places)), {})
     file = next((place / name for place in places for name in TRUE_POSES if (place / name).is_file()), None)
     truth = {} if file is None else {ROBOT: true_path(file, t_ns, request)}
+    known = known or (NEW_TSUKUBA if file is not None and file.name == TRUE_POSES[2] else {})
     return camera_log(format, path, request, frames, {CAMERA: camera(frames, known)}, name=path.stem, truth=truth)
 
 

@@ -14,7 +14,14 @@ from kalmark.logs.log import Log
 from kalmark.logs.source import Request, one_robot
 
 ROBOT, CAMERA = "robot", "camera"
-MOTION = {"type": "constant_velocity_3d"}
+MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 1.0, "sigma_w_radps_per_sqrt_s": 2.0}
+"""Of a camera that is moved by hand."""
+START = {"sigma_v_mps": 0.3, "sigma_w_radps": 0.5}
+SEARCH = {
+    "detector": {"type": "active_search"},
+    "landmark": {"type": "homogeneous", "prior_rho_per_m": 0.5, "sigma_rho_per_m": 0.5},
+}
+"""How landmarks are found; of one camera alone the depths with which they begin are the unit of length."""
 CALIBRATIONS = ("calibration.yaml", "camera.yaml", "camera_info.yaml", "calibration.yml", "camera.yml", "config.yml")
 
 
@@ -29,7 +36,7 @@ def camera(frames: Sequence[Frame], known: Mapping[str, Any] | None = None) -> d
         if scale != 1.0:
             found[f"f{axis}_px"] *= scale
             found[f"c{axis}_px"] = (found[f"c{axis}_px"] + 0.5) * scale - 0.5
-    return {"type": "pinhole"} | found | size
+    return {"type": "pinhole"} | found | size | SEARCH
 
 
 def calibration_beside(folder: Path) -> dict[str, Any]:
@@ -50,7 +57,8 @@ def camera_log(
     motion: Mapping[str, Any] = MOTION, controls: tuple[str, ...] = (), **rest: Any,
 ) -> Log:  # fmt: skip
     """Return the log of a robot with cameras, `sensors` by name, whose frames are among the events."""
-    rig = {"robots": {ROBOT: {"motion": dict(motion), "sensors": dict(sensors)} | rest.pop("start", {})}}
+    start = rest.pop("start", START)
+    rig = {"robots": {ROBOT: {"motion": dict(motion), "start": dict(start), "sensors": dict(sensors)}}}
     return one_robot(format, path, request, ROBOT, events, controls, {}, describes=rig, **rest)
 
 
