@@ -58,7 +58,8 @@ def camera_log(
 ) -> Log:  # fmt: skip
     """Return the log of a robot with cameras, `sensors` by name, whose frames are among the events."""
     start = rest.pop("start", START)
-    rig = {"robots": {ROBOT: {"motion": dict(motion), "start": dict(start), "sensors": dict(sensors)}}}
+    robot = {"motion": dict(motion), "start": dict(start), "sensors": dict(sensors)}
+    rig = {"robots": {ROBOT: robot}, "map": {"type": "dense"}}  # most landmarks are in view
     return one_robot(format, path, request, ROBOT, events, controls, {}, describes=rig, **rest)
 
 
