@@ -590,10 +590,10 @@ def speed() -> Iterator[Figure]:
             command,
             row(f"{numbers}:", "{9} landmarks in {12} GiB"),
         )
-    nearby = "python benchmarks/nearby.py"
-    for count in ("1,024", "10,000"):
+    nearby = "python benchmarks/nearby.py --sides"
+    for count, side in (("1,024", 32), ("10,000", 100)):
         yield Figure(section, f"nearest neighbour over known association, {count} landmarks: mission / known place",
-                     "2" if count == "10,000" else "", nearby, row(f"{count} ", "{2} / {5}"))  # fmt: skip
+                     "2 / 2.5" if count == "10,000" else "- / 2.5", f"{nearby} {side}", row(f"{count} ", "{2} / {5}"))  # fmt: skip
 
 
 def structure() -> Iterator[Figure]:
