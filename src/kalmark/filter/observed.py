@@ -69,7 +69,11 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
     S = np.empty((n, n))
     kernels.copy_submatrix(P, index[:head], S)
     for i in range(k):
-        H[:, :head], H[:, head:] = E_r[i], E_l[i]
+        for a in range(p):  # element by element: the check of shapes of a slice takes numba 2 s to compile
+            for c in range(head):
+                H[a, c] = E_r[i, a, c]
+            for c in range(d):
+                H[a, head + c] = E_l[i, a, c]
         own = index[head + i * d] if d > 0 else 0
         for a in range(head, n):
             row = own + a - head

@@ -372,3 +372,16 @@ def test_a_map_of_many_panels_saved_within_a_full_update_goes_on_as_the_one_that
     for i in range(0, len(points), 7):
         np.testing.assert_array_equal(slams[1].mean(i), slam.mean(i))
         np.testing.assert_array_equal(slams[1].covariance("r", i), slam.covariance("r", i))
+
+
+def test_landmarks_known_beforehand_do_not_stay_active() -> None:
+    lidar = km.Mount(km.sensors.RangeBearing(0.1, 0.02))
+    slam = km.Slam([km.Robot("r", km.motion.Odometry2D(0.01, 0.0, 0.02), START, {"lidar": lidar})], map="postponed")
+    for i, place in enumerate(WORLD):
+        slam.add_landmark(i, place, 0.01 * np.eye(2))
+    y, rows = km.geometry.observe(np.array(START), WORLD[:5])[0], []
+    for t in range(60):
+        slam.process(km.Scan(t, "r", "lidar", y, range(5)))
+        rows.append(slam.map.active.n)  # type: ignore[attr-defined]
+    assert rows[0] > 100
+    assert rows[-1] < 40

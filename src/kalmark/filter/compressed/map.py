@@ -29,7 +29,7 @@ from kalmark.filter.compressed.reading import carried_along, joined, split
 from kalmark.filter.compressed.schedule import PREFAULT, SLICE, Schedule
 from kalmark.filter.compressed.search import Search
 from kalmark.filter.compressed.storage import PANEL, Triangle
-from kalmark.filter.layout import P_AT, Layout, State, laid_out
+from kalmark.filter.layout import P_AT, P_SIZE, Layout, State, laid_out
 from kalmark.filter.map import AT_ONCE, NO_SLOTS, Marginal, Pairs, StochasticMap
 from kalmark.filter.neighbours import Sorts, distances, near_places
 from kalmark.geometry.spaces import RHO, Rn, Space, Table
@@ -327,6 +327,9 @@ class CompressedMap(Layout):
             for slot in slots.tolist():
                 self._enter(slot)
             at = self._at[slots]
+        if not self.schedule.begun:
+            observed = self.active.blocks[[self.entered[robot], *at], P_SIZE].sum()
+            self.schedule.begin(self.active.n, int(observed))
         self._before = {r: self.active.mean(self.entered[r]) for r in {robot, *self.displaced}}
         return Marginal(self.active, self.entered[robot], self.entered.get(mount, -1), at)
 

@@ -9,6 +9,7 @@ LEAST = 2e7  # and at least, if any: to begin takes time, too
 ELEMENT = 80.0  # multiplications of a full update that take as long as to correct one more active element
 PREFAULT = 45.0  # multiplications that take as long as the page fault of one byte
 START = 5e7  # multiplications that take as long as to begin a full update
+NEEDED = 4  # times the rows that a scan observes, at most, are those of an active map without any others
 MOST = 1000  # rows of the active map, besides those it began with
 
 
@@ -17,12 +18,18 @@ class Schedule:
 
     def __init__(self, most: int | None) -> None:
         self.most = most
-        self.begun = 0  # rows of the active map when it was first corrected
+        self.begun = 0  # rows of the active map when it was first corrected, but for new blocks
         self.paid = 0  # elements that have been corrected besides those
+
+    def begin(self, rows: int, observed: int) -> None:
+        """Take note of the rows of the active map at its first correction, of which so many are observed.
+
+        What is more than `NEEDED` times these are blocks that were added before it.
+        """
+        self.begun = min(rows, NEEDED * observed)
 
     def count(self, rows: int) -> None:
         """Take note of a correction of so many rows of the active map."""
-        self.begun = self.begun or rows
         self.paid += rows**2 - self.begun**2
 
     def progress(self, rows: int, auxiliary: int, n: int) -> float:
