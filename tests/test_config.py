@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
-from kalmark.config import documentation, load_config, resolve_config, shipped_configs
+from kalmark.config import documentation, load_config, open_run, resolve_config, shipped_configs
 from kalmark.config.schema import LogConfig
 from kalmark.config.tree import name_of, name_on
 from kalmark.errors import ConfigError
@@ -199,9 +200,13 @@ def test_the_page_of_the_documentation_is_in_step_with_the_model() -> None:
     assert page.read_text() == documentation.page()
 
 
+LOGS = {"visual": "visual/tum_fr1_xyz", "visual_inertial": "visual/euroc_v101_micro"}  # which describe the cameras
+
+
 @pytest.mark.parametrize("name", sorted(shipped_configs()))
-def test_every_shipped_configuration_loads(name: str) -> None:
-    assert load_config(name).name == name
+def test_every_shipped_configuration_loads(name: str, data: Callable[[str], Path]) -> None:
+    config = open_run(name, data(LOGS[name]))[0] if name in LOGS else load_config(name)
+    assert config.name == name
 
 
 def test_a_missing_path_with_a_shipped_name_means_the_shipped_one(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_times_are_selected_from_the_first_event_on(folder: Path) -> None:
         ({"from_s": 100}, "no event from 100 to None s, expected times within 0 to 4"),
         ({"from_s": float("nan")}, "from_s is nan"),
         ({"to_s": -1}, "to_s is -1"),
-        ({"bearing_shift_s": 0.1}, "'bearing_shift_s' is unknown to native, expected none"),
+        ({"bearing_shift_s": 0.1}, "'bearing_shift_s' is unknown to native, expected origin"),
         ({"on_error": "ignore"}, "on_error is 'ignore', expected one of raise, skip"),
         ({"format": "nativ"}, "expected one of native, mrclam, .*did you mean 'native'"),
         ({"format": "mrclam"}, "not a log of format mrclam, expected a folder with Barcodes.dat"),

@@ -143,7 +143,10 @@ def test_the_page_names_figures_in_the_words_of_the_command_line(run: Run, capsy
     assert len(shown) > 12
     for label in shown:
         assert escape(label) in table
+    of_one_camera = {"ate_similarity_m", "scale", "scale_drift"}
     for key, label, unit in ROBOT:
+        if key in of_one_camera:
+            continue
         assert key in summary["robots"]["rover"]
         assert f"<th>{header(label, unit)}</th>" in table and header(label, unit) in printed
     assert "<td>toolbox: position RMSE</td><td>0.25</td><td>m</td>" in table

@@ -63,6 +63,11 @@ class Fit(NamedTuple):
         """The sum of the d2."""
         return float(self.values @ self.dof)
 
+    @property
+    def share(self) -> float:
+        """The share of the observations that fit a landmark."""
+        return float(np.mean(self.values < LOST)) if len(self.values) else 0.0
+
     def of(self, rows: slice) -> Fit:
         """Return that of some observations."""
         return Fit(self.values[rows], self.dof[rows])
@@ -117,7 +122,8 @@ def likeliest(run: Run, log: Log, events: list[Event], config: Mapping[str, Any]
             continue
         after = fit_without(mistake, log, events)
         if after.mean < FITS and BETTER * after.mean < as_it_is.mean:
-            made.append(mistake._replace(gain=explained(as_it_is, after), since_s=events[0].t_s))
+            gain = explained(as_it_is, after) - as_it_is.share * shrinkage(mistake, events)
+            made += [mistake._replace(gain=gain, since_s=events[0].t_s)] if gain > 0.0 else []
     if not made:
         return None
     most = max(mistake.gain for mistake in made)
@@ -125,6 +131,15 @@ def likeliest(run: Run, log: Log, events: list[Event], config: Mapping[str, Any]
     others = "; or: ".join(mistake.evidence for mistake in alike)
     told = f"; the log cannot tell this from: {others}" if others else ""
     return first._replace(evidence=f"{first.evidence}{told}")
+
+
+def shrinkage(mistake: Mistake, events: list[Event]) -> float:
+    """Return the logarithm of by how much all measurements of events are smaller without a mistake.
+
+    The density of y is that of f y times f: what is made so small that it lies within the noise fits, but says little.
+    It counts for the share that fits as it is; what fits nothing counts a constant instead of its density.
+    """
+    return sum(len(e.y) * mistake.shrunk.get((e.robot, e.sensor), 0.0) for e in events if isinstance(e, Scan))
 
 
 def later(run: Run, log: Log, first: int) -> Mistake | None:

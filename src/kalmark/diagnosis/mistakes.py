@@ -36,7 +36,8 @@ class Mistake(NamedTuple):
     """What may have been done wrongly: its name, what it is, its cure, and the configuration and log without it.
 
     `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
-    `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.
+    `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.  `shrunk` has the sensors
+    of which a measurement is smaller without it, and the logarithm of by how much: its noise then explains more.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Mistake(NamedTuple):
     gain: float = 0.0
     since_s: float = 0.0
     share: float = 1.0
+    shrunk: Mapping[Where, float] = {}
 
 
 def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
@@ -91,7 +93,8 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
     def made(name: str, evidence: str, which: list[str], factor: float) -> Mistake:
         cures = (corrected(config, "factors", (*where, column), factor) for where in sensors for column in which)
         by = np.array([factor if column in which else 1.0 for column in names])
-        return Mistake(name, evidence, " ".join(cures), config, _measured({*sensors}, lambda y: y * by))
+        shrunk = dict.fromkeys(sensors, -math.log(float(np.abs(by).prod())))
+        return Mistake(name, evidence, " ".join(cures), config, _measured({*sensors}, lambda y: y * by), shrunk=shrunk)
 
     if turned or names[:2] == ("x_m", "y_m"):
         evidence = f"directions of {of} fit only with their sign changed: clockwise, or upside down"

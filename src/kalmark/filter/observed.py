@@ -57,6 +57,15 @@ def observed_block(
 
 
 @compiled
+def concatenated(E_r: Array, E_l: Array, H: Array) -> None:
+    """Set H (p, h + d) to (E_r, E_l), element by element: numba compiles the check of a slice's shape for 2 s."""
+    head = E_r.shape[1]
+    for a in range(len(H)):
+        for c in range(H.shape[1]):
+            H[a, c] = E_r[a, c] if c < head else E_l[a, c - head]
+
+
+@compiled
 def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Array) -> tuple[Array, Array, bool]:
     """Return each observation's innovation covariance Z (K, p, p), its d2 (K,), and whether all Z are valid.
 
@@ -69,11 +78,7 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
     S = np.empty((n, n))
     kernels.copy_submatrix(P, index[:head], S)
     for i in range(k):
-        for a in range(p):  # element by element: the check of shapes of a slice takes numba 2 s to compile
-            for c in range(head):
-                H[a, c] = E_r[i, a, c]
-            for c in range(d):
-                H[a, head + c] = E_l[i, a, c]
+        concatenated(E_r[i], E_l[i], H)
         own = index[head + i * d] if d > 0 else 0
         for a in range(head, n):
             row = own + a - head

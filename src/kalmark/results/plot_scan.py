@@ -32,7 +32,7 @@ FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
 PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
 ON_IMAGE = "#ffd400"  # of what was measured, over a picture
-MOST_NAMES = 30  # of landmarks in an image
+MOST_NAMES = 30  # of landmarks, over a picture
 PAPER = 490.0  # width of the axes in points, about
 MARK = 6.0  # half a cross or a square, in points
 ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
@@ -224,7 +224,8 @@ def draw_image(axes: Axes, image: Image, size: tuple[float, float], picture: Any
     axes.tick_params(colors="#555b66", labelsize=8)
     if image.side:
         axes.set_title(f"{image.side} image", fontsize=10, color="#555b66")
-    named, measured = len(image.sightings) <= MOST_NAMES, MEASURED if picture is None else ON_IMAGE
+    named = picture is None or len(image.sightings) <= MOST_NAMES
+    measured = MEASURED if picture is None else ON_IMAGE
     for sighting in image.sightings:
         _draw(axes, sighting, size, named, measured)
 

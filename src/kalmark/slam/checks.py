@@ -149,5 +149,6 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
         raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
     _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)
     refuse_vague(event.cov, sensor.columns, when(event))
-    covs = np.array(np.broadcast_to(event.cov, (count, p, p)))  # one that cannot be written would be compiled for, too
+    # a copy in order: one that cannot be written, or has another order, would be compiled for, too
+    covs = np.array(np.broadcast_to(event.cov, (count, p, p)), order="C")
     return sensor.noise_from(event.y, covs) if isinstance(sensor, OwnNoise) else covs
