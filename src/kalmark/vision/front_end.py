@@ -103,7 +103,7 @@ class FrontEnd:
         self.found: Selection | None = None
         self.prospect: Prospect | None = None
         self.image: Any = None
-        self.times: dict[str, float] = dict.fromkeys(("predict", "search", "match", "start", "learn"), 0.0)
+        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
     def search(self, frame: Frame, image: Any, prospect: Prospect) -> Sighting:
         """Search an image (H, W) for the landmarks of a prospect, and for new ones."""
@@ -123,7 +123,7 @@ class FrontEnd:
         y = found.y[rows]
         ids: list[Id] = [prospect.names[k] for k in rows]
         new = self._new(image, found, prospect, len(rows))
-        ids += [self._name() for _ in new]
+        ids += [self._name(frame) for _ in new]
         removed += self._room(len(new), {name for name, _ in removed}, prospect)
         y = np.concatenate([y, new])
         t3 = perf_counter()
@@ -195,9 +195,10 @@ class FrontEnd:
         look = self.looks.get(name)
         return [] if look is None else look.views
 
-    def _name(self) -> Id:
+    def _name(self, frame: Frame) -> Id:
+        """Return the id of a new landmark, which no other sensor gives."""
         self.named += 1
-        return self.named
+        return f"{frame.robot}.{frame.sensor} {self.named}"
 
     def _new(self, image: Any, found: Selection, prospect: Prospect, count: int) -> Array:
         """Return the pixels (n, 2) of new landmarks."""
