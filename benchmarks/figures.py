@@ -511,6 +511,8 @@ def commands() -> Iterator[Figure]:
     for verb in ("demo", "evaluate", "explain"):
         yield Figure("Speed", f"`kalmark {verb}`, warm, processor time added to the filter's own: here / 9ae1bee / ratio", "2 s",
                      "python benchmarks/warm.py 9ae1bee", row(f"{verb}, added:", "{0} s / {3} s / {7}"))  # fmt: skip
+    yield Figure("Speed", "page of a long run, of three logs of the plane and KITTI's 3,217 landmarks in space: largest / slowest to open",
+                 "10 MB / 2 s", "python benchmarks/pages.py", row("pages:", "{1} MB / {4} s"))  # fmt: skip
 
 
 def speed() -> Iterator[Figure]:
