@@ -99,7 +99,7 @@ def _savez(path: Path, arrays: Mapping[str, Any]) -> None:
             np.lib.format.write_array(out, array, allow_pickle=False)
             pays = len(zlib.compress(sample, FAST)) < PAYS * len(sample)
             how = zipfile.ZIP_DEFLATED if pays else zipfile.ZIP_STORED
-            file.writestr(f"{name}.npy", out.getbuffer(), how, FAST)
+            file.writestr(zipfile.ZipInfo(f"{name}.npy"), out.getbuffer(), how, FAST)  # without the clock
 
 
 def config_yaml(config: dict[str, Any]) -> str:

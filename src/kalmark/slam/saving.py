@@ -92,9 +92,9 @@ def save(path: Path, state: State) -> None:
     temporary = path.with_name(path.name + ".part")
     try:
         try:
-            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-                for name, data in (members | {SUMS: sums}).items():
-                    archive.writestr(name, data)
+            with zipfile.ZipFile(temporary, "w") as archive:
+                for name, data in (members | {SUMS: sums}).items():  # without the clock: equal maps are equal files
+                    archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
