@@ -20,10 +20,14 @@ from kalmark.arrays import Array, Flags
 from kalmark.batch.course import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
 from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, Ints, State, unsolved
+from kalmark.batch.walls import anchors
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, when
+from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import mount_space
+from kalmark.models.landmarks import Point2D, Wall2D
 from kalmark.models.observe import inverse_expectation, view_of
-from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor
+from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor, sees_kinds
+from kalmark.models.walls import axes
 from kalmark.slam.checks import measurements
 from kalmark.tracks.channel import huber_length
 from kalmark.tracks.front_ends import FrameDetector
@@ -34,6 +38,7 @@ if TYPE_CHECKING:
 Texts = npt.NDArray[np.str_]
 Known = Mapping[Id, tuple[Any, Any]]
 NONE = np.zeros(0, dtype=np.int64)
+FIRMLY = 0.1  # of the noise of its distance is the sigma of where a wall is anchored
 
 
 class Seen(NamedTuple):
@@ -96,6 +101,11 @@ class Given:
     huber: float = np.inf
     biases: Mapping[str, Array] = field(default_factory=dict)
     segments: Ints | None = None
+
+    def seen_by(self, sensor: Sensor) -> Landmark:
+        """Return what a landmark is to a sensor: in a map with walls a point is the first two of three numbers."""
+        beside = isinstance(self.landmark, Wall2D) and self.landmark.kind not in (sees_kinds(sensor) or ())
+        return Point2D() if beside else self.landmark
 
 
 def replayed(given: Given, events: Iterable[Event]) -> Problem:
@@ -244,6 +254,10 @@ class Replay:
         free = np.ones(state.ends[-1], dtype=np.bool_)
         for group, rows in ((POSES, held), (LANDMARKS, np.flatnonzero(exactly))):
             free[state.columns(group, rows)[:, None] + np.arange(state.spaces[group].dof)] = False
+        if isinstance(given.landmark, Wall2D):
+            anchored, points = self._anchors(seen, state)
+            free[state.columns(LANDMARKS, points) + 2] = False
+            seen += anchored
         kind = "tag" if given.landmark.kind == "tag" else "landmark"
         robots = [node.robot for node in self.chain.nodes] if given.motion else [robot for robot, _ in self.apart]
         return Problem(motion, (*seen, *self._positions(names)), free, state, names, nodes, robots, kind)
@@ -255,7 +269,9 @@ class Replay:
             for one in seen if group == LANDMARKS else ():
                 if one.target is not None:
                     numbers[one.target] = numbers.get(one.target, 0) + len(one.R)
-        return [name for name, k in numbers.items() if k >= self.given.landmark.space.dof or name in self.known]
+        walls = isinstance(self.given.landmark, Wall2D)  # two numbers are measured of a wall, and two of a point
+        least = 2 if walls else self.given.landmark.space.dof
+        return [name for name, k in numbers.items() if k >= least or name in self.known]
 
     def _sightings(self, at: Mapping[Id | None, int]) -> tuple[list[Factor], list[Array]]:
         """Return what each sensor saw and the means of the mounts to be solved for, in the order of their groups."""
@@ -274,13 +290,39 @@ class Replay:
         for (robot, sensor, group), (node, target, y, R) in kept.items():
             mount = given.robots[robot].sensors[sensor]
             mean = np.array(given.mounts.get((robot, sensor), mount.at), dtype=np.float64)
-            blocks = [Block(POSES, node, POSE_SPACES[size]), Block(group, target, given.landmark.space)]
+            landmark = given.seen_by(mount.sensor)
+            blocks = [Block(POSES, node, POSE_SPACES[size]), Block(group, target, landmark.space)]
             if (robot, sensor) in groups:
                 blocks.insert(1, Block(groups[robot, sensor], np.zeros_like(node), mount_space(size)))
-            view = view_of(mount.sensor, given.landmark, mean)
+            view = view_of(mount.sensor, landmark, mean)
             huber = given.huber if mount.robust is None else min(given.huber, huber_length(R.shape[1]))
             factors.append(sightings(view, tuple(blocks), y, R, huber, (robot, sensor)))
         return factors, [np.array(given.mounts[name], dtype=np.float64) for name in groups]
+
+    def _anchors(self, seen: list[Factor], state: State) -> tuple[list[Factor], Ints]:
+        """Return the factors of where the anchors of walls are along them, and which landmarks are points.
+
+        It is where the start has them, from the pose of their first sighting.
+        """
+        found, points = [], np.ones(len(state.groups[LANDMARKS]), dtype=np.bool_)
+        for factor in seen:
+            (of_pose, *_, of_wall), mount = (
+                factor.term.blocks,
+                self.given.robots[factor.sensor[0]].sensors[factor.sensor[1]],
+            )
+            if of_wall.group != LANDMARKS or self.given.seen_by(mount.sensor) is not self.given.landmark:
+                continue
+            wall, first = np.unique(of_wall.rows, return_index=True)
+            new = points[wall]
+            wall, first = wall[new], first[new]
+            points[wall] = False
+            node, normal, at = of_pose.rows[first], factor.y[first, 1], np.tile(mount.at, (len(wall), 1))
+            T = np.array([compose(pose, mount.at)[0] for pose in state.groups[POSES][node]]).reshape(-1, 3)
+            along = axes(T[:, 2] + normal)[1]
+            t = np.einsum("ki,ki->k", along, state.groups[LANDMARKS][wall, :2] - T[:, :2])
+            R = (FIRMLY**2 * factor.R[first, 0, 0])[:, None, None]
+            found.append(anchors(node, wall, self.given.landmark.space, at, normal, t, R))
+        return found, np.flatnonzero(points)
 
     def _positions(self, names: list[Id]) -> list[Factor]:
         """Return the factors of the fixes and of the landmarks known with a covariance."""
@@ -293,6 +335,8 @@ class Replay:
         if name in self.known or name in self.given.landmarks:
             mean = np.asarray((self.known if name in self.known else self.given.landmarks)[name][0], dtype=np.float64)
             size = self.given.landmark.space.size
+            if isinstance(self.given.landmark, Wall2D) and mean.shape == (2,):
+                mean = np.append(mean, 0.0)  # a point
             if mean.shape != (size,) or not np.isfinite(mean).all():
                 raise unsolved(
                     f"landmark {str(name)!r} is at {mean.tolist()}, expected a point of {size} finite numbers"
@@ -303,7 +347,9 @@ class Replay:
             for node, landmark, y, *_ in seen:
                 if landmark == name and isinstance(mount.sensor, FullSensor):
                     at = np.array(mount.at)
-                    return inverse_expectation(poses[node], at, mount.sensor, self.given.landmark, y[None])[0][0]
+                    seen_as = self.given.seen_by(mount.sensor)
+                    place = inverse_expectation(poses[node], at, mount.sensor, seen_as, y[None])[0][0]
+                    return np.append(place, np.zeros(self.given.landmark.space.size - len(place)))
         raise unsolved(f"landmark {str(name)!r} is not in the map, expected a place to start from")
 
 

@@ -78,7 +78,7 @@ def _mounts(linear: Linear, given: Given) -> Iterator[Column]:
         for axis in range(d):
             at = np.array(mount.at, dtype=np.float64)
             at[axis] += MOVED_M
-            view = view_of(mount.sensor, given.landmark, at)
+            view = view_of(mount.sensor, given.seen_by(mount.sensor), at)
             moved, _ = sightings(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor).term.at(
                 linear.state
             )

@@ -118,11 +118,13 @@ def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates:
 
         for c, name in enumerate(names):
             one = np.eye(p)[c]
-            if name.startswith("range"):
-                yield Column("range_scale", (*factor.sensor, name), "", added((factor.y - z)[:, c : c + 1] * one), none)
+            if name.startswith(("range", "distance")):
+                yield Column(
+                    "range_scale", (*factor.sensor, name), "", added((factor.y[:, c] - z[:, c])[:, None] * one), none
+                )
                 yield Column("range_offset", (*factor.sensor, name), "m", added(np.tile(one, (k, 1))), none)
             elif name.endswith("_rad"):
-                offset = f"{name.removesuffix('_rad')}_offset"
+                offset = "bearing_offset" if name == "normal_rad" else f"{name.removesuffix('_rad')}_offset"
                 yield Column(offset, (*factor.sensor, name), "rad", added(np.tile(one, (k, 1))), none)
         pose = factor.term.blocks[0]
         moving = np.einsum("kij,kj->ki", E[:, :, : pose.space.dof], rates[pose.rows])

@@ -15,6 +15,7 @@ from kalmark.batch.state import LANDMARKS, looked
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import Finding, Where
 from kalmark.diagnosis.linear import OUT, Linear
+from kalmark.diagnosis.mounts import turned
 from kalmark.logs.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
@@ -24,6 +25,7 @@ SHARE = (
 )
 LEAST_GAIN = 8.0
 TAKEN_UP, ALIKE = 0.5, 0.85
+MOST_CONDITION = 1e6  # of the information on errors of one column, as correlations
 ORDER = ("steering_offset", "odometry_scale", "odometry_turn", "odometry_offset")
 SCALINGS, SCALED = 5, 0.03
 NEAR = 9.0  # d2 of a landmark that an observation may well be of
@@ -121,6 +123,7 @@ class Search:
             *causes.landmarks(self.linear, self.t_s),
             *causes.jumps(self.linear, self.t_s),
             *causes.priors(self.linear, self.t_s),
+            *turned(self.linear, self.t_s),
         ]
 
     def take(self, finding: Finding) -> None:
@@ -144,16 +147,20 @@ class Search:
         """Return a systematic error as it is beside the others of its column, and take these out of the data.
 
         One that is no cause by itself may still do the opposite: of a speed that is .94 v + .02 m/s the offset alone
-        would move the map.  Those that the data cannot tell from it are left.
+        would move the map.  Those that the data cannot tell from it, alone or with others, are left.
         """
         every = causes.columns_of(self.linear, self.sensors, self.rates)
         mine = next((c for c in every if (c.name, c.of) == (finding.name, finding.of)), None)
         same = [c for c in every if mine and c is not mine and c.group == mine.group]
         if mine is None or not same:
             return finding
-        s, I = causes.together(self.linear, [mine, *same])
-        size = np.sqrt(np.diag(I))
-        told = [0, *(k for k in range(1, len(size)) if abs(I[0, k]) < ALIKE * size[0] * size[k])]
+        I = causes.together(self.linear, [mine, *same])[1]
+        told = [0]
+        for k in range(1, len(I)):
+            part = I[np.ix_([*told, k], [*told, k])]
+            scaled = part / np.sqrt(np.outer(part.diagonal(), part.diagonal()))
+            if np.linalg.cond(scaled) < MOST_CONDITION and np.linalg.inv(scaled)[0, 0] < 1.0 / (1.0 - ALIKE**2):
+                told.append(k)
         s, _ = causes.together(self.linear, [(mine, *same)[k] for k in told])
         for k, value in zip(told, s, strict=True):
             column = (mine, *same)[k]

@@ -15,16 +15,18 @@ from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.diagnosis import copies
 from kalmark.diagnosis.causes import JUMPS, Finding, Where
-from kalmark.diagnosis.gross import fit, gross
+from kalmark.diagnosis.gross import fit, gross, until
 from kalmark.diagnosis.jumps import LISTED, OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import Mistake
+from kalmark.diagnosis.mounts import TURNED
 from kalmark.diagnosis.search import LEAST_GAIN, Search
 from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
-from kalmark.results.batch import given_by, log_of
+from kalmark.models.sensors import Wall
+from kalmark.results.batch import filtered_map, given_by, log_of
 from kalmark.results.gaps import RULED_OUT, left_out, matters
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
@@ -212,9 +214,12 @@ def _calibrated(slam: Slam, name: str, mount: Mount) -> Mount:
 
 
 def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
-    """Return the columns that each sensor of a run measures, by robot and sensor."""
-    robots = run.final_slam().robots.values()
-    return {(r.name, name): tuple(m.sensor.columns) for r in robots for name, m in r.sensors.items()}
+    """Return the columns that each sensor of a run measures, by robot and sensor; of a wall those that have a noise."""
+    robots, found = run.final_slam().robots.values(), {}
+    for key, sensor in (((r.name, name), m.sensor) for r in robots for name, m in r.sensors.items()):
+        columns = tuple(sensor.columns)
+        found[key] = tuple(c for c in columns if f"sigma_{c}" in sensor.sigmas) if isinstance(sensor, Wall) else columns
+    return found
 
 
 def thinned(run: Run, given: Given, most: int) -> Given:
@@ -265,6 +270,8 @@ def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     name, told = finding.name, words(finding, run.config)
     if odd is not None:
         name, told = "odometry_jump", of_odd_control(finding, odd)
+    if name == TURNED and log is not None:
+        told = f"from t={since_s:.1f} s on {told[0]}", until(run, log, round(since_s * 1e9))
     return Cause(name, since_s, finding.gain, *told, harmless)
 
 
@@ -429,7 +436,8 @@ def effect_of(run: Run, found: Searched) -> Effect:
     d, first, cured = found.batch.state.d, found.search.first, found.search.linear
     places, moved = (state.groups[LANDMARKS][its, :d] for state in (found.batch.state, cured.moved()))
     off, extent = rigid(places, moved)(places) - moved, rmse(moved - moved.mean(axis=0))
-    filtered = _sigma(np.array([run.landmarks.covariances[k][:d, :d] for k in mine]))
+    mapped = filtered_map(run)
+    filtered = _sigma(np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine]))
     stated, honest = (_sigma(linear.reduced.covariances()[its, :d, :d]) for linear in (first, cured))
     shift_m = float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0)))
     share, free = shift_m / max(extent, TINY_M), (filtered > 0) & (stated > 0)

@@ -15,6 +15,7 @@ from kalmark.slam.gaps import MARGIN
 
 Words = tuple[str, str]  # evidence, cure
 MOST_SIGMAS = 1e4
+RANGE = "range_m"  # the column whose scale and offset a sensor may have
 UNKNOWN_IDS = "--set log.ids=hidden --set association.type=auto"
 CALIBRATIONS = {  # the keys that put an error of a column of the controls into the map, by its kind
     ("v_mps", "offset"): "sigma_v_bias_mps",
@@ -104,19 +105,26 @@ def corrected(config: Mapping[str, Any], option: str, path: tuple[str, ...], by:
 
 
 def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
-    robot, sensor, _ = finding.of
+    robot, sensor, column = finding.of
     scale = _current(config, robot, "sensors", sensor, "scale") or 1.0
-    how = "long" if finding.value > 0 else "short"
-    evidence = f"ranges of {_sensor(finding)} are {abs(finding.value):.2%} too {how} ({_sure(finding)})"
-    return evidence, _set(robot, f"sensors.{sensor}.scale", scale * (1.0 + finding.value))
+    evidence = f"{_lengths(finding)} are {abs(finding.value):.2%} too {_how(finding)} ({_sure(finding)})"
+    cure = _set(robot, f"sensors.{sensor}.scale", scale * (1.0 + finding.value)) if column == RANGE else ""
+    return evidence, cure
 
 
 def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
-    robot, sensor, _ = finding.of
+    robot, sensor, column = finding.of
     bias = _current(config, robot, "sensors", sensor, "bias_m") or 0.0
-    how = "long" if finding.value > 0 else "short"
-    evidence = f"ranges of {_sensor(finding)} are {_size(abs(finding.value), 'm')} too {how} ({_sure(finding)})"
-    return evidence, _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value)
+    evidence = f"{_lengths(finding)} are {_size(abs(finding.value), 'm')} too {_how(finding)} ({_sure(finding)})"
+    return evidence, _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value) if column == RANGE else ""
+
+
+def _lengths(finding: Finding) -> str:
+    return f"{'ranges' if finding.of[2].startswith('range') else 'distances'} of {_sensor(finding)}"
+
+
+def _how(finding: Finding) -> str:
+    return "long" if finding.value > 0 else "short"
 
 
 def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -245,6 +253,10 @@ def of_odd_control(finding: Finding, odd: OddControl) -> Words:
     )
 
 
+def _mount(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"the sensor {_sensor(finding)} is turned by {_value(finding)} ({_sure(finding)})", ""
+
+
 _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "range_scale": _range_scale,
     "range_offset": _range_offset,
@@ -262,4 +274,5 @@ _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "kidnapped": _kidnapped,
     "odometry_jump": _odometry_jump,
     "start": _noise,
+    "mount": _mount,
 }

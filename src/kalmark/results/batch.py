@@ -23,7 +23,7 @@ from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.logs.progress import track
-from kalmark.models.landmarks import Point2D, Point3D, Tag
+from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
 from kalmark.models.protocols import Landmark, OfState, SeesVelocity
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
@@ -51,7 +51,8 @@ def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dic
         problem = tag_problem(run)
         return compare_tags(run, problem, optimum(problem))
     log = log_of(run) if log is None else log
-    if not unknown(run).any():
+    walls = any(isinstance(track.model, Wall2D) for track in run.final_slam().tracks.confirmed.values())
+    if walls or not unknown(run).any():
         return compare(run, solve_batch(run, log))
     opinion = second_opinion(run, log)
     return compare(run, opinion.found.batch, opinion.found.merged) | opinion.as_dict()
@@ -146,11 +147,9 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
         what = f"the filter rejected {len(rejected)} of {len(run.history.fixes)} fixes"
         raise KalmarkError(f"batch solution: {what}, expected a run that used most")
     history, slam = run.history, run.final_slam()
-    refuse_other_than_points(slam, "batch solution")
+    refuse_other_than_points(slam, "batch solution", walls=True)
     robots = slam.robots
-    landmarks = dict(
-        zip(run.landmarks.ids, zip(run.landmarks.means, run.landmarks.covariances, strict=True), strict=True)
-    )
+    landmarks = filtered_map(run)
     ids = {str(id_): id_ for id_ in landmarks} | {name: name for name in robots}
     fused = np.flatnonzero(history.fused)
     rows = _of_places(history, slam, fused if rows is None else rows)
@@ -186,6 +185,14 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
         fixes=len(run.history.fixes),
         left_out=rejected,
     )
+
+
+def filtered_map(run: Recording) -> dict[Id, tuple[Array, Array]]:
+    """Return mean and covariance of the landmarks of a run as the filter has them: a wall is not its ends."""
+    slam, table = run.final_slam(), run.landmarks
+    found = dict(zip(table.ids, zip(table.means, table.covariances, strict=True), strict=True))
+    walls = [track.id for track in slam.tracks.confirmed.values() if isinstance(track.model, Wall2D)]
+    return found | {name: (slam.mean(name), slam.covariance(name)) for name in walls}
 
 
 def _surveyed(history: History) -> Known:
@@ -225,10 +232,16 @@ def _in_the_end(history: History, rows: Index) -> list[str]:
 
 
 def _point(slam: Slam) -> Landmark:
-    """Return what the landmarks of a map are in the batch solution: tags, or points with the numbers that all have."""
+    """Return what the landmarks of a map are in the batch solution: tags, or points with the numbers that all have.
+
+    Where some are walls all have their three numbers (`Given.seen_by`).
+    """
     space = any(robot.motion.space.axes > 1 for robot in slam.robots.values())
     models = {track.model.space.kinds: track.model for track in slam.tracks.confirmed.values()}
     models |= {of.model.space.kinds: of.model for of in slam.tracks.known.of_kind.values()}
+    wall = next((model for model in models.values() if isinstance(model, Wall2D)), None)
+    if wall is not None:
+        return wall
     if models and all(isinstance(model, Tag) for model in models.values()):
         return Tag()
     kinds, model = next(iter(models.items()), ((), None))
@@ -287,11 +300,11 @@ def compare(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None)
     difference of the poses in the filter's own sigmas, at most 1 of an honest filter, whose difference from the batch
     solution has the covariance P_filter - P_batch; `pose_differences` is that over time, a robot and stretch a row.
     """
-    at, same = {id_: j for j, id_ in enumerate(batch.ids)}, merged or {}
-    rows = [(k, at[same.get(id_, id_)]) for k, id_ in enumerate(run.landmarks.ids) if same.get(id_, id_) in at]
+    at, same, mine = {id_: j for j, id_ in enumerate(batch.ids)}, merged or {}, filtered_map(run)
+    rows = [(id_, at[same.get(id_, id_)]) for id_ in mine if same.get(id_, id_) in at]
     d, sigma = batch.state.d, batch.sigma()[np.array([j for _, j in rows], dtype=np.int64)]
-    distance = np.array([np.linalg.norm(run.landmarks.means[k][:d] - batch.means[j][:d]) for k, j in rows])
-    filtered = np.array([np.sqrt(np.trace(run.landmarks.covariances[k][:d, :d])) for k, _ in rows])
+    distance = np.array([np.linalg.norm(mine[k][0][:d] - batch.means[j][:d]) for k, j in rows])
+    filtered = np.array([np.sqrt(np.trace(mine[k][1][:d, :d])) for k, _ in rows])
     free, path, truth = sigma > 0, run.history.mean[:, :d], run.truth.poses_in_map()
     known = np.isfinite(truth).all(axis=1)
     errors = [_or_none(rmse, poses[known, :d] - truth[known, :d]) for poses in (path, batch.poses)]

@@ -227,12 +227,14 @@ class MapLandmarks:
         return replace(table, exact=frozenset(exact))
 
 
-def refuse_other_than_points(slam: Slam, what: str) -> None:
-    """Refuse a map with walls, or landmarks of a user's own that are more than points with numbers.
+def refuse_other_than_points(slam: Slam, what: str, *, walls: bool = False) -> None:
+    """Refuse a map with walls, unless `walls` may be, or a user's own landmarks that are more than points with numbers.
 
     Raises KalmarkError.
     """
     for track in slam.tracks.confirmed.values():
+        if walls and isinstance(track.model, Wall2D):
+            continue
         first, *others = track.model.space.kinds
         odd = not is_own(type(track.model)) and (first not in (VECTOR, VECTOR3) or {*others} - {SCALAR})
         if odd or isinstance(track.model, Wall2D):
