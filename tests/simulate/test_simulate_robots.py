@@ -196,10 +196,23 @@ def test_a_simulated_log_is_written_and_read_back(tmp_path: Path) -> None:
 
 
 def test_a_constant_route_stops_as_often_and_as_long_as_it_says() -> None:
-    world = load_world("stop_and_go", ["steps=600"])
+    world = load_world("stop_and_go", ["steps=600", "robots.rover.route.ramp_s=0.0"])
     ((_, states),) = simulation(world, seed=1).states.items()
     way = np.linalg.norm(np.diff(states[:, :2], axis=0), axis=1)
     stood = way < 1e-12
     assert [*stood[:150]] == [False] * 150
     assert [*stood[150:300]] == [True] * 150
     assert not stood[300:450].any()
+
+
+def test_a_constant_route_accelerates_evenly_after_a_stop_and_before_the_next() -> None:
+    drive = load_world(
+        "stop_and_go", ["robots.rover.route={type: constant, u: [0.5, 0.1], drive_s: 1.0, stop_s: 0.2, ramp_s: 0.4}"]
+    )
+    driver = drive.robots["rover"].route.driver(None, 0.1, np.zeros((2, 2)), np.random.default_rng(0))
+    told = np.array([driver(np.zeros(3)) for _ in range(24)])
+    np.testing.assert_allclose(
+        told[:12, 0], 0.5 * np.array([0.125, 0.375, 0.625, 0.875, 1, 1, 0.875, 0.625, 0.375, 0.125, 0, 0])
+    )
+    np.testing.assert_allclose(told[:, 1], told[:, 0] / 5)
+    np.testing.assert_allclose(told[12:], told[:12])

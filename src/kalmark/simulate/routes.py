@@ -47,6 +47,8 @@ class Constant(Section):
     """Time between stops."""
     stop_s: NotNegative = 0.0
     """Time of a stop, in which the control is zero."""
+    ramp_s: NotNegative = 0.0
+    """Time in which the control rises after a stop and falls before the next, at most half of `drive_s` each."""
 
     def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
         """Return the function from a true state (size,) to the control (m,)."""
@@ -54,7 +56,9 @@ class Constant(Section):
         if not self.stop_s:
             return lambda state: u
         steps, stops = (max(1, round(time / dt_s)) for time in (self.drive_s, self.stop_s))
-        controls = cycle([u] * steps + [stop] * stops)
+        ramp = max(0.5, min(self.ramp_s, self.drive_s / 2) / dt_s)
+        shares = np.clip((np.arange(steps) + 0.5) / ramp, 0.0, 1.0)
+        controls = cycle([*(np.minimum(shares, shares[::-1])[:, None] * u), *[stop] * stops])
         return lambda state: next(controls)
 
 
