@@ -124,3 +124,14 @@ def test_a_camera_mount_finds_itself_in_a_world_of_two_robots() -> None:
     f = run_campaign(world_, 3, ["invariant"], seed=1, jobs=1, progress=False).summary()["estimators"]["invariant"]
     assert f["mount_deg"] < 0.25 and f["mount_m"] < 0.02  # of 2.6 deg and 0.087 m
     assert f["mount_sure"] == 3
+
+
+def test_a_mount_is_judged_by_what_of_it_is_not_known_exactly() -> None:
+    """An antenna has no direction, and behind its place in the map is an error that lasts."""
+    world_ = load_world("lever_arm", ["steps=200", "robots.robot.sensors.receiver.sigma_bias_m=0.3"])
+    plan = Plan(world_, configs_of(world_, ["invariant"]), 0, 10)
+    (scores,) = plan.run(0).values()
+    assert scores.series["mount_dof"][0, -1] == 2
+    assert 0.0 < scores.series["mount"][0, -1] < 11.8  # of two degrees of freedom, 99.73 %
+    assert scores.series["joint_dof"][0, -1] == 3 + 2 + 2 * scores.landmarks
+    assert np.isfinite(scores.series["joint"][0, -1])

@@ -497,6 +497,14 @@ def test_the_table_of_innovations_accuses_the_range_that_is_wrong() -> None:
     assert parts["pose"] < 3
 
 
+def test_a_filter_that_reads_its_position_is_not_too_sure_against_a_batch_solution_that_does_not() -> None:
+    world = load_world("lever_arm", ["steps=300"])
+    log, config = simulate(world, 3), world.config()
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    assert not verdict.causes
+    assert verdict.sigma_factor is not None and 0.5 < verdict.sigma_factor < 2.0
+
+
 def test_the_textbook_filter_is_named_as_what_is_too_sure() -> None:
     for estimator, named, factor in (("ekf", ["estimator"], 2.0), ("invariant", [], 0.9)):
         world = load_world("loop_b2", [f"filter.estimator.type={estimator}"])

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Flags
 from kalmark.errors import DivergedError
 from kalmark.events import Id, Scan
 from kalmark.geometry.angles import wrap
@@ -52,6 +52,14 @@ class Judged(NamedTuple):
     F: Array
     place: Array = NO_POINTS
     truth: Array = NO_POINTS
+
+
+class Uncertain(NamedTuple):
+    """A mount that calibrates itself: whose, its true pose (3,) or (7,), and which errors (3|6,) are not 0 for sure."""
+
+    carrier: str
+    truth: Array
+    open: Flags
 
 
 def state_error(mean: Array, truth: Array, turn: Any, coordinates: str) -> Array:
@@ -199,10 +207,10 @@ class _Scorer:
         self.series = {key: np.full(shape, np.nan) for key in SERIES}
         self.true_id: dict[Id, Id | None] = {}
         self.uncertain = {
-            f"{name}.{key}": (name, simulated.mounts[name, key])
+            f"{name}.{key}": Uncertain(name, simulated.mounts[name, key], np.diagonal(mount.cov) > 0)
             for name, robot in slam.robots.items()
             for key, mount in robot.sensors.items()
-            if mount.cov is not None
+            if mount.cov is not None and mount.cov.any()
         }
         self.nis, self.nis_dof = 0.0, 0
 
@@ -244,11 +252,12 @@ class _Scorer:
             own, world = (state_error(mean, self._state(name, k), turn, c) for c in (coordinates, "world"))
             judged[name] = Judged(own, world, np.eye(dof))
         mounts: dict[Id, Judged] = {}  # rotations of the world frame do not change them
-        for name, (_, truth) in self.uncertain.items():
-            d = pose_error(slam.mean(name)[: len(truth)], truth)
-            mounts[name] = Judged(d, d, np.eye(len(d)))
+        errors = {name: pose_error(slam.mean(name)[: len(of.truth)], of.truth) for name, of in self.uncertain.items()}
+        for name, of in self.uncertain.items():
+            d = errors[name][of.open]
+            mounts[name] = Judged(d, d, np.eye(len(slam.covariance(name)))[np.flatnonzero(of.open)])
         landmarks = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
-        self._score_mounts({n: mounts[n] for n, (carrier, _) in self.uncertain.items() if carrier == robot}, row, k)
+        self._score_mounts({n: errors[n] for n, of in self.uncertain.items() if of.carrier == robot}, row, k)
         judged |= mounts | landmarks
         F = on_diagonal([j.F for j in judged.values()])
         P = F @ slam.covariance(*judged) @ F.T
@@ -296,16 +305,19 @@ class _Scorer:
             if np.isfinite(numbers).any():
                 self.series["landmarks" + name][row, k] = np.nanmean(numbers)
 
-    def _score_mounts(self, mounts: dict[str, Judged], row: int, k: int) -> None:
-        if not mounts:
+    def _score_mounts(self, errors: dict[str, Array], row: int, k: int) -> None:
+        """Score mounts by their errors d (3|6,); a coordinate that is known exactly has no sigma to compare with."""
+        if not errors:
             return
-        d, series = np.array([j.own for j in mounts.values()]), self.series
-        dof = d.shape[1]
-        value = nees(d, np.array([self.slam.covariance(name)[:dof, :dof] for name in mounts]))
-        if np.isfinite(value).any():
-            series["mount"][row, k], series["mount_dof"][row, k] = np.nanmean(value), dof
-        series["mount_m"][row, k] = np.linalg.norm(d[:, : self.d], axis=1).max()
-        series["mount_rad"][row, k] = np.linalg.norm(d[:, self.d :], axis=1).max()
+        series, values, dof = self.series, [], []
+        for name, d in errors.items():
+            at = np.flatnonzero(self.uncertain[name].open)
+            values.append(nees(d[at], self.slam.covariance(name)[np.ix_(at, at)]))
+            dof.append(len(at))
+        if np.isfinite(values).any():
+            series["mount"][row, k], series["mount_dof"][row, k] = np.nanmean(values), np.mean(dof)
+        parts = np.array([[np.linalg.norm(d[: self.d]), np.linalg.norm(d[self.d :])] for d in errors.values()])
+        series["mount_m"][row, k], series["mount_rad"][row, k] = parts.max(axis=0)
 
     def scores(self, stopped: str) -> Scores:
         """Return the scores."""

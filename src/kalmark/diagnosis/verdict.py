@@ -26,7 +26,7 @@ from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.models.sensors import Wall
-from kalmark.results.batch import filtered_map, given_by, log_of
+from kalmark.results.batch import filtered_map, given_by, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
@@ -446,7 +446,8 @@ def effect_of(run: Run, found: Searched) -> Effect:
     off_it = share > LEAST and shift_m > SIGMAS * float(np.median(filtered[free]))
     status = "ok" if not off_it else "doubtful" if share < WRONG else "wrong"
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
-    comparable = found.given.segments is None and not waited  # what waited is not in the batch solution
+    same_data = not waited and not of_the_filter_alone(run.final_slam())  # what waited is not in the batch solution
+    comparable = found.given.segments is None and same_data
     claimed = float(np.median(ratio)) if comparable else None
     twice = copies.of_scans(run).any()
     over = 1.0 / claimed if claimed is not None and (claimed < TOO_SURE or twice) else 1.0

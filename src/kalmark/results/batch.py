@@ -208,13 +208,18 @@ def _surveyed(history: History) -> Known:
     return {as_id(prior.landmark): (prior.mean, prior.covariance) for prior in points}
 
 
+def of_the_filter_alone(slam: Slam) -> set[tuple[str, str]]:
+    """Return the sensors (robot, name) whose readings no batch solution has: of the state, and of range rates."""
+    mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
+    return {key for key, mount in mounted.items() if isinstance(mount.sensor, SeesVelocity | OfState)}
+
+
 def _of_places(history: History, slam: Slam, rows: Index) -> Index:
     """Return those rows of the history that say where landmarks or other robots are, seen from a pose alone.
 
     Readings of the state do not, nor do range rates.
     """
-    mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
-    others = {key for key, mount in mounted.items() if isinstance(mount.sensor, SeesVelocity | OfState)}
+    others = of_the_filter_alone(slam)
     if not others:
         return rows
     keys = zip(history.robot[history.step[rows]].tolist(), history.sensor[rows].tolist(), strict=True)
