@@ -307,7 +307,9 @@ def test_a_wrong_first_heading_is_named_where_fixes_tell(heading: float) -> None
     log = with_fixes(simulate(world_of(), 3))
     start = f"robots.rover.start={{x_m: 12, y_m: 12, theta_rad: {heading}}}"
     verdict = km.diagnose(recorded(log, start))
-    assert (verdict.map, verdict.causes[0].name) == ("wrong", "start")
+    assert (verdict.map, verdict.causes[0].name, verdict.causes[0].harmless) == ("ok", "start", True)
+    assert "the map was moved onto them" in verdict.causes[0].evidence
+    assert not [cause for cause in verdict.causes if not cause.harmless]
     cured = km.diagnose(recorded(log, verdict.causes[0].cure.removeprefix("--set ").strip("'")))
     assert (cured.map, cured.causes) == ("ok", ())
 

@@ -10,7 +10,11 @@ import pytest
 
 import kalmark as km
 from kalmark.arrays import Array
+from kalmark.geometry.angles import rotation
 from kalmark.geometry.frames import compose
+from kalmark.geometry.spaces import POINT2, POINT3, SE2, SE3, Rn, Space
+from kalmark.models.landmarks import AnchoredHomogeneous, Wall2D
+from kalmark.slam.replacing import Shift, moved
 
 R = 0.25 * np.eye(2)
 
@@ -61,6 +65,47 @@ def test_a_robot_that_was_carried_away_is_placed_by_the_fixes_that_agree(seed: i
     error = slam.robots["r"].motion.space.minus(slam.mean("r"), truth)
     assert error @ np.linalg.solve(slam.covariance("r"), error) < 21.1  # .9999 of chi-square of 3
     assert np.sqrt(slam.covariance("r")[2, 2]) < 0.2
+
+
+PILLARS = {k: np.array([6.0 * np.cos(k), 10.0 + 14.0 * np.sin(k)]) for k in range(12)}
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+@pytest.mark.parametrize("start", [(8.0, 0.0, 0.0), (-300.0, 250.0, 1.5), (0.0, 0.0, 2.8)])
+def test_a_wrong_start_is_mended_with_all_of_the_map_by_the_first_fixes(start: Any, map_: Any) -> None:
+    """Landmarks that were mapped from a wrong start would pull the robot back to it."""
+    rng, x = np.random.default_rng(2), np.zeros(3)
+    laser = km.Mount(km.sensors.RangeBearing(0.1, 0.02))
+    slam = km.Slam([km.Robot("r", km.motion.Odometry2D(), sensors={"lidar": laser}, start=start)], map=map_)
+    for k in range(1, 81):
+        u = np.array([0.5, 0.0, 0.05])
+        x = compose(x, u)[0]
+        slam.process(km.Control(0.5 * k, "r", u + rng.normal(0, [0.01, 0.0, 0.01])))
+        y = km.geometry.observe(x, np.array([*PILLARS.values()]))[0] + rng.normal(size=(12, 2)) * (0.1, 0.02)
+        slam.process(km.Scan(0.5 * k, "r", "lidar", y, [*PILLARS]))
+        if k % 3 == 0:
+            slam.process(km.Fix(0.5 * k, "r", x[:2] + rng.normal(0, 0.5, 2), R))
+    off = slam.robots["r"].motion.space.minus(slam.mean("r"), x)
+    assert off @ np.linalg.solve(slam.covariance("r"), off) < 21.1
+    assert np.linalg.norm(off[:2]) < 0.6
+    of_landmarks = [(slam.mean(name) - at, slam.covariance(name)) for name, at in PILLARS.items()]
+    assert np.mean([d @ np.linalg.solve(P, d) for d, P in of_landmarks]) < 9.2
+
+
+@pytest.mark.parametrize("space", [SE2, POINT2, SE3, POINT3, Wall2D().space, AnchoredHomogeneous().space, Rn(2)])
+def test_the_motion_of_a_block_by_an_error_of_the_shift_matches_differences(space: Space) -> None:
+    rng, h = np.random.default_rng(3), 1e-6
+    x = space.plus(np.r_[np.zeros(space.size - 1), 1.0], rng.normal(size=space.dof))
+    d = 2 if space.world == "plane" or not space.world else 3
+    shift = Shift(0.7, rng.normal(size=d), rng.normal(size=d), np.eye(d + 1))
+    new, G = moved(space, x, shift)
+    for k in range(d):
+        other, _ = moved(space, x, shift._replace(t=shift.t + h * np.eye(d)[k]))
+        np.testing.assert_allclose(space.minus(other, new) / h, G[:, k], atol=1e-5)
+    turn = rotation(h)  # about the pivot
+    about = shift.pivot[:2] + turn @ (shift.t[:2] - shift.pivot[:2])
+    other, _ = moved(space, x, shift._replace(yaw=shift.yaw + h, t=np.r_[about, shift.t[2:]]))
+    np.testing.assert_allclose(space.minus(other, new) / h, G[:, d], atol=1e-5)
 
 
 def test_wild_fixes_that_do_not_agree_never_move_it() -> None:

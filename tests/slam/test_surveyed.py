@@ -16,9 +16,9 @@ PLACES = {1: (3.0, 1.0), 2: (4.0, -2.0), 3: (6.0, 2.0), 4: (2.0, -3.0)}
 WRONG = {3: (5.0, 3.5)}  # where the survey has it
 
 
-def surveyed(cov: Any, wrong: dict[int, tuple[float, float]], **of_robot: Any) -> km.Slam:
+def surveyed(cov: Any, wrong: dict[int, tuple[float, float]], gate: Any = "default", **of_robot: Any) -> km.Slam:
     """Return a filter with surveyed landmarks, some of them at wrong places."""
-    laser = km.Mount(km.sensors.RangeBearing(0.05, 0.01))
+    laser = km.Mount(km.sensors.RangeBearing(0.05, 0.01), association=km.association.ByIdentity(gate=gate))
     slam = km.Slam([km.Robot("r", km.motion.Unicycle(0.05, 0.05), sensors={"l": laser}, **of_robot)])
     for name, place in (PLACES | wrong).items():
         slam.add_landmark(name, place, cov)
@@ -41,9 +41,10 @@ def drive(slam: km.Slam, steps: int, start: tuple[float, float, float] = (0.0, 0
     return pose, removed
 
 
+@pytest.mark.parametrize("gate", ["default", 0.99])
 @pytest.mark.parametrize("cov", [None, 1e-4 * np.eye(2)])
-def test_a_wrong_survey_is_left_out_with_a_reason_then_mapped_anew(cov: Any) -> None:
-    slam, right = surveyed(cov, WRONG), surveyed(cov, {})
+def test_a_wrong_survey_is_left_out_with_a_reason_then_mapped_anew(cov: Any, gate: Any) -> None:
+    slam, right = surveyed(cov, WRONG, gate), surveyed(cov, {}, gate)
     pose, removed = drive(slam, 20)
     drive(right, 20)
     assert removed == [(3, ELSEWHERE, 4)]  # five sightings
@@ -66,6 +67,14 @@ def test_a_robot_that_is_elsewhere_is_brought_back_and_no_survey_is_given_up(cov
     pose, removed = drive(slam, 20)
     assert removed == []
     assert np.linalg.norm(slam.mean("r")[:2] - pose[:2]) < 0.15
+
+
+def test_what_is_outside_the_gate_of_the_association_is_never_taken() -> None:
+    slam, rng = surveyed(None, {}, 0.99), np.random.default_rng(1)
+    for k in range(6):
+        report = slam.process(scan(0.1 * k, np.array([0.8, -0.7, 0.1]), [*PLACES], rng))
+        assert {o.outcome for o in report.observations} == {"rejected"}
+        assert not report.removed  # nothing fits: the robot may be elsewhere
 
 
 def test_one_landmark_alone_is_left_out_until_another_says_the_same() -> None:

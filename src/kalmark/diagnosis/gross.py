@@ -202,7 +202,7 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
             continue
         at = np.column_stack([np.interp([e.t_ns for e in seen], t_ns, x) for x in p.T])
         onto = rigid(at, np.array([e.y for e in seen]))
-        changed, evidence, cure = _started_at(run.config, start, onto)
+        changed, evidence, cure = started_at(run.config, start, onto)
         after = _filtered(changed, log, events)
         if after is not None and fit(after).mean < FITS and np.mean([f.used for f in after.history.fixes]) > REJECTED:
             gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
@@ -210,13 +210,15 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
     return max(found, key=lambda f: f.gain, default=None)
 
 
-def _started_at(config: Mapping[str, Any], start: Start, onto: Rigid) -> tuple[dict[str, Any], str, str]:
+def started_at(config: Mapping[str, Any], start: Start, onto: Rigid) -> tuple[dict[str, Any], str, str]:
     """Return a configuration with a start that is moved, and that in words and as a line that makes it."""
     x, y = onto(start.mean[None, :2])[0].tolist()
     theta = math.remainder(start.mean[2] + math.atan2(onto.rotation[1, 0], onto.rotation[0, 0]), 2 * math.pi)
-    key = start.robot if start.robot in config["robots"] else "each"
+    robots = config.get("robots") or {}
+    key = start.robot if start.robot in robots else "each"
     moved = {"x_m": x, "y_m": y, "theta_rad": theta}
-    changed = with_value(config, ("robots", key, "start"), {**(config["robots"][key].get("start") or {}), **moved})
+    stated = (robots.get(key) or {}).get("start") or {}
+    changed = with_value(config, ("robots", key, "start"), {**stated, **moved})
     was, now = (
         f"at ({figure(float(a))}, {figure(float(b))}) m with a heading of {math.degrees(c):.0f} deg"
         for a, b, c in (start.mean[:3], (x, y, theta))

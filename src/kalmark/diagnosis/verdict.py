@@ -15,7 +15,7 @@ from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.diagnosis import copies
 from kalmark.diagnosis.causes import JUMPS, Finding, Where
-from kalmark.diagnosis.gross import fit, gross, until
+from kalmark.diagnosis.gross import fit, gross, started_at, until
 from kalmark.diagnosis.jumps import LISTED, OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import Mistake
@@ -29,6 +29,7 @@ from kalmark.models.sensors import Wall
 from kalmark.results.batch import filtered_map, given_by, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters
 from kalmark.results.measures import rigid, rmse
+from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.warnings import window_warnings
 from kalmark.results.words import count, figure
@@ -258,7 +259,9 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
 
     A noise that is stated too large has no cure where its errors last: with it the filter would be too sure.
     """
+    again = restarts(run.history)  # their starts were made uncertain for the batch solution
     matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
+    matter = [f for f in matter if f.name != "start" or not again]
     lasting = {f.of for f in matter if f.name == "correlated_noise"}
     causes = [(f, _cause(run, f, log)) for f in joined(matter, begin_s(run))]
     return [replace(c, cure="") if f.overstated and f.of in lasting else c for f, c in causes]
@@ -316,7 +319,26 @@ def misplaced(run: Run, finding: Finding) -> bool:
 
 def _structural(run: Run, log: Log) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
-    return [*repeats(run.summary), *misplaced_landmarks(run), *gaps(run.summary), *given_up(run), *_copied(run, log)]
+    return [
+        *repeats(run.summary),
+        *misplaced_landmarks(run),
+        *gaps(run.summary),
+        *given_up(run),
+        *_started_elsewhere(run),
+        *_copied(run, log),
+    ]
+
+
+def _started_elsewhere(run: Run) -> Iterator[Cause]:
+    """Yield the robots that did not start where it was said: the map was moved onto their fixes, so it does no harm."""
+    for start in run.history.starts:
+        restart = restarts(run.history).get(start.robot)
+        if restart is not None:
+            _, evidence, cure = started_at(run.config, start, restart.onto)
+            evidence += f"; the map was moved onto them at t={restart.t_ns * 1e-9:.1f} s"
+            first = run.history.fixes[: restart.fixes]
+            score = 0.5 * sum(float(fix.z @ np.linalg.solve(fix.Z, fix.z)) for fix in first)
+            yield Cause("start", start.t_ns * 1e-9, score, evidence, cure, True)
 
 
 def misplaced_landmarks(run: Run) -> list[Cause]:

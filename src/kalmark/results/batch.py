@@ -27,9 +27,10 @@ from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
 from kalmark.models.protocols import Landmark, OfState, SeesVelocity
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
-from kalmark.results.history import History, as_id
+from kalmark.results.history import History, Start, as_id
 from kalmark.results.landmarks import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
+from kalmark.results.restarts import Restart, restarts
 from kalmark.slam.surveyed import ELSEWHERE
 
 MOST_REJECTED = 0.2  # of the fixes
@@ -142,7 +143,9 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
 
     With `rows` of the history these are read; those that the filter did not use are of no landmark.
     """
-    rejected = frozenset(k for k, fix in enumerate(run.history.fixes) if not fix.used)
+    again = restarts(run.history)
+    begun = max((restart.fixes for restart in again.values()), default=0)  # fixes that the map was moved onto fit
+    rejected = frozenset(k for k, fix in enumerate(run.history.fixes) if not fix.used and k >= begun)
     if len(rejected) > MOST_REJECTED * len(run.history.fixes):
         what = f"the filter rejected {len(rejected)} of {len(run.history.fixes)} fixes"
         raise KalmarkError(f"batch solution: {what}, expected a run that used most")
@@ -171,7 +174,7 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
         landmark=_point(slam),
         t_ns=history.t_ns,
         robot=history.robot,
-        poses=history.poses,
+        poses=_moved(history, again),
         associations=Associations(
             history.step[rows],
             history.sensor[rows],
@@ -181,10 +184,29 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
         ),
         landmarks=landmarks,
         known=beforehand,
-        starts={start.robot: (start.mean, start.covariance) for start in history.starts},
+        starts={start.robot: _start(start, again.get(start.robot)) for start in history.starts},
         fixes=len(run.history.fixes),
         left_out=rejected,
     )
+
+
+def _moved(history: History, again: Mapping[str, Restart]) -> Array:
+    """Return the poses (S, .) of a run, those before the map was moved onto its fixes moved with it."""
+    poses = history.poses.copy()
+    for robot, restart in again.items():
+        before = (history.robot == robot) & (history.t_ns <= restart.t_ns)  # a fix follows the scans of its time
+        poses[before] = restart.onto.poses(poses[before])
+    return poses
+
+
+def _start(start: Start, again: Restart | None) -> tuple[Array, Array]:
+    """Return mean and covariance of a robot at its start; a start that was wrong says nothing."""
+    if again is None:
+        return start.mean, start.covariance
+    mean, cov = start.mean.copy(), start.covariance.copy()
+    mean[:3] = again.onto.poses(mean[None, :3])[0]
+    cov[:3, :3] = np.diag([max(again.moved_m, 1.0) ** 2] * 2 + [1.0])
+    return mean, cov
 
 
 def filtered_map(run: Recording) -> dict[Id, tuple[Array, Array]]:

@@ -31,6 +31,7 @@ from kalmark.results.measures import (
 )
 from kalmark.results.recording import Recording
 from kalmark.results.repeats import repeat_figures, repeat_notes
+from kalmark.results.restarts import restarts
 from kalmark.results.truth import Truth, fitted
 from kalmark.results.warnings import POSE_NEES, advice, fix_nis_per_dof, warnings, window_figures
 from kalmark.results.words import count, figure
@@ -146,6 +147,10 @@ def robot_figures(run: Recording, name: str) -> dict[str, Any]:
     known = np.isfinite(truth).all(axis=1)
     if known.any():
         figures |= pose_figures(mean[known], P[known], truth[known], run.coordinates)
+        restart = restarts(run.history).get(name)
+        if restart is not None:  # before it the path was in another frame
+            later = known & (run.history.t_ns[mine] > restart.t_ns)
+            figures["diverged"] = pose_figures(mean[later], P[later], truth[later], run.coordinates)["diverged"]
         if any(isinstance(s, dict) and s.get("detector") for s in run.sections(name).values()) and mean.shape[1] == 7:
             figures |= scale_figures(mean[known, :3], truth[known, :3])
     elif name in run.truth.fixes:

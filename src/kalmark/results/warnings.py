@@ -33,6 +33,7 @@ from kalmark.results.matching import LEAST, no_ids
 from kalmark.results.measures import nis
 from kalmark.results.recording import Recording
 from kalmark.results.repeats import repeat_warnings
+from kalmark.results.restarts import restarts
 from kalmark.results.words import count, figure
 
 DEGREES = 100  # of freedom in a window, at least
@@ -213,7 +214,9 @@ def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     begin_ns = run.history.t_ns[0] if len(run.history.t_ns) else 0
     for fix in (fix for fix in run.history.fixes if fix.moved_m > 0):
         when = f"{(fix.t_ns - begin_ns) * 1e-9:.1f} s after the first scan"
-        yield f"{fix.robot} was lost {when}: its fixes agreed that it was {fix.moved_m:.1f} m away; it was moved there"
+        again = restarts(run.history).get(fix.robot)
+        what = "it was" if again is None or again.t_ns != fix.t_ns else "with all of the map it was"
+        yield f"{fix.robot} was lost {when}: its fixes agreed that it was {fix.moved_m:.1f} m away; {what} moved there"
     lost = [name for name, figures in summary["robots"].items() if figures.get("diverged")]
     if lost:
         names = ", ".join(lost)

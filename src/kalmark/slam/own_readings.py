@@ -9,10 +9,12 @@ import numpy as np
 from kalmark.errors import MapError
 from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Update
+from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.observe import fix_view
 from kalmark.report import Judged, Observation, Report
 from kalmark.slam import moves, replacing
 from kalmark.slam.checks import refuse_bad_fix
+from kalmark.slam.motion import Moving
 from kalmark.slam.reader import Reader
 from kalmark.slam.state import State
 
@@ -87,6 +89,7 @@ def _believed(state: State, name: str, position: replacing.LeftOut, fused: bool)
     left_out = state.moving[name].left_out
     if fused:
         left_out.clear()
+        state.placed += 1
         return 0.0
     del left_out[: len(left_out) + 1 - replacing.KEPT]
     left_out.append(position)
@@ -98,12 +101,47 @@ def _replace(state: State, name: str) -> float:
     moving = state.moving[name]
     space = moving.motion.space
     size, dof = (3, 3) if space.axes == 1 else (7, 6)
-    mean, index = state.map.mean(moving.slot), state.map.index(moving.slot)
+    mean = state.map.mean(moving.slot)
     found = replacing.replaced(mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out)
     if found is None:
         return 0.0
-    state.map.predict(index[:dof], np.zeros((dof, dof)), found.cov)
-    state.map.set_predicted(moving.slot, np.concatenate([found.pose, mean[size:]]))
+    blocks = _blocks(state)
+    if (
+        state.placed < replacing.NEEDED
+        and len(state.robots) == 1
+        and all(replacing.can_move(space) for _, space in blocks)
+    ):
+        _move(state, blocks, found.shift)
+    else:
+        _put(state, moving, found)
+    state.placed = replacing.NEEDED
     state.clones.moved(name)
     moving.left_out.clear()
     return float(np.linalg.norm(found.pose[: dof // 2] - mean[: dof // 2]))
+
+
+def _put(state: State, moving: Moving, found: replacing.Replaced) -> None:
+    """Move a robot alone."""
+    mean, dof = state.map.mean(moving.slot), len(found.cov)
+    state.map.predict(state.map.index(moving.slot)[:dof], np.zeros((dof, dof)), found.cov)
+    state.map.set_predicted(moving.slot, np.concatenate([found.pose, mean[len(found.pose) :]]))
+
+
+def _blocks(state: State) -> list[tuple[int, Space]]:
+    """Return the slots and spaces of all that a motion of the world moves: robots, clones of their poses, landmarks."""
+    poses = {name: SE2 if robot.motion.space.axes == 1 else SE3 for name, robot in state.robots.items()}
+    return [
+        *((moving.slot, moving.motion.space) for moving in state.moving.values()),
+        *((clone.slot, poses[clone.robot]) for clone in state.clones.clones.values()),
+        *((state.tracks.slots[name], track.model.space) for name, track in state.tracks.confirmed.items()),
+    ]
+
+
+def _move(state: State, blocks: list[tuple[int, Space]], shift: replacing.Shift) -> None:
+    """Move the whole map; its covariance becomes P + G C G', C of the motion.  Once in a run: O(n^3)."""
+    found = [replacing.moved(space, state.map.mean(slot), shift) for slot, space in blocks]
+    rows = state.rows(tuple((slot, space.dof) for slot, space in blocks))
+    G = np.concatenate([G_block for _, G_block in found])
+    state.map.predict(rows, np.eye(len(rows)), G @ shift.cov @ G.T)
+    for (slot, _), (mean, _) in zip(blocks, found, strict=True):
+        state.map.set_predicted(slot, mean)

@@ -6,6 +6,10 @@ A fix outside its gate is left out.  A filter that has lost its robot would leav
 that were left out, one after the other, are compared with where the filter believed the robot to be: if a shift and a
 turn about the vertical axis lead from there to all of them, within their noise, the robot is moved by it.  What that
 does not determine, and all correlation of the robot with the map, is given up.
+
+If nothing has said yet where the map is in the world, no survey and fewer fixes that fitted than must agree, it was the
+start that was wrong: then the whole map is moved with the robot.  Its covariance gets that of the shift and of the
+turn, which all of it shares.
 """
 
 from __future__ import annotations
@@ -14,11 +18,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from kalmark.arrays import Array
 from kalmark.geometry.angles import rotation, wrap
 from kalmark.geometry.gaussian import gate
 from kalmark.geometry.rotations import exp, multiply
+from kalmark.geometry.spaces import ANCHOR, VECTOR, VECTOR3, Space
 
 NEEDED, KEPT = 5, 30  # fixes that must agree, and the last so many that are compared
 SHARE = 0.999  # of agreeing fixes that are believed
@@ -34,11 +40,24 @@ class LeftOut(NamedTuple):
     p: Array
 
 
+class Shift(NamedTuple):
+    """A motion of the world: a turn by `yaw` about the vertical axis, then by t (d,).
+
+    `cov` (d + 1, d + 1) is that of t and of the turn, which counts from `pivot` (d,).
+    """
+
+    yaw: float
+    t: Array
+    pivot: Array
+    cov: Array
+
+
 class Replaced(NamedTuple):
-    """The robot's new pose (3,) or (7,), and the covariance (3, 3) or (6, 6) of that."""
+    """The robot's new pose (3,) or (7,), and the covariance (3, 3) or (6, 6) of that; and by what it was moved."""
 
     pose: Array
     cov: Array
+    shift: Shift
 
 
 def replaced(pose: Array, P: Array, left_out: Sequence[LeftOut]) -> Replaced | None:
@@ -72,4 +91,22 @@ def replaced(pose: Array, P: Array, left_out: Sequence[LeftOut]) -> Replaced | N
         new[2] = wrap(pose[2] + yaw)
     else:
         new[3:] = multiply(exp(np.array([0.0, 0.0, yaw])), pose[3:])
-    return Replaced(new, cov)
+    t = y0 - np.array([*rotation(yaw) @ p0[:2], *p0[2:]])
+    return Replaced(new, cov, Shift(yaw, t, y0, block_diag(R / len(y), variance)))
+
+
+def can_move(space: Space) -> bool:
+    """Return whether a block of the map can be moved: it has a place, or none at all."""
+    return space.world == "" or space.kinds[0] in (VECTOR, VECTOR3, ANCHOR)
+
+
+def moved(space: Space, x: Array, shift: Shift) -> tuple[Array, Array]:
+    """Return a block's mean x (size,) after a motion of the world, and G (dof, d + 1) by that motion's error."""
+    d, G = len(shift.t), np.zeros((space.dof, len(shift.t) + 1))
+    if space.world == "":
+        return x, G
+    new = space.rotated(x, shift.yaw if d == 2 else np.array([0.0, 0.0, shift.yaw]))
+    new[:d] += shift.t
+    G[:d, :d], G[:, d] = np.eye(d), space.generator(new)[:, -1]
+    G[:2, d] += [shift.pivot[1], -shift.pivot[0]]
+    return new, G

@@ -51,7 +51,7 @@ from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 10
+VERSION = 11
 DESCRIPTION, SUMS = "slam.json", "sha256"
 OF_TRACKS = (
     "recent",
@@ -108,6 +108,7 @@ def _state(state: State) -> Description:
     blocks = {name: slot for name, slot in tracks.slots.items() if name not in tracks.confirmed}
     return {
         "t_ns": state.t_ns,
+        "placed": state.placed,
         "map": state.map.state(),
         "blocks": [[_id(name), slot] for name, slot in blocks.items()],
         "tracks": [_record(track) | {"id": _id(track.id)} for track in all_],
@@ -229,6 +230,7 @@ class Saved:
         map_ = restored_map(s["map"], partial(_array, self._members))
         robots, tracks, clones = state.robots, Tracks(state.robots), Clones()
         state.t_ns, state.map, state.tracks, state.clones = _time(s["t_ns"]), map_, tracks, clones
+        state.placed = _count(s["placed"], "placed")
         for name, slot in s["blocks"]:
             tracks.enter_block(name, slot, robot=name in robots)
         for record in s["tracks"]:

@@ -43,6 +43,7 @@ from kalmark.slam.checks import numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.policy import Policy, refuse_other_world
+from kalmark.slam.replacing import NEEDED
 from kalmark.slam.robot import Robot, robots_given
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import CURE, Settings, State
@@ -308,6 +309,7 @@ class Slam(Estimate):
         if cov is not None:
             cov = covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         state.tracks.reserve([name])
+        state.placed = NEEDED
         if cov is None and not any(policy.averages for policy in state.policies.values()):
             state.tracks.rename_tentative([name])
             state.tracks.known.add(name, model, mean)

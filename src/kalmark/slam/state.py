@@ -59,6 +59,7 @@ class State:
         self.t_ns: int | None = None
         self.map: Map = new_map(settings.map, settings.numbers)
         self.tracks, self.clones, self.surveys = Tracks(robots), Clones(), Surveys()
+        self.placed = 0  # fixes that have told where the map is in the world; a survey counts as many
         self.moving: dict[str, Moving] = {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}

@@ -44,17 +44,17 @@ def corrected(
 ) -> Correction:  # fmt: skip
     """Correct by sightings of which some are of surveys; of these the ones beyond `least` are left out.
 
-    They are taken all the same if it is the robot that is elsewhere.
+    They are taken all the same if it is the robot that is elsewhere, unless they are outside the association's gate.
     """
     if least == math.inf:
         return state.corrected(update, scan.event, estimator)
     done = state.corrected(update._replace(gate=min(update.gate, least)), scan.event, estimator)
     trial, known = state.surveys.trial, state.tracks.known
-    beyond = np.flatnonzero(~done.fused & (done.d2 <= update.gate)).tolist()
+    beyond = np.flatnonzero(~done.fused & ~np.isnan(done.d2)).tolist()
     tried = [name in trial or name in known for name in names]
     fitting = [names[k] for k in np.flatnonzero(done.fused & (done.d2 <= least)).tolist()]
     lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
-    out = np.array([k for k in beyond if lost or not tried[k]], dtype=np.int64)
+    out = np.array([k for k in beyond if (lost or not tried[k]) and done.d2[k] <= update.gate], dtype=np.int64)
     if not len(out):
         return done
     pose = state.map.mean(scan.robot)[: len(scan.channel.at)]
