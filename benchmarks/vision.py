@@ -14,6 +14,7 @@ import numpy as np
 import kalmark as km
 from kalmark.arrays import Array
 from kalmark.config import build_slam, open_run
+from kalmark.events import Id
 from kalmark.filter.kernels import one_thread
 from kalmark.vision.front_end import FrontEnd
 
@@ -46,20 +47,25 @@ def run(name: str, seed: int) -> dict[str, float]:
     (front_end,) = slam.state.front_ends.values()
     assert isinstance(front_end, FrontEnd)
     way, took, matched, wanted = [], [], 0, 0
+    seen: list[dict[Id, Array]] = []  # where landmarks were in each frame
     for frame in log.events:
         image = frame.grey()  # type: ignore[union-attr]
         here = km.Frame(t_ns=frame.t_ns, robot=frame.robot, sensor="camera", image=image)
         start = time.perf_counter()
         report = slam.process(here)
         took.append(time.perf_counter() - start)
+        fits = [o for o in report.observations if o.outcome in ("new", "associated") and o.landmark is not None]
+        seen.append({o.landmark: report.y[o.index] for o in fits if o.landmark is not None})
         matched += sum(o.outcome == "associated" for o in report.observations)
         assert front_end.prospect is not None
         wanted += len(front_end.prospect)
         way.append(slam.mean(frame.robot)[:3])
+    shifts = [float(np.hypot(*(seen[-1][name] - y))) for name, y in seen[0].items() if name in seen[-1]]
     p, length = np.array(way), float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
     found = {
         "matched": matched / len(took), "found": matched / max(wanted, 1), "ms": 1e3 * float(np.median(took)),
         "hz": 1.0 / float(np.mean(took)), "return": float(np.linalg.norm(p[-1] - p[0])) / length,
+        "back": len(shifts), "shift_px": float(np.median(shifts)) if shifts else np.nan,
         **{f"{part}_ms": 1e3 * spent / len(took) for part, spent in front_end.times.items()},
     }  # fmt: skip
     truth = log.truth.get(log.robots[0])

@@ -35,7 +35,7 @@ from kalmark.management import reparametrize as points
 from kalmark.management.attention import left_out
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
-from kalmark.models.protocols import Landmark
+from kalmark.models.protocols import Landmark, UnknownDepth
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import locating, maintenance, moves, own_readings, starting, tentative
 from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
@@ -113,6 +113,8 @@ class Slam(Estimate):
         if event.robot not in state.robots:
             names = sorted(state.robots)
             raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
+        if not isinstance(event, Frame):
+            state.settle()
         try:
             report: Report = take(event)
             if event.robot in state.standing:
@@ -171,7 +173,28 @@ class Slam(Estimate):
         report.gaps += gaps
         report.removed = (*removed, *report.removed)
         front_end.learn(report, channel.pose(state.map, state.moving[event.robot].slot))
+        if isinstance(channel.landmark, UnknownDepth) and channel.landmark.prior_rho_per_m > 0.0:
+            begun = front_end.begun(channel.landmark.prior_rho_per_m)
+            if begun is not None:
+                self._begin_again(front_end, *begun)
         return report
+
+    def _begin_again(self, front_end: FrontEnd, scans: list[tuple[Scan, list[Id]]], rho: dict[Id, float]) -> None:
+        """Filter all frames so far again, landmarks starting at the inverse distances that are known now."""
+        again = Slam(self.robots.values(), **vars(self.state.settings))
+        state, key, poses = again.state, (scans[0][0].robot, scans[0][0].sensor), []
+        channel = state.channels[key]
+        channel.rho = rho
+        for scan, removed in scans:
+            for name in removed:
+                if name in state.tracks.confirmed:
+                    state.remove(name)
+            again._found(scan)
+            poses.append(channel.pose(state.map, state.moving[key[0]].slot))
+        channel.rho = {}
+        front_end.moved(poses, state.tracks.confirmed.keys())
+        state.front_ends = self.state.front_ends
+        self.state = state
 
     def _policy(self, event: Scan | Frame) -> Policy:
         """Return the policy for what a sensor of landmarks saw.  Raises EventError."""
@@ -297,6 +320,7 @@ class Slam(Estimate):
         """
         state = self.state
         name = checked_id(name, "landmark")
+        state.settle()
         if landmark is not None:
             instance(landmark, Landmark, f"landmark {name!r}", "a landmark model")
         default = next((channel.landmark for channel in state.channels.values()), Point2D())
@@ -320,6 +344,7 @@ class Slam(Estimate):
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
+        self.state.settle()
         self.state.remove(name)
 
     # ------------------------------------------------------------------ before the first event

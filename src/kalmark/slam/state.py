@@ -70,6 +70,9 @@ class State:
         self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}
         for robot in robots.values():
             self._place(robot)
+        if len(robots) == 1 and all(len(robot.sensors) == 1 for robot in robots.values()):
+            for front_end in self.front_ends.values():
+                front_end.watch_beginning()
         self.may_grow = settings.map == "auto" and not any(policy.averages for policy in self.policies.values())
 
     @property
@@ -164,6 +167,11 @@ class State:
             used.update(self.clones.of(key)[-1:])
         for slot in self.clones.refer(key, used):
             self.map.remove(slot)
+
+    def settle(self) -> None:
+        """Let front ends know that something else than their frames changes the map."""
+        for front_end in self.front_ends.values():
+            front_end.settle()
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.errors import ModelError
+from kalmark.events import Id
 from kalmark.filter import corrections, kernels
 from kalmark.filter.map import AT_ONCE, Map, StochasticMap
 from kalmark.filter.neighbours import has_place
@@ -141,6 +142,7 @@ class Channel:
         self.dof = self._dof()
         self.gate = threshold(self.dof)
         self.robust = robust
+        self.rho: dict[Id, float] = {}  # inverse distances at which landmarks of these ids start, in place of the prior
         full, self.finds_depth = isinstance(sensor, protocols.FullSensor), finds_depth(sensor)
         any_depth = self.finds_depth or isinstance(landmark, protocols.UnknownDepth) or landmark.kind not in EUCLIDEAN
         self.starts_landmarks = full and any_depth
@@ -298,7 +300,7 @@ class Channel:
         return model.predict(*map_.marginal(robot, self.second(robot), slots), y, R)
 
     def landmark_of(
-        self, map_: Map, robot: int, y: Array, R: Array, own_noise: bool, which: int = 0
+        self, map_: Map, robot: int, y: Array, R: Array, own_noise: bool, which: int = 0, id_: Id | None = None
     ) -> tuple[Array, Array, Array]:
         """Return the landmark l (n,) that explains a measurement y (1, m) with the noise R, L_h and Q.  [S] (32)-(35).
 
@@ -309,7 +311,9 @@ class Channel:
         r, mount, own = self.split(observer)
         sensor = self.calibrated(map_)
         v, V_y = (a[:, which] for a in sensor.both(y)[:2]) if self.is_ambiguous else sensor.invert(y)
-        l, L_r, L_s, L_y, prior = landmark_at(r, mount, self.landmark, v, V_y, self.finds_depth)
+        rho = self.rho.get(id_) if id_ is not None else None
+        landmark = self.landmark if rho is None else replace(self.landmark, prior_rho_per_m=rho)  # type: ignore[type-var]
+        l, L_r, L_s, L_y, prior = landmark_at(r, mount, landmark, v, V_y, self.finds_depth)
         if self.noise_at is not None and not own_noise:
             R = self.noise_at(self.sensor.invert(y)[0])[0]
         if self.start_noise is not None and not own_noise:

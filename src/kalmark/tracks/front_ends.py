@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from typing import Any, Protocol, runtime_checkable
 
 from kalmark.arrays import Array
@@ -29,6 +29,25 @@ class FrontEnd(Protocol):
 
     def learn(self, report: Report, T: Array) -> None:
         """Learn what became of the last frame, its sensor being at T (7,)."""
+        ...
+
+    def watch_beginning(self) -> None:
+        """Keep the first frames, which alone move the map: together they may say how it begins."""
+        ...
+
+    def settle(self) -> None:
+        """Keep them no longer: something else has changed the map."""
+        ...
+
+    def begun(self, prior: float) -> tuple[list[tuple[Scan, list[Id]]], dict[Id, float]] | None:
+        """Return the frames so far, each with the landmarks given up before it, if they are to be filtered again.
+
+        And inverse distances of landmarks, 1/m, at which these are to start then; their median is the `prior`.
+        """
+        ...
+
+    def moved(self, poses: list[Array], names: Set[Id]) -> None:
+        """Learn that the sensor was at other poses (7,) in the frames so far, and that only `names` are landmarks."""
         ...
 
     def state(self) -> dict[str, Any]:

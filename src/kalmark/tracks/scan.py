@@ -128,7 +128,9 @@ class ScanContext:
         R = self.R[k]
         if self.event.cov is not None and self.channel.start_noise is not None:
             R = np.broadcast_to(self.event.cov, (len(self.y), *self.event.cov.shape[-2:]))[k]
-        l, L_h, Q = self.channel.landmark_of(self.map, self.robot, self.y[k : k + 1], R, self.own_noise, which)
+        l, L_h, Q = self.channel.landmark_of(
+            self.map, self.robot, self.y[k : k + 1], R, self.own_noise, which, self.ids[k]
+        )
         G = self.estimator.pose_jacobian(self.map, self.robot, L_h)
         return Start(self.channel.landmark.space, l, self.channel.parts(self.map, self.robot), G, Q)
 

@@ -24,11 +24,15 @@ MOST_VIEWS = 4
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A patch (2 q + 1, 2 q + 1) of an image taken from the pose T (7,); `rays` (5, 3) of its corners, its centre."""
+    """A patch (2 q + 1, 2 q + 1) of an image taken from the pose T (7,); `rays` (5, 3) of its corners, its centre.
+
+    `frame` is the number of the image.
+    """
 
     patch: Any
     T: Array
     rays: Array
+    frame: int = 0
 
 
 class Looks(NamedTuple):
@@ -47,14 +51,14 @@ def corners(y: Array, q: float) -> Array:
     return y + q * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [0.0, 0.0]])
 
 
-def taken(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int) -> View | None:
+def taken(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int, frame: int = 0) -> View | None:
     """Return the view of what is at the pixel y (2,) of an image taken from T, None too near to its border."""
     height, width = image.shape
     if not (q <= y[0] <= width - 1 - q and q <= y[1] <= height - 1 - q):
         return None
     patch = cv2.getRectSubPix(image, (2 * q + 1, 2 * q + 1), (float(y[0]), float(y[1])))
     rays = sensor.invert(corners(y, q))[0]
-    return View(patch, T.copy(), rays) if np.isfinite(rays).all() else None
+    return View(patch, T.copy(), rays, frame) if np.isfinite(rays).all() else None
 
 
 def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[View | None], Array]:

@@ -8,8 +8,8 @@ ones from another side, and which landmarks are not worth their place any more.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Set
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -23,6 +23,7 @@ from kalmark.models.sensors import PinHole
 from kalmark.report import Report
 from kalmark.tracks.prospect import Prospect
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
+from kalmark.vision.beginning import Beginning, Begun
 from kalmark.vision.features import Cells
 from kalmark.vision.matching import Searcher
 from kalmark.vision.selection import Search, Selection
@@ -103,6 +104,8 @@ class FrontEnd:
         self.found: Selection | None = None
         self.prospect: Prospect | None = None
         self.image: Any = None
+        self.beginning: Beginning | None = None
+        self.sighting: Sighting | None = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
     def search(self, frame: Frame, image: Any, prospect: Prospect) -> Sighting:
@@ -130,7 +133,8 @@ class FrontEnd:
         for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", t3 - t2)):
             self.times[part] += spent
         scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None)
-        return Sighting(scan, removed)
+        self.sighting = Sighting(scan, removed)
+        return self.sighting
 
     def learn(self, report: Report, T: Array) -> None:
         """Learn from what became of a frame, its sensor at T (7,) now: patches, and which landmarks fitted."""
@@ -142,7 +146,7 @@ class FrontEnd:
             if name is None:
                 continue
             if o.outcome == "new":
-                view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH)
+                view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH, self.frame - 1)
                 if view is not None:
                     self.looks[name] = Look([view], seen=self.frame)
             elif o.outcome == "associated":
@@ -151,11 +155,41 @@ class FrontEnd:
                 cosine, scale = self.likeness[at[name]]
                 other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
                 if other and len(look.views) < MOST_VIEWS:
-                    view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH)
+                    view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH, self.frame - 1)
                     look.views += [view] if view is not None else []
         for name, _ in report.removed:
             self.looks.pop(name, None)
+        if self.beginning is not None:
+            assert self.sighting is not None
+            fitted = {o.landmark: report.y[o.index] for o in report.observations
+                      if o.landmark is not None and o.outcome in ("new", "associated")}  # fmt: skip
+            self.beginning.add(self.sighting.scan, [name for name, _ in self.sighting.removed], fitted, T)
         self.times["learn"] += perf_counter() - t0
+
+    # ------------------------------------------------------------------ the beginning
+    def watch_beginning(self) -> None:
+        """Keep the first frames until they tell how far the first landmarks are: nothing else moves the map."""
+        if isinstance(self.sensor, PinHole):
+            self.beginning = Beginning()
+
+    def begun(self, prior: float) -> Begun | None:
+        """Return, once, how the map begins, as soon as the first frames tell; the median of rho is the `prior`, 1/m."""
+        if self.beginning is None:
+            return None
+        found = self.beginning.tried(self.cv2, self.sensor, prior)
+        if self.beginning.over:
+            self.beginning = None
+        return found
+
+    def moved(self, poses: list[Array], names: Set[Id]) -> None:
+        """Take over that the sensor was at other poses (7,) in all frames so far, and that only `names` are left."""
+        self.looks = {name: look for name, look in self.looks.items() if name in names}
+        for look in self.looks.values():
+            look.views = [replace(view, T=poses[view.frame]) for view in look.views]
+
+    def settle(self) -> None:
+        """Take the map as it is: something else than frames has changed it."""
+        self.beginning = None
 
     # ------------------------------------------------------------------ files
     def state(self) -> dict[str, Any]:
@@ -166,7 +200,11 @@ class FrontEnd:
         ]
         failed = [[*place, frame] for place, frame in self.cells.failed.items()]
         random = self.random.bit_generator.state
-        return {"frame": self.frame, "named": self.named, "random": random, "looks": looks, "failed": failed}
+        beginning = None if self.beginning is None else self.beginning.state()
+        return {
+            "frame": self.frame, "named": self.named, "random": random, "looks": looks, "failed": failed,
+            "beginning": beginning,
+        }  # fmt: skip
 
     def arrays(self) -> dict[str, Array]:
         """Return patches, poses and rays of all views, landmark after landmark."""
@@ -175,13 +213,15 @@ class FrontEnd:
             "patches": np.array([view.patch for view in views], dtype=np.float64).reshape(-1, side, side),
             "poses": np.array([view.T for view in views]).reshape(-1, 7),
             "rays": np.array([view.rays for view in views]).reshape(-1, 5, 3),
+            "frames": np.array([view.frame for view in views], dtype=np.float64),
         }
 
     def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
         """Take over what was saved; `read` gives an array by its name and shape."""
         side, count = 2 * PATCH + 1, sum(int(look[1]) for look in state["looks"])
         patches = read("patches", (count, side, side)).astype(np.uint8)
-        views = list(map(View, patches, read("poses", (count, 7)), read("rays", (count, 5, 3))))
+        frames = read("frames", (count,)).astype(np.int64).tolist()
+        views = list(map(View, patches, read("poses", (count, 7)), read("rays", (count, 5, 3)), frames))
         self.looks, at = {}, 0
         for name, own, *counts in state["looks"]:
             self.looks[name] = Look(views[at : at + own], *map(int, counts))
@@ -189,6 +229,8 @@ class FrontEnd:
         self.frame, self.named = int(state["frame"]), int(state["named"])
         self.random.bit_generator.state = state["random"]
         self.cells.failed = {(int(i), int(j)): int(frame) for i, j, frame in state["failed"]}
+        begun = state["beginning"]
+        self.beginning = None if begun is None else Beginning.restored(begun)
 
     # ------------------------------------------------------------------ landmarks
     def _views(self, name: Id) -> list[View]:
