@@ -39,7 +39,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         if not rows:
             continue
         names: list[Any] = [decisions[k][0] for k in rows]
-        on_trial = surveyed.is_tried(state, scan, names)
+        on_trial = surveyed.is_tried(state, scan.event.robot, names)
         least = surveyed.gate_of(state, scan, policy) if on_trial else math.inf
         slots = state.tracks.slots_of(names)
         if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:

@@ -48,6 +48,7 @@ class Gaps:
     ) -> None:
         self.robot, self.motion, self.action = robot, motion, action
         self.max_speed_mps, self.max_turn_radps = max_speed_mps, max_turn_radps
+        self.limited = action != "ignore" and (max_speed_mps, max_turn_radps) != (None, None)
         self.last_ns: int | None = None  # time of the last control
         self.late_ns = NEVER_NS  # after which the next is late
         self.since_ns: int | None = None  # from when on the motion is unknown,
@@ -86,9 +87,9 @@ class Gaps:
 
     def rules_out(self, control: Control) -> bool:
         """Return whether a control is of a motion far beyond the limits that the robot was given."""
-        limits = self.max_speed_mps, self.max_turn_radps
-        if limits == (None, None) or self.action == "ignore" or (self.usual_ns == 0 and not self.motion.held):
+        if not self.limited or (self.usual_ns == 0 and not self.motion.held):
             return False
+        limits = self.max_speed_mps, self.max_turn_radps
         rates = self._rates(control.u, self.usual_ns if self.last_ns is None else control.t_ns - self.last_ns)
         return any(limit is not None and rate > RULED_OUT * limit for rate, limit in zip(rates, limits, strict=True))
 

@@ -85,6 +85,12 @@ class HeldInput:
             if self.gaps is not None:
                 vars(self.gaps).update(watched)
 
+    def stays(self, to_ns: int) -> bool:
+        """Return whether the robot is at that time where it was, and nothing is to be told of a gap."""
+        gaps = self.gaps
+        on_time = gaps is None or (to_ns <= gaps.late_ns and gaps.noticed is None)
+        return on_time and not (self.motion.held or self.coasts)
+
     def advance(self, to_ns: int, last: bool = False) -> Part | None:
         """Return the part from where the robot stands to `to_ns`, or None if it does not move."""
         if self.coasts:
@@ -147,7 +153,7 @@ class HeldInput:
         """Take a new control; return the parts of motion it closes."""
         if control.t_ns <= self.rests_until_ns:
             return []
-        if self.gaps is not None and self.gaps.rules_out(control):
+        if self.gaps is not None and self.gaps.limited and self.gaps.rules_out(control):
             return self._left_out(control, self.gaps)
         N = self.motion.control_noise(control.u) if control.cov is None else control.cov
         if not self.motion.held:

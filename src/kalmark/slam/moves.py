@@ -23,6 +23,8 @@ def advance(state: State, name: str, *others: str, before: Moves = ()) -> tuple[
     `before` are those that move with these: an error puts back the clocks of all.
     """
     assert state.t_ns is not None
+    if not others and not before and state.moving[name].held.stays(state.t_ns):
+        return ()
     with state.moving[name].held as held:
         part = held.advance(state.t_ns)
         moves = before if part is None else (*before, (name, part))

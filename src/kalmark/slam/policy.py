@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from kalmark.association.gated import ByIdentity
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Association, averages, weighs
 from kalmark.errors import ModelError
 from kalmark.events import Scan
 from kalmark.filter.estimators import Estimator
-from kalmark.management.attention import Attention
+from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
 from kalmark.management.pending import Initialization
 from kalmark.management.tags import Mirrored
@@ -38,7 +39,8 @@ class Policy:
     first sight).  `starts` are the answers to an observation without an id that start one.  `averages`: the association
     may answer with mixtures; `holds_back`: its pairs are tested against chance; `reviews`: landmarks may change after a
     scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the
-    last `keep_poses` clones are kept for tentative landmarks.
+    last `keep_poses` clones are kept for tentative landmarks.  `by_ids`: nothing is to be decided of a scan whose ids
+    are of landmarks of one type in the map.
     """
 
     association: Association
@@ -53,6 +55,7 @@ class Policy:
     reviews: bool
     linear: float
     keep_poses: int
+    by_ids: bool
 
 
 def policy_of(
@@ -69,11 +72,16 @@ def policy_of(
     seen = [model.landmark for model in channel.models.values()]
     kinds = [kind.ray if isinstance(kind, AsPoint) else kind for kind in seen]
     reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
+    varies = channel.noise_at is not None or channel.robust is not None
+    looks_back = channel.counts or channel.sees_velocity
+    approaches = channel.far is not None or channel.depths
     return Policy(
         association, upkeep, mount.attention, mount.detector, _deferred(mount), delayed, _starts(association, upkeep),
         averages(association), upkeep.hold_back and not weighs(association), reviews,
         0.0 if channel.joins else linear or 0.0,
         upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
+        type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
+        and not (reviews or varies or looks_back or approaches),
     )  # fmt: skip
 
 

@@ -37,7 +37,7 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.protocols import Landmark, UnknownDepth
 from kalmark.report import Observation, Report, outcomes_of
-from kalmark.slam import locating, maintenance, moves, own_readings, starting, tentative
+from kalmark.slam import by_ids, locating, maintenance, moves, own_readings, starting, tentative
 from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
 from kalmark.slam.checks import numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
@@ -208,10 +208,12 @@ class Slam(Estimate):
         """Take what was found of landmarks."""
         state = self.state
         key = event.robot, event.sensor
+        channel, policy = state.channels[key], state.policies[key]
+        if policy.by_ids and self.before_scan is None and (done := by_ids.corrected(state, event, channel, policy)):
+            return done
         if event.ids is not None and not state.inner.isdisjoint(event.ids):
             name = next(i for i in event.ids if i in state.inner)
             raise EventError(f"{when(event)}: id {name!r} names a robot's bias or mount, expected another")
-        channel, policy = state.channels[key], state.policies[key]
         R = measurements(event, channel.sensor, channel.check)
         if policy.averages:
             refuse_averaging(state.map, state.estimator, event)

@@ -32,10 +32,10 @@ def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
     return least if sure else math.inf
 
 
-def is_tried(state: State, scan: ScanContext, names: Sequence[Any]) -> bool:
+def is_tried(state: State, robot: str, names: Sequence[Any]) -> bool:
     """Return whether a scan says something of surveys: of those on trial, or of landmarks that did not fit before."""
     trial = state.surveys.trial.keys()
-    return bool(state.surveys.strangers.get(scan.event.robot)) or (bool(trial) and not trial.isdisjoint(names))
+    return bool(state.surveys.strangers.get(robot)) or (bool(trial) and not trial.isdisjoint(names))
 
 
 def corrected(

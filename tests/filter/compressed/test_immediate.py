@@ -79,11 +79,11 @@ def test_a_correction_is_judged_by_what_it_separates_and_not_by_how_far_it_goes(
     point = map_.augment(km.landmarks.Point2D().space, np.array([4.0, 1.0]), rows, np.eye(2, 3), np.eye(2) * 0.01**2)
     straight, turned, little = np.array([0.0, 1.0, 0.1]), np.array([0.0, 1.0, 0.3]), np.array([2.999, 1.0, 0.101])
     points = immediate.Points()
-    told = [points.parted(map_, robot, before) for before in (straight, turned, little)]
+    told = [points.parted(map_, robot, np.concatenate([before, map_.x[3:]])) for before in (straight, turned, little)]
     assert told == [False, True, False], "3 m without a turn part nothing, 3 m and .2 rad .3 m, 1 mm and 1 mrad .5 um"
     map_.remove(point)
     points.reset()
-    assert not points.parted(map_, robot, turned), "nothing is known from the robot"
+    assert not points.parted(map_, robot, np.concatenate([turned, map_.x[3:]])), "nothing is known from the robot"
 
 
 def test_a_map_that_remembers_an_immediate_correction_and_a_removal_can_be_saved_and_resumes(

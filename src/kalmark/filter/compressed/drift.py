@@ -19,7 +19,8 @@ from kalmark.geometry.spaces import DIRECTION, ERROR_SIZE, HOMOGENEOUS, MEAN_SIZ
 
 NO_NUMBERS = np.zeros(0)
 NO_ROWS = np.zeros(0, dtype=np.int64)
-
+Standing = tuple[Index, Array, Index, Index]  # as `Watch`
+Moved = tuple[Array, Array, Array]  # of `is_farther`: G, left, one over the sigmas
 
 TAU = 5e-4  # how far, in sigmas and radians of heading, an inactive block may be from its error coordinates,
 SMALL = 5000  # in a map of so many rows at most; in a larger one farther by as much: a full update costs more
@@ -42,16 +43,19 @@ class Watch(NamedTuple):
     size: Index
 
 
+NOTHING = Watch(NO_ROWS, NO_NUMBERS, NO_ROWS, NO_ROWS)
+
+
 @compiled
 def is_farther(
-    P: Array, turn: Index, clones: Index, x: Array, clones_x: Index, at: Index, frozen: Array, first: Index,
-    size: Index, G: Array, s: Array, left: Array, per_sigma: Array, tau: float,
+    P: Array, x: Array, s: Array, last: tuple[Index, Index, Index], standing: Standing, moving: Moved, tau: float
 ) -> bool:  # fmt: skip
     """Return whether a number is more than so many sigmas from where it was: of standing blocks, or among G (s - left).
 
-    The limit is tau over the uncertainty and the correction of the robot's turn since it was cloned: `turn` and
-    `clones` are rows of P, `clones_x` the numbers of the clones.
+    The limit is tau over the uncertainty and the correction of the robot's turn since it was cloned: `last` are the
+    rows in P of turn and clones, and the numbers of the clones.
     """
+    (turn, clones, clones_x), (at, frozen, first, size), (G, left, per_sigma) = last, standing, moving
     variance = 1e-300
     for i in range(len(turn)):
         variance += P[turn[i], turn[i]] + P[clones[i], clones[i]] - 2.0 * P[clones[i], turn[i]] + x[clones_x[i]] ** 2
@@ -64,7 +68,7 @@ def is_farther(
             return True
     for i in range(len(per_sigma)):
         moved = 0.0
-        for j in range(len(s)):
+        for j in range(G.shape[1]):
             moved += G[i, j] * (s[j] - left[j] if j < len(left) else s[j])
         if abs(moved) * per_sigma[i] > limit:
             return True
@@ -77,7 +81,8 @@ class Drift:
     def __init__(self) -> None:
         self.standing: dict[int, Watch] = {}
         self._stored: dict[int, Array] = {}  # one over the sigmas that they had at the full update
-        self._all: Watch | None = None
+        self._all: Standing | None = None  # of all of these
+        self._moved: Moved | None = None
         self.moving: list[int] = []  # the blocks that move by themselves,
         self._rows: Index = NO_ROWS  # the rows of their positions,
         self._per_sigma: Array = NO_NUMBERS  # one over those sigmas,
@@ -115,33 +120,32 @@ class Drift:
             self.moving.append(slot)
             self._rows = np.concatenate([self._rows, rows])
             self._per_sigma = np.concatenate([self._per_sigma, self._stored[slot][: len(rows)]])
-            self._rest = None
+            self._rest = self._moved = None
 
     def leave(self, x: Array, s: Array) -> None:
         """Take note that the coordinates are left at x of the active map and the auxiliary states' mean s."""
         for slot, watch in self.standing.items():
             self.standing[slot] = watch._replace(frozen=x[watch.at])
-        self._all, self._left = None, s
+        self._all, self._left, self._moved = None, s, None
 
     def is_beyond(
-        self, P: Array, turn: Index, clones: Index, x: Array, clones_x: Index, s: Array, n: int,
+        self, P: Array, x: Array, s: Array, count: int, last: tuple[Index, Index, Index], n: int,
         read: Callable[[Index, int], Array],
     ) -> bool:  # fmt: skip
         """Return whether inactive blocks are too far from where their error coordinates were left.
 
-        P and x are the covariance and the mean of the active map, `turn` the rows there of the turn of the robot that
-        corrects, `clones` and `clones_x` the rows and numbers of its last clone, s the mean of the auxiliary states, n
-        the rows of the whole map; `read` returns the stored covariance of rows with those of A0 from a first one on.
+        P and x are the covariance and the mean of the active map, s (`count` or more,) the mean of the auxiliary
+        states, `last` the rows there of the turn of the robot that corrects, and the rows and numbers of its last
+        clone, n the rows of the whole map; `read` returns the stored covariance of rows with those of A0 from a first
+        one on.
         """
         if self._all is None:
-            parts = zip(*self.standing.values(), strict=True)
-            self._all = (
-                Watch(*map(np.concatenate, parts)) if self.standing else Watch(NO_ROWS, NO_NUMBERS, NO_ROWS, NO_ROWS)
-            )
-        if self._rest is None:
-            self._rest = read(self._rows, 0)
-        elif self._rest.shape[1] < len(s):
-            self._rest = np.hstack([self._rest, read(self._rows, self._rest.shape[1])])
-        at, frozen, first, size = self._all
-        G, left, tau = self._rest, self._left, tolerance(n)
-        return bool(is_farther(P, turn, clones, x, clones_x, at, frozen, first, size, G, s, left, self._per_sigma, tau))
+            at, frozen, first, size = zip(NOTHING, *self.standing.values(), strict=True)
+            self._all = np.concatenate(at), np.concatenate(frozen), np.concatenate(first), np.concatenate(size)
+        if self._moved is None or self._moved[0].shape[1] < count:
+            if self._rest is None:
+                self._rest = read(self._rows, 0)
+            elif self._rest.shape[1] < count:
+                self._rest = np.hstack([self._rest, read(self._rows, self._rest.shape[1])])
+            self._moved = self._rest, self._left, self._per_sigma
+        return bool(is_farther(P, x, s, last, self._all, self._moved, tolerance(n)))

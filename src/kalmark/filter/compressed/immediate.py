@@ -51,21 +51,22 @@ class Points:
         """Take note that blocks have come or gone."""
         self._rows = None
 
-    def parted(self, m: StochasticMap, robot: int, before: Array) -> bool:
-        """Return whether the correction of the active map m that moved a robot from `before` has moved them too far."""
+    def parted(self, m: StochasticMap, robot: int, x_before: Array) -> bool:
+        """Return whether the correction of the active map m, whose mean was `x_before`, has moved them too far."""
         if self._rows is None:
             slots = [slot for slot, space in enumerate(m.spaces) if space is not None and space.kinds in _POINTS]
             self._rows = m.blocks[np.array(slots, dtype=np.int64), P_AT]
-        r, x = int(m.blocks[robot, P_AT]), m.x[m.numbers(robot)]
-        return bool(_parts(m.P, r, self._rows, before, x, 2 if m.axes == 1 else 3))
+        return bool(_parts(m.P, m.blocks[robot], self._rows, x_before, m.x, 2 if m.axes == 1 else 3))
 
 
 _POINTS = ((VECTOR,), (VECTOR3,))
 
 
 @compiled
-def _parts(P: Array, r: int, points: Index, before: Array, now: Array, d: int) -> bool:
-    """Return whether turn and motion of the robot at row r move a point by more than TAU sigmas seen from it."""
+def _parts(P: Array, robot: Index, points: Index, x_before: Array, x: Array, d: int) -> bool:
+    """Return whether turn and motion of a robot, a row of `blocks`, move a point by over TAU sigmas seen from it."""
+    at, r = robot[0], robot[2]
+    now, before = x[at : at + 7], x_before[at : at + 7]
     moved = 0.0
     for i in range(d):
         moved += (now[i] - before[i]) ** 2
@@ -116,7 +117,7 @@ class ImmediateCorrections:
         self.S_done, self.U_done = np.zeros((0, 1)), np.zeros((0, 1))  # displaced until the last one, by each robot
         self.rows, self.numbers = np.zeros((2, 0), dtype=np.int64)  # the clones in the active map
         self.axes = 0  # of the turns: blocks that need more axes get them in the next interval
-        self.last: dict[int, tuple[Index, Index]] = {}  # of these the last one of each robot
+        self.last: dict[int, tuple[Index, Index, Index]] = {}  # and behind what it is of, of each robot the last one
         self.turn, self.turns = NO_TURN, NO_TURN  # how each turns the world, what it did to the robots' turns, e' d,
         self.origins = np.zeros((0, 3))  # and where the robots stood: one after the other
 
@@ -153,7 +154,7 @@ class ImmediateCorrections:
         rows, numbers = m.rows(slot), np.arange(k) + m.numbers(slot).start
         self.rows, self.numbers = np.concatenate([self.rows, rows]), np.concatenate([self.numbers, numbers])
         last = [slice(end - min(3, self.axes), end) for end in range(self.axes, k + 1, self.axes)]
-        self.last = {robot: (rows[i], numbers[i]) for robot, i in zip(turns, last, strict=True)}
+        self.last = {robot: (index[i], rows[i], numbers[i]) for robot, i in zip(turns, last, strict=True)}
         return k
 
 

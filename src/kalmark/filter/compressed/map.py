@@ -34,7 +34,7 @@ from kalmark.filter.map import AT_ONCE, NO_SLOTS, Marginal, Pairs, StochasticMap
 from kalmark.filter.neighbours import Sorts, distances, near_places
 from kalmark.geometry.spaces import RHO, Rn, Space, Table
 
-NO_ROWS = np.zeros(0, dtype=np.int64)
+NO_ROWS, NO_NUMBERS = np.zeros(0, dtype=np.int64), np.zeros(0)
 ALL = 1e300  # multiplications: all the work that is left
 SEARCHED = 8  # inactive blocks to be read for each place: they have moved since the tree was made
 
@@ -79,7 +79,7 @@ class CompressedMap(Layout):
         self.displaced: dict[int, Array] = {}  # the part of each robot's corrections in these states and the clones
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of the turn of the world in them
         self.drift, self.schedule, self._points = Drift(), Schedule(self.most), Points()
-        self._immediate, self._before = ImmediateCorrections(), dict[int, Array]()
+        self._immediate, self._before = ImmediateCorrections(), NO_NUMBERS
         self._search = Search()
 
     @classmethod
@@ -330,7 +330,7 @@ class CompressedMap(Layout):
         if not self.schedule.begun:
             observed = self.active.blocks[[self.entered[robot], *at], P_SIZE].sum()
             self.schedule.begin(self.active.n, int(observed))
-        self._before = {r: self.active.mean(self.entered[r]) for r in {robot, *self.displaced}}
+        self._before = self.active.x.copy()
         return Marginal(self.active, self.entered[robot], self.entered.get(mount, -1), at)
 
     def corrected(self, robot: int, transports: bool) -> None:
@@ -341,7 +341,7 @@ class CompressedMap(Layout):
             others = [displaced for other, displaced in self.displaced.items() if other != robot]
             self.displaced[robot] = now = s - sum(others) if others else s
             some = len(self.entered) < self.used
-            if some and (self._far(robot, s) or self._points.parted(m, self.entered[robot], self._before[robot])):
+            if some and (self._far(robot, s) or self._points.parted(m, self.entered[robot], self._before)):
                 self.correct_all(robot, now - before)
             if len(self._immediate.rows) >= immediate.most(self.n):
                 self._advance(SLICE)
@@ -404,9 +404,8 @@ class CompressedMap(Layout):
         last = self._immediate.last.get(robot)
         if last is None:
             return True
-        m, (clones, clones_x) = self.active, last
-        turn = self._turn_rows(robot)[-len(clones) :]
-        return self.drift.is_beyond(m.P, turn, clones, m.x, clones_x, s[: len(self.A0)], self.n, self._read_with)
+        m = self.active
+        return self.drift.is_beyond(m.P, m.x, s, len(self.A0), last, self.n, self._read_with)
 
     def _read_with(self, rows: Index, first: int) -> Array:
         """Return the stored covariance of rows with those that have auxiliary states, from the `first` of these on."""
@@ -419,7 +418,8 @@ class CompressedMap(Layout):
         these the error coordinates of inactive blocks have turned.
         """
         robots, count = list(self.displaced), len(self.A0)
-        moved = {r: (self._before[r], self.active.mean(self.entered[r])) for r in robots}
+        numbers = [self.active.numbers(self.entered[r]) for r in robots]
+        moved = {r: (self._before[at], self.active.x[at]) for r, at in zip(robots, numbers, strict=True)}
         S, U = (D.copy() for D in self._by_robot())
         S[:, robots.index(robot)] -= displaced[:count]
         U[:, robots.index(robot)] -= displaced[count:]

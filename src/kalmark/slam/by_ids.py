@@ -1,0 +1,46 @@
+"""The short way of a scan of which nothing is to be decided: its ids are of landmarks of one type in the map.
+
+It is `Slam._fuse` and `maintain` without what they would not do then.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+from kalmark.events import Id, Scan
+from kalmark.filter.estimators import Update
+from kalmark.report import Judged, Report
+from kalmark.slam import moves
+from kalmark.slam.checks import measurements
+from kalmark.slam.policy import Policy
+from kalmark.slam.state import State
+from kalmark.slam.surveyed import is_tried
+from kalmark.tracks.channel import Channel
+
+
+def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Report | None:
+    """Correct the map by a scan whose policy is `by_ids`; None of a scan of which something is to be decided."""
+    tracks, name, ids = state.tracks, event.robot, cast("tuple[Id, ...]", event.ids)
+    moving = state.moving[name]
+    if not ids or moving.held.is_adrift or tracks.tentative or state.clones.clones or state.surveys.misfits:
+        return None
+    seen, kinds = [track for track in map(tracks.confirmed.get, ids) if track], set(map(tracks.sorts.get, ids))
+    alike = len(seen) == len(ids) and len(kinds) == 1 and not tracks.known
+    model = channel.models.get(kinds.pop() or "") if alike else None
+    if model is None or (is_tried(state, name, ids) and policy.association.threshold(channel.dof, 0.0) < math.inf):
+        return None
+    R, report = measurements(event, channel.sensor, channel.check), Report(event, event.y)
+    state.t_ns = event.t_ns
+    report.gaps, slots = moves.advance(state, name), tracks.slots_of(ids)
+    parallax = not channel.finds_depth
+    done = state.corrected(
+        Update(model.model, moving.slot, channel.mount, slots, model.d, event.y, R, channel.gate, parallax), event
+    )
+    report.e, report.z, report.Z, _, fused, _ = done
+    for track, used in zip(seen, fused.tolist(), strict=True):
+        track.observations += used
+    if report.gaps and fused.any():
+        moving.held.located(event.t_ns)
+    report.judged = (Judged(range(len(ids)), ids, ids, done, channel.gate),)
+    return report
