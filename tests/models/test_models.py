@@ -110,6 +110,18 @@ def test_the_compiled_seam_equals_the_written_out_one(sensor: km.sensors.RangeBe
         np.testing.assert_allclose(ours, plain, atol=1e-13)
 
 
+@pytest.mark.parametrize("mounted", [False, True])
+def test_ranges_and_bearings_of_points_worked_out_equal_the_chain_rule(mounted: bool) -> None:
+    rng = np.random.default_rng(6)
+    sensor = km.sensors.RangeBearing(scale=1.07, bias_m=-0.2)
+    for _ in range(100):
+        mount = rng.normal(size=3)
+        view, head = view_of(sensor, km.landmarks.Point2D(), mount), rng.normal(size=6 if mounted else 3) * 3.0
+        l, y = rng.normal(size=(5, 2)) * 5.0, rng.normal(size=(5, 2)) * 4.0
+        for ours, plain in zip(linearize(view, head, l, y), linearize_in_plane.py_func(view, head, l, y), strict=True):
+            np.testing.assert_allclose(ours, plain, rtol=1e-12, atol=1e-12)
+
+
 def test_range_noise_grows_with_range() -> None:
     R = km.sensors.RangeBearing(sigma_range_m=0.1, sigma_range_rel=0.08).noise(np.array([[0.0, 0], [5.0, 0]]))
     np.testing.assert_allclose(R[:, 0, 0], [0.01, 0.01 + 0.16])

@@ -288,15 +288,26 @@ def gain(HP: Array, M: Array, v: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def take_off(HP: Array, H: Array, V: Array, index: Index, count: int) -> None:
-    """HP <- H (P - V' V) of HP = H P (p, n), for the first `count` rows of V; H (p, m) is of the rows `index`."""
-    for a in range(len(HP)):
+def product_left(E_r: Array, E_l: Array, rows: Array, at: int, V: Array, index: Index, count: int) -> Array:
+    """Return H (P - V' V) (p, n) of one observation, H = (E_r, E_l), for the first `count` rows of V (., n).
+
+    `rows` are those of P at `index`: E_r (p, h) is of the first h of them, E_l (p, d) of d from the number `at` on.
+    """
+    p, h = E_r.shape
+    n, size = rows.shape[1], h + E_l.shape[1]
+    HP = np.zeros((p, n))
+    for a in range(p):
+        for c in range(size):
+            k, e = (c, E_r[a, c]) if c < h else (at + c - h, E_l[a, c - h])
+            for j in range(n):
+                HP[a, j] += e * rows[k, j]
         for b in range(count):
             s = 0.0
-            for c in range(len(index)):
-                s += H[a, c] * V[b, index[c]]
-            for j in range(HP.shape[1]):
+            for c in range(size):
+                s += E_r[a, c] * V[b, index[c]] if c < h else E_l[a, c - h] * V[b, index[at + c - h]]
+            for j in range(n):
                 HP[a, j] -= s * V[b, j]
+    return HP
 
 
 def invariant(
@@ -487,19 +498,22 @@ def textbook(
     k, p = len(y), R.shape[1]
     e, z, Z, d2 = np.empty((k, y.shape[1])), np.empty((k, p)), np.empty((k, p, p)), np.empty(k)
     near, valid, head = np.zeros(k, np.bool_), True, head_sizes(blocks, atoms, robot, mount)[1]
-    V = np.zeros((k * p, n))
+    index, _table, _mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    rows, V = rows_of(P, index, n), np.zeros((k * p, n))
     for i in range(k):
         one = slice(i, i + 1)
-        index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots[one], d)
+        _index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots[one], d)
         e[one], z[one], E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(1, d), y[one])
-        H = stacked(E_r, E_l)
-        HP = sparse_product(H, rows_of(P, index, n), E_r.shape[2], 1)
-        take_off(HP, H, V, index, i * p)
+        h = E_r.shape[2]
+        at = h + i * E_l.shape[2]
+        HP = product_left(E_r[0], E_l[0], rows, at, V, index, i * p)
         for a in range(p):
             for b in range(p):
                 Z[i, a, b] = R[i, a, b]
-                for c in range(len(index)):
-                    Z[i, a, b] += HP[a, index[c]] * H[b, c]
+                for c in range(h):
+                    Z[i, a, b] += HP[a, index[c]] * E_r[0, b, c]
+                for c in range(E_l.shape[2]):
+                    Z[i, a, b] += HP[a, index[at + c]] * E_l[0, b, c]
             Z[i, a, a] *= 1.0 + RAISED
         d2[one], positive = squared_distances(Z[one], z[one])
         valid = valid and positive

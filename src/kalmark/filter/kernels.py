@@ -219,26 +219,50 @@ def downdate(P: Array, V: Array) -> None:
     """
     q, n = V.shape
     keep_some(P, V)
-    if n <= 40 or (q <= 2 and n <= CACHED):  # the call would cost more than the sum
-        k = 0
-        while k + 2 <= q:
-            for i in range(n):
-                v, w = V[k, i], V[k + 1, i]
-                for j in range(i + 1):
-                    P[i, j] -= v * V[k, j] + w * V[k + 1, j]
-            k += 2
-        while k < q:
-            for i in range(n):
-                v = V[k, i]
-                for j in range(i + 1):
-                    P[i, j] -= v * V[k, j]
-            k += 1
+    if n <= CACHED:  # where a call of BLAS takes longer
+        none = np.empty((0, n))
+        subtract_squares(P, V, none, none)
         return
     sizes = np.array([n, q, P.shape[1]], dtype=np.int32)
     at = sizes.ctypes.data
     chars, numbers = _UPPER_NO.ctypes.data, _MINUS_ONE_ONE.ctypes.data
     _dsyrk(chars, chars + 1, at, at + 4, numbers, V.ctypes.data, at, numbers + 8, P.ctypes.data, at + 8)
     sizes[0] = V.shape[0]  # keeps both alive until the call is over
+
+
+@compiled
+def subtract_squares(P: Array, V: Array, a: Array, w: Array) -> None:
+    """P <- P - V' V + a' w + w' a on the lower triangle, V (q, n), a and w (axes, n): by two rows of P and four of V.
+
+    It writes to the right of the diagonal of P, too.
+    """
+    q, n = V.shape
+    odd = n % 2
+    for k in range(q * odd):
+        P[0, 0] -= V[k, 0] * V[k, 0]
+    for c in range(len(a) * odd):
+        P[0, 0] += 2.0 * a[c, 0] * w[c, 0]
+    for i in range(odd, n, 2):
+        k = 0
+        while k + 4 <= q:
+            a_0, a_1, a_2, a_3 = V[k, i], V[k + 1, i], V[k + 2, i], V[k + 3, i]
+            b_0, b_1, b_2, b_3 = V[k, i + 1], V[k + 1, i + 1], V[k + 2, i + 1], V[k + 3, i + 1]
+            for j in range(i + 2):
+                v_0, v_1, v_2, v_3 = V[k, j], V[k + 1, j], V[k + 2, j], V[k + 3, j]
+                P[i, j] -= a_0 * v_0 + a_1 * v_1 + a_2 * v_2 + a_3 * v_3
+                P[i + 1, j] -= b_0 * v_0 + b_1 * v_1 + b_2 * v_2 + b_3 * v_3
+            k += 4
+        while k < q:
+            a_0, b_0 = V[k, i], V[k, i + 1]
+            for j in range(i + 2):
+                P[i, j] -= a_0 * V[k, j]
+                P[i + 1, j] -= b_0 * V[k, j]
+            k += 1
+        for c in range(len(a)):
+            a_0, b_0, a_1, b_1 = a[c, i], a[c, i + 1], w[c, i], w[c, i + 1]
+            for j in range(i + 2):
+                P[i, j] += a_0 * w[c, j] + a_1 * a[c, j]
+                P[i + 1, j] += b_0 * w[c, j] + b_1 * a[c, j]
 
 
 @compiled
@@ -306,23 +330,23 @@ def subtract_outer(C: int, stride: int, L: int, rows: int, R: int, columns: int,
 
 @compiled
 def downdate_and_transport(P: Array, V: Array, a: Array, theta: Index) -> None:
-    """Compute P (n, n) <- A (P - V' V) A', V (m, n): `downdate` and `transport` in one pass over a large P."""
+    """Compute P (n, n) <- A (P - V' V) A', V (m, n): `downdate` and `transport` in one pass over P."""
     n, axes = a.shape
-    if n <= CACHED:
-        downdate(P, V)
-        transport(P, a, theta)
-        return
     q = len(V)
     keep_some(P, V)
     w, a_T = np.empty((axes, n)), np.empty((axes, n))
     for c in range(axes):
         t = theta[c]
         for j in range(n):
-            s = P[t, j] if j <= t else P[j, t]
-            for i in range(q):
-                s -= V[i, t] * V[i, j]
-            w[c, j], a_T[c, j] = s, a[j, c]
+            w[c, j], a_T[c, j] = P[t, j] if j <= t else P[j, t], a[j, c]
+        for i in range(q):
+            v = V[i, t]
+            for j in range(n):
+                w[c, j] -= v * V[i, j]
     half_turned(w, a_T, theta)
+    if n <= CACHED:
+        subtract_squares(P, V, a_T, w)
+        return
     L, R = np.empty((q + 2 * axes, n)), np.empty((q + 2 * axes, n))
     for i in range(len(L)):
         for j in range(n):

@@ -10,6 +10,7 @@ Motions have their seam at the end: a built-in one is compiled and called by its
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -21,6 +22,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.declare import built_in
 from kalmark.geometry import frames3d
+from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
 from kalmark.models import landmarks, seen, sensors
 from kalmark.models.landmarks3d import chained
@@ -128,15 +130,31 @@ def fix_view(antenna: Array) -> View:
 
 
 def built_in_view(
-    look: Any, expect: Any, code: int, mount: Array, par: Array, angular: Flags, varied: Any = None
+    look: Any,
+    expect: Any,
+    code: int,
+    mount: Array,
+    par: Array,
+    angular: Flags,
+    varied: Any = None,
+    linearized: Any = None,
 ) -> View:
     """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,).
 
-    `varied` is that of a sensor with parameters in the map.
+    `varied` is that of a sensor with parameters in the map, `linearized` a function for these two alone.
     """
-    linearize_at = address_of(linearize_in_plane if len(mount) == 3 else linearize_in_space, LINEARIZE)
+    linearized = linearized or (linearize_in_plane if len(mount) == 3 else linearize_in_space)
     vary_at = 0 if varied is None else address_of(varied, VARY)
-    return linearize_at, address_of(look, LOOK), address_of(expect, EXPECT), code, mount, par, angular, vary_at
+    return (
+        address_of(linearized, LINEARIZE),
+        address_of(look, LOOK),
+        address_of(expect, EXPECT),
+        code,
+        mount,
+        par,
+        angular,
+        vary_at,
+    )
 
 
 def is_built_in(sensor: Any, landmark: Any) -> bool:
@@ -151,7 +169,9 @@ def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
     if is_built_in(sensor, landmark):
         par = np.array(sensor.parameters if isinstance(sensor, Parametrized) else NOTHING, dtype=np.float64)
         varied = None if parameter_covariance(sensor) is None else type(sensor).varied
-        return built_in_view(landmark.look, type(sensor).expected, int(sensor.code), mount, par, angular, varied)
+        plain = type(sensor) is sensors.RangeBearing and type(landmark) is landmarks.Point2D and varied is None
+        models = landmark.look, type(sensor).expected, int(sensor.code)
+        return built_in_view(*models, mount, par, angular, varied, linearize_ranges if plain else None)
     return PythonView(sensor, landmark, mount, angular)
 
 
@@ -234,6 +254,39 @@ def linearize_in_plane(view: View, head: Array, l: Array, y: Array) -> tuple[Arr
     mount = view[4]
     T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 else mount)
     return _linearized(view, head, T, T_r, T_s, l, y)
+
+
+@compiled
+def linearize_ranges(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what `linearize_in_plane` does of ranges and bearings of points l (K, 2), its chain rule worked out.
+
+    The points stand at d from the sensor, in the axes of the map.  [S] (56), (61).
+    """
+    gain, offset = view[5]
+    s = head[3:6] if len(head) > 3 else view[4]
+    cos, sin = math.cos(head[2]), math.sin(head[2])
+    b_x, b_y = cos * s[0] - sin * s[1], sin * s[0] + cos * s[1]  # from the robot to the sensor
+    c_T, s_T = math.cos(head[2] + s[2]), math.sin(head[2] + s[2])
+    k = len(l)
+    e, z, E_h, E_l = np.empty((k, 2)), np.empty((k, 2)), np.empty((k, 2, len(head))), np.empty((k, 2, 2))
+    for i in range(k):
+        d_x, d_y = l[i, 0] - (head[0] + b_x), l[i, 1] - (head[1] + b_y)
+        d2 = d_x * d_x + d_y * d_y
+        d = math.sqrt(d2)
+        e[i, 0], e[i, 1] = (d + offset) / gain, math.atan2(c_T * d_y - s_T * d_x, c_T * d_x + s_T * d_y)
+        z[i, 0], z[i, 1] = y[i, 0] - e[i, 0], wrap(y[i, 1] - e[i, 1])
+        E_l[i, 0, 0], E_l[i, 0, 1] = d_x / d / gain, d_y / d / gain
+        E_l[i, 1, 0], E_l[i, 1, 1] = -d_y / d2, d_x / d2
+        for a in range(2):
+            E_x, E_y = E_l[i, a, 0], E_l[i, a, 1]
+            E_h[i, a, 0], E_h[i, a, 1], E_h[i, a, 2] = (
+                -E_x,
+                -E_y,
+                E_x * b_y - E_y * b_x - a,
+            )  # a turn is one of bearings
+            if len(head) > 3:
+                E_h[i, a, 3], E_h[i, a, 4], E_h[i, a, 5] = -E_x * cos - E_y * sin, E_x * sin - E_y * cos, -a
+    return e, z, E_h, E_l
 
 
 @compiled
