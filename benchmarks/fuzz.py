@@ -14,6 +14,7 @@ ones.  What is broken is kept as `fuzz/TARGET/crash-...`, seeds for later runs i
 from __future__ import annotations
 
 import argparse
+import itertools
 import shutil
 import subprocess
 import sys
@@ -36,7 +37,7 @@ from kalmark.errors import DivergedError, KalmarkError
 from kalmark.logs import open_log, write_native
 
 LONGEST_MESSAGE = 1500
-TIMEOUT_S, RSS_MB, LONGEST_INPUT = 25, 2048, 20_000
+TIMEOUT_S, RSS_MB, LONGEST_INPUT, LONGEST_STREAM = 25, 2048, 20_000, 400
 GUIDED = ("kalmark.logs", "kalmark.config", "kalmark.events", "kalmark.slam.slam", "kalmark.slam.state",
           "kalmark.slam.checks", "kalmark.declare")  # fmt: skip
 """Whose coverage guides.  Compiled functions are left alone: their byte code must stay as it is."""
@@ -52,6 +53,7 @@ class Target:
 
     seeds: tuple[bytes, ...]
     take: Callable[[bytes, Path], None]
+    longest: int = LONGEST_INPUT  # bytes
 
 
 # ------------------------------------------------------------------ files
@@ -372,6 +374,8 @@ def first(seeds: dict[str, Any]) -> tuple[bytes, ...]:
 STREAM = bytes(
     [0, 1, 0, 0, 2, 0, 0, 0, 120, 0, 100, 0, 0, 2, 0, 4, 2, 0, 150, 0, 100, 9, 130, 0, 110, 0, 0, 1, 0, 0, 0]
 )  # fmt: skip
+KINDS = tuple(bytes(kind) + STREAM[4:] * 3 for kind in itertools.product((0, 3), range(3), range(2), range(2)))
+"""The same events for each kind of filter: world, estimator, map, association.  All of them are compiled first."""
 
 
 def targets() -> dict[str, Target]:
@@ -381,7 +385,7 @@ def targets() -> dict[str, Target]:
         "mrclam": Target(first(MRCLAM), mrclam),
         "config": Target((CONFIG,), config),
         "map": Target((a_map(),), saved),
-        "process": Target((STREAM, STREAM * 3, bytes([3]) + STREAM, bytes(range(256))), process),
+        "process": Target((*KINDS, bytes(range(256))), process, LONGEST_STREAM),
         "parquet": Target((b"\0" + a_log(True),), parquet),
         "mcap": Target((a_log(False),), mcap),
         "ros1": Target((a_bag(True),), bag("a.bag")),
@@ -482,7 +486,7 @@ def guided(name: str, seconds: int, found: Path, timeout_s: int) -> None:
         attacked(target, seed, folder)
     instrumented()
     options = (f"-max_total_time={seconds}", f"-timeout={timeout_s}", f"-rss_limit_mb={RSS_MB}",
-               f"-max_len={LONGEST_INPUT}", f"-artifact_prefix={found / name}/", "-print_final_stats=1")  # fmt: skip
+               f"-max_len={target.longest}", f"-artifact_prefix={found / name}/", "-print_final_stats=1")  # fmt: skip
     atheris.Setup([sys.argv[0], *options, str(corpus)], lambda data: attacked(target, data, folder))
     atheris.Fuzz()
 

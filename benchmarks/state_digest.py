@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from enum import Enum
 from typing import Any
 
@@ -17,28 +16,28 @@ MADE_ANEW = {"_rows", "_numbers", "_wanted", "_sort_at", "_next", "prefault", "_
              "addresses"}  # fmt: skip
 
 
-def parts(value: Any) -> Iterator[bytes]:
-    """Return a value as bytes, piece by piece."""
+def add(found: Any, value: Any) -> None:
+    """Add a value to a hash, piece by piece."""
     if isinstance(value, np.ndarray):
-        yield f"{value.shape}{value.dtype}".encode()
-        yield np.ascontiguousarray(value).tobytes()
+        found.update(f"{value.shape}{value.dtype.str}".encode())
+        found.update(np.ascontiguousarray(value))
     elif isinstance(value, dict):
         for key, item in value.items():
-            yield repr(key).encode()
-            yield from parts(item)
+            found.update(repr(key).encode())
+            add(found, item)
     elif isinstance(value, set | frozenset):
-        yield repr(sorted(value, key=repr)).encode()
+        found.update(repr(sorted(value, key=repr)).encode())
     elif isinstance(value, list | tuple):
-        yield str(len(value)).encode()
+        found.update(str(len(value)).encode())
         for item in value:
-            yield from parts(item)
+            add(found, item)
     elif type(value).__module__.startswith("kalmark.") and not isinstance(value, Enum) and hasattr(value, "__dict__"):
         for key, item in vars(value).items():
             if key not in MADE_ANEW:
-                yield key.encode()
-                yield from parts(item)
+                found.update(key.encode())
+                add(found, item)
     else:
-        yield repr(value).encode()
+        found.update(repr(value).encode())
 
 
 def digest(slam: km.Slam) -> str:
@@ -56,6 +55,5 @@ def digest_of_saved(slam: km.Slam) -> str:
 
 def _digest(slam: km.Slam, map_: Any) -> str:
     found = hashlib.sha256()
-    for part in parts((slam.t_ns, map_, slam.tracks, slam.clones, slam.state.moving)):
-        found.update(part)
+    add(found, (slam.t_ns, map_, slam.tracks, slam.clones, slam.state.moving))
     return found.hexdigest()

@@ -18,6 +18,7 @@ FOUND: list[tuple[str, bytes]] = [
     ("g2o", b"\0PARAMS_SE3OFFSET 0\0 1\nEDGE"),
     ("config", b"log: {path: ~log, to_s: 0 }\n"),
     ("plaza", b"122E22222223 .1 2\n"),
+    ("native", b'\0t_s,robot,vove=r,"""*1,0\n1,rover,1,0.1\n2,ro"\n2,ro""\n'),
     ("freiburg", b"ODOMETRY 0 1 0\nSENSOR " + 390 * b"\0"),
 ]
 
@@ -48,4 +49,10 @@ def test_what_is_broken_is_told() -> None:
     ((_, outcome),) = fuzz.by_chance(fuzz.Target((b"seed",), odd), 1)
     assert isinstance(outcome, ZeroDivisionError)
     with pytest.raises(fuzz.Broken, match="message"):
-        fuzz.plain(fuzz.KalmarkError("two\nlines"))
+        fuzz.plain(fuzz.KalmarkError(""))
+
+
+def test_a_message_is_one_line_whatever_the_input_has_in_it() -> None:
+    assert str(fuzz.KalmarkError("column 'a\nb\x1b[2J' in Zürich")) == "column 'a\\nb\\x1b[2J' in Zürich"
+    long = str(fuzz.KalmarkError(f"file:1: {'x' * 5000}, expected a number"))
+    assert len(long) < 1000 and long.startswith("file:1: xxx") and long.endswith("xxx, expected a number")

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+LONGEST = 1000  # characters of a message
+
+
+def one_line(text: str) -> str:
+    """Return a text with line breaks and control characters as escapes; the middle of a long one is left out."""
+    plain = text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return plain if len(plain) <= LONGEST else f"{plain[: 2 * LONGEST // 3]} ... {plain[-LONGEST // 4 :]}"
+
 
 class KalmarkError(Exception):
     """Any input kalmark refuses.  The command line prints it as one line and exits with status 2."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class EventError(KalmarkError):

@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             app(args=None if arguments is None else list(arguments), prog_name="kalmark", standalone_mode=False) or 0
         )
     except KalmarkError as error:
-        return _refuse(" ".join(str(error).splitlines()))
+        return _refuse(str(error))
     except USAGE as error:
         if type(error).__name__ == "NoArgsIsHelpError":
             error.show()  # type: ignore[attr-defined]

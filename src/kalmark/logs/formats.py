@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from kalmark.errors import LogError
+from kalmark.errors import LogError, one_line
 from kalmark.events import Event, Fix, Scan, order, shown
 from kalmark.logs.bag.importer import BAG
 from kalmark.logs.carmen import CARMEN
@@ -97,7 +97,11 @@ def stream_log(
 def requested(robots: tuple[str, ...] | None, on_error: str, progress: bool = False) -> Request:
     """Return what the caller asked for.  Raises LogError."""
     skipped: list[str] = []
-    refuse = raising if choice(on_error, "on_error", ("raise", "skip")) == "raise" else skipped.append
+    refuse = (
+        raising
+        if choice(on_error, "on_error", ("raise", "skip")) == "raise"
+        else lambda line: skipped.append(one_line(line))
+    )
     return Request(robots, refuse, skipped, progress)
 
 
