@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from command_line import Kalmark
-from kalmark.config import load_config, open_run
+from kalmark.config import build_slam, load_config, open_run
+from kalmark.errors import LogError
 from kalmark.events import Control
+from kalmark.logs import open_log
 from kalmark.logs.bag.first_config import first_config
 from kalmark.logs.bag.survey import survey
 
@@ -253,6 +255,62 @@ def test_markers_in_a_frame_of_the_world_are_a_map_and_no_observations(tmp_path:
     ]
     text = config_of(tmp_path, messages)
     assert text.count("is one of the world: a map, not what a sensor of the robot sees") == 2
+
+
+def test_an_inertial_unit_moves_a_robot_of_space_without_other_controls(tmp_path: Path) -> None:
+    units = [
+        imu(T0 + k * 5 * 10**6, (0.001 * (-1) ** k, 0.0, 0.0), a=(0.01 * (-1) ** k, 0.0, 9.81)) for k in range(300)
+    ]
+    text = config_of(tmp_path, units)
+    assert "/imu: {type: inertial}" in text and "motion: {type: inertial, preset: mems_imu}" in text
+    assert "gyro" not in text, "a unit that moves the robot is no sensor of it as well"
+    config, log = open_run(tmp_path / "config.yaml")
+    slam = build_slam(config, log)
+    for event in log.events:
+        slam.process(event)
+    assert np.linalg.norm(slam.mean("robot")[:3]) < 0.1
+    beams = {"header": header(T0, "laser"), "angle_increment": 0.1, "range_max": 9.0, "ranges": [1.0, 2.0]}
+    (tmp_path / "flat").mkdir()
+    assert "type: inertial" not in config_of(
+        tmp_path / "flat", [*units, Outgoing("/scan", "sensor_msgs/msg/LaserScan", T0, beams)]
+    )
+
+
+@pytest.mark.parametrize("frame", ["odom", "vicon"])
+def test_fixes_say_where_a_robot_starts_unless_the_truth_is_in_their_frame(frame: str, tmp_path: Path) -> None:
+    messages = [odometry(T0 + t * 10**9, pose(t, 0, 0)) for t in range(5)]
+    for k, (topic, kind, x) in enumerate((("/amcl", "PoseWithCovarianceStamped", 3.0), ("/vicon", "PoseStamped", 7.0))):
+        at = {"pose": pose(x, 0, 0), "covariance": np.eye(6).ravel()} if k == 0 else pose(x, 0, 0)
+        fields = {"header": header(T0, "odom" if k == 0 else frame), "pose": at}
+        messages.append(Outgoing(topic, f"geometry_msgs/msg/{kind}", T0, fields))
+    text = config_of(tmp_path, messages)
+    assert "/vicon: {type: truth}" in text and ("start: {x_m: 3" in text) == (frame == "vicon")
+
+
+def test_satellite_positions_that_are_the_truth_by_their_name_only_score(tmp_path: Path) -> None:
+    fixes = [fix(T0 + t * 10**9, geodetic([float(t), 0.0, 0.0])) for t in range(3)]
+    messages = [odometry(T0 + t * 10**9, pose(t, 0, 0)) for t in range(3)]
+    text = config_of(tmp_path, [*messages, *(each._replace(topic="/gps_truth/fix") for each in fixes)])
+    assert "/gps_truth/fix: {type: truth}" in text
+    assert len(open_run(tmp_path / "config.yaml")[1].gps["robot"].xy) == 3
+
+
+def test_a_message_whose_definition_lacks_a_field_is_listed_and_refused_with_one_line(
+    kalmark: Kalmark, tmp_path: Path
+) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    kind = "sensor_msgs/msg/Range"
+    store.register(get_types_from_msg("float32 range\nfloat32 min_range\n", kind))
+    with Writer(tmp_path / "odd.bag") as writer:
+        connection = writer.add_connection("/sonar", kind, typestore=store)
+        writer.write(connection, T0, store.serialize_ros1(store.types[kind](range=1.0, min_range=0.1), kind))
+    said = "sensor_msgs/msg/Range, as the bag defines it, has no field 'max_range'"
+    assert said in first_config(survey(tmp_path / "odd.bag"))
+    with pytest.raises(LogError, match=said):
+        open_log(tmp_path / "odd.bag", topics={"/sonar": {"type": "scan", "landmark": "post"}})
 
 
 def test_markers_without_rotations_are_points(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ numbered in the order of the columns (`cov_xx, cov_xy, cov_yy, ...` where they a
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -82,7 +83,10 @@ def tables(path: Path) -> dict[str, Path]:
     """Return the tables in a folder by the names of their CSV files.  Raises LogError if one is there twice."""
     found: dict[str, Path] = {}
     for name in FILES:
-        same = [file for file in (path / name, (path / name).with_suffix(PARQUET)) if file.is_file()]
+        same = [file for file in (path / name, (path / name).with_suffix(PARQUET)) if os.path.lexists(file)]
+        for file in same:
+            if not file.is_file():  # a folder, a pipe, a link to nothing
+                raise LogError(f"{file}: not a file, expected a table")
         if len(same) > 1:
             raise LogError(f"{same[1]}: beside {name}, expected one of them")
         if same:

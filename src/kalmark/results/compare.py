@@ -17,7 +17,7 @@ from kalmark.events import shown
 from kalmark.results.evaluate import summary_of
 from kalmark.results.history import Ints
 from kalmark.results.measures import rigid, rmse
-from kalmark.results.plot import draw_plan
+from kalmark.results.plot import draw_plan, legend
 from kalmark.results.recording import Recording
 from kalmark.results.scene import COLOURS, INK, Scene
 from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, figure, header
@@ -149,6 +149,9 @@ def draw_comparison(told: Comparison) -> Figure:
         axes.set_ylim(low[1], high[1])
         axes.set_title(name, fontsize=10, color=INK, loc="left")
     _curves(figure_.add_subplot(grid[1, :]), told)
+    entries = {handle.get_label(): handle for scene in scenes for handle in legend(scene)}
+    columns = max(1, int(figure_.get_figwidth() / 1.9))
+    figure_.legend(handles=[*entries.values()], loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     return figure_
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+import warnings
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any, NamedTuple
@@ -66,8 +67,10 @@ def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim
     figure.set_dpi(dpi)
     FigureCanvasAgg(figure)
     laid_out = figure.get_layout_engine() is not None
-    box = None if not rim else "tight" if laid_out else figure.get_tightbbox().padded(0.15)
-    figure.savefig(path, dpi=dpi, format="png", bbox_inches=box, pad_inches=0.15, pil_kwargs={"compress_level": 3})
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing")  # of a name in a script that the font does not have
+        box = None if not rim else "tight" if laid_out else figure.get_tightbbox().padded(0.15)
+        figure.savefig(path, dpi=dpi, format="png", bbox_inches=box, pad_inches=0.15, pil_kwargs={"compress_level": 3})
 
 
 def save_map(run: Recording, path: str | PathLike[str]) -> None:

@@ -98,7 +98,7 @@ def report_html(run: Recording) -> str:
         skipped=_skipped(run, summary),
         config=html.escape(config_yaml(run.config)),
         plotly=get_plotlyjs(),
-        data=json.dumps(series(run), allow_nan=False, separators=(",", ":")).replace("</", "<\\/"),
+        data=json.dumps(series(run), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         scene=_resource("scene.js"),
         script=_resource("report.js"),
         hint=_HINTS[run.history.in_space],

@@ -22,7 +22,7 @@ LATER = ("filtered", "global", "map", "gps")  # odometry of these names has been
 WANTED = ("goal", "target", "setpoint", "clicked", "initial", "desired")  # poses that the robot is to have
 WORLD = ("map", "odom", "world", "earth")
 LEAST_POSES = 10
-SPACE = ("", "odometry_3d", "velocity_3d")
+SPACE = ("", "odometry_3d", "velocity_3d", "inertial")
 COASTING = {
     True: {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3},
     False: {"type": "constant_velocity", "sigma_vx_mps_per_sqrt_s": 0.3, "sigma_vy_mps_per_sqrt_s": 0.3,
@@ -30,6 +30,7 @@ COASTING = {
 }  # fmt: skip
 """The motion of a robot without controls, in space or in the plane."""
 AT_REST = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
+STILL_UNIT = {"at_rest": True, "sigma_bias_w_radps": 0.1, "sigma_bias_a_mps2": 0.1}
 IMAGES_ADVICE = "images: `{type: images}` gives them to the detector of a sensor, such as tags (docs/detectors.md)"
 SLOW = 0.5
 """An odometry of less than two messages for each of a sensor's gives increments that end at its scans."""
@@ -129,13 +130,15 @@ class _Writer:
         """Add the lines of one robot."""
         scans = [topic for topic in topics if topic.offers.seen is not None and not self.useless(topic)]
         control, kind = self.control(robot, topics, not any(map(_in_pixels, scans)))
+        if control is None and not any(topic.columns[:2] == BEAM for topic in scans):
+            control, kind = self.inertial(topics)
         space = kind in SPACE if kind else not any(topic.columns[:2] == BEAM for topic in scans)
         used = self.used(robot, topics, scans, control, kind, space)
         start = start_of(self.found, control, used, space)
         true = [self.found.named(name).poses.frames for name, (entry, _) in used.items() if entry["type"] == "truth"]
         ahead = start.at[2] if start is not None else yaw(true[0][0]) if true else 0.0
         readings = Readings(self.found, control, kind, space, start, ahead)
-        used |= readings.entries(topics)
+        used |= readings.entries([topic for topic in topics if kind != "inertial" or topic is not control])
         whose = {"robot": robot} if robot != "robot" else {}
         out.entries |= {name: (entry | whose, why) for name, (entry, why) in used.items()}
         out.unused += [
@@ -148,6 +151,9 @@ class _Writer:
         if kind:
             car = {"wheelbase_m": 2.83, "encoder_offset_m": 0.0} if kind == "ackermann" else {}
             why = f"{GUESS} its wheelbase; " if car else ""
+            if kind == "inertial":
+                car, why = {"preset": "mems_imu"}, f"{GUESS} a small unit, whose frame is the robot's; "
+                lines.append(f"start: {mapping(STILL_UNIT)}  # {GUESS} at rest for half a second or more")
             motion = mapping({"type": kind} | car)
             lines.append(f"motion: {motion}  # {why}its noise has defaults; `kalmark tune` estimates it")
         elif used:
@@ -212,6 +218,12 @@ class _Writer:
             return topic, "odometry_2d" if flat and topic.poses.flat else "odometry_3d"
         return None, ""
 
+    def inertial(self, topics: Sequence[TopicSummary]) -> tuple[TopicSummary | None, str]:
+        """Return the inertial unit that moves a robot of space without other controls: the fastest one."""
+        units = [topic for topic in topics if {"rates", "force"} <= topic.first.keys()]
+        best = max(units, key=lambda topic: (topic.rate_hz > 0, topic.rate_hz), default=None)
+        return best, "" if best is None else "inertial"
+
     def of_control(self, topic: TopicSummary) -> str:
         """Return why this is the control."""
         path = f"its path is {'flat' if topic.poses.frames and topic.poses.flat else 'not flat'}"
@@ -219,6 +231,8 @@ class _Writer:
             return f"{told(topic)}; {GUESS} its velocities, because its poses stand still"
         if topic.offers.pose is not None:
             return f"{told(topic)}: {path}" + ("" if topic.offers.twist else f"; {GUESS} it is an odometry")
+        if topic.offers.rates is not None:
+            return f"{told(topic)}; {GUESS} it moves the robot, as there is no odometry and no velocity"
         commanded = ", as commanded" if "cmd" in topic.name else ""
         return f"{told(topic)}; {GUESS} these are velocities of the robot{commanded}"
 
@@ -226,6 +240,8 @@ class _Writer:
     def place(self, topic: TopicSummary) -> tuple[dict[str, Any], str] | None:
         """Return what a topic of positions is, None if it is none or not to be used."""
         if topic.offers.globe is not None and topic.origin is not None:
+            if _is_true(topic):
+                return {"type": "truth"}, f"{told(topic)}; {GUESS} by its name: its positions only score"
             entry: dict[str, Any] = {"type": "fix", "origin": [float(v) for v in topic.origin]}
             if topic.poses.cov is None:
                 why = f"{told(topic)}; {GUESS} sigma_m, as the receiver has no covariance"

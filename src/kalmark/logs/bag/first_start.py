@@ -33,11 +33,13 @@ class Start:
 
 
 def start_of(found: Survey, control: Any, used: Mapping[str, tuple[dict[str, Any], str]], space: bool) -> Start | None:
-    """Return a robot's start in the frame of its fixes, None if nothing tells it or truth does."""
-    if control is None or space or any(entry["type"] == "truth" for entry, _ in used.values()):
+    """Return a robot's start in the frame of its fixes, None if nothing tells it or true poses in that frame do."""
+    if control is None or space:
         return None
-    fixes = [found.named(name) for name, (entry, _) in used.items() if entry["type"] == "fix"]
-    if not fixes:
+    fixes, true = ([found.named(name) for name, (entry, _) in used.items() if entry["type"] == kind]
+                   for kind in ("fix", "truth"))  # fmt: skip
+    of_poses = [topic for topic in true if topic.offers.pose is not None]
+    if not fixes or any(topic.frame == fixes[0].frame or not topic.frame for topic in of_poses):
         return None
     fix, poses = fixes[0], control.poses if isinstance(control, TopicSummary) else found.pairs[control]
     if fix.offers.pose is not None:

@@ -33,7 +33,7 @@ from kalmark.logs.bag.messages import (
     Pose,
     Seen,
 )
-from kalmark.logs.bag.reading import Bag, Received, find_bag, has_header, stamp
+from kalmark.logs.bag.reading import Bag, Received, declared, find_bag, has_header, stamp
 from kalmark.logs.bag.topics import (
     Carried,
     Compass,
@@ -251,25 +251,30 @@ class _Importer:
             self.left_out[received.topic, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
             return
         try:
-            if isinstance(topic, Scans):
-                self.scan(received, topic, offer, t_ns)
-            elif isinstance(topic, Images):
-                self.image(received, topic, t_ns)
-            elif isinstance(topic, InertialTopic):
-                self.inertial(received, topic, offer, t_ns)
-            elif isinstance(topic, Sparse):
-                self.of_robot(received, topic, offer, t_ns)
-            elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
-                self.globe(received, topic, offer.globe(received.message), t_ns)
-            elif isinstance(topic, Posed):
-                self.poses(received, topic, offer, t_ns)
-            elif offer.drive is not None and "drive" in topic.wants:
-                self.control(topic, t_ns, offer.drive(received.message), None)
-            elif offer.twist is not None:
-                self.velocity(topic, t_ns, offer, received.message)
+            with declared():
+                self.taken(received, topic, offer, t_ns)
         except (Refused, EventError) as refused:
             at = f"{received.topic} at t={seconds(t_ns)} s"
             self.request.refuse(f"{self.bag.path}: {at}: {refused}")
+
+    def taken(self, received: Received, topic: Topic, offer: Message, t_ns: int) -> None:
+        """Take what a topic wants of a message.  Raises Refused and EventError."""
+        if isinstance(topic, Scans):
+            self.scan(received, topic, offer, t_ns)
+        elif isinstance(topic, Images):
+            self.image(received, topic, t_ns)
+        elif isinstance(topic, InertialTopic):
+            self.inertial(received, topic, offer, t_ns)
+        elif isinstance(topic, Sparse):
+            self.of_robot(received, topic, offer, t_ns)
+        elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
+            self.globe(received, topic, offer.globe(received.message), t_ns)
+        elif isinstance(topic, Posed):
+            self.poses(received, topic, offer, t_ns)
+        elif offer.drive is not None and "drive" in topic.wants:
+            self.control(topic, t_ns, offer.drive(received.message), None)
+        elif offer.twist is not None:
+            self.velocity(topic, t_ns, offer, received.message)
 
     def time(self, received: Received, topic: Topic) -> int | None:
         """Return the time (ns) of a message, None if its header has 0, which says nothing.
@@ -614,7 +619,7 @@ def images_of(path: Path, name: str) -> Iterator[Any]:
 def frame_id(message: Any) -> str:
     """Return the frame of a message; of markers that of the first."""
     if has_header(message):
-        return str(message.header.frame_id)
+        return str(getattr(message.header, "frame_id", ""))
     markers = getattr(message, "markers", ())
     return str(markers[0].header.frame_id) if markers else ""
 

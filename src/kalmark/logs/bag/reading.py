@@ -9,13 +9,14 @@ import bz2
 import shutil
 import tempfile
 from collections.abc import Collection, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from kalmark.errors import LogError
 from kalmark.events import shown
 from kalmark.logs.source import nearest
+from kalmark.logs.table import Refused
 
 ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which is a folder
@@ -148,4 +149,16 @@ def stamp(message: Any) -> int:
 
 def has_header(message: Any) -> bool:
     """Return whether a message carries a time of its own."""
-    return "header" in vars(type(message)).get("__dataclass_fields__", {})
+    return hasattr(getattr(getattr(message, "header", None), "stamp", None), "nanosec")
+
+
+@contextmanager
+def declared() -> Iterator[None]:
+    """Raise Refused where a field is read that the bag's definition of a message does not have."""
+    try:
+        yield
+    except AttributeError as error:
+        kind = getattr(error.obj, "__msgtype__", None)
+        if kind is None:
+            raise
+        raise Refused(f"{kind}, as the bag defines it, has no field {error.name!r}, expected it to have one") from None

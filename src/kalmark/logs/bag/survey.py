@@ -13,7 +13,7 @@ from kalmark.geometry import rotations
 from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.importer import frame_id
 from kalmark.logs.bag.messages import MESSAGES, Measured, Message, Pose
-from kalmark.logs.bag.reading import Bag, has_header, stamp
+from kalmark.logs.bag.reading import Bag, declared, has_header, stamp
 from kalmark.logs.bag.tables import holds_log
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.table import Refused
@@ -88,7 +88,7 @@ class TopicSummary:
     origin: Array | None = None
     camera: dict[str, Any] | None = None
     first: dict[str, Measured] = field(default_factory=dict)
-    """Of an inertial unit or a compass the first rates, attitude and field."""
+    """Of an inertial unit or a compass the first rates, attitude, force and field."""
 
     @property
     def offers(self) -> Message:
@@ -130,7 +130,7 @@ def survey(path: Path) -> Survey:
             own = has_header(m)
             t_ns = stamp(m) if own else received.recorded_ns
             if own and not summary.frame:
-                summary.frame, summary.child = m.header.frame_id, getattr(m, "child_frame_id", "")
+                summary.frame, summary.child = frame_id(m), getattr(m, "child_frame_id", "")
             if own and t_ns == 0:
                 summary.unset, t_ns = not summary.header, received.recorded_ns
             elif own:
@@ -140,12 +140,12 @@ def survey(path: Path) -> Survey:
                 summary.back_s = max(summary.back_s, (summary.latest_ns - t_ns) * 1e-9)
                 summary.latest_ns = max(summary.latest_ns, t_ns)
             try:
-                _look(summary, m, t_ns)
-                if summary.offers.transforms is not None:
-                    transforms = summary.offers.transforms(m)
-                    frames.take(transforms)
-                    for at, parent, child, frame in transforms:
-                        pairs.setdefault((parent, child), Poses()).take(at, Pose(frame, None, parent, child))
+                with declared():
+                    _look(summary, m, t_ns)
+                    transforms = summary.offers.transforms(m) if summary.offers.transforms is not None else []
+                frames.take(transforms)
+                for at, parent, child, frame in transforms:
+                    pairs.setdefault((parent, child), Poses()).take(at, Pose(frame, None, parent, child))
             except Refused as refused:
                 summary.error = summary.error or str(refused)
         moving = {pair: poses for pair, poses in pairs.items() if pair in frames.moving}
@@ -192,7 +192,7 @@ def _look(summary: TopicSummary, m: Any, t_ns: int) -> None:
             summary.poses.take(t_ns, Pose(np.append(lla, [0.0, 0, 0, 1]), cov, summary.frame, ""))
     if offers.camera is not None and summary.camera is None:
         summary.camera = offers.camera(m)
-    for name in ("rates", "attitude", "field"):
+    for name in ("rates", "attitude", "force", "field"):
         read = getattr(offers, name)
         told = None if read is None or name in summary.first else read(m)
         if told is not None and np.isfinite(told.v).all():
