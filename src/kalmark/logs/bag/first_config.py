@@ -149,7 +149,7 @@ class _Writer:
         ]
         lines = []
         if kind:
-            car = {"wheelbase_m": 2.83, "encoder_offset_m": 0.0} if kind == "ackermann" else {}
+            car: dict[str, Any] = {"wheelbase_m": 2.83, "encoder_offset_m": 0.0} if kind == "ackermann" else {}
             why = f"{GUESS} its wheelbase; " if car else ""
             if kind == "inertial":
                 car, why = {"preset": "mems_imu"}, f"{GUESS} a small unit, whose frame is the robot's; "
