@@ -37,7 +37,7 @@ def best(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
     Surveys that are off go before outliers and noise that would take them up, which are one for all of them, and noise
-    of several columns before outliers that explain no more: these would be one for all columns.
+    of several columns before outliers that explain clearly less: these would be one for all columns.
     A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
     as much, one in the sensors goes before one in the controls.
     """
@@ -47,7 +47,7 @@ def best(sure: list[Finding]) -> list[Finding]:
     if surveys and spread and sum(f.gain for f in surveys) > TAKEN_UP * first.gain:
         return [max(surveys, key=lambda f: f.gain)]
     noisy = [f for f in sure if f.unit == causes.TIMES and f.noise is not None]
-    if first.name == "outliers" and sum(f.gain for f in noisy) >= first.gain:
+    if first.name == "outliers" and ALIKE * sum(f.gain for f in noisy) >= first.gain:
         first = max(noisy, key=lambda f: f.gain)
     jump = [f for f in sure if f.at is not None and f.gain > TAKEN_UP * first.gain]
     if jump and first.unit == causes.TIMES:
