@@ -83,7 +83,7 @@ def run(name: str, seed: int) -> dict[str, float]:
 
 
 def inertial(seed: int) -> dict[str, float]:
-    """Return the errors of a run with the inertial unit, the poses neither moved nor scaled, and NEES of the pose / 6."""
+    """Return the errors of a run with the inertial unit, poses as they are, and NEES of the pose / 6."""
     config, log = open_run("visual_inertial", None, [f"robots.each.sensors.cam0.detector.seed={seed}"])
     slam = build_slam(config, log)
     name, times, means, covariances = log.robots[0], [], [], []
