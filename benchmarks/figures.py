@@ -336,8 +336,10 @@ def storms() -> Iterator[Figure]:
                  "about 60,000 / 0 / all", "python benchmarks/storm.py --events 66000 --share 0.91", row("total", "{1} / {2} / {3} of {4}"))  # fmt: skip
     yield Figure("Bad events", "Odd files, configurations, maps and streams of events, 100 of each target: inputs / taken / broken",
                  "all / some / 0", "python benchmarks/fuzz.py --inputs 100", row("total", "{0} / {1} / {2}"))  # fmt: skip
-    yield Figure("Bad events", "Fuzzing guided by coverage, 10 minutes a target: inputs / crashes, hangs, tracebacks",
-                 "all / 0", "python benchmarks/fuzz.py --seconds 600", row("total", "{0} / {2}"))  # fmt: skip
+    for name in ("native", "mrclam", "config", "map", "process", "parquet", "mcap", "ros1", "sqlite", "matlab", "g2o", "carmen",
+                 "tum", "kitti", "freiburg", "dlr", "plaza"):  # fmt: skip
+        yield Figure("Bad events", f"Fuzzing `{name}` guided by coverage, 10 minutes: inputs / crashes, hangs, tracebacks", "all / 0",
+                     f"python benchmarks/fuzz.py --seconds 600 --timeout 400 {name}", row("total", "{0} / {2}"))  # fmt: skip
     yield Figure("Bad events", "A log of 1,000,000 rows of CSV: time / memory / bytes a row", "- / that of its events / -",
                  "python benchmarks/tables.py --rows 1000000", row("1000000 rows,", "{6} s / {8} MB / {10}"))  # fmt: skip
     yield Figure("Bad events", "Of 10,000,000 rows, event by event (`stream_log`): time / growth of the memory", "- / bounded",

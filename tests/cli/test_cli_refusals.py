@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
@@ -279,3 +280,13 @@ def test_what_is_configured_and_serves_nothing_is_said_in_one_line(kalmark: Kalm
         "warning: robots.each of the configuration stands for no robot of the log: each one is named",
         "warning: no observation is by the sensor lidra of rover, which is configured; did you mean lidar?",
     ]
+
+
+def test_a_full_disk_gets_one_line(kalmark: Kalmark, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("kalmark.config.load_config", full)
+    monkeypatch.setattr("kalmark.config.open_run", full)
+    done = kalmark("run", "native", "--log", ".")
+    assert done.status == 2 and done.err == "kalmark: No space left on device; what was being written is not complete\n"

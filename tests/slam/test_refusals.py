@@ -172,3 +172,12 @@ def test_a_landmark_with_the_name_of_an_inner_block_is_refused_wherever_it_comes
         with pytest.raises(MapError, match="names a robot's bias or mount"):
             slam.add_landmark(name, (1.0, 0.0))
     assert digest(slam) == before
+
+
+def test_a_scan_of_more_observations_than_a_map_can_take_is_refused_and_changes_nothing() -> None:
+    mount = km.Mount(km.sensors.RangeBearing())
+    slam = km.Slam([km.Robot("a", km.motion.Unicycle(sigma_v_mps=0.1), sensors={"lidar": mount})])
+    before = digest(slam)
+    with pytest.raises(EventError, match="1000000 observations, expected at most 5000 in one scan"):
+        slam.process(km.Scan(t_s=1.0, robot="a", sensor="lidar", y=np.ones((1_000_000, 2))))
+    assert digest(slam) == before

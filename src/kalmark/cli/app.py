@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import sys
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from kalmark.cli.tune import tune
 from kalmark.errors import KalmarkError
 
 USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # no place for a file
 INTERRUPTED = 130
 GARBAGE = 10_000  # objects between two collections of garbage: at Python's 700 they take an eighth of a short run
 
@@ -99,6 +101,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return 0
     except OSError as error:
+        if error.errno in FULL:
+            return _refuse(f"{error.strerror}; what was being written is not complete")
         if error.filename is None:
             raise
         return _refuse(f"{error.filename}: {error.strerror}")

@@ -14,6 +14,7 @@ from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
 
 LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
+MOST_OBSERVATIONS = 5000  # of one scan: new landmarks as many take gigabytes, and minutes
 ROUNDING = 1e-3  # of a correlation
 
 
@@ -135,6 +136,8 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
     if event.width != m and (count or event.width):
         expected = f"expected {m}: {', '.join(sensor.columns)}"
         raise EventError(f"{when(event)}: y has {event.width} columns, {expected}")
+    if count > MOST_OBSERVATIONS:
+        raise EventError(f"{when(event)}: {count} observations, expected at most {MOST_OBSERVATIONS} in one scan")
     if count and event.largest > SMALLEST_BOUND:
         refuse_huge(event.y, sensor.columns, when(event))
     if check is not None and count:
