@@ -181,7 +181,9 @@ def test_tum_rgbd_has_each_depth_at_the_nearest_image(tmp_path: Path) -> None:
     assert np.allclose(depths[0], picture(0, depth=True) / 5000)
     assert np.allclose(depths[1], picture(1, depth=True) / 5000)
     assert np.allclose(frames(km.open_log(folder, depth_scale=1000))[0].depths(), picture(0, depth=True) / 1000)
+    assert camera(km.open_log(folder))["type"] == "pixel_depth"
     assert all(f.depth is None for f in frames(km.open_log(folder, depth="none")))
+    assert camera(km.open_log(folder, depth="none"))["type"] == "pinhole"
     assert log.truth["robot"].at(10_050_000_000)[0] == pytest.approx(1.05)
     assert camera(log)["fx_px"] == pytest.approx(517.306 / 10)
     assert camera(log)["cx_px"] == pytest.approx((318.643 + 0.5) / 10 - 0.5)

@@ -30,6 +30,7 @@ SENSORS: list[Any] = [
     km.sensors.PinHole(lens="radtan", distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.0)),
     km.sensors.PinHole(lens="equidistant", distortion=(-0.01, 0.003, 0.0, 0.0)),
     km.sensors.Omnidirectional(),
+    km.sensors.PixelDepth(lens="radtan", distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.0)),
     km.sensors.Stereo(),
     km.sensors.Segments(),
     km.sensors.TagPose(),
@@ -74,6 +75,8 @@ def drawn(rng: np.random.Generator, sensor: Any, landmark: Any) -> tuple[np.ndar
     noise = rng.normal(size=y.shape)
     if landmark.kind == "tag":
         noise[:, 8 if y.shape[1] == 9 else 0 :] = 0.0
+    if "rho_per_m" in sensor.columns:
+        noise[:, 2] *= 0.001
     return np.concatenate([r, mount]), l, y + noise * (1.0 if "u_px" in str(sensor.columns) or y.shape[1] > 7 else 0.01)
 
 

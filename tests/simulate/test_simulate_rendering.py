@@ -138,5 +138,7 @@ def test_images_want_a_world_of_textures_and_a_camera() -> None:
     with pytest.raises(ConfigError, match="expected images in a world of textures, textured_room or textured_planes"):
         load_world("textured_room", [room])
     stereo = "robots.robot.sensors.camera={type: stereo, mount: {roll_deg: -90}}"
-    with pytest.raises(ConfigError, match="expected images of pinhole or omnidirectional, not of 'camera', a stereo"):
+    with pytest.raises(
+        ConfigError, match="expected images of pinhole or pixel_depth or omnidirectional, not of 'camera', a stereo"
+    ):
         load_world("textured_room", [stereo])

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, to_frame_many
+from kalmark.geometry.frames3d import compose, from_euler_pose, from_frame_many, minus, to_frame_many
 from kalmark.simulate.rendering import Plane, Renderer, texture
 from kalmark.tracks.prospect import Prospect
 from kalmark.vision.appearance import predicted, taken
+from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.matching import Searcher, correlation
 from kalmark.vision.selection import Search
 
@@ -144,13 +145,17 @@ def test_one_point_ransac_rejects_planted_outliers_and_keeps_the_rest(seed: int)
     assert sorted(np.flatnonzero(~found.matched).tolist()) == sorted(out)
 
 
-def room(frames: int) -> tuple[list[km.Frame], np.ndarray]:
-    """Return images of a corner of a room on a way with curves, and the poses of the camera."""
-    sides = [
+def sides() -> list[Plane]:
+    """Return the walls of a corner of a room."""
+    return [
         wall(), Plane(pose(-2.0, -1.5, 2.0, 0, 90, 0), texture(3.0, 3.0, 0.004, np.random.default_rng(4), 60.0), 0.004),
         Plane(pose(-2.0, 0.9, 2.0, -90, 0, 0), texture(4.0, 3.0, 0.004, np.random.default_rng(6), 60.0), 0.004),
     ]  # fmt: skip
-    renderer, rng, T = Renderer(sides, CAMERA), np.random.default_rng(1), []
+
+
+def room(frames: int) -> tuple[list[km.Frame], np.ndarray]:
+    """Return images of a corner of a room on a way with curves, and the poses of the camera."""
+    renderer, rng, T = Renderer(sides(), CAMERA), np.random.default_rng(1), []
     for k in range(frames):
         a = 0.05 * k
         T.append(pose(0.4 * np.sin(a), 0.15 * np.sin(2 * a), 0.2 * (1 - np.cos(a)), 2 * np.sin(a), -6 * np.sin(a), 0))
@@ -158,13 +163,15 @@ def room(frames: int) -> tuple[list[km.Frame], np.ndarray]:
     return [km.Frame(k / 30, "camera", "eye", image) for k, image in enumerate(images)], np.array(T)
 
 
-def searching(seed: int = 0) -> km.Slam:
+def searching(seed: int = 0, others: dict[str, np.ndarray] | None = None, camera: Any = CAMERA) -> km.Slam:
+    """Return a map seen by a `camera`, its sensor "eye", and by `others` like it on their mounts."""
     motion = km.motion.ConstantVelocity3D(sigma_v_mps_per_sqrt_s=0.5, sigma_w_radps_per_sqrt_s=0.5)
     start = np.array([0, 0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0])
     landmark = km.landmarks.Homogeneous(prior_rho_per_m=0.5, sigma_rho_per_m=0.25)
     detector = km.vision.ActiveSearch(in_view=30, seed=seed)
-    mount = km.Mount(CAMERA, at=(0, 0, 0, 0, 0, 0, 1), landmark=landmark, detector=detector)
-    robot = km.Robot("camera", motion, start, {"eye": mount}, np.diag([0.0] * 6 + [0.3] * 6))
+    mounts = {"eye": pose(0, 0, 0, 0, 0, 0)} | (others or {})
+    sensors = {name: km.Mount(camera, at=at, landmark=landmark, detector=detector) for name, at in mounts.items()}
+    robot = km.Robot("camera", motion, start, sensors, np.diag([0.0] * 6 + [0.3] * 6))
     return km.Slam(robot, map="dense")
 
 
@@ -206,3 +213,95 @@ def test_a_frame_whose_image_cannot_be_read_changes_nothing() -> None:
         slam.process(km.Frame(1.0, "camera", "eye", lambda: np.zeros((240, 320))))
     assert slam.t_ns == 0
     assert np.array_equal(slam.mean("camera"), before)
+
+
+def test_two_cameras_share_a_map_whose_landmarks_each_finds_by_its_own_patches_and_resume(tmp_path: Path) -> None:
+    frames, true = room(24)
+    side = pose(0.12, 0.0, 0.0, 0, 4, 0)
+    renderer, rng = Renderer(sides(), CAMERA), np.random.default_rng(2)
+    events = []
+    for k, frame in enumerate(frames):
+        image = renderer.taken(compose(true[k], side)[0], rng, noise=1.0, blur_px=0.6)[0]
+        events += [frame, km.Frame(t_ns=frame.t_ns, robot="camera", sensor="side", image=image)]
+    one = searching(others={"side": side})
+    for k, event in enumerate(events):
+        report = one.process(event)
+        if k == 22:  # after an image of the one, before that of the other
+            one.save(tmp_path / "map.kmk")
+    assert sum(o.outcome == "associated" for o in report.observations) > 15
+    names = {str(name).rsplit(" ", 1)[0] for name in one.landmarks().ids}
+    assert names == {"camera.eye", "camera.side"}
+    looks = {key: front_end.looks for key, front_end in one.state.front_ends.items()}
+    assert set(looks["camera", "eye"]) | set(looks["camera", "side"]) == set(one.landmarks().ids)
+    again = km.Slam.load(tmp_path / "map.kmk")
+    for event in events[23:]:
+        again.process(event)
+    assert np.array_equal(one.mean("camera"), again.mean("camera"))
+    assert np.array_equal(one.covariance("camera"), again.covariance("camera"))
+    assert one.landmarks().ids == again.landmarks().ids
+
+
+DEEP = km.sensors.PixelDepth(
+    fx_px=250, fy_px=250, cx_px=159.5, cy_px=119.5, width_px=320, height_px=240, sigma_px=0.5, sigma_rho_per_m=0.003
+)
+
+
+def test_the_depth_of_a_pixel_counts_where_all_around_it_agree_and_what_is_expected_agrees() -> None:
+    depth = np.full((20, 30), 2.0)
+    depth[:, 15:] = 3.0  # an edge
+    depth[5, 5] = 0.0  # a hole
+    y = np.array([[10.2, 10.0], [14.4, 10.0], [20.0, 8.0], [6.0, 6.0], [0.0, 0.0], [29.0, 19.0]])
+    rho = inverse_depths(depth, y, 0.003)
+    np.testing.assert_allclose(rho, [0.5, np.nan, 1 / 3, np.nan, 0.5, 1 / 3])
+    landmark = km.landmarks.Homogeneous(prior_rho_per_m=0.4, sigma_rho_per_m=0.2)
+    e, variance = np.array([0.501, 0.4, 0.7]), np.full(3, 1e-5)
+    out, R = with_depths(DEEP, landmark, y, rho, e, variance)
+    z = DEEP.rays(y)[:, 2]
+    np.testing.assert_allclose(
+        out[:, 2], [0.5, 0.4, 0.7, 0.4 / z[3], 0.5, 1 / 3]
+    )  # one at an edge, one not as expected
+    np.testing.assert_allclose(np.sqrt(R[:, 2, 2]), [0.003, 1e3, 1e3, 0.2 / z[3], 0.003, 0.003])
+    np.testing.assert_allclose(R[:, :2, :2], np.tile(0.25 * np.eye(2), (6, 1, 1)))
+    bare = with_depths(DEEP, km.landmarks.Point3D(), y, rho, e, variance)[0]
+    assert np.isnan(bare[:, 2]).tolist() == [False, False, False, True, False, False]  # it cannot start
+
+
+def with_depth(frames: list[km.Frame], true: np.ndarray, holes: bool) -> list[km.Frame]:
+    """Return the frames with depths beside them, noisy as a disparity is, with holes in half of the image or not."""
+    renderer, rng, found = Renderer(sides(), CAMERA), np.random.default_rng(8), []
+    for frame, T in zip(frames, true, strict=True):
+        depth = renderer.render(T)[1].astype(np.float64)
+        rho = 1.0 / depth + rng.normal(0.0, 0.003, depth.shape)
+        there = np.isfinite(depth) & (rho > 0)
+        if holes:
+            there[:, :160] = False
+        found.append(km.Frame(frame.t_s, "camera", "eye", frame.image, np.where(there, 1.0 / rho, 0.0)))
+    return found
+
+
+@pytest.mark.parametrize("holes", [False, True])
+def test_a_camera_with_depths_knows_the_scale_also_where_half_of_the_image_has_none(holes: bool) -> None:
+    frames, true = room(60)
+    slam, off, nees = searching(camera=DEEP), [], []
+    for frame, T in zip(with_depth(frames, true, holes), true, strict=True):
+        slam.process(frame)
+        error = minus(slam.mean("camera")[:7], T)
+        off.append(error[:3])
+        P = slam.covariance("camera")[:6, :6]
+        if np.linalg.cond(P) < 1e12:
+            nees.append(error @ np.linalg.solve(P, error))
+    length = np.linalg.norm(np.diff(true[:, :3], axis=0), axis=1).sum()
+    assert np.sqrt(np.mean(np.sum(np.square(off), axis=1))) < 0.01 * length  # in metres, nothing aligned
+    assert np.mean(nees) < 12  # 6 degrees of freedom
+    depths = slam.state.front_ends["camera", "eye"].prospect
+    assert depths.belief.e.shape[1] == 3
+
+
+def test_a_frame_whose_depths_are_of_another_size_changes_nothing() -> None:
+    slam = searching(camera=DEEP)
+    image = room(1)[0][0].image
+    with pytest.raises(km.errors.EventError, match=r"the depths are \(120, 160\), expected \(240, 320\) as the image"):
+        slam.process(km.Frame(0.0, "camera", "eye", image, np.ones((120, 160))))
+    assert not slam.landmarks().ids
+    slam.process(km.Frame(0.0, "camera", "eye", image))  # without depths: pixels alone
+    assert slam.landmarks().ids

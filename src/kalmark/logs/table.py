@@ -40,7 +40,7 @@ OBSERVATION = (
     "range_m", "bearing_rad", "azimuth_rad", "elevation_rad", "signature",
     "distance_m", "normal_rad", "right_m", "left_m",
     "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "x2_m", "y2_m", "z2_m",
-    "u_px", "v_px", "ul_px", "vl_px", "ur_px", "vr_px",
+    "u_px", "v_px", "rho_per_m", "ul_px", "vl_px", "ur_px", "vr_px",
     "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
 )  # fmt: skip
 READING = (  # of a robot itself by its own sensors, and of senders

@@ -117,6 +117,26 @@ def camera(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[A
 
 
 @compiled
+def pixel_depth(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z (K, 3), E_v (K, 3, d) of pixels of a camera, `code` its lens, with 1 / depth along its axis."""
+    k, d = len(v), v.shape[1]
+    e, z, E_v = np.empty((k, 3)), np.empty((k, 3)), np.zeros((k, 3, d))
+    pixel, shift, E_pixel = camera(code, par, angular, v, y)
+    for i in range(k):
+        rho = v[i, 3] if d == 4 else 1.0  # v is (x, y, z), or a ray with its inverse distance
+        for a in range(2):
+            e[i, a], z[i, a] = pixel[i, a], shift[i, a]
+            for b in range(d):
+                E_v[i, a, b] = E_pixel[i, a, b]
+        e[i, 2] = rho / v[i, 2]
+        z[i, 2] = y[i, 2] - e[i, 2]
+        E_v[i, 2, 2] = -rho / (v[i, 2] * v[i, 2])
+        if d == 4:
+            E_v[i, 2, 3] = 1.0 / v[i, 2]
+    return e, z, E_v
+
+
+@compiled
 def stereo(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return e, z (K, 4), E_v (K, 4, 3) of the pixels of a stereo pair."""
     e, E_v = cameras.project_stereo(v, par[:4], par[4])

@@ -48,10 +48,10 @@ from kalmark.models.state_sensors import (
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "Bearing", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity",
     "GroundSpeed", "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D",
-    "Omnidirectional", "PinHole", "Position2D", "Position3D", "Radar2D", "Radar3D", "Range", "RangeBearing",
-    "RangeBearing3D", "RangeBearingSignature", "RangeDifference2D", "RangeDifference3D", "RangeRate2D", "RangeRate3D",
-    "Segments", "SignalStrength2D", "SignalStrength3D", "Speed", "Stereo", "TagCorners", "TagPose", "Wall",
-    "ZeroVelocity2D", "ZeroVelocity3D",
+    "Omnidirectional", "PinHole", "PixelDepth", "Position2D", "Position3D", "Radar2D", "Radar3D", "Range",
+    "RangeBearing", "RangeBearing3D", "RangeBearingSignature", "RangeDifference2D", "RangeDifference3D", "RangeRate2D",
+    "RangeRate3D", "Segments", "SignalStrength2D", "SignalStrength3D", "Speed", "Stereo", "TagCorners", "TagPose",
+    "Wall", "ZeroVelocity2D", "ZeroVelocity3D",
 ]  # fmt: skip
 
 TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed
@@ -549,6 +549,10 @@ class _Camera(Spatial):
         """Return the viewing rays (K, 3), unit vectors, of pixels y (K, 2), and their Jacobian (K, 3, 2)."""
         return cameras.back_project(self.code, np.ascontiguousarray(y), np.array(self.parameters))
 
+    def rays(self, y: Array) -> Array:
+        """Return the viewing rays (K, 3), unit vectors, of pixels y (K, 2)."""
+        return _Camera.invert(self, y)[0]
+
 
 @declared
 class _PinHole(_Camera):
@@ -609,6 +613,35 @@ class PinHole(_Lens):
 
     [TB] pinHole.  `calibration` names a file of OpenCV, Kalibr, ROS or EuRoC instead: cameras.md.
     """
+
+
+@register("sensor", "pixel_depth")
+class PixelDepth(_Lens):
+    """A camera that measures the depth of its pixels along its axis (RGB-D): u, v and the inverse depth.
+
+    Structured light and stereo measure a disparity, proportional to 1 / z: its noise is the same at any depth, that of
+    the depth is sigma_rho z^2.  Khoshelham and Elberink 2012 (Kinect): 1.4e-3 / m.
+    """
+
+    sigma_rho_per_m: Annotated[Positive, "Noise of the inverse depth: that of a depth z is sigma_rho z^2."] = 0.003
+
+    expected: ClassVar[Any] = seen.pixel_depth
+    columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px", "rho_per_m")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_px", "sigma_px", "sigma_rho_per_m")
+    finds_depth: ClassVar[bool] = True
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return unit rays with their inverse distances (K, 4) of y (K, 3), and their Jacobian (K, 4, 3)."""
+        m, M_y = super().invert(np.array(y[:, :2]))
+        V_y = np.zeros((len(y), 4, 3))
+        V_y[:, :3, :2], V_y[:, 3, :2], V_y[:, 3, 2] = M_y, M_y[:, 2] * y[:, 2:], m[:, 2]
+        return np.column_stack([m, m[:, 2] * y[:, 2]]), V_y
+
+    def check(self, y: Array) -> None:
+        """Refuse observations y (K, 3) behind the camera."""
+        for i, row in enumerate(y):
+            if row[2] < 0:
+                raise EventError(f"observation {i}: rho_per_m is {row[2]}, expected at least 0")
 
 
 @register("sensor", "omnidirectional")

@@ -115,9 +115,15 @@ def rendered(renderer: Renderer, T: Array, seed: int, noise: float, blur_px: flo
     return renderer.taken(T, np.random.default_rng(seed), noise, blur_px)[0]
 
 
-def rendered_depth(renderer: Renderer, T: Array) -> Array:
-    """Return the depth (H, W) in m from the camera's pose T (7,), to 1 / DEPTH_SCALE m as in files; 0: no plane."""
+def rendered_depth(renderer: Renderer, T: Array, seed: int = 0, sigma_rho: float = 0.0) -> Array:
+    """Return the depth (H, W) in m from the camera's pose T (7,), to 1 / DEPTH_SCALE m as in files; 0: no plane.
+
+    Its inverse has a noise of `sigma_rho` [1/m], by a seed.
+    """
     depth = renderer.render(T)[1].astype(np.float64)
+    if sigma_rho:
+        rho = 1.0 / depth + np.random.default_rng(seed).normal(0.0, sigma_rho, depth.shape)
+        depth = np.where(np.isfinite(depth) & (rho > 0), 1.0 / np.where(rho > 0, rho, 1.0), 0.0)
     return np.rint(np.where(np.isfinite(depth), depth, 0.0) * DEPTH_SCALE) / DEPTH_SCALE
 
 

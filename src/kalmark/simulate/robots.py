@@ -42,6 +42,7 @@ from kalmark.models.protocols import (
     range_limit,
     true_control,
 )
+from kalmark.models.sensors import PixelDepth
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
@@ -332,7 +333,8 @@ def taken(robot: SimRobot, name: str, carried: SimSensor, renderer: Renderer, t_
     """Return the frame of a camera from its robot's true pose, rendered when its pixels are needed."""
     T, sensing, seed = composed(robot.pose, carried.at)[0], carried.sensing, int(chance.sight.integers(2**62))
     image = partial(rendered, renderer, T, seed, sensing.noise_grey, sensing.blur_px)
-    depth = partial(rendered_depth, renderer, T) if sensing.depth else None
+    sigma = carried.sensor.sigma_rho_per_m if isinstance(carried.sensor, PixelDepth) else 0.0
+    depth = partial(rendered_depth, renderer, T, seed + 1, sigma) if sensing.depth else None
     return Frame(t_ns=t_ns, robot=robot.name, sensor=name, image=image, depth=depth)
 
 

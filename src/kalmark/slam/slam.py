@@ -164,9 +164,12 @@ class Slam(Estimate):
     def _searched(self, event: Frame, front_end: FrontEnd) -> Report:
         """Search a frame for the landmarks that are expected in it.  [S] 2.4."""
         state, channel, image = self.state, self.state.channels[event.robot, event.sensor], event.grey()
+        depth = event.depths() if channel.finds_depth else None
+        if depth is not None and depth.shape != image.shape:
+            raise EventError(f"{when(event)}: the depths are {depth.shape}, expected {image.shape} as the image")
         state.t_ns = event.t_ns
         gaps = moves.advance(state, event.robot)
-        scan, removed = front_end.search(event, image, Prospect(state.map, state.tracks, channel, event.robot))
+        scan, removed = front_end.search(event, image, Prospect(state.map, state.tracks, channel, event.robot), depth)
         for name, _ in removed:
             state.remove(name)
         report = self._found(scan)

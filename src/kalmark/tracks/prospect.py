@@ -27,6 +27,7 @@ from kalmark.models.observe import linearize
 from kalmark.tracks.channel import Channel, ObservationModel, in_frame
 from kalmark.tracks.track import Tracks
 
+PIXEL = 2  # numbers of a measurement that are searched for: the first ones, the place in the image
 LEAST_RHO = 1e-3  # 1/m: a point of unknown depth is looked at as if it were so far away at most
 
 
@@ -43,12 +44,20 @@ class _Group(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is believed of the landmarks in view after some measurements: e (K, 2), joint S (2 K, 2 K), C and d."""
+    """What is believed of the landmarks in view after some measurements: e (K, m), joint S (m K, m K), C and d.
+
+    A measurement has m numbers; those made of some landmarks are `PIXEL`s, the first two of them.
+    """
 
     e: Array
     S: Array
     C: Array
     d: Array
+
+    @property
+    def pixels(self) -> Array:
+        """Where the landmarks are expected in the image (K, 2)."""
+        return self.e[:, :PIXEL]
 
 
 class Prospect:
@@ -133,14 +142,18 @@ class Prospect:
 
     # ------------------------------------------------------------------ what measurements say
     def innovations(self, belief: Belief, rows: Index) -> Array:
-        """Return the covariances Z (k, p, p) of the innovations of some landmarks, each by itself."""
+        """Return the covariances Z (k, 2, 2) of the innovations of some landmarks' pixels, each by itself."""
+        return self.whole_innovations(belief, rows)[:, :PIXEL, :PIXEL]
+
+    def whole_innovations(self, belief: Belief, rows: Index) -> Array:
+        """Return the covariances Z (k, m, m) of the innovations of some landmarks, each by itself."""
         k, p = belief.e.shape
         blocks = belief.S.reshape(k, p, k, p)
         return blocks[rows, :, rows, :] + self.R[rows]
 
     def moved(self, belief: Belief, rows: Sequence[int] | Index, y: Array) -> Array:
-        """Return d (N,) after measurements y (k, m) of some landmarks."""
-        return belief.d + self._gain(belief, rows) @ (y - belief.e[rows]).ravel()
+        """Return d (N,) after measurements y (k, 2) of some landmarks."""
+        return belief.d + self._gain(belief, rows) @ (y - belief.pixels[rows]).ravel()
 
     def expected(self, d: Array) -> Array:
         """Return what is expected (K, m) of all landmarks from the mean moved by d (N,)."""
@@ -156,27 +169,30 @@ class Prospect:
         return e
 
     def after(self, belief: Belief, rows: Sequence[int] | Index, y: Array) -> Belief:
-        """Return what is believed after measurements y (k, m) of some landmarks."""
-        p = belief.e.shape[1]
-        flat = (p * np.asarray(rows)[:, None] + np.arange(p)).ravel()
+        """Return what is believed after measurements y (k, 2) of some landmarks."""
+        flat = _of_pixels(belief, rows)
         K, S_i = self._gain(belief, rows), belief.S[flat]
-        d = belief.d + K @ (y - belief.e[rows]).ravel()
+        d = belief.d + K @ (y - belief.pixels[rows]).ravel()
         G = np.linalg.solve(self._innovation(belief, rows), S_i)
         return Belief(self.expected(d), belief.S - S_i.T @ G, belief.C - belief.C[:, flat] @ G, d)
 
     def _innovation(self, belief: Belief, rows: Sequence[int] | Index) -> Array:
-        p = belief.e.shape[1]
-        flat = (p * np.asarray(rows)[:, None] + np.arange(p)).ravel()
+        flat, p = _of_pixels(belief, rows), PIXEL
         Z: Array = belief.S[np.ix_(flat, flat)]
         for k, i in enumerate(rows):
-            Z[p * k : p * k + p, p * k : p * k + p] += self.R[i]
+            Z[p * k : p * k + p, p * k : p * k + p] += self.R[i, :p, :p]
         return Z
 
     def _gain(self, belief: Belief, rows: Sequence[int] | Index) -> Array:
-        p = belief.e.shape[1]
-        flat = (p * np.asarray(rows)[:, None] + np.arange(p)).ravel()
+        flat = _of_pixels(belief, rows)
         K = np.linalg.solve(self._innovation(belief, rows), belief.C[:, flat].T).T
         return np.asarray(K, dtype=np.float64)
+
+
+def _of_pixels(belief: Belief, rows: Sequence[int] | Index) -> Index:
+    """Return the rows of S (2 k,) of the pixels of some landmarks."""
+    flat: Index = (belief.e.shape[1] * np.asarray(rows)[:, None] + np.arange(PIXEL)).ravel()
+    return flat
 
 
 def _places(model: ObservationModel, l: Array) -> Array:

@@ -57,7 +57,7 @@ def taken(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int, frame: 
     if not (q <= y[0] <= width - 1 - q and q <= y[1] <= height - 1 - q):
         return None
     patch = cv2.getRectSubPix(image, (2 * q + 1, 2 * q + 1), (float(y[0]), float(y[1])))
-    rays = sensor.invert(corners(y, q))[0]
+    rays = sensor.rays(corners(y, q))
     return View(patch, T.copy(), rays, frame) if np.isfinite(rays).all() else None
 
 
@@ -99,7 +99,7 @@ def predicted(cv2: Any, views: list[list[View]], places: Array, T: Array, sensor
         along = view.rays @ x
         X[i] = view.T[:3] + (view.rays * (x @ x / along)[:, None]) @ turn.T
     seen = (X.reshape(-1, 3) - T[:3]) @ matrix(T[3:])
-    pixels = sensor.expect(np.ascontiguousarray(seen))[0].reshape(-1, 5, 2)
+    pixels = sensor.expect(np.ascontiguousarray(seen))[0][:, :2].reshape(-1, 5, 2)
     for i, k in enumerate(told):
         view = best[k]
         assert view is not None

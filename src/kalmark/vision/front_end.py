@@ -19,11 +19,12 @@ from kalmark.arrays import Array
 from kalmark.declare import Count, Positive, Within, register
 from kalmark.errors import ModelError
 from kalmark.events import Frame, Id, Scan
-from kalmark.models.sensors import PinHole
+from kalmark.models.sensors import PinHole, PixelDepth
 from kalmark.report import Report
-from kalmark.tracks.prospect import Prospect
+from kalmark.tracks.prospect import PIXEL, Prospect
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
 from kalmark.vision.beginning import Beginning, Begun
+from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.features import Cells
 from kalmark.vision.matching import Searcher
 from kalmark.vision.selection import Search, Selection
@@ -108,8 +109,8 @@ class FrontEnd:
         self.sighting: Sighting | None = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
-    def search(self, frame: Frame, image: Any, prospect: Prospect) -> Sighting:
-        """Search an image (H, W) for the landmarks of a prospect, and for new ones."""
+    def search(self, frame: Frame, image: Any, prospect: Prospect, depth: Array | None = None) -> Sighting:
+        """Search an image (H, W) for the landmarks of a prospect, and for new ones; `depth` (H, W) in m, 0: none."""
         t0 = perf_counter()
         settings, cv2 = self.settings, self.cv2
         self.frame += 1
@@ -128,11 +129,16 @@ class FrontEnd:
         new = self._new(image, found, prospect, len(rows))
         ids += [self._name(frame) for _ in new]
         removed += self._room(len(new), {name for name, _ in removed}, prospect)
-        y = np.concatenate([y, new])
+        y, cov = np.concatenate([y, new]), None
+        if self.sensor.columns == PixelDepth.columns:
+            y, cov = self._with_depths(y, rows, depth, prospect, found)
+            there = np.flatnonzero(np.isfinite(y).all(axis=1))
+            y, cov, ids = y[there], cov[there], [ids[k] for k in there.tolist()]
         t3 = perf_counter()
         for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", t3 - t2)):
             self.times[part] += spent
-        scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None)
+        scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None,
+                    cov=cov if len(y) else None)  # fmt: skip
         self.sighting = Sighting(scan, removed)
         return self.sighting
 
@@ -146,7 +152,7 @@ class FrontEnd:
             if name is None:
                 continue
             if o.outcome == "new":
-                view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH, self.frame - 1)
+                view = taken(self.cv2, self.image, report.y[o.index, :PIXEL], T, self.sensor, PATCH, self.frame - 1)
                 if view is not None:
                     self.looks[name] = Look([view], seen=self.frame)
             elif o.outcome == "associated":
@@ -155,7 +161,7 @@ class FrontEnd:
                 cosine, scale = self.likeness[at[name]]
                 other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
                 if other and len(look.views) < MOST_VIEWS:
-                    view = taken(self.cv2, self.image, report.y[o.index], T, self.sensor, PATCH, self.frame - 1)
+                    view = taken(self.cv2, self.image, report.y[o.index, :PIXEL], T, self.sensor, PATCH, self.frame - 1)
                     look.views += [view] if view is not None else []
         for name, _ in report.removed:
             self.looks.pop(name, None)
@@ -247,8 +253,17 @@ class FrontEnd:
         wanted = min(self.settings.in_view - count, self.settings.starts if len(self.looks) else self.settings.in_view)
         if wanted <= 0:
             return np.zeros((0, 2))
-        e = np.where(found.matched[:, None], found.y, found.belief.e)
+        e = np.where(found.matched[:, None], found.y, found.belief.pixels)
         return self.cells.corners(image, e[np.isfinite(e).all(axis=1)], wanted, PATCH + 1, self.frame, self.random)
+
+    def _with_depths(
+        self, y: Array, rows: list[int], depth: Array | None, prospect: Prospect, found: Selection
+    ) -> tuple[Array, Array]:
+        """Return measurements (n, 3) and their noise (n, 3, 3) of pixels y (n, 2), the first of landmarks `rows`."""
+        sensor = prospect.sensor
+        rho = np.full(len(y), np.nan) if depth is None else inverse_depths(depth, y, sensor.sigma_rho_per_m)
+        Z = prospect.whole_innovations(found.belief, np.array(rows, dtype=np.int64))
+        return with_depths(sensor, prospect.channel.landmark, y, rho, found.belief.e[rows, 2], Z[:, 2, 2])
 
     def _count(self, prospect: Prospect, found: Selection) -> list[tuple[Id, str]]:
         """Count searches; return the landmarks that are given up, each with the reason."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.report import Report
+from kalmark.tracks.prospect import PIXEL
 from kalmark.vision.front_end import FrontEnd
 from kalmark.vision.selection import GATE
 
@@ -40,5 +41,5 @@ def overlay(front_end: FrontEnd, report: Report, scale: int = 1) -> Any:
     for o in report.observations:
         radius, filled = (4 * scale * FINE, 1) if o.outcome == "new" else (2 * scale * FINE, -1)
         colour = {"new": NEW, "associated": MATCH}.get(o.outcome, REJECTED)
-        cv2.circle(picture, place(report.y[o.index]), radius, colour, filled, cv2.LINE_AA, 4)
+        cv2.circle(picture, place(report.y[o.index, :PIXEL]), radius, colour, filled, cv2.LINE_AA, 4)
     return picture

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.tracks.prospect import Belief, Prospect
+from kalmark.tracks.prospect import PIXEL, Belief, Prospect
 from kalmark.vision.matching import Searcher
 
 GATE = 9.0  # of d2: three sigmas of each axis of an ellipse
@@ -48,7 +48,7 @@ class Search:
 
     def __init__(self, prospect: Prospect, told: Index, searcher: Searcher, updates: int) -> None:
         self.prospect, self.told, self.searcher, self.updates = prospect, told, searcher, updates
-        self.sigma = np.sqrt(np.diagonal(prospect.R, axis1=1, axis2=2).max(axis=1, initial=0.0))
+        self.sigma = np.sqrt(np.diagonal(prospect.R, axis1=1, axis2=2)[:, :PIXEL].max(axis=1, initial=0.0))
         k = len(prospect)
         self.found = Selection(
             prospect.belief, np.full((k, 2), np.nan), np.zeros(k, np.bool_), np.zeros(k, np.bool_),
@@ -90,7 +90,7 @@ class Search:
     def _agreeing(self, base: int, y: Array) -> tuple[Index, Array]:
         """Return the landmarks (n,) that are found where the match y (1, 2) of one says that they are, and where."""
         prospect, prior = self.prospect, self.prospect.belief
-        e = prospect.expected(prospect.moved(prior, [base], y))
+        e = prospect.expected(prospect.moved(prior, [base], y))[:, :PIXEL]
         others = self.told[self.told != base]
         at, scores = self.searcher.in_discs(others, e[others], AGREE * self.sigma[others])
         good = np.flatnonzero(scores >= self.searcher.accept)
@@ -98,7 +98,7 @@ class Search:
         return np.concatenate([[base], others[fits]]), np.concatenate([y, at[fits]])
 
     def _d2(self, belief: Belief, rows: Index, y: Array) -> Array:
-        z = y - belief.e[rows]
+        z = y - belief.pixels[rows]
         return np.einsum(
             "ka,ka->k", z, np.linalg.solve(self.prospect.innovations(belief, rows), z[:, :, None])[:, :, 0]
         )
@@ -137,7 +137,7 @@ class Search:
 
     def _in_ellipses(self, belief: Belief, rows: Index) -> tuple[Array, Flags]:
         """Return where landmarks are found in their ellipses (n, 2), and which are (n,)."""
-        found, Z, e = self.found, self.prospect.innovations(belief, rows), belief.e[rows]
+        found, Z, e = self.found, self.prospect.innovations(belief, rows), belief.pixels[rows]
         found.searched[rows], found.centres[rows], found.regions[rows] = True, e, Z
         area = math.pi * GATE * np.sqrt(np.maximum(np.linalg.det(Z), 1e-12))
         smaller = np.minimum(1.0, MOST_AREA_PX / area)[:, None, None]

@@ -1,6 +1,7 @@
 """The layout of TUM RGB-D (Sturm and others, 2012): `rgb.txt`, `depth.txt` and `groundtruth.txt`.
 
-The robot is the colour camera.  A depth image belongs to the colour image nearest in time, within 20 ms.
+The robot is the colour camera.  A depth image belongs to the colour image nearest in time, within 20 ms; with depth
+images the camera is one that measures depths (`pixel_depth`).
 """
 
 from __future__ import annotations
@@ -46,6 +47,8 @@ def read(path: Path, request: Request, depth: Any = "auto", depth_scale: Any = D
     poses = path / "groundtruth.txt"
     truth = {ROBOT: read_path(poses, request)} if poses.is_file() else {}
     section = camera(frames, calibration_beside(path) or published(path.resolve().name))
+    if depths:
+        section["type"] = "pixel_depth"
     return camera_log("tum_rgbd", path, request, frames, {CAMERA: section}, name=path.name, truth=truth)
 
 
