@@ -13,7 +13,7 @@ from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, Ints
-from kalmark.diagnosis import copies
+from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding, Where
 from kalmark.diagnosis.gross import fit, gross, started_at, until
 from kalmark.diagnosis.jumps import LISTED, OddControl, joined, odd_control
@@ -48,6 +48,9 @@ FEW = 0.01  # of landmarks or observations: a mistake about no more than these i
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
+SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to associations comes after it
+LOSES_TRACK = ("kidnapped", "gap")
+STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped anew because of it
 COPIES = "copies"  # the cause that events come twice
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
 LOOKED_INTO = 3  # segments with the worst scans
@@ -139,9 +142,15 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         causes += odd_controls(run, log)
     twice = any(cause.name == COPIES for cause in first)  # then the filter is too sure for that
     causes = sorted([*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, -c.score))
-    causes = sorted([*first, *causes], key=lambda c: c.harmless)
+    if not any(
+        cause.name in LOSES_TRACK and not cause.harmless for cause in first
+    ):  # then it is that what doubles maps
+        steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
+        first = [*(c for c in causes if c.name in steady and c.score > SURELY), *first]
+    causes = [*first, *(c for c in causes if c not in first)]
+    causes.sort(key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(
-        c.name == "misplaced_landmark" and not c.harmless for c in first
+        c.name in ("misplaced_landmark", "split_landmarks") and not c.harmless for c in first
     )
     if effect.status == "ok" and wrong:
         effect = replace(effect, status="doubtful")
@@ -320,7 +329,9 @@ def misplaced(run: Run, finding: Finding) -> bool:
 def _structural(run: Run, log: Log) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
     return [
+        *carried_away(run, log),
         *repeats(run.summary),
+        *split_landmarks(run),
         *misplaced_landmarks(run),
         *gaps(run.summary),
         *given_up(run),
@@ -412,15 +423,44 @@ def gaps(summary: dict[str, Any]) -> list[Cause]:
 
 
 def repeats(summary: dict[str, Any]) -> list[Cause]:
-    """Return the parts of the map that agree, as if one place were mapped twice."""
-    found = []
-    for repeat in summary.get("repeats", ()):
-        number, shift = len(repeat["landmarks"]), figure(float(np.linalg.norm(repeat["shift_m"])))
-        evidence = f"{number} landmarks repeat {number} others {shift} m away: one place is mapped twice"
-        found.append(
-            Cause("map_repeats", repeat["start_s"] or 0.0, repeat["score"], evidence, "--set upkeep.repeats=merge")
+    """Return the parts of the map that agree, as if one place were mapped twice, as one cause: the largest of them."""
+    parts = sorted(summary.get("repeats", ()), key=lambda part: -len(part["landmarks"]))
+    if not parts:
+        return []
+    number, shift = len(parts[0]["landmarks"]), figure(float(np.linalg.norm(parts[0]["shift_m"])))
+    more = f"; {count(len(parts) - 1, 'more such part')}" if len(parts) > 1 else ""
+    evidence = f"{number} landmarks repeat {number} others {shift} m away: one place is mapped twice{more}"
+    since_s, score = min(part["start_s"] or 0.0 for part in parts), sum(part["score"] for part in parts)
+    return [Cause("map_repeats", since_s, score, evidence, "--set upkeep.repeats=merge")]
+
+
+def carried_away(run: Run, log: Log) -> Iterator[Cause]:
+    """Yield that the robot was carried away where a place was mapped anew: what it saw until then vanished at once.
+
+    Not if its controls had stopped: then it may have driven.
+    """
+    for part in run.summary.get("repeats", ())[:1]:
+        since_s, shift_m = part["start_s"] or 0.0, float(np.linalg.norm(part["shift_m"]))
+        stopped = any(gap["start_s"] <= since_s <= gap["end_s"] + STOPPED_S for gap in run.summary.get("gaps", ()))
+        number = 0 if stopped else sightings.vanished(run, since_s)
+        if number and shift_m > sightings.spacing(run):
+            told = f"it sees none of the {number} landmarks that it saw just before, and maps them again"
+            evidence = f"the robot was elsewhere by {figure(shift_m)} m from t={since_s:.1f} s on: {told}"
+            yield Cause("kidnapped", since_s, part["score"], evidence, until(run, log, round(since_s * 1e9)))
+
+
+def split_landmarks(run: Run) -> Iterator[Cause]:
+    """Yield that things are in the map twice, side by side: their landmarks are seen in turn, never together."""
+    pairs = sightings.split(run)
+    if pairs:
+        number, mapped = len({pair.name for pair in pairs}), len(run.landmarks)
+        first = ", ".join(f"{pair.name} and {pair.other}" for pair in pairs[:LISTED])
+        told = "seen in turn and never together with their neighbours, so they are the same things"
+        evidence = f"{number} of {mapped} landmarks are {told} ({first}{', ...' if len(pairs) > LISTED else ''})"
+        cure = "a noise that is stated too small splits landmarks: state more"
+        yield Cause(
+            "split_landmarks", begin_s(run), sum(p.score for p in pairs), evidence, cure, number <= FEW * mapped
         )
-    return found
 
 
 def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:

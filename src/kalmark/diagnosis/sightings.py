@@ -1,0 +1,100 @@
+"""What the order of sightings tells of a map without ids: one thing that is there twice, and a robot that was moved.
+
+A residual shows neither: each landmark fits its own sightings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from kalmark.arrays import Array
+from kalmark.batch.state import Ints
+from kalmark.results.run import Run
+
+NEIGHBOURS = 3  # of a landmark that may be the same thing
+NEAR_SCANS = 5  # within which both of two landmarks in view would be seen
+SELDOM = 1e-4  # the probability, over all pairs, that two things are never seen together by chance
+LEAST_SEEN = 4  # landmarks that are seen until a robot is moved
+
+
+class Pair(NamedTuple):
+    """A landmark and another one that are one thing; `score` is the logarithm of how seldom chance does that."""
+
+    name: str
+    other: str
+    score: float
+
+
+def split(run: Run) -> list[Pair]:
+    """Return pairs of near landmarks that are one thing.
+
+    They are sighted in turn, within a few scans, but never together.  Of two things, each is seen in a share p of the
+    scans between others in which it is, so both are in p^2 of them.
+    """
+    seen, where = _sightings(run), _places(run)
+    names = [name for name in seen if name in where]
+    if len(names) < 2:
+        return []
+    places = np.array([where[name] for name in names])
+    never = -np.log1p(-(_regularity(seen.values()) ** 2))
+    least, found = np.log(len(names) * NEIGHBOURS / SELDOM), []
+    near = cKDTree(places).query(places, k=range(2, 2 + min(NEIGHBOURS, len(names) - 1)))[1]
+    for a, b in sorted({(min(k, j), max(k, j)) for k, others in enumerate(near.tolist()) for j in others}):
+        score = float(never * _in_turn(seen[names[a]], seen[names[b]]))
+        if score > least:
+            found.append(Pair(names[a], names[b], score))
+    return found
+
+
+def spacing(run: Run) -> float:
+    """Return the median distance of a landmark to the next one, m."""
+    places = np.array([*_places(run).values()])
+    return float(np.median(cKDTree(places).query(places, k=[2])[0])) if len(places) > 1 else 0.0
+
+
+def _places(run: Run) -> dict[str, Array]:
+    """Return the positions (2,) or (3,) of the landmarks that have one."""
+    d, marks = 3 if run.landmarks.in_space else 2, run.landmarks
+    where = {str(id_): mean[:d] for id_, mean in zip(marks.ids, marks.means, strict=True)}
+    return {name: place for name, place in where.items() if np.isfinite(place).all()}
+
+
+def _sightings(run: Run) -> dict[str, Ints]:
+    """Return the scans (k,) of two landmarks or more in which each landmark was seen that ids do not tell."""
+    h = run.history
+    used = (h.outcome == "associated") & (h.id == "")
+    used &= np.bincount(h.step[used], minlength=len(h.t_ns))[h.step] > 1
+    if not used.any():
+        return {}
+    order = np.argsort(h.landmark[used], kind="stable")
+    names, first = np.unique(h.landmark[used][order], return_index=True)
+    return dict(zip(names.tolist(), np.split(h.step[used][order], first[1:]), strict=True))
+
+
+def _regularity(all_scans: Iterable[Ints]) -> float:
+    """Return the share of scans in which a landmark is seen, of those between two in which it is."""
+    gaps = np.concatenate([np.diff(scans) for scans in all_scans])
+    there, left_out = float((gaps == 1).sum()), float((gaps == 2).sum())
+    return there / (there + left_out + 1.0)
+
+
+def _in_turn(a: Ints, b: Ints) -> int:
+    """Return how many sightings of two landmarks alternate, 0 if they were ever seen together."""
+    scans, of = np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)])
+    order = np.argsort(scans, kind="stable")
+    gaps, changes = np.diff(scans[order]), np.diff(of[order]) != 0
+    return 0 if (gaps == 0).any() else int((changes & (gaps <= NEAR_SCANS)).sum())
+
+
+def vanished(run: Run, start_s: float) -> int:
+    """Return how many landmarks were seen until a time of the log if none of them is seen just after it, else 0."""
+    h = run.history
+    now = int(np.searchsorted(h.t_ns, round(start_s * 1e9)))
+    used = np.isin(h.outcome, ("associated", "new"))
+    before = set(h.landmark[used & (h.step >= now - NEAR_SCANS) & (h.step < now)].tolist())
+    after = set(h.landmark[used & (h.step >= now) & (h.step < now + NEAR_SCANS)].tolist())
+    return len(before) if len(before) >= LEAST_SEEN and after and not before & after else 0

@@ -1,0 +1,83 @@
+"""What the order of sightings tells: a robot that was carried away, and one thing that is in the map twice."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hall import hall, mapped
+
+import kalmark as km
+from kalmark.diagnosis import sightings
+from kalmark.events import Scan
+
+NEAR, FAR, POST = (5.0, 0.0), (5.2, 0.0), (0.0, 5.0)
+
+
+def seen(*scans: str, **places: tuple[float, float]) -> Any:
+    """Return a run of scans, 1 s apart, of landmarks named by single letters."""
+    step = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
+    history = SimpleNamespace(
+        t_ns=np.arange(len(scans)) * 10**9, step=step, landmark=np.array([*"".join(scans)]),
+        outcome=np.full(len(step), "associated"), id=np.full(len(step), ""),
+    )  # fmt: skip
+    means = [np.array(place) for place in places.values()]
+    return SimpleNamespace(history=history, landmarks=SimpleNamespace(ids=[*places], means=means, in_space=False))
+
+
+def test_one_thing_is_seen_in_turn_and_two_are_seen_together() -> None:
+    in_turn = seen(*12 * ("ac", "bc", "ac", "ac", "bc"), a=NEAR, b=FAR, c=POST)
+    assert [(pair.name, pair.other) for pair in sightings.split(in_turn)] == [("a", "b")]
+    assert not sightings.split(seen(*12 * ("ac", "bc", "abc", "ac", "bc"), a=NEAR, b=FAR, c=POST))
+
+
+def test_two_sides_of_a_wall_and_scans_of_single_landmarks_say_nothing() -> None:
+    assert not sightings.split(seen(*30 * ("ac",), *30 * ("bc",), a=NEAR, b=FAR, c=POST))
+    assert not sightings.split(seen(*30 * ("a", "b"), a=NEAR, b=FAR))
+
+
+def test_landmarks_vanish_at_once_or_one_after_the_other() -> None:
+    places = dict.fromkeys("abcdefgh", NEAR)
+    assert sightings.vanished(seen(*9 * ("abcd",), *9 * ("efgh",), **places), 9.0) == 4
+    assert not sightings.vanished(seen(*9 * ("abcd",), *9 * ("defg",), **places), 9.0)
+    assert not sightings.vanished(seen(*9 * ("abc",), *9 * ("efgh",), **places), 9.0)
+
+
+@pytest.mark.parametrize("carried_m", [0.0, 5.0])
+def test_a_robot_that_is_carried_away_is_named_before_the_map_that_is_doubled(carried_m: float) -> None:
+    log = hall(2, bad_wheel=False)
+    middle = log.events[len(log.events) // 2].t_ns
+    truth = log.truth["rover"]
+    rng, places = np.random.default_rng(0), np.array([*log.landmarks.values()])
+
+    def moved(event: Scan) -> Scan:
+        pose = truth.poses[np.searchsorted(truth.t_ns, event.t_ns)] - (0.0, carried_m, 0.0)
+        y = km.geometry.observe(pose, places)[0] + rng.normal(size=(len(places), 2)) * (0.03, 0.01)
+        return Scan(t_ns=event.t_ns, robot="rover", sensor="laser", y=y[y[:, 0] < 8.0])
+
+    events = [moved(e) if isinstance(e, Scan) and e.t_ns > middle else e for e in log.events]
+    verdict = km.diagnose(mapped(replace(log, events=events)))
+    names = [cause.name for cause in verdict.causes if not cause.harmless]
+    if carried_m:
+        assert (verdict.map, names[:2]) == ("wrong", ["kidnapped", "map_repeats"])
+        assert verdict.causes[0].since_s == pytest.approx(middle * 1e-9, abs=0.5)
+        assert "log.to_s" in verdict.causes[0].cure
+    else:
+        assert verdict.map == "ok"
+        assert "kidnapped" not in names
+
+
+def test_a_noise_that_is_stated_too_small_splits_landmarks() -> None:
+    rng, log = np.random.default_rng(1), hall(3, bad_wheel=False)
+
+    def noisier(event: Scan) -> Scan:
+        y = event.y + rng.normal(size=event.y.shape) * (0.1, 0.0)
+        return Scan(t_ns=event.t_ns, robot="rover", sensor="laser", y=y[y[:, 0] > 0.0])
+
+    events = [noisier(e) if isinstance(e, Scan) else e for e in log.events]
+    verdict = km.diagnose(mapped(replace(log, events=events)))
+    assert verdict.map != "ok"
+    assert "split_landmarks" in [cause.name for cause in verdict.causes[:3]]
