@@ -579,3 +579,17 @@ def test_a_map_of_tags_is_judged_by_its_batch_solution() -> None:
     (cause,) = verdict.causes
     assert cause.name == "measurement_sigma"
     assert float(cause.cure.removeprefix("--set robots.rig.sensors.camera.sigma_px=")) == pytest.approx(0.5, rel=0.1)
+
+
+def test_bearings_alone_accuse_no_odometry() -> None:
+    settings = (
+        "world.count=35", "world.size_m=18", "steps=900", "dt_s=0.15", "noise_on=robot",
+        "robots.rover.start={x_m: 9, y_m: 4}",
+        "robots.rover.route={type: wander, speed_mps: 0.6, turn_radius_m: 1}",
+        "robots.rover.motion={type: odometry_2d, sigma_x_m: 0.01, sigma_y_m: 0.005, sigma_theta_rad: 0.005}",
+        "robots.rover.sensors={eye: {type: bearing, range_max_m: 8, initialization: {type: delayed}}}",
+        "robots.rover.sensors.eye.sigma_bearing_rad=0.01",
+    )  # fmt: skip
+    world = load_world("random_field", settings)
+    log, config = simulate(world, 1), world.config()
+    assert not km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config))).causes

@@ -174,12 +174,14 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
     have, left = linear.residuals, linear.left(Z, W)
     g, I = Z.T @ have.r + W.T @ have.m, np.sum(Z * left.r, axis=0) + np.sum(W * left.m, axis=0)
     (block, motion), Q, found = _blocks(linear), linear.root @ linear.root.T, []
+    n = len(linear.problem.robots)
     for k, column in enumerate(columns):
         if not LEAST_INFORMATION * (Z[:, k] @ Z[:, k] + 1.0) < I[k] < math.inf:
             continue
         s = float(g[k] / I[k])
-        if not column.unit and abs(s) > MOST_SCALE:
-            continue
+        moves = 0.0 if Z[:, k].any() else np.abs(s * W[:, k]).reshape(n, -1)[:, : linear.state.d].max(initial=0.0)
+        if (not column.unit and abs(s) > MOST_SCALE) or moves > linear.step:
+            continue  # no small error: the problem is not linear so far away
         parts = np.bincount(block, left.r[:, k] * (have.r - s * left.r[:, k]), minlength=BLOCKS)
         parts += np.bincount(motion, left.m[:, k] * (Q @ (have.m - s * left.m[:, k])), minlength=BLOCKS)
         sigma = float(np.sqrt(max(I[k], float(parts @ parts))) / I[k])
