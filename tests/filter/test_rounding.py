@@ -83,6 +83,7 @@ def test_800_s_among_surveyed_tags_of_which_some_stand_elsewhere(in_space: bool,
         else:
             slam.add_landmark(i, said[i], 1e-8 * np.eye(2))
     pose, seen, refused = np.array([0.0, -8.0, 0.0]), np.zeros(count), np.zeros(count)
+    renewed: set[int] = set()  # whose surveys were given up
     for k in range(1600):
         u = np.array([0.12, 0.0, 0.015])  # a circle of 8 m about the middle
         pose += np.array([u[0] * np.cos(pose[2]), u[0] * np.sin(pose[2]), u[2]])
@@ -102,12 +103,14 @@ def test_800_s_among_surveyed_tags_of_which_some_stand_elsewhere(in_space: bool,
         report = slam.process(km.Scan(0.5 * k, "r", "eye", y, ids.tolist()))
         for o in report.observations:
             seen[o.id] += 1
-            refused[o.id] += o.outcome == "rejected"
-            assert o.outcome == "associated" or o.reason.startswith("outside the gate")
+            renewed |= {o.id} if o.outcome == "new" else set()
+            refused[o.id] += o.outcome == "rejected" or o.id in renewed
+            assert o.outcome in ("associated", "new") or o.reason.startswith("outside the gate")
     assert not fault_of(slam.covariance("r"))
     far = wrong[2:]  # by 20 cm and more
     far = far[seen[far] > 0]
-    assert len(far) and (refused[far] > 0.9 * seen[far]).all(), "what does not fit is rejected"
+    assert len(far) and (refused[far] > 0.9 * seen[far]).all(), "what does not fit is rejected or mapped anew"
+    assert renewed <= set(wrong.tolist())
     right = np.setdiff1d(np.arange(count), wrong)
     assert refused[right].sum() < 0.05 * seen[right].sum()
     assert np.hypot(*(slam.mean("r")[:2] - pose[:2])) < 0.1
