@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.errors import KalmarkError
 from kalmark.geometry.frames3d import from_euler_pose, to_frame_many
 from kalmark.vision.beginning import LEAST_RHO, Beginning, Begun, residuals
 
@@ -89,6 +90,13 @@ def test_anything_but_a_frame_ends_the_beginning() -> None:
     mount = km.Mount(CAMERA, at=(0, 0, 0, 0, 0, 0, 1), landmark=km.landmarks.Homogeneous(0.5, 0.5), detector=detector)
     slam = km.Slam(km.Robot("camera", km.motion.ConstantVelocity3D(), sensors={"eye": mount}))
     front_end = slam.state.front_ends["camera", "eye"]
-    assert front_end.beginning is not None  # type: ignore[attr-defined]
+    for refused in (
+        lambda: slam.process(km.Control(t_s=0.0, robot="camera", u=np.zeros(5))),
+        lambda: slam.add_landmark("a", (1.0, 2.0)),
+        lambda: slam.remove("a"),
+    ):
+        with pytest.raises(KalmarkError):
+            refused()
+    assert front_end.beginning is not None, "what is refused changes nothing"  # type: ignore[attr-defined]
     slam.process(km.Control(t_s=0.0, robot="camera", u=np.zeros(6)))
     assert front_end.beginning is None  # type: ignore[attr-defined]

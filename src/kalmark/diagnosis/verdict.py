@@ -142,9 +142,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         causes += odd_controls(run, log)
     twice = any(cause.name == COPIES for cause in first)  # then the filter is too sure for that
     causes = sorted([*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, -c.score))
-    if not any(
-        cause.name in LOSES_TRACK and not cause.harmless for cause in first
-    ):  # then it is that what doubles maps
+    lost = any(c.name in LOSES_TRACK and not c.harmless for c in first)
+    if not lost:  # else it is that what doubles maps
         steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
         first = [*(c for c in causes if c.name in steady and c.score > SURELY), *first]
     causes = [*first, *(c for c in causes if c not in first)]

@@ -113,10 +113,10 @@ class Slam(Estimate):
         if event.robot not in state.robots:
             names = sorted(state.robots)
             raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
-        if not isinstance(event, Frame):
-            state.settle()
         try:
             report: Report = take(event)
+            if not isinstance(event, Frame):
+                state.settle()
             if event.robot in state.standing:
                 report.standing = own_readings.stood(state, event)
             return report
@@ -325,7 +325,6 @@ class Slam(Estimate):
         """
         state = self.state
         name = checked_id(name, "landmark")
-        state.settle()
         if landmark is not None:
             instance(landmark, Landmark, f"landmark {name!r}", "a landmark model")
         default = next((channel.landmark for channel in state.channels.values()), Point2D())
@@ -337,6 +336,7 @@ class Slam(Estimate):
         mean = checked_numbers(mean, model.space.size, f"landmark {name!r}: mean", MapError)
         if cov is not None:
             cov = covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
+        state.settle()
         state.tracks.reserve([name])
         state.placed = NEEDED
         if cov is None and not any(policy.averages for policy in state.policies.values()):
@@ -349,8 +349,8 @@ class Slam(Estimate):
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
-        self.state.settle()
         self.state.remove(name)
+        self.state.settle()
 
     # ------------------------------------------------------------------ before the first event
     def warm_up(self) -> None:
