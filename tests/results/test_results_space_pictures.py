@@ -35,7 +35,7 @@ def run() -> Run:
 
 
 def page_data(page: str) -> dict[str, Any]:
-    found = re.search(r"<script>const DATA = (.*?);</script>", page, flags=re.DOTALL)
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, flags=re.DOTALL)
     assert found is not None
     return json.loads(found[1])
 

@@ -68,6 +68,16 @@ function band(t, low, high, gaps) {
   return {x, y, mode: "lines", line: {width: 0}, fill: "toself", fillcolor: BAND, hoverinfo: "skip"};
 }
 
+/* Draw what an element holds when it comes into view, or is printed: to draw all at once takes longer than the map. */
+const waiting = new Map();
+const drawNow = element => { waiting.get(element)?.(); waiting.delete(element); coming.unobserve(element); };
+const coming = new IntersectionObserver(seen => seen.filter(s => s.isIntersecting).forEach(s => drawNow(s.target)), {rootMargin: "200px"});
+function inView(id, draw) {
+  waiting.set(el(id), draw);
+  coming.observe(el(id));
+}
+window.addEventListener("beforeprint", () => [...waiting.keys()].forEach(drawNow));
+
 function drawMap() {
   if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
   const slider = el("time"), draw = mapPicture();
@@ -162,7 +172,7 @@ function ofEach(robots, choice, section, draw) {
   robots.forEach((r, i) => el(choice).add(new Option(r.name, i)));
   el(choice).hidden = robots.length < 2;
   el(choice).addEventListener("change", () => draw(robots[+el(choice).value]));
-  draw(robots[0]);
+  inView(section, () => draw(robots[+el(choice).value]));
 }
 
 const CHANGE = {merged: ["#1f5fa8", "triangle-down"], removed: ["#c8553d", "x-thin"]};
@@ -227,10 +237,10 @@ drawMap();
 ofEach(DATA.robots.filter(r => r.error), "robot", "against-truth", drawErrors);
 ofEach(DATA.robots.filter(r => !r.error), "blind", "sigma-section", drawSigmas);
 ofEach(DATA.innovations, "fixed", "fixes-section", drawFixes);
-if (DATA.nis.t.length) drawNis(); else el("nis-section").remove();
-if (Object.keys(DATA.outcomes.counts).length) drawOutcomes(); else el("association").remove();
+if (DATA.nis.t.length) inView("nis-section", drawNis); else el("nis-section").remove();
+if (Object.keys(DATA.outcomes.counts).length) inView("association", drawOutcomes); else el("association").remove();
 if (DATA.association.scans.length && el("which")) {
   DATA.association.scans.forEach((scan, i) => el("which").add(new Option(`t = ${scan.t} s, ${scan.robot} (--scan ${scan.in_log})`, i)));
   el("which").addEventListener("change", () => drawScan(DATA.association.scans[+el("which").value]));
-  drawScan(DATA.association.scans[0]);
+  inView("ambiguous", () => drawScan(DATA.association.scans[0]));
 } else if (el("ambiguous")) el("ambiguous").remove();

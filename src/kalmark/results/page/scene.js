@@ -119,9 +119,9 @@ function moving(frame) {
     const rows = map.group.flatMap((g, i) => SPACE && g !== group ? [] : [i]), pick = k => rows.map(i => map[k][i]);
     const sigma = rows.map(i => map.pxx[i] === null ? null : Math.sqrt(Math.max(AXES.reduce((sum, k) => sum + map["p" + k + k][i], 0), 0)));
     const shown = rows.length > 0 || DATA.maps.some(m => m.group.includes(group)), width = SPACE ? (many ? 0.4 : 0.8) : many ? 0.7 : 1.1;
-    traces.push(stroke(contours(map, rows, many && SPACE ? 12 : 24), color, width,
+    traces.push(stroke(contours(map, rows, many && SPACE ? 8 : 24), color, width,
                        {name, legendgroup: name, showlegend: shown, opacity: SPACE ? 0.6 : 1}));
-    traces.push(marks({...boxed(along(pick)), text: pick("id"), customdata: sigma}, {color}, many ? [3, 1.8] : [5, 3],
+    traces.push(marks({...boxed(along(pick)), text: pick("id"), customdata: sigma}, {color, symbol: many && SPACE ? "square" : "circle"}, many ? [3, 1.8] : [5, 3],
                       {legendgroup: name, ...quiet, hovertemplate: `%{text}: ${WHERE}<br>sigma %{customdata:.3g} m<extra></extra>`}));
   });
   traces.push(stroke(boxed(map.lines), LINE, SPACE ? 1.6 : 2.2, quiet));
@@ -160,14 +160,18 @@ function spatialPage() {
             camera: {center: {x: 0, y: 0, z: -0.18}, eye: {x: 0.95, y: -1.4, z: 0.9}, up: {x: 0, y: 0, z: 1}}, dragmode: "turntable"}});
 }
 
-/* The picture of a map: a function that draws it, and the images, at a position of the slider. */
+/* The picture of a map: a function that draws it, and the images if they are in view, at a position of the slider. */
 function mapPicture() {
   const background = still(), page = SPACE ? spatialPage() : planarPage();
+  let now = 0;
+  const images = () => DATA.cameras.forEach((camera, i) => drawImages(camera, i, now));
+  if (DATA.cameras.length) inView("images", images);
   return frame => {
+    now = frame;
     const shown = el("map")._fullLayout?.scene?._scene;  /* the slider must not turn the view back */
     if (shown) page.scene.camera = shown.getCamera();
     Plotly.react("map", [...background, ...moving(frame)], page, CONFIG);
-    DATA.cameras.forEach((camera, i) => drawImages(camera, i, frame));
+    if (!waiting.has(el("images"))) images();
   };
 }
 
