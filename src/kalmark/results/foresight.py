@@ -1,11 +1,13 @@
 """What a run's history keeps of landmarks that a scan should have shown: in view, not measured.  [TB] Obs.vis.
 
-It is asked before a scan is used, of some scans, and so many landmarks of each: what is kept is bounded.
+It is asked before a scan is used, of some scans, and so many landmarks of each: what is kept is bounded, and so is the
+time that it takes, a few landmarks a scan.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -18,15 +20,20 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 SCANS, LANDMARKS = 2_000, 32  # at most so many scans of a run, and of each so many landmarks
+LOOKED_AT = 200  # landmarks of the map that are looked at, a scan: of a larger map, not every scan is asked
 KNOWN = ("associated", "new", "rejected")
 
 
 class Foresight:
-    """Asks a filter before its scans what is in view; a context, within which it is asked."""
+    """Asks a filter before its scans what is in view; a context, within which it is asked.
 
-    def __init__(self, slam: Slam, scans: int) -> None:
+    The scans in `shown` are asked whatever it costs.
+    """
+
+    def __init__(self, slam: Slam, scans: int, shown: Iterable[int] = ()) -> None:
         self._slam, self._at = slam, set(np.linspace(0, max(scans - 1, 0), min(scans, SCANS)).round().astype(int))
-        self._scans = self._spent = 0
+        self._shown = set(shown)
+        self._scans = self._spent = self._saved = 0
         self._asked: Expectations | None = None
         self._kept: list[tuple[int, Expectations, list[int]]] = []
 
@@ -39,8 +46,11 @@ class Foresight:
         self._slam.before_scan = None
 
     def _ask(self, robot: str, sensor: str) -> None:
-        self._asked = None
-        if self._scans in self._at:
+        self._asked, count = None, len(self._slam.tracks.confirmed)
+        self._saved = min(self._saved + LOOKED_AT, max(count, LOOKED_AT))
+        affords = self._scans in self._at and self._saved >= count
+        if affords or self._scans in self._shown:
+            self._saved -= count if affords else 0
             start = time.perf_counter_ns()
             self._asked = self._slam.expect(robot, sensor, in_view=True)
             self._spent = time.perf_counter_ns() - start

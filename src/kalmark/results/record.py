@@ -118,7 +118,7 @@ class _Recorder:
         self.stepped_by, self.stepped = next((step for step in steps if step[1] & kinds), steps[-1])
         scans = sum(type(e) in self.stepped for e in log.events)
         self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS)
-        self.foresight = Foresight(slam, scans)
+        self.foresight = Foresight(slam, scans, np.floor(self.snapshot_at).astype(int).tolist())
         self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
         begins = {name: begins_at(log.events, name, robot.motion.held) for name, robot in slam.robots.items()}
         self.starts = tuple(

@@ -11,7 +11,7 @@ from kalmark.association import Association
 from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
-from kalmark.filter.map import Map
+from kalmark.filter.map import AT_ONCE, Map
 from kalmark.models.protocols import Landmark, Segmented, place_of
 from kalmark.report import Expectations, LandmarkTable
 from kalmark.slam.robot import Robot
@@ -94,7 +94,7 @@ class Estimate:
         """
         tracks = self.tracks.confirmed.values()
         kinds, counts = [track.model.kind for track in tracks], [track.observations for track in tracks]
-        means, covs = [self.mean(track.id) for track in tracks], [self.covariance(track.id) for track in tracks]
+        means, covs = self._each([track.slot for track in tracks])
         names, known = [track.id for track in tracks], self.tracks.known
         for name in known if exactly_known else ():
             space = known.model(name).space
@@ -104,6 +104,15 @@ class Estimate:
             covs.append(np.zeros((space.dof, space.dof)))
             counts.append(known.observations(name))
         return LandmarkTable(names, kinds, means, covs, counts)
+
+    def _each(self, slots: list[int]) -> tuple[list[Array], list[Array]]:
+        """Return the mean and the covariance of each of some blocks."""
+        means, covs, robot = list[Array](), list[Array](), next(iter(self.state.moving.values())).slot
+        for i in range(0, len(slots), AT_ONCE):
+            m, _, _, here = self.map.marginal(robot, -1, np.array(slots[i : i + AT_ONCE]))
+            means += [m.mean(at) for at in here.tolist()]
+            covs += [m.covariance([at]) for at in here.tolist()]
+        return means, covs
 
     def expect(
         self, robot: str, sensor: str, names: Iterable[Id] | None = None, *, in_view: bool = False

@@ -53,6 +53,7 @@ Description = dict[str, Any]
 
 VERSION = 11
 DESCRIPTION, SUMS = "slam.json", "sha256"
+LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
 OF_TRACKS = (
     "recent",
     "last_scan",
@@ -94,7 +95,8 @@ def save(path: Path, state: State) -> None:
         try:
             with zipfile.ZipFile(temporary, "w") as archive:
                 for name, data in (members | {SUMS: sums}).items():  # without the clock: equal maps are equal files
-                    archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
+                    small = len(data) < LARGE  # a large covariance is of digits that do not compress
+                    archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED if small else zipfile.ZIP_STORED)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)

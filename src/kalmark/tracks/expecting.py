@@ -57,7 +57,8 @@ def expectations(
     for model, group in tracks.by_model(channel, names, robot):
         rows = np.array(group)
         slots = tracks.slots_of([names[i] for i in group])
-        seen = looked(map_, channel, slot, model, slots, [tracks.confirmed.get(names[i]) for i in group])
+        of = [tracks.confirmed.get(names[i]) for i in group]
+        seen = looked(map_, channel, slot, model, slots, of, told=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):
             why[i] = reason
         in_view[rows] = seen.in_view
@@ -68,7 +69,8 @@ def expectations(
     for model, group in tracks.known_by_model(channel, names):
         rows, known = np.array(group), [names[i] for i in group]
         l = tracks.known.means(known)
-        seen = look(channel, model, channel.pose(map_, slot), l, [tracks.known.extent(name) for name in known])
+        extents = [tracks.known.extent(name) for name in known]
+        seen = look(channel, model, channel.pose(map_, slot), l, extents, told=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):
             why[i] = reason
         in_view[rows] = seen.in_view
@@ -126,21 +128,22 @@ def _not_observed(channel: Channel, tracks: Tracks, name: Id, robot: str) -> str
 
 # ---------------------------------------------------------------------- in view
 def looked(
-    map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, tracks: Sequence[Track | None]
+    map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, tracks: Sequence[Track | None],
+    told: bool = True,
 ) -> Looked:  # fmt: skip
-    """Return which blocks of one kind are in view, and measurements to linearise at."""
+    """Return which blocks of one kind are in view, and measurements to linearise at; `told`: why the others are not."""
     T, l = channel.pose(map_, robot), map_.means(slots, model.d)
     sizes = [None if track is None else track.size_m for track in tracks]
-    return look(channel, model, T, l, [None if track is None else track.extent for track in tracks], sizes)
+    return look(channel, model, T, l, [None if track is None else track.extent for track in tracks], sizes, told)
 
 
 def look(
     channel: Channel, model: ObservationModel, T: Array, l: Array, extents: Sequence[Array | None],
-    sizes: Sequence[float | None] = (),
+    sizes: Sequence[float | None] = (), told: bool = True,
 ) -> Looked:  # fmt: skip
     """Return which landmarks l (K, n) of one kind are in view from the pose T, and measurements to linearise at.
 
-    `extents` (2,) are those of lines, `sizes` in m those of tags.
+    `extents` (2,) are those of lines, `sizes` in m those of tags; `told`: and why the others are not in view.
     """
     sensor: Any = channel.sensor
     columns: tuple[str, ...] = tuple(sensor.columns)
@@ -152,14 +155,17 @@ def look(
         return Looked(in_view, ["" if seen else "no part of its segment is in the image" for seen in in_view], y)
     v = in_frame(model.landmark, T, l)
     in_view = sensor.sees(v) if isinstance(sensor, protocols.Visible) else np.ones(len(v), dtype=np.bool_)
-    why = ["" if seen else _out_of_view(sensor, v[i]) for i, seen in enumerate(in_view.tolist())]
+    why = [""] * len(v)
+    for i in np.flatnonzero(~in_view).tolist() if told else ():
+        why[i] = _out_of_view(sensor, v[i])
     if "qw" in columns:
         y[:, QUATERNION_AT] = 1.0
     if "size_m" in columns:
         y[:, -1] = [math.nan if size is None else size for size in sizes or [None] * len(l)]
         unmeasured = np.isnan(y[:, -1]).tolist()
         why = [reason or (UNMEASURED if lacks else "") for reason, lacks in zip(why, unmeasured, strict=True)]
-    return Looked(np.array([not reason for reason in why], dtype=np.bool_), why, y)
+        in_view = in_view & ~np.array(unmeasured, dtype=np.bool_)
+    return Looked(in_view, why, y)
 
 
 def _out_of_view(sensor: Any, v: Array) -> str:

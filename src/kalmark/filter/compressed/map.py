@@ -24,7 +24,7 @@ from kalmark.filter import kernels
 from kalmark.filter.compressed import immediate
 from kalmark.filter.compressed.drift import Drift
 from kalmark.filter.compressed.full_update import FullUpdate, Interval, Workspace
-from kalmark.filter.compressed.immediate import Displacements, ImmediateCorrections, Points
+from kalmark.filter.compressed.immediate import Displacements, ImmediateCorrections, Points, carried
 from kalmark.filter.compressed.reading import carried_along, joined, split
 from kalmark.filter.compressed.schedule import PREFAULT, SLICE, Schedule
 from kalmark.filter.compressed.search import Search
@@ -127,9 +127,12 @@ class CompressedMap(Layout):
         inactive, out = self._at[slots] < 0, np.empty((len(slots), d))
         out[~inactive] = self.active.means(self._at[slots[~inactive]], d)
         if inactive.any():
-            slots = slots[inactive]
-            cuts = [self._inactive(slots[i : i + AT_ONCE]) for i in range(0, len(slots), AT_ONCE)]
-            out[inactive] = np.concatenate([x[blocks[:, :1] + np.arange(d)] for blocks, (x, *_) in cuts])
+            slots, found, moved = slots[inactive], list[Array](), self._displacements()
+            for i in range(0, len(slots), AT_ONCE):
+                blocks, atoms, numbers, rows = self._laid_out(slots[i : i + AT_ONCE])
+                x = carried(atoms, self.x[numbers], self._read(rows, self.A0), *moved)[0]
+                found.append(x[blocks[:, :1] + np.arange(d)])
+            out[inactive] = np.concatenate(found)
         return out
 
     def covariance(self, slots: Sequence[int]) -> Array:
@@ -183,10 +186,14 @@ class CompressedMap(Layout):
 
         The covariances are those with the auxiliary states and, behind that, their own.
         """
+        blocks, atoms, numbers, rows = self._laid_out(slots)
+        return blocks, atoms, self.x[numbers], self._read(rows, np.concatenate([self.A0, rows]))
+
+    def _laid_out(self, slots: Index) -> tuple[Table, Table, Index, Index]:
+        """Return the tables of inactive blocks, laid out one after the other, their numbers and rows, to be read."""
         if self._job is not None:
             self._job.know(slots)
-        blocks, atoms, numbers, rows = laid_out(self.blocks[slots], self.atoms)
-        return blocks, atoms, self.x[numbers], self._read(rows, np.concatenate([self.A0, rows]))
+        return laid_out(self.blocks[slots], self.atoms)
 
     def _read(self, rows: Index, columns: Index) -> Array:
         return self.storage.get(rows, columns) if self._job is None else self._job.read(rows, columns)
