@@ -43,6 +43,7 @@ MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verd
 EVENTS = 4  # times as many as observations are taken
 SEGMENT = 30  # successive scans that are taken together where not all are
 MORE = 4  # times as many are taken if the segments do not determine the map
+SEEN = 3  # observations a landmark, at first: with fewer a larger problem would take minutes
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
@@ -129,7 +130,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
     first = _structural(run, log)
     try:
-        found = _searched(run, log, most, progress)
+        found = _searched(run, log, most, most // SEEN, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
@@ -172,8 +173,11 @@ class Searched(NamedTuple):
     given: Given
 
 
-def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
-    """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none."""
+def _searched(run: Run, log: Log, most: int, landmarks: int, progress: bool) -> Searched:
+    """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none.
+
+    Where `most` observations do not determine it, more are tried, but for a problem of more `landmarks` than that.
+    """
     every = calibrated(run, once(run, given_by(run)))
     given = thinned(run, every, most)
     try:
@@ -182,9 +186,9 @@ def _searched(run: Run, log: Log, most: int, progress: bool) -> Searched:
             raise KalmarkError("no observation was of a landmark in the map")
         batch = optimum(problem, tolerance=NEAR)
     except KalmarkError:
-        if given is every:
+        if given is every or len(set(given.associations.landmark)) > landmarks:
             raise
-        return _searched(run, log, MORE * most, progress)
+        return _searched(run, log, MORE * most, landmarks, progress)
     search = Search(Linear.of(problem, batch.state), sensors_of(run), given.robot, given.t_ns)
     search.run(progress)
     return Searched(search, batch, given)
