@@ -1,7 +1,9 @@
-"""One camera on recorded images: the error of its path after an alignment by similarity, matches and time a frame.
+"""Cameras on recorded and rendered images: errors of their paths, NEES, matches and time a frame.
 
 python benchmarks/vision.py SEQUENCE [SEEDS]     of `SEQUENCES`; a row a seed, then the worst of them
 python benchmarks/vision.py euroc [SEEDS]        90 images of V1_01 with the inertial unit: errors against the truth
+python benchmarks/vision.py WORLD [SEEDS]        of `WORLDS`, rendered: errors against the truth, ANEES of the pose
+One camera on recorded images is aligned by similarity; what knows its scale and its start is not aligned at all.
 The drift of the scale is that of the second half of the path against the first.  One thread; times are of the
 processor, so that other programs count little.
 """
@@ -10,6 +12,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,6 +22,9 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam, open_run
 from kalmark.events import Id
 from kalmark.filter.kernels import one_thread
+from kalmark.geometry.frames3d import minus
+from kalmark.results.measures import anees_interval
+from kalmark.simulate import load_world, simulate
 from kalmark.vision.front_end import FrontEnd
 
 SEQUENCES: dict[str, list[str]] = {
@@ -30,6 +36,9 @@ SEQUENCES: dict[str, list[str]] = {
     ],
     "desk": ["log.path=visual/openekf_s3/escritorio_traslacion.mp4"],
 }
+
+
+WORLDS = ("textured_room", "textured_room_depth")
 
 
 def similarity(p: Array, q: Array) -> tuple[float, float]:
@@ -116,10 +125,55 @@ def print_inertial(seeds: int) -> None:
     print("| euroc | {:.3f} | {:.2f} | {:.3f} | {:.1f} | {:.0f} |".format(*worst))
 
 
+def rendered(name: str, seed: int) -> tuple[Array, Array, float]:
+    """Return after each image of a world the position's error [m] and the NEES of the pose (6); a frame's time [ms].
+
+    The first image is left out: the pose is known exactly.
+    """
+    world = load_world(name)
+    log = simulate(world, seed=seed)
+    slam = build_slam(world.config(), log)
+    (robot,), off, nees, took = log.robots, [], [], []
+    for event in log.events:
+        if not isinstance(event, km.Frame):
+            slam.process(event)
+            continue
+        frame = replace(event, image=event.grey(), depth=event.depths())  # rendered here, not in the time
+        start = time.process_time()
+        slam.process(frame)
+        if event.t_ns == 0:
+            continue
+        took.append(time.process_time() - start)
+        error = minus(slam.mean(robot)[:7], log.truth[robot].at([event.t_ns])[0][:7])
+        off.append(float(np.linalg.norm(error[:3])))
+        nees.append(float(error @ np.linalg.solve(slam.covariance(robot)[:6, :6], error)))
+    return np.array(off), np.array(nees), 1e3 * float(np.median(took))
+
+
+def print_rendered(name: str, seeds: int) -> None:
+    """Print the errors of each seed, and the mean NEES of all at each image against its 95 % band."""
+    off, nees, ms = [], [], []
+    for seed in range(seeds):
+        found = rendered(name, seed)
+        off.append(float(np.sqrt(np.mean(found[0] ** 2))))
+        nees.append(found[1] / 6)
+        ms.append(found[2])
+        print(f"seed {seed}: position {off[-1]:.4f} m, NEES {nees[-1].mean():.2f}", flush=True)
+    low, high = anees_interval(6, seeds)
+    mean = np.mean(nees, axis=0)
+    inside = 100 * float(np.mean((mean > low) & (mean < high)))
+    print("| world | position, m, RMS of each seed, largest | ANEES of the pose | in its band | ms, median |")
+    print("|---|---|---|---|---|")
+    print(f"| {name} | {max(off):.3f} | {mean.mean():.2f} | {inside:.0f} % | {np.median(ms):.1f} |")
+
+
 def main(name: str, seeds: int) -> None:
     """Print the figures of each seed and the row of all."""
     if name == "euroc":
         print_inertial(seeds)
+        return
+    if name in WORLDS:
+        print_rendered(name, seeds)
         return
     rows = []
     for seed in range(seeds):

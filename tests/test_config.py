@@ -203,7 +203,9 @@ def test_the_page_of_the_documentation_is_in_step_with_the_model() -> None:
     assert page.read_text() == subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
-LOGS = {"visual": "visual/tum_fr1_xyz", "visual_inertial": "visual/euroc_v101_micro"}  # which describe the cameras
+LOGS = {  # which describe the cameras
+    "visual": "visual/tum_fr1_xyz", "visual_depth": "visual/tum_fr1_xyz", "visual_inertial": "visual/euroc_v101_micro"
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(shipped_configs()))

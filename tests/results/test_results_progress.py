@@ -33,3 +33,8 @@ def test_the_bar_is_closed_when_the_loop_is_left(capsys: pytest.CaptureFixture[s
         for item in track("abc", "log", 3, delay_s=-1.0):
             first(item)
     assert "log" in capsys.readouterr().err
+
+
+def test_the_bar_shows_what_stands_behind_it(capsys: pytest.CaptureFixture[str]) -> None:
+    list(track("abc", "my log", 3, delay_s=-1.0, note=lambda: "60 images/s"))
+    assert "60 images/s" in capsys.readouterr().err

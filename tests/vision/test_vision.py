@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.config import build_slam, open_run
 from kalmark.geometry.frames3d import compose, from_euler_pose, from_frame_many, minus, to_frame_many
 from kalmark.simulate.rendering import Plane, Renderer, texture
 from kalmark.tracks.prospect import Prospect
@@ -204,6 +205,59 @@ def test_a_camera_finds_its_way_in_a_rendered_room_twice_the_same_and_from_a_sav
         assert one.landmarks().ids == same.landmarks().ids
 
 
+def surveyed(frame: km.Frame, T: np.ndarray, cov: Any = None) -> tuple[km.Slam, dict[str, np.ndarray]]:
+    """Return a map that knows corners of the wall, as in an image taken from T, and their pixels; it may start off."""
+    image, stop = np.asarray(frame.image), (cv2.TERM_CRITERIA_COUNT, 20, 0)
+    y = cv2.cornerSubPix(image, corners(image, 8).astype(np.float32), (4, 4), (-1, -1), stop).astype(np.float64)
+    names = {f"corner {k}": one for k, one in enumerate(y)}
+    motion = km.motion.ConstantVelocity3D(sigma_v_mps_per_sqrt_s=0.5, sigma_w_radps_per_sqrt_s=0.5)
+    start = np.concatenate([pose(0.04, -0.03, 0.05, 1.0, -1.5, 0.8), np.zeros(6)])
+    detector, landmark = km.vision.ActiveSearch(in_view=30, most=40), km.landmarks.Homogeneous(0.5, 0.25)
+    mount = km.Mount(CAMERA, at=(0, 0, 0, 0, 0, 0, 1), landmark=landmark, detector=detector)
+    spread = np.diag([0.04**2] * 3 + [np.radians(1.5) ** 2] * 3 + [0.3] * 6)
+    slam = km.Slam(km.Robot("camera", motion, start, {"eye": mount}, spread), map="dense")
+    for name, place in zip(names, places_of(CAMERA, T, y), strict=True):
+        slam.add_landmark(name, place, cov)
+    return slam, names
+
+
+@pytest.mark.parametrize("cov", [None, 1e-6 * np.eye(3)])
+def test_landmarks_known_beforehand_are_found_in_the_first_image_and_set_place_and_scale(
+    cov: Any, tmp_path: Path
+) -> None:
+    frames, true = room(60)
+    slam, known = surveyed(frames[0], true[0], cov)
+    first = slam.process(frames[0])
+    for o in first.observations:
+        if o.landmark in known:
+            assert np.abs(first.y[o.index] - known[o.landmark]).max() < 0.3
+    assert sum(o.outcome == "associated" and o.landmark in known for o in first.observations) >= 6  # of 8
+    slam.save(tmp_path / "map.kmk")
+    off, nees, again = [], [], km.Slam.load(tmp_path / "map.kmk")
+    for frame, T in zip(frames[1:], true[1:], strict=True):
+        report = slam.process(frame)
+        again.process(frame)
+        assert sum(o.outcome == "associated" for o in report.observations) > 12
+        error = minus(slam.mean("camera")[:7], T)
+        off.append(error[:3])
+        nees.append(error @ np.linalg.solve(slam.covariance("camera")[:6, :6], error))
+    assert np.sqrt(np.mean(np.sum(np.square(off[10:]), axis=1))) < 0.01  # m; nothing aligned
+    assert np.mean(nees) < 12  # 6 degrees of freedom
+    assert set(known) <= set(slam.state.front_ends["camera", "eye"].looks)
+    assert np.array_equal(slam.mean("camera"), again.mean("camera"))
+
+
+def test_landmarks_known_beforehand_of_which_an_image_shows_nothing_are_not_guessed() -> None:
+    frames, true = room(1)
+    slam, known = surveyed(frames[0], true[0])
+    before = slam.mean("camera")[:7]
+    flat = np.random.default_rng(0).integers(118, 122, (240, 320)).astype(np.uint8)
+    report = slam.process(km.Frame(0.0, "camera", "eye", flat))
+    assert not report.observations
+    assert np.array_equal(slam.mean("camera")[:7], before)
+    assert known.keys() <= slam.state.front_ends["camera", "eye"].looks.keys()
+
+
 def test_a_frame_whose_image_cannot_be_read_changes_nothing() -> None:
     slam = searching()
     frames, _ = room(1)
@@ -305,3 +359,27 @@ def test_a_frame_whose_depths_are_of_another_size_changes_nothing() -> None:
     assert not slam.landmarks().ids
     slam.process(km.Frame(0.0, "camera", "eye", image))  # without depths: pixels alone
     assert slam.landmarks().ids
+
+
+def test_the_shipped_configuration_of_depth_images_runs_the_layout_of_tum(tmp_path: Path) -> None:
+    frames, true = room(30)
+    lists: dict[str, str] = {"rgb": "", "depth": ""}
+    for frame in with_depth(frames, true, holes=False):
+        depth = np.rint(frame.depths() * 5000).astype(np.uint16)
+        for kind, picture in (("rgb", frame.grey()), ("depth", depth)):
+            file = tmp_path / kind / f"{frame.t_s:.6f}.png"
+            file.parent.mkdir(exist_ok=True)
+            assert cv2.imwrite(str(file), picture)
+            lists[kind] += f"{frame.t_s:.6f} {kind}/{file.name}\n"
+    for kind, rows in lists.items():
+        (tmp_path / f"{kind}.txt").write_text(rows)
+    (tmp_path / "calibration.yaml").write_text(
+        "image_width: 320\nimage_height: 240\ncamera_matrix: {data: [250, 0, 159.5, 0, 250, 119.5, 0, 0, 1]}\n"
+        "distortion_model: plumb_bob\ndistortion_coefficients: {data: [0, 0, 0, 0, 0]}\n"
+    )
+    config, log = open_run("visual_depth", tmp_path)
+    slam = build_slam(config, log)
+    assert slam.robots["robot"].sensors["camera"].sensor.columns[2] == "rho_per_m"
+    for event in log.events:
+        slam.process(event)
+    assert np.linalg.norm(minus(slam.mean("robot")[:7], true[-1])[:3]) < 0.01  # of .3 m, in metres

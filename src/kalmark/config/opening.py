@@ -71,8 +71,7 @@ def known_path(config: Config) -> Path:
 
     Raises LogError, naming all places.
     """
-    own = config.file is not None and config.file not in shipped_configs().values()
-    beside = config.file.resolve().parent if config.file and own and not config.overridden("map", "known") else None
+    beside = config.file.resolve().parent if config.file and not config.overridden("map", "known") else None
     return find_data(str(config.map.known), beside).resolve()
 
 

@@ -17,10 +17,11 @@ def track(
     show: bool = True,
     delay_s: float = 2.0,
     at: Callable[[], int] | None = None,
+    note: Callable[[], str] | None = None,
 ) -> Iterator[T]:
     """Yield the items; after `delay_s` seconds show a bar named `what` on standard error, if `show`.
 
-    `at` says how much of `total` is done, if that is not the number of items.
+    `at` says how much of `total` is done, if that is not the number of items; `note` is what stands behind the bar.
     """
     if not show:
         yield from items
@@ -32,7 +33,8 @@ def track(
             now = time.perf_counter()
             if now - start > delay_s and (bar is None or now - shown > 0.1):
                 bar, shown = bar or _bar(what, total), now
-                bar.update(bar.task_ids[0], completed=done if at is None else at(), refresh=True)
+                behind = "" if note is None else note()
+                bar.update(bar.task_ids[0], completed=done if at is None else at(), note=behind, refresh=True)
             yield item
         if bar is not None:
             bar.update(bar.task_ids[0], completed=done + 1, refresh=True)
@@ -48,7 +50,8 @@ def _bar(what: str, total: int | None) -> Any:
 
     parts = (rich.TextColumn("{task.description}"), rich.BarColumn(), rich.MofNCompleteColumn())
     times = (rich.TimeElapsedColumn(), rich.TimeRemainingColumn())
-    bar = rich.Progress(*parts, *times, console=Console(stderr=True), auto_refresh=False)
-    bar.add_task(what, total=total)
+    behind = rich.TextColumn("{task.fields[note]}")
+    bar = rich.Progress(*parts, *times, behind, console=Console(stderr=True), auto_refresh=False)
+    bar.add_task(what, total=total, note="")
     bar.start()
     return bar

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 SNAPSHOTS = 60
+LATEST = 30  # images whose rate the bar shows
 SMALL = 5000  # landmarks in all snapshots, up to which the map is kept whenever it grows, too
 
 
@@ -62,7 +63,7 @@ def record(
     recorder = _Recorder(slam, log)
     begin = time.perf_counter()
     with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.foresight:
-        for event in track(log.events, log.name or "log", len(log.events), show=progress):
+        for event in track(log.events, log.name or "log", len(log.events), show=progress, note=recorder.rate):
             try:
                 recorder.process(event)
             except EventError as error:
@@ -114,6 +115,7 @@ class _Recorder:
     def __init__(self, slam: Slam, log: Log) -> None:
         self.slam, self.log = slam, log
         kinds = {type(event) for event in log.events}
+        self.has_images = Frame in kinds
         steps: tuple[tuple[str, set[type]], ...] = (("scan", {Scan, Frame}), ("fix", {Fix}), ("control", {Control}))
         self.stepped_by, self.stepped = next((step for step in steps if step[1] & kinds), steps[-1])
         scans = sum(type(e) in self.stepped for e in log.events)
@@ -145,6 +147,11 @@ class _Recorder:
         self.due = self.kept = 0  # snapshots that were due, and landmarks in all of them
         self.compiler = _Compiler()
         self.spent_ns = 0
+
+    def rate(self) -> str:
+        """Return how many images a second the latest ones took, in words; of a log with images."""
+        latest = [ns for ns in self.step_ns[-LATEST:] if not math.isnan(ns)]
+        return f"{1e9 * len(latest) / sum(latest):.0f} images/s" if self.has_images and latest else ""
 
     def process(self, event: Event) -> None:
         """Feed one event and, if it is a scan, keep the step that ends with it; of a log without scans, if it is a fix.

@@ -337,6 +337,8 @@ class Slam(Estimate):
         if cov is not None:
             cov = covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         state.settle()
+        for front_end in state.front_ends.values():
+            front_end.survey(name)
         state.tracks.reserve([name])
         state.placed = NEEDED
         if cov is None and not any(policy.averages for policy in state.policies.values()):

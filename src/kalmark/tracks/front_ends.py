@@ -44,6 +44,10 @@ class FrontEnd(Protocol):
         """Keep them no longer: something else has changed the map."""
         ...
 
+    def survey(self, name: Id) -> None:
+        """Search for a landmark known beforehand, too."""
+        ...
+
     def begun(self, prior: float) -> tuple[list[tuple[Scan, list[Id]]], dict[Id, float]] | None:
         """Return the frames so far, each with the landmarks given up before it, if they are to be filtered again.
 

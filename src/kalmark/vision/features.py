@@ -53,9 +53,16 @@ class Cells:
         """Return the pixel of a part of the image whose surroundings differ most from any near it."""
         h = self.half
         part = image[top - h : bottom + h, left - h : right + h]
-        response = self.cv2.cornerMinEigenVal(part, 2 * h + 1, ksize=3)[h:-h, h:-h]
+        response = responses(self.cv2, part, 2 * h + 1)[h:-h, h:-h]
         j, i = divmod(int(response.argmax()), response.shape[1])
-        # OpenCV's is 4 / 255^2 times the mean square of the gradient, of the direction in which that is least
-        if not response[j, i] * 255.0**2 / 4.0 >= self.contrast**2:
+        if not response[j, i] >= self.contrast**2:
             return None
         return float(left + i), float(top + j)
+
+
+def responses(cv2: Any, image: Any, block: int) -> Any:
+    """Return for each pixel of an image (H, W) the mean square of the gradient around it, where that is least.
+
+    Of all directions, over a square of `block` pixels: in (grey values a pixel)^2.
+    """
+    return cv2.cornerMinEigenVal(image, block, ksize=3) * (255.0**2 / 4.0)  # OpenCV's is 4 / 255^2 times that

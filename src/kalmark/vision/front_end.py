@@ -25,9 +25,10 @@ from kalmark.tracks.prospect import PIXEL, Prospect
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
 from kalmark.vision.beginning import Beginning, Begun
 from kalmark.vision.depths import inverse_depths, with_depths
-from kalmark.vision.features import Cells
+from kalmark.vision.features import FORGIVEN, Cells
 from kalmark.vision.matching import Searcher
 from kalmark.vision.selection import Search, Selection
+from kalmark.vision.surveyed import FirstLook
 
 PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
 TRIAL = 10  # searches after which a landmark may be given up
@@ -82,6 +83,7 @@ class Look:
     fitted: int = 0
     missed: int = 0  # searches since it last fitted
     seen: int = -1  # frame of the last
+    surveyed: bool = False  # known beforehand: it has no view until it is first seen, and is not given up
 
 
 class Sighting(NamedTuple):
@@ -122,6 +124,7 @@ class FrontEnd:
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
         found = self.found = Search(prospect, looks.told, searcher, settings.updates).run(self.random)
         removed = self._count(prospect, found)
+        self._first_look(image, prospect, found)
         t2 = perf_counter()
         rows = np.flatnonzero(found.matched).tolist()
         y = found.y[rows]
@@ -158,7 +161,7 @@ class FrontEnd:
             elif o.outcome == "associated":
                 look = self.looks[name]
                 look.fitted, look.missed, look.seen = look.fitted + 1, 0, self.frame
-                cosine, scale = self.likeness[at[name]]
+                cosine, scale = self.likeness[at[name]]  # 0 where there is no view yet
                 other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
                 if other and len(look.views) < MOST_VIEWS:
                     view = taken(self.cv2, self.image, report.y[o.index, :PIXEL], T, self.sensor, PATCH, self.frame - 1)
@@ -197,11 +200,15 @@ class FrontEnd:
         """Take the map as it is: something else than frames has changed it."""
         self.beginning = None
 
+    def survey(self, name: Id) -> None:
+        """Search, too, for a landmark known beforehand: its patch is taken where it is first seen."""
+        self.looks[name] = Look(surveyed=True)
+
     # ------------------------------------------------------------------ files
     def state(self) -> dict[str, Any]:
         """Return what is to be saved with the map, but for `arrays`."""
         looks = [
-            [name, len(of.views), of.searched, of.found, of.fitted, of.missed, of.seen]
+            [name, len(of.views), of.searched, of.found, of.fitted, of.missed, of.seen, of.surveyed]
             for name, of in self.looks.items()
         ]
         failed = [[*place, frame] for place, frame in self.cells.failed.items()]
@@ -229,8 +236,9 @@ class FrontEnd:
         frames = read("frames", (count,)).astype(np.int64).tolist()
         views = list(map(View, patches, read("poses", (count, 7)), read("rays", (count, 5, 3)), frames))
         self.looks, at = {}, 0
-        for name, own, *counts in state["looks"]:
-            self.looks[name] = Look(views[at : at + own], *map(int, counts))
+        for name, own, *counts, surveyed in state["looks"]:
+            searched, found, fitted, missed, seen = map(int, counts)
+            self.looks[name] = Look(views[at : at + own], searched, found, fitted, missed, seen, bool(surveyed))
             at += own
         self.frame, self.named = int(state["frame"]), int(state["named"])
         self.random.bit_generator.state = state["random"]
@@ -248,9 +256,20 @@ class FrontEnd:
         self.named += 1
         return f"{frame.robot}.{frame.sensor} {self.named}"
 
+    def _first_look(self, image: Any, prospect: Prospect, found: Selection) -> None:
+        """Enter where landmarks known beforehand are that have no view yet; not in each frame, as it takes long."""
+        if self.frame % FORGIVEN != 1:
+            return
+        rows = [k for k, name in enumerate(prospect.names) if name in self.looks and not self.looks[name].views]
+        if rows:
+            first = FirstLook(self.cv2, image, prospect, self.settings.contrast)
+            for k, y in first.found(found.belief, rows).items():
+                found.matched[k], found.y[k] = True, y
+
     def _new(self, image: Any, found: Selection, prospect: Prospect, count: int) -> Array:
         """Return the pixels (n, 2) of new landmarks."""
-        wanted = min(self.settings.in_view - count, self.settings.starts if len(self.looks) else self.settings.in_view)
+        known = any(not look.surveyed for look in self.looks.values())
+        wanted = min(self.settings.in_view - count, self.settings.starts if known else self.settings.in_view)
         if wanted <= 0:
             return np.zeros((0, 2))
         e = np.where(found.matched[:, None], found.y, found.belief.pixels)
@@ -275,6 +294,8 @@ class FrontEnd:
             if found.matched[k]:
                 look.found += 1
                 continue
+            if look.surveyed:
+                continue
             if look.searched >= TRIAL and look.fitted < LEAST_SHARE * look.searched:
                 removed.append((name, f"fitted in {look.fitted} of {look.searched} searches"))
             elif look.searched < TRIAL and look.missed >= 3:
@@ -282,7 +303,8 @@ class FrontEnd:
         if self.settings.keep == "odometry":
             gone = {name for name, _ in removed}
             view = set(prospect.names)
-            removed += [(name, "out of view") for name in self.looks if name not in view and name not in gone]
+            removed += [(name, "out of view") for name, look in self.looks.items()
+                        if not (name in view or name in gone or look.surveyed)]  # fmt: skip
         return removed
 
     def _room(self, new: int, gone: set[Id], prospect: Prospect) -> list[tuple[Id, str]]:
@@ -292,6 +314,8 @@ class FrontEnd:
             return []
         view = {*prospect.names, *gone}
         out = sorted(
-            (look.fitted, look.seen, k, name) for k, (name, look) in enumerate(self.looks.items()) if name not in view
+            (look.fitted, look.seen, k, name)
+            for k, (name, look) in enumerate(self.looks.items())
+            if name not in view and not look.surveyed
         )
         return [(name, "made room") for *_, name in out[:over]]
