@@ -227,8 +227,10 @@ def inertial() -> Iterator[Figure]:
         name = f"V1_01, readings of the unit, densities times {scale}, stereo points: position / attitude ANEES (3) / state ANEES (15)"
         yield Figure("Inertial", name, ".3 %", f"python benchmarks/inertial.py recorded --runs 2 --scale {scale}",
                      row("recorded stereo invariant:", "{3} % / {14} / {30}"))  # fmt: skip
-    yield Figure("Inertial", "V1_01, the truth: its turns in 1 s against those of the unit, RMS an axis / of the unit's noise", "",
-                 "python benchmarks/inertial.py truth", row("truth: turns", "{5} mrad / {12} mrad"))  # fmt: skip
+    for at, seconds in enumerate((1, 5, 20)):
+        name = f"V1_01, the truth: its turns in {seconds} s against those of the unit, RMS an axis / of the unit's noise / fitted"
+        text = " / ".join(f"{{{at * 10 + k}}} mrad" for k in (6, 10, 12))
+        yield Figure("Inertial", name, "", "python benchmarks/inertial.py truth", row("truth: turns off,", text))
     for estimator in ("invariant", "ekf"):
         wanted = "0 of 100" if estimator == "invariant" else ""
         yield Figure("Inertial", f"information about position and yaw, `{estimator}`: most, start 1 / runs that gain any", wanted,

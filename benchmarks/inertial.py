@@ -15,8 +15,9 @@ densities of the data sheet are multiplied by `--scale`, as the drone shakes.  A
 its time, and the truth is turned so that the mean of its accelerations less those that were read points down; `--held`
 and `--tilted` leave this out.
 
-`truth`: by how much its turns in a second differ from the integral of the rates that were read, less the mean of ten
-seconds, and what the density of the gyroscope's noise is in a second: the truth knows no attitude better than that.
+`truth`: by how much its turns in 1, 5 and 20 s differ from the integral of the rates that were read, a spline in
+quarter steps; what the gyroscope's noise is in that time; and what is left in either half of the flight after a delay,
+scales, wrong axes and a bias of the gyroscope that are fitted to the other half.
 
 `gauge`: 10 s of it, from 20 s on, with an unknown start, 20 deg and 1 m.  `still`: one run at rest.  Both print how the
 information about the directions that nothing observes, shifts and turns about the gravity, compares with that of the
@@ -238,25 +239,40 @@ class Recorded(Run):
 
 
 def turns() -> None:
-    """Print by how much the turns of the truth differ from those that were read."""
-    rows = table("gt_V1_01_easy.csv")[1]
-    u = table("mav0/imu0/data.csv.gz")[1]
-    every, q = RATE_HZ // 20, Rotation.from_quat(rows[:, [4, 5, 6, 3]])
-    odd = []
-    for k in range((len(u) - 1) // every):
-        if k + 1 == len(q):
-            break
-        part = (u[k * every : (k + 1) * every, :3] + u[k * every + 1 : (k + 1) * every + 1, :3]) / 2 - rows[k, 10:13]
-        turn = Rotation.identity()
-        for w in part:
-            turn *= Rotation.from_rotvec(w / RATE_HZ)
-        odd.append((turn.inv() * q[k].inv() * q[k + 1]).as_rotvec())
-    second = np.cumsum(odd, axis=0)
-    second = second[20:] - second[:-20]
-    kernel = np.ones(200) / 200
-    slow = np.column_stack([np.convolve(column, kernel, "same") for column in second.T])
-    rms = np.sqrt(np.mean((second - slow) ** 2))
-    print(f"truth: turns in 1 s off by {1e3 * rms:.2f} mrad RMS an axis, of noise {1e3 * UNIT.densities[0]:.2f} mrad")
+    """Print by how much the turns of the truth differ from those read, and what of it a gyroscope explains."""
+    t, rows = table("gt_V1_01_easy.csv")
+    at, u = table("mav0/imu0/data.csv.gz")
+    q, fine = Rotation.from_quat(rows[:, [4, 5, 6, 3]]), 4 * RATE_HZ // 20
+    biases = np.column_stack([np.interp(at, t, column) for column in rows[:, 10:13].T])
+    rates = CubicSpline(at, u[:, :3] - biases)
+    dt = (t[1:] - t[:-1]) / fine
+    odd = q[:-1].inv() * q[1:]  # the turn of the truth between two of its rows, less that of the unit
+    read, w = Rotation.identity(len(dt)), np.zeros((len(dt), 3))
+    for k in range(fine):
+        now = rates(t[:-1] + (k + 0.5) * dt)
+        read, w = read * Rotation.from_rotvec(now * dt[:, None]), w + now * dt[:, None]
+    R = q[:-1].as_matrix()
+    off = added(R @ (read.inv() * odd).as_rotvec()[:, :, None])[:, :, 0]
+    delay, bias = (rates(t[1:]) - rates(t[:-1]))[:, :, None], np.eye(3) * fine * dt[:, None, None]
+    scales_and_axes = np.einsum("ij,nk->nijk", np.eye(3), w).reshape(len(w), 3, 9)
+    causes = added(R @ np.concatenate([delay, scales_and_axes, bias], axis=2))
+    begin, words = 120, []  # under way
+    for seconds in (1, 5, 20):
+        d, X = (each[begin + 20 * seconds :] - each[begin : -20 * seconds] for each in (off, causes))
+        halves = slice(0, len(d) // 2), slice(len(d) // 2, len(d))
+        left = [
+            d[b] - X[b] @ np.linalg.lstsq(X[a].reshape(-1, X.shape[2]), d[a].ravel())[0]
+            for a, b in (halves, halves[::-1])
+        ]
+        noise = UNIT.densities[0] * math.sqrt(seconds)
+        rms, fitted = (1e3 * np.sqrt(np.mean(each**2)) for each in (d, np.concatenate(left)))
+        words.append(f"in {seconds} s {rms:.2f} mrad, of noise {1e3 * noise:.2f}, fitted {fitted:.2f}")
+    print("truth: turns off, RMS an axis, " + "; ".join(words))
+
+
+def added(steps: np.ndarray) -> np.ndarray:
+    """Return the sums of the first 0 to N of N steps."""
+    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
 def path(seed: SeedSequence, given: argparse.Namespace) -> tuple[np.ndarray, float]:
