@@ -342,6 +342,9 @@ def storms() -> Iterator[Figure]:
                  "tum", "kitti", "freiburg", "dlr", "plaza"):  # fmt: skip
         yield Figure("Bad events", f"Fuzzing `{name}` guided by coverage, 10 minutes: inputs / crashes, hangs, tracebacks", "all / 0",
                      f"python benchmarks/fuzz.py --seconds 600 --timeout 400 {name}", row("total", "{0} / {2}"))  # fmt: skip
+    for kind in ("dense", "postponed"):
+        yield Figure("Bad events", f"A scan of 3,000 landmarks, `{kind}` map: all new / known by their ids / memory", "seconds / seconds / -",
+                     f"python benchmarks/large_scan.py --map {kind}", row("3000 landmarks:", "{0} s / {2} s / {4} MB"))  # fmt: skip
     yield Figure("Bad events", "A log of 1,000,000 rows of CSV: time / memory / bytes a row", "- / that of its events / -",
                  "python benchmarks/tables.py --rows 1000000", row("1000000 rows,", "{6} s / {8} MB / {10}"))  # fmt: skip
     yield Figure("Bad events", "Of 10,000,000 rows, event by event (`stream_log`): time / growth of the memory", "- / bounded",

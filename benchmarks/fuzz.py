@@ -7,7 +7,7 @@
 
 An input is refused with one line (`KalmarkError`) or taken.  Broken is everything else: another exception, a message of
 several lines or of more than 1,500 characters, a state that an error has changed, a covariance that is none; guided by
-coverage also what takes longer than 25 s or more than 2 GB.  A line a target: inputs, those that were taken, broken
+coverage also what takes longer than 25 s, twice, or more than 2 GB.  A line a target: inputs, those that were taken, broken
 ones.  What is broken is kept as `fuzz/TARGET/crash-...`, seeds for later runs in `fuzz/TARGET/corpus`.
 """
 
@@ -15,10 +15,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import types
 import warnings
 from collections.abc import Callable, Iterator
@@ -536,9 +538,8 @@ def chances(name: str, asked: Any) -> tuple[int, int, int]:
 
 def in_process(name: str, asked: Any) -> tuple[int, int, int]:
     """Attack a target in a process of its own; one that libFuzzer ends early has found something."""
-    inputs = broken = 0
-    left = asked.seconds
-    while left > 0:
+    inputs, end = 0, time.monotonic() + asked.seconds
+    while (left := round(end - time.monotonic())) > 0:
         command = [sys.executable, __file__, "--alone", name, "--seconds", str(left), "--found", str(asked.found)]
         command += ["--timeout", str(asked.timeout)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -546,14 +547,28 @@ def in_process(name: str, asked: Any) -> tuple[int, int, int]:
         inputs += int(stats[-1][1]) if stats else 0
         if done.returncode == 0:
             break
-        broken += 1
         lines = [*done.stdout.splitlines(), *done.stderr.splitlines()]
+        slow = [Path(line.split("written to ")[1]) for line in lines if "written to" in line and "/timeout-" in line]
+        if slow and (took_s := again_s(name, slow[-1], asked.timeout)) < asked.timeout:
+            print(f"  {name}: {slow[-1]} takes {took_s:.1f} s alone: the machine was busy, no hang", flush=True)
+            continue
         said = [
             line for line in lines if "Error" in line or "Broken" in line or "ERROR" in line or "written to" in line
         ]
         print(f"  {name}: {' | '.join(said)[:600]}", flush=True)
-        left = 0  # the same again would be found at once
-    return inputs, 0, broken
+        return inputs, 0, 1  # the same again would be found at once
+    return inputs, 0, 0
+
+
+def again_s(name: str, path: Path, timeout_s: int) -> float:
+    """Return how many seconds an input takes when it is tried once more, with the start of the process; inf if it fails."""
+    start = time.monotonic()
+    try:
+        done = subprocess.run([sys.executable, __file__, "--again", name, str(path)], capture_output=True, check=False,
+                              timeout=4 * timeout_s)  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return math.inf
+    return time.monotonic() - start if done.returncode == 0 else math.inf
 
 
 if __name__ == "__main__":

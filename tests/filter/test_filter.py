@@ -51,6 +51,34 @@ def drive(steps: int, seed: int, world: np.ndarray, most: int = 6) -> list[km.Co
 WORLD = np.random.default_rng(0).uniform(-8, 8, (30, 2))
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_scan_of_more_landmarks_than_are_fused_together_is_fused_in_parts(
+    estimator: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = drive(3, 1, np.random.default_rng(2).uniform(-8, 8, (30, 2)), 30)
+
+    def run(together: int, kind: str) -> tuple[km.Slam, Any]:
+        monkeypatch.setattr("kalmark.filter.estimators.TOGETHER", together)
+        slam = km.Slam([robot()], estimator=estimator, map=kind)
+        return slam, [slam.process(event) for event in events][-1]
+
+    (one, whole), (other, parts), (compressed, _) = run(30, "dense"), run(7, "dense"), run(7, "postponed")
+    names = ["r", *one.landmarks().ids]
+    P = one.covariance(*names)
+    sigma = np.sqrt(np.diag(P))
+    for name in names:
+        s = np.sqrt(np.diag(one.covariance(name)))
+        assert (np.abs(one.mean(name) - other.mean(name)) < 0.2 * s).all()
+        np.testing.assert_allclose(compressed.mean(name), other.mean(name), rtol=0, atol=1e-3 * s.min())
+    assert (np.abs(P - other.covariance(*names)) / np.outer(sigma, sigma)).max() < 0.05
+    assert [(o.index, o.id, o.outcome) for o in whole.observations] == [
+        (o.index, o.id, o.outcome) for o in parts.observations
+    ]
+    first = slice(0, 7)  # the first part is compared with what all of them are compared with
+    np.testing.assert_allclose([o.d2 for o in whole.observations[first]], [o.d2 for o in parts.observations[first]],
+                               rtol=0.2, atol=0.05)  # fmt: skip
+
+
 def test_the_fast_ekf_equals_the_textbook_to_1e_10() -> None:
     slam, book, number = km.Slam([robot()], estimator=km.estimators.Ekf()), TextbookSlam([0, 0, 0], Q, R), {}
     for event in drive(60, 1, WORLD):

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -117,6 +117,26 @@ class Averaging(Protocol):
         """
 
 
+TOGETHER = 128  # observations of one correction
+
+
+def _parts(update: Update) -> Iterator[Update]:
+    """Yield a correction by K observations in parts of at most `TOGETHER`.
+
+    Each part is linearised and gated at the estimate after the one before it.  Together they would cost O(K^3), and a
+    compressed map would have all of their landmarks active at once.
+    """
+    for k in range(0, len(update.y), TOGETHER):
+        part = slice(k, k + TOGETHER)
+        yield update._replace(slots=update.slots[part], y=update.y[part], R=update.R[part])
+
+
+def _joined(done: list[Correction]) -> Correction:
+    """Return the corrections of all parts as one."""
+    e, z, Z, d2, fused = (np.concatenate(parts) for parts in list(zip(*done, strict=True))[:-1])
+    return Correction(e, z, Z, d2, fused, all(part.valid for part in done))
+
+
 class _Estimator:
     """Runs the compiled correction for built-in models and the same source in Python for a user's."""
 
@@ -143,8 +163,10 @@ class _Estimator:
         """Fuse a scan, where d2 is within the gate.
 
         Observations whose covariance is not positive definite are left out; if only that of all together is not, they
-        are fused one after the other.
+        are fused one after the other.  A scan of more than `TOGETHER` is fused in parts.
         """
+        if len(update.y) > TOGETHER:
+            return _joined([self.correct(map_, part) for part in _parts(update)])
         model, robot, mount, slots, d, y, R, gate, parallax = update
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
         scan = robot_here, mount_here, here, d, y, R, gate

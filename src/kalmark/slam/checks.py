@@ -14,7 +14,7 @@ from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
 
 LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
-MOST_OBSERVATIONS = 5000  # of one scan: new landmarks as many take gigabytes, and minutes
+MOST_OBSERVATIONS = 5000  # of one scan: a map of as many takes 2 GB, and a scan of all of them half a minute
 ROUNDING = 1e-3  # of a correlation
 
 

@@ -331,6 +331,8 @@ class CompressedMap(Layout):
             self._enter(mount)
         at = self._at[slots]
         if -1 in at.tolist():
+            if self._job is not None:
+                self._job.know(slots[at < 0])  # all at once, rather than each as it enters
             for slot in slots.tolist():
                 self._enter(slot)
             at = self._at[slots]
