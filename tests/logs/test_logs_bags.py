@@ -256,6 +256,15 @@ def test_own_noise_is_that_of_the_twist_over_the_interval(tmp_path: Path) -> Non
     np.testing.assert_allclose(held[0].cov, np.diag([0.01, 0.02]))
 
 
+@pytest.mark.parametrize("kind", ["odometry_2d", "unicycle", "odometry_3d"])
+def test_own_noise_that_is_not_finite_is_refused(kind: str, tmp_path: Path) -> None:
+    sent = [odometry(T0 + k * 10**8, pose(0.1 * k, 0, 0), 1.0) for k in range(2)]
+    sent[1].fields["twist"]["covariance"][:] = np.nan
+    path = bag_of(tmp_path, sent)
+    with pytest.raises(LogError, match="noise .*nan.*, expected finite numbers"):
+        open_log(path, topics={"/odom": {"type": kind, "own_noise": True}})
+
+
 # ------------------------------------------------------------------ the robot itself
 def turned(angle: float, axis: int = 2) -> list[float]:
     q = [0.0, 0.0, 0.0, np.cos(angle / 2)]

@@ -379,8 +379,11 @@ class _Importer:
 
     def control(self, topic: Topic, t_ns: int, u: Array, cov: Array | None) -> None:
         """Take a control."""
-        if cov is not None and np.linalg.eigvalsh(cov)[0] < -1e-12 * np.abs(cov).max(initial=0.0):
-            raise Refused(f"noise {cov.tolist()}, expected it positive semidefinite")
+        if cov is not None:
+            if not np.isfinite(cov).all():
+                raise Refused(f"noise {cov.tolist()}, expected finite numbers")
+            if np.linalg.eigvalsh(cov)[0] < -1e-12 * np.abs(cov).max(initial=0.0):
+                raise Refused(f"noise {cov.tolist()}, expected it positive semidefinite")
         self.events.append(Control(t_ns=t_ns, robot=topic.robot, u=u, cov=cov))
 
     def inertial(self, received: Received, topic: InertialTopic, offer: Message, t_ns: int) -> None:
