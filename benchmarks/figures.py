@@ -338,10 +338,14 @@ def storms() -> Iterator[Figure]:
                  "about 60,000 / 0 / all", "python benchmarks/storm.py --events 66000 --share 0.91", row("total", "{1} / {2} / {3} of {4}"))  # fmt: skip
     yield Figure("Bad events", "Odd files, configurations, maps and streams of events, 100 of each target: inputs / taken / broken",
                  "all / some / 0", "python benchmarks/fuzz.py --inputs 100", row("total", "{0} / {1} / {2}"))  # fmt: skip
+    yield Figure("Bad events", "Odd files and configurations, whole runs with pictures and page (308 once had 14 tracebacks): inputs / taken / broken", "308 or more / some / 0",
+                 "python benchmarks/fuzz.py --odd", row("total", "{0} / {1} / {2}"))  # fmt: skip
+    yield Figure("Bad events", "Damages to the cache of compiled code (199 once had 73 tracebacks and a crash): damages / same map / tracebacks, crashes, other maps", "199 or more / all / 0",
+                 "python benchmarks/fuzz.py --caches 200", row("total", "{0} / {1} / {2}"))  # fmt: skip
     for name in ("native", "mrclam", "config", "map", "process", "parquet", "mcap", "ros1", "sqlite", "matlab", "g2o", "carmen",
                  "tum", "kitti", "freiburg", "dlr", "plaza"):  # fmt: skip
         yield Figure("Bad events", f"Fuzzing `{name}` guided by coverage, 10 minutes: inputs / crashes, hangs, tracebacks", "all / 0",
-                     f"python benchmarks/fuzz.py --seconds 600 --timeout 400 {name}", row("total", "{0} / {2}"))  # fmt: skip
+                     f"python benchmarks/fuzz.py --seconds 600 {name}", row("total", "{0} / {2}"))  # fmt: skip
     for kind in ("dense", "postponed"):
         yield Figure("Bad events", f"A scan of 3,000 landmarks, `{kind}` map: all new / known by their ids / memory", "seconds / seconds / -",
                      f"python benchmarks/large_scan.py --map {kind}", row("3000 landmarks:", "{0} s / {2} s / {4} MB"))  # fmt: skip

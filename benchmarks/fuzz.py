@@ -4,18 +4,26 @@
     python benchmarks/fuzz.py --seconds 60 native config      # some of them
     python benchmarks/fuzz.py --inputs 1000                   # so many mutated inputs a target, without atheris
     python benchmarks/fuzz.py --again native crash-0123abc    # one input that was found
+    python benchmarks/fuzz.py --odd                           # each column and key with odd values, odd files
+    python benchmarks/fuzz.py --caches 240                    # so many damages to the cache of compiled code
 
 An input is refused with one line (`KalmarkError`) or taken.  Broken is everything else: another exception, a message of
 several lines or of more than 1,500 characters, a state that an error has changed, a covariance that is none; guided by
-coverage also what takes longer than 25 s, twice, or more than 2 GB.  A line a target: inputs, those that were taken, broken
-ones.  What is broken is kept as `fuzz/TARGET/crash-...`, seeds for later runs in `fuzz/TARGET/corpus`.
+coverage also what takes longer than 25 s, twice, or more than 2 GB.  A line a target: inputs, those that were taken,
+broken ones.  --odd also saves the run of what is taken, with its pictures and its page, and a table with other ends of
+lines, or with semicolons, must give the same map.  So must a damaged cache.  What is broken is kept as
+`fuzz/TARGET/crash-...`, seeds for later runs in `fuzz/TARGET/corpus`.
 """
 
 from __future__ import annotations
 
 import argparse
+import gzip
 import itertools
+import json
 import math
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -30,11 +38,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from state_digest import digest
-from storm import ESTIMATORS, MAPS, robots
+from state_digest import digest, digest_of_saved
+from storm import ESTIMATORS, MAPS, events, robots
 
 import kalmark as km
-from kalmark.config import build_slam, open_run
+from kalmark.config import build_slam, config_dict, open_run
 from kalmark.errors import DivergedError, KalmarkError
 from kalmark.logs import open_log, write_native
 
@@ -459,6 +467,213 @@ def by_chance(target: Target, inputs: int, seed: int = 0) -> Iterator[tuple[byte
                 yield data, error
 
 
+# ------------------------------------------------------------------ odd files and configurations
+CONFIG_NAME = "my.yaml"
+VALUES = (b"", b"nan", b"-inf", b"1e999", b"1e999990", b"1e155", b"-1e300", b"9" * 5000, b"0x10", b"x\0y",
+          b"\xe2\x85\xa7", b'"', b"<b>&", b"[[1]]")  # fmt: skip
+LAUGHS = "\n".join(["a0: &a0 [x, x]", *(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 10))])
+DIGITS = "9" * 5000
+ODD_CONFIGS = (
+    "robots: 5", "robots: {robot: 5}", "robots: {rover: 5}", "robots: [1]", "robots: {5: 5}", "a: &a {b: *a}",
+    "robots: &r {rover: *r}", "a: &a [*a, *a]", "? [1, 2]\n: 3", "? [[1]]\n: 3", "? {a: 1}\n: 3", f"x: {DIGITS}",
+    f"seed: {DIGITS}", "seed: 1e300", f"upkeep: {{confirm: {DIGITS}}}", f"association: {{gate: {DIGITS[:400]}}}",
+    "plugins: [[1]]", "a: 2001-99-99", "a: !!int x", "robots: {rover: {motion: {type: [1]}}}", f"a: {'[' * 2000}",
+    "robots: {rover: {sensors: {lidar: {preset: [1], type: range_bearing}}}}", LAUGHS,
+    "robots: {rover: {motion: {type: unicycle}, sensors: {lidar: {type: [[1]], sigma_range_m: 1}}}}",
+)  # fmt: skip
+ODD_RIGS = (
+    "robots: 5", "robots: [1]", "robots: {rover: 5}", "robots: {rover: {motion: [1]}}", "[1, 2]", "5: 5",
+    "? {a: 1} : 2", "a: &a {b: *a}", "robots: &r {rover: *r}", f"x: {DIGITS}", "a: 2001-99-99", "landmarks: 5",
+    LAUGHS, "robots: {rover: {sensors: 5}}", "a: !!python/object:os.system x",
+)  # fmt: skip
+EQUAL: dict[str, Callable[[bytes], bytes]] = {
+    "a mark of the byte order": lambda text: b"\xef\xbb\xbf" + text,
+    "ends of lines of Windows": lambda text: text.replace(b"\n", b"\r\n"),
+    "no last end of line": lambda text: text.rstrip(b"\n"),
+    "semicolons": lambda text: text.replace(b",", b";"),
+    "spaces beside the cells": lambda text: text.replace(b",", b" , "),
+}
+"""Changes of a table that must not change the map, if they are taken."""
+WHOLE: dict[str, Callable[[bytes], bytes]] = EQUAL | {
+    "empty": lambda text: b"",
+    "a header alone": lambda text: text.split(b"\n")[0],
+    "two headers": lambda text: text.split(b"\n")[0] + b"\n" + text,
+    "a column twice": lambda text: text.replace(b"\n", b",1\n").replace(b",1\n", b",t_s\n", 1),
+    "cut in a row": lambda text: text[: -len(text) // 5],
+    "zeros": lambda text: bytes(len(text)),
+    "UTF-16": lambda text: text.decode().encode("utf-16"),
+    "compressed": gzip.compress,
+    "a picture": lambda text: b"\x89PNG\r\n\x1a\n" + text,
+    "one long line": lambda text: text.replace(b"\n", b",") * 2000,
+    "backwards": lambda text: b"\n".join([text.split(b"\n")[0], *text.split(b"\n")[:0:-1]]),
+}
+
+
+def odd_files() -> Iterator[tuple[str, dict[str, bytes], bool]]:
+    """Yield what is odd, the odd files, and whether the map must be that of the right ones."""
+    for name, texts in TABLES.items():
+        if not name.endswith(".csv"):
+            continue
+        for k, text in enumerate(texts):
+            *above, last = text.rstrip(b"\n").split(b"\n")
+            comma = b";" if b";" in last else b","
+            for column, value in itertools.product(range(last.count(comma) + 1), VALUES):
+                cells = last.split(comma)
+                cells[column] = value
+                rows = b"\n".join([*above, comma.join(cells), b""])
+                yield f"{name}, {k}: column {column} is {value[:20]!r}", {name: rows}, False
+        yield from ((f"{name}: {told}", {name: change(texts[0])}, told in EQUAL) for told, change in WHOLE.items())
+    for at in re.finditer(rb"(?<=: )[^,{}\[\]\n]+", CONFIG):
+        for value in VALUES:
+            changed = CONFIG[: at.start()] + value + CONFIG[at.end() :]
+            yield f"config: {at[0]!r} is {value[:20]!r}", {CONFIG_NAME: changed}, False
+    for odd in ODD_CONFIGS:
+        yield f"config: {odd[:40]}", {CONFIG_NAME: b"log: {path: log}\n" + odd.encode()}, False
+    for odd in ODD_RIGS:
+        yield f"rig: {odd[:40]}", {CONFIG_NAME: b"log: {path: log}\n", "rig.yaml": odd.encode()}, False
+
+
+def saved_run(folder: Path, odd: dict[str, bytes]) -> str:
+    """Run a log of which some files are odd, and save the run; return the digest of the map."""
+    files = {"controls.csv": CONTROLS, "scans.csv": SCANS, CONFIG_NAME: CONFIG.replace(b"skip", b"raise")} | odd
+    config_text = files.pop(CONFIG_NAME)
+    written(folder / "log", files)
+    (folder / CONFIG_NAME).write_bytes(config_text)
+    made, log = open_run(folder / CONFIG_NAME)
+    slam = build_slam(made, log)
+    run = km.record(slam, log, progress=False, on_error=made.log.on_error, config=config_dict(made))
+    run.evaluate()
+    out = run.save(folder / "out")
+    json.loads((out / "summary.json").read_text())
+    if not (out / "map.png").stat().st_size or b"<b>&" in (out / "report.html").read_bytes():
+        raise Broken("an empty picture, or an id that is not escaped")
+    names = [*slam.robots, *slam.tracks.confirmed]
+    P = slam.covariance(*names)
+    if not np.isfinite(P).all() or np.linalg.eigvalsh(P)[0] < -1e-9 * max(1.0, float(np.abs(P).max())):
+        raise Broken(f"covariance {np.linalg.eigvalsh(P)}")
+    return digest_of_saved(slam)
+
+
+def odd_ones() -> tuple[int, int, int]:
+    """Return how many odd files and configurations there were, were taken and broke something."""
+    counts = [0, 0, 0]
+    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        right = saved_run(Path(name), {})
+        for told, files, equal in odd_files():
+            counts[0] += 1
+            try:
+                map_ = saved_run(Path(name), files)
+                if equal and {*files} <= {"controls.csv", "scans.csv"} and map_ != right:
+                    raise Broken("another map")
+                counts[1] += 1
+            except KalmarkError as error:
+                try:
+                    plain(error)
+                except Broken as broken:
+                    counts[2] += report(told, broken)
+            except Exception as error:
+                counts[2] += report(told, error)
+    return counts[0], counts[1], counts[2]
+
+
+def report(told: str, error: Exception | str) -> int:
+    """Print what was broken; return 1."""
+    print(f"  {told}: {type(error).__name__}: {' '.join(str(error).split())[:300]}", flush=True)
+    return 1
+
+
+# ------------------------------------------------------------------ damaged caches
+DAMAGES: dict[str, Callable[[bytes, np.random.Generator, bytes], bytes]] = {
+    "empty": lambda code, random, other: b"",
+    "cut": lambda code, random, other: code[: random.integers(len(code))],
+    "cut by one": lambda code, random, other: code[:-1],
+    "a bit": lambda code, random, other: flipped(code, int(random.integers(len(code)))),
+    "a bit of the head": lambda code, random, other: flipped(code, int(random.integers(min(64, len(code))))),
+    "a hole": lambda code, random, other: code[: len(code) // 3] + bytes(len(code) // 3) + code[2 * len(code) // 3 :],
+    "zeros": lambda code, random, other: bytes(len(code)),
+    "noise": lambda code, random, other: random.bytes(len(code)),
+    "twice": lambda code, random, other: code + code,
+    "a text": lambda code, random, other: b"not code\n",
+    "another file": lambda code, random, other: other,
+    "half of another file": lambda code, random, other: code[: len(code) // 2] + other[len(other) // 2 :],
+}
+GONE = "gone", "a folder"
+
+
+def flipped(code: bytes, at: int) -> bytes:
+    """Return a file with one bit changed."""
+    return code[:at] + bytes([code[at] ^ 1 << at % 8]) + code[at + 1 :]
+
+
+def damage(files: list[Path], random: np.random.Generator) -> str:
+    """Damage one of these files, or one in ten times a third of them; return how."""
+    how = str(random.choice([*DAMAGES, *GONE]))
+    count = len(files) // 3 if random.random() < 0.1 else 1
+    for k in random.choice(len(files), count, replace=False):
+        file, other = files[k], files[int(random.integers(len(files)))]
+        code = file.read_bytes() or b"0"
+        if how in GONE:
+            file.unlink()
+            if how == "a folder":
+                file.mkdir()
+        else:
+            file.write_bytes(DAMAGES[how](code, random, other.read_bytes() if other.exists() else b""))
+    return f"{how}, {count} of {len(files)} files"
+
+
+def small_map() -> str:
+    """Return the digest of a small map in the plane."""
+    slam = km.Slam(robots(False))
+    for told in itertools.islice(events(False, np.random.default_rng(0)), 24):
+        slam.process(told.made())
+    return digest_of_saved(slam)
+
+
+def forked() -> str:
+    """Return the digest of the small map, from a process of its own, or how that ended."""
+    out, into = os.pipe()
+    child = os.fork()
+    if not child:
+        try:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+            os.write(into, small_map().encode())
+        except BaseException as error:
+            os.write(into, f"{type(error).__name__}: {error}"[:500].encode())
+        os._exit(0)
+    os.close(into)
+    with os.fdopen(out) as file:
+        told = file.read()
+    status = os.waitpid(child, 0)[1]
+    return f"ended by signal {status}" if status else told
+
+
+def damaged(count: int, seed: int) -> tuple[int, int]:
+    """Return how many damages there were to the cache that this process begins with, and how many broke something."""
+    random, root, broken = np.random.default_rng(seed), Path(os.environ["KALMARK_CACHE"]), 0
+    right = forked()
+    for _ in range(count):
+        told = damage([path for path in sorted(root.rglob("*")) if path.is_file()], random)
+        if (found := forked()) != right:
+            broken += report(told, found)
+        for folder in root.rglob("*.nb*"):
+            if folder.is_dir():
+                folder.rmdir()
+    return count, broken
+
+
+def damaged_caches(count: int, seed: int) -> tuple[int, int, int]:
+    """Return how many damages there were to a cache, how many of them kept the map, and how many broke something."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"KALMARK_CACHE": cache, "OPENBLAS_NUM_THREADS": "1"}
+        command = [sys.executable, __file__, "--alone", "--caches", str(count), "--seed", str(seed)]
+        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    *lines, last = done.stdout.splitlines()
+    print("\n".join(lines))
+    damages, broken = map(int, last.split())
+    return damages, damages - broken, broken
+
+
 # ------------------------------------------------------------------ guided by coverage
 def instrumented() -> None:
     """Have the functions of the modules that guide report their coverage."""
@@ -502,18 +717,26 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--found", type=Path, default=Path("fuzz"), help="folder of what was found")
     parser.add_argument("--timeout", type=int, default=TIMEOUT_S, help="seconds after which an input hangs")
+    parser.add_argument("--odd", action="store_true", help="odd files and configurations, each a whole run")
+    parser.add_argument("--caches", type=int, help="so many damages to the cache of compiled code")
     parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--again", nargs=2, metavar=("TARGET", "FILE"), help="one input that was found")
     asked = parser.parse_args()
     if asked.again is not None:
         print(attacked(targets()[asked.again[0]], Path(asked.again[1]).read_bytes(), Path(tempfile.mkdtemp())))
         return
+    if asked.alone and asked.caches:
+        print(*damaged(asked.caches, asked.seed))
+        return
     if asked.alone:
         guided(asked.target[0], asked.seconds, asked.found, asked.timeout)
         return
     totals = np.zeros(3, dtype=int)
-    for name in asked.target or targets():
-        counts = chances(name, asked) if asked.inputs else in_process(name, asked)
+    special = {"odd": odd_ones} if asked.odd else {}
+    if asked.caches:
+        special["caches"] = lambda: damaged_caches(asked.caches, asked.seed)
+    for name in special or asked.target or targets():
+        counts = special[name]() if special else chances(name, asked) if asked.inputs else in_process(name, asked)
         print(f"{name}: {counts[0]} inputs, {counts[1]} taken, {counts[2]} broken", flush=True)
         totals += counts
     print(f"total {totals[0]} {totals[1]} {totals[2]}")
@@ -561,7 +784,7 @@ def in_process(name: str, asked: Any) -> tuple[int, int, int]:
 
 
 def again_s(name: str, path: Path, timeout_s: int) -> float:
-    """Return how many seconds an input takes when it is tried once more, with the start of the process; inf if it fails."""
+    """Return the seconds that an input takes in a process of its own, with its start; inf if it fails."""
     start = time.monotonic()
     try:
         done = subprocess.run([sys.executable, __file__, "--again", name, str(path)], capture_output=True, check=False,

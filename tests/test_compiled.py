@@ -115,6 +115,8 @@ for file in (index, data):
         assert anew() == 0, "what is damaged is not loaded"
         assert anew() == 1, "it has been made anew"
         cases += 1
+    (index if file is data else data).replace(file)
+    assert anew() == 0 and anew() == 1, "another file under its name is not loaded"
     file.unlink()
     assert anew() == 0 and anew() == 1
 print(cases)

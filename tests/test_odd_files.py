@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz import DIGITS, ODD_CONFIGS, ODD_RIGS
 
 import kalmark as km
 from kalmark.config import build_slam, open_run
@@ -19,11 +20,7 @@ CONFIG = """robots:
     motion: {type: unicycle, sigma_v_mps: 0.05}
     sensors: {lidar: {type: range_bearing, sigma_range_m: 0.1, sigma_bearing_rad: 0.02}}
 """
-DIGITS = "9" * 5000
 SIGMA = "robots: {rover: {motion: {type: unicycle, sigma_v_mps: VALUE}}}"
-LAUGHS = "\n".join(
-    ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 10))]
-)  # each line is ten times the one before
 
 
 def outcome(folder: Path, controls: str = "", scans: str = "", config: str = CONFIG, **files: str) -> str:
@@ -95,28 +92,12 @@ def test_a_value_beyond_what_means_anything_is_refused(files: dict[str, str], me
     assert message in outcome(tmp_path, **files)
 
 
-@pytest.mark.parametrize(
-    "rig",
-    [
-        "robots: 5", "robots: [1]", "robots: {rover: 5}", "robots: {rover: {motion: [1]}}", "[1, 2]", "5: 5",
-        "? {a: 1} : 2", "a: &a {b: *a}", "robots: &r {rover: *r}", f"x: {DIGITS}", "a: 2001-99-99", "landmarks: 5",
-        LAUGHS, "robots: {rover: {sensors: 5}}", "a: !!python/object:os.system x",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("rig", ODD_RIGS)
 def test_an_odd_rig_is_refused_with_one_line(rig: str, tmp_path: Path) -> None:
     assert outcome(tmp_path, config="", rig_yaml=rig)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        "robots: 5", "robots: {robot: 5}", "robots: {rover: 5}", "robots: [1]", "robots: {5: 5}", "a: &a {b: *a}",
-        "robots: &r {rover: *r}", "a: &a [*a, *a]", "? [1, 2]\n: 3", "? [[1]]\n: 3", "? {a: 1}\n: 3", f"x: {DIGITS}",
-        f"seed: {DIGITS}", "seed: 1e300", f"upkeep: {{confirm: {DIGITS}}}", f"association: {{gate: {DIGITS[:400]}}}",
-        "plugins: [[1]]", "a: 2001-99-99", "a: !!int x", "robots: {rover: {motion: {type: [1]}}}", f"a: {'[' * 2000}",
-        "robots: {rover: {sensors: {lidar: {preset: [1], type: range_bearing}}}}", LAUGHS,
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("config", ODD_CONFIGS)
 def test_an_odd_configuration_is_refused_with_one_line(config: str, tmp_path: Path) -> None:
     assert outcome(tmp_path, config=config).startswith(str(tmp_path / "my.yaml"))
 

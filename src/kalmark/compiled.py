@@ -7,8 +7,8 @@ What one compiled function calls is compiled into it once more.  Where that woul
 ever needed, the call goes `by_address` instead: the callee is compiled once, alone, and only when it is used.  The
 filter calls the models so, hence its code does not depend on theirs: each has a folder of its own.
 
-Each file of compiled code ends with its SHA-256.  One that is damaged, or cut, counts as none and is made anew: what
-numba would take out of it might do anything.
+Each file of compiled code ends with the SHA-256 of its name and content.  One that is damaged or cut, or
+another one under its name, counts as none and is made anew: what numba would take out of it might do anything.
 
 An address holds in the process that made it, as long as the function lives.  So it is always an argument of compiled
 code, never a constant in it that the disk would keep; who is copied to another process leaves it behind and asks again.
@@ -94,7 +94,11 @@ class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc, unused-ignore]
             content = io.BytesIO()
             yield content
             file.write(content.getvalue())
-            file.write(hashlib.sha256(content.getvalue()).digest())
+            file.write(_checksum(filepath, content.getvalue()))
+
+
+def _checksum(path: str, content: bytes) -> bytes:
+    return hashlib.sha256(os.path.basename(path).encode() + b"\n" + content).digest()
 
 
 def _whole(path: str) -> bytes | None:
@@ -104,7 +108,7 @@ def _whole(path: str) -> bytes | None:
     except OSError:
         return None
     content, checksum = data[:-32], data[-32:]
-    return content if hashlib.sha256(content).digest() == checksum else None
+    return content if _checksum(path, content) == checksum else None
 
 
 def compiled(function: F) -> F:

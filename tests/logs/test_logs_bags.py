@@ -261,7 +261,7 @@ def test_own_noise_that_is_not_finite_is_refused(kind: str, tmp_path: Path) -> N
     sent = [odometry(T0 + k * 10**8, pose(0.1 * k, 0, 0), 1.0) for k in range(2)]
     sent[1].fields["twist"]["covariance"][:] = np.nan
     path = bag_of(tmp_path, sent)
-    with pytest.raises(LogError, match="noise .*nan.*, expected finite numbers"):
+    with pytest.raises(LogError, match=r"noise .*nan.*, expected finite numbers"):
         open_log(path, topics={"/odom": {"type": kind, "own_noise": True}})
 
 

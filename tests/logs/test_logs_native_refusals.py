@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -248,3 +249,17 @@ def test_a_file_whose_name_is_nearly_one_of_a_log_is_named(tmp_path: Path) -> No
         open_log(folder)
     (folder / "scan.csv").rename(folder / "scans.csv")
     assert len(open_log(folder).events) == 2
+
+
+@pytest.mark.parametrize("kind", ["a folder", "a pipe", "a link to itself"])
+def test_a_table_that_is_no_file_is_refused_with_one_line(kind: str, tmp_path: Path) -> None:
+    scans = (native(tmp_path) / "scans.csv").resolve()
+    scans.unlink(missing_ok=True)
+    if kind == "a folder":
+        scans.mkdir()
+    elif kind == "a pipe":
+        os.mkfifo(scans)
+    else:
+        scans.symlink_to(scans)
+    with pytest.raises(LogError, match=r"scans.csv: not a file, expected a table"):
+        open_log(scans.parent)

@@ -18,7 +18,7 @@ from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
 from kalmark.logs import open_log, write_native
 from kalmark.results.record import record
-from kalmark.results.recording import replace_file
+from kalmark.results.recording import file_name, replace_file
 from kalmark.results.run import Run
 from results_world import STEP_NS, circle, slam_for
 
@@ -310,3 +310,27 @@ def test_a_misspelt_column_is_no_other_number_of_a_filter_built_in_python(
     (tmp_path / name).write_text(text.replace(column, misspelt, 1))
     with pytest.raises(LogError, match=rf"{name}:1: the {told}.*; did you mean '{column}'\?"):
         record(slam_for(log), open_log(tmp_path), progress=False)
+
+
+def test_ids_and_names_that_look_like_a_page_are_shown_as_they_are(tmp_path: Path) -> None:
+    odd, name = "<b>&'\"</b><script>", "<i>a/b</i>"
+    log = circle(robots=(name, name.replace("/", "_")), steps=30)
+    events = [
+        replace(event, ids=tuple(odd if i == 3 else i for i in event.ids))
+        if isinstance(event, km.Scan) and event.ids
+        else event
+        for event in log
+    ]
+    run = record(slam_for(log), replace(log, events=events), progress=False)
+    run.evaluate()
+    run.save(tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert odd in run.landmarks.ids and odd not in page and name not in page
+    assert len(list(tmp_path.glob("trajectory_*.tum"))) == 2, "a file a robot, though both names are alike in files"
+    assert Run.load(tmp_path).landmarks.ids == run.landmarks.ids
+
+
+def test_the_name_of_a_robot_may_be_longer_than_that_of_a_file() -> None:
+    assert file_name("rover-1.b") == "rover-1.b"
+    assert len({file_name(name) for name in ("a/b", "a_b", "a b", "x" * 300, "x" * 301)}) == 5
+    assert len(file_name("\u6f22" * 300).encode()) <= 100

@@ -175,7 +175,7 @@ def _expected(kind: str, context: dict[str, Any], message: str) -> str:
 def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
     kind = _kind(path[:-1])
     for here, there, world in (("space", "the plane", "plane"), ("the plane", "space", "space")):
-        if kind == "sensor" and path[-1] == "type" and got in classes("sensor", world):
+        if kind == "sensor" and path[-1] == "type" and str(got) in classes("sensor", world):
             return f"got {show(got)}, a sensor of {there} on a robot of {here}, expected {_one_of(words)}"
     return f"got {show(got)}, expected {_one_of(words)}{did_you_mean(str(got), words)}"
 

@@ -6,6 +6,7 @@ Those are TUM trajectories, ``associations.csv``, ``changes.csv`` and ``config.y
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
 CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
 FAST, PAYS = 1, 0.75  # the level of compression of ``history.npz``, and what it must leave at most to be used
+LONGEST_NAME = 100  # bytes of a robot or a sensor in the name of a file, which has 255 at most
 NEEDED = ("summary.json", "config.yaml", "history.npz", "landmarks.csv")
 
 
@@ -122,8 +124,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def file_name(robot: str) -> str:
-    """Return a robot's name as part of a file's name."""
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in robot)
+    """Return a robot's name as part of a file's name, another one for each robot.
+
+    A name that is not one of files, or is long, gets a part of its SHA-256.
+    """
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in robot)
+    if name == robot and len(name.encode()) <= LONGEST_NAME:
+        return name
+    return f"{name[: LONGEST_NAME // 4]}_{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
 
 
 def write(path: Path, text: str) -> None:
