@@ -663,10 +663,32 @@ def copied(source: Path, out: Path, mode: str, first: int = 0, last: int | None 
     return out
 
 
-@pytest.mark.parametrize(("kind", "mode"), [("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "MESSAGE")])
+@pytest.mark.parametrize(("kind", "mode"), [("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "FILE"), ("mcap", "MESSAGE"),
+                                              ("mcap", "STORAGE")])  # fmt: skip
 def test_a_packed_ros_2_bag_is_the_same_log(kind: str, mode: str, bags: dict[str, Path], tmp_path: Path) -> None:
     path = copied(bags[kind], tmp_path / "packed", mode)
     assert all(map(same, events_of(path), events_of(bags[kind]))) and len(events_of(path))
+
+
+@pytest.mark.parametrize("packed", ["NONE", "LZ4", "ZSTD"])
+@pytest.mark.parametrize("chunks", [True, False])
+def test_mcap_of_its_own_library_with_packed_chunks_or_none_is_the_same_log(
+    packed: str, chunks: bool, bags: dict[str, Path], tmp_path: Path
+) -> None:
+    reader, writer = pytest.importorskip("mcap.reader"), pytest.importorskip("mcap.writer")
+    path = tmp_path / "packed.mcap"
+    (source,) = bags["mcap"].glob("*.mcap")
+    with source.open("rb") as file, path.open("wb") as out:
+        kept: dict[int, int] = {}
+        to = writer.Writer(out, 4096, writer.CompressionType[packed], use_chunking=chunks)
+        to.start("ros2", "a library")
+        for schema, channel, message in reader.make_reader(file).iter_messages(log_time_order=False):
+            if channel.id not in kept:
+                number = to.register_schema(schema.name, schema.encoding, schema.data)
+                kept[channel.id] = to.register_channel(channel.topic, channel.message_encoding, number)
+            to.add_message(kept[channel.id], message.log_time, message.data, message.publish_time)
+        to.finish()
+    assert all(map(same, events_of(path), events_of(bags["mcap"]))) and len(events_of(path))
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
