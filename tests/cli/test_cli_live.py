@@ -5,8 +5,12 @@ from __future__ import annotations
 import io
 import json
 import socket
+import struct
 import subprocess
 import sys
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,7 @@ import pytest
 
 import kalmark as km
 from command_line import Kalmark
+from kalmark.cli.live import serve
 from kalmark.logs.lines import KEYS, LONGEST_LINE, event_of, line_of, mapping_of
 from kalmark.results.live import Live, converse
 
@@ -151,6 +156,50 @@ def test_a_program_talks_through_a_socket_and_the_next_one_goes_on(tmp_path: Pat
             assert last["landmarks"][0]["id"] == 7
         finally:
             process.kill()
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def test_one_program_waits_for_the_other_and_none_that_is_gone_stops_the_next(tmp_path: Path) -> None:
+    live, port = a_live(tmp_path), free_port()
+    threading.Thread(target=serve, args=(live, port), daemon=True).start()
+
+    def connected() -> socket.socket:
+        for _ in range(200):
+            with suppress(OSError):
+                return socket.create_connection(("127.0.0.1", port), timeout=60)
+            time.sleep(0.05)
+        raise AssertionError("nobody listens")
+
+    def control(t_s: float) -> bytes:
+        return json.dumps(CONTROL | {"t_s": t_s}).encode() + b"\n"
+
+    def answers(connection: socket.socket, count: int) -> list[dict[str, Any]]:
+        with connection.makefile() as lines:
+            return [json.loads(lines.readline()) for _ in range(count)]
+
+    one = connected()
+    one.sendall(control(1.0))
+    assert answers(one, 2)[1]["t_s"] == 1.0
+    other = connected()  # waits for its turn
+    other.sendall(control(2.0)[:20])
+    one.sendall(control(1.5) + control(1.8)[:30])  # half a line, and gone
+    one.close()
+    other.sendall(control(2.0)[20:])
+    assert answers(other, 2)[1]["t_s"] == 2.0
+    other.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    other.close()  # resets the connection
+    deaf = connected()
+    deaf.sendall(b"".join(control(3.0 + k / 1000) for k in range(3000)))  # never reads an answer
+    deaf.close()
+    last = connected()
+    last.sendall(control(100.0))
+    assert answers(last, 2)[1]["t_s"] == 100.0
+    last.close()
 
 
 def test_events_come_back_from_their_lines() -> None:

@@ -663,8 +663,10 @@ def copied(source: Path, out: Path, mode: str, first: int = 0, last: int | None 
     return out
 
 
-@pytest.mark.parametrize(("kind", "mode"), [("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "FILE"), ("mcap", "MESSAGE"),
-                                              ("mcap", "STORAGE")])  # fmt: skip
+PACKED = [("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "FILE"), ("mcap", "MESSAGE"), ("mcap", "STORAGE")]
+
+
+@pytest.mark.parametrize(("kind", "mode"), PACKED)
 def test_a_packed_ros_2_bag_is_the_same_log(kind: str, mode: str, bags: dict[str, Path], tmp_path: Path) -> None:
     path = copied(bags[kind], tmp_path / "packed", mode)
     assert all(map(same, events_of(path), events_of(bags[kind]))) and len(events_of(path))
