@@ -453,7 +453,8 @@ def images() -> Iterator[Figure]:
     yield Figure("Images", "one camera that begins before a known target, MonoSLAM's sequence, 1,000 frames, worst of five seeds: medians against the target's PnP of position / angle / middle of the target / its corners; scatter of PnP; matched, least",
                  "0.01 m / 1 deg / - / - / - / never lost", "python benchmarks/vision_target.py",
                  row("target", "{0} m / {1} deg / {2} m / {3} px / {4} m / {8}"))  # fmt: skip
-    for name, label in (("textured_room", "one camera"), ("textured_room_depth", "a camera with depth")):
+    worlds = {"": "one camera", "_depth": "a camera with depth", "_stereo": "a rectified pair"}
+    for name, label in ((f"textured_room{kind}", label) for kind, label in worlds.items()):
         yield Figure("Images", f"`{name}`, {label}, 450 rendered images, five seeds: largest RMS of the position, not aligned / ANEES of the pose, a dof / in its band / a frame",
                      "- / 1 / 80 % / -", f"python benchmarks/vision.py {name}",
                      row(name, "{0} m / {1} / {2} % / {4} ms"))  # fmt: skip

@@ -302,9 +302,10 @@ class Fix:
 class Frame:
     """What one camera of one robot took at one instant: an image, and the depth of its pixels where that is measured.
 
-    The detector of its sensor makes a scan of it.  `image` (H, W) or (H, W, 3) of bytes, blue, green and red, and
-    `depth` (H, W) in m, 0 where there is none, are arrays, or functions that read them each time they are needed: a log
-    of many frames holds no pixel.
+    The detector of its sensor makes a scan of it.  `image` (H, W) or (H, W, 3) of bytes, blue, green and red, `right`,
+    that of the right camera of a rectified pair, of which `image` is the left one, and `depth` (H, W) in m, 0 where
+    there is none, are arrays, or functions that read them each time they are needed: a log of many frames holds no
+    pixel.
     """
 
     t_ns: int
@@ -312,6 +313,7 @@ class Frame:
     sensor: str
     image: Array | Callable[[], Array]
     depth: Array | Callable[[], Array] | None
+    right: Array | Callable[[], Array] | None
 
     def __init__(
         self,
@@ -320,6 +322,7 @@ class Frame:
         sensor: str = "",
         image: Any = (),
         depth: Any = None,
+        right: Any = None,
         *,
         t_ns: int | None = None,
     ) -> None:
@@ -331,6 +334,7 @@ class Frame:
             set_(self, "sensor", _text(sensor, "sensor"))
             set_(self, "image", image if callable(image) else _pixels(image))
             set_(self, "depth", depth if depth is None or callable(depth) else _depths(depth))
+            set_(self, "right", right if right is None or callable(right) else _pixels(right))
         except EventError as error:
             what = f"frame of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
             raise EventError(f"{what}: {error}") from None
@@ -346,11 +350,11 @@ class Frame:
 
     def grey(self) -> Any:
         """Return the image (H, W) as bytes, .114 blue + .587 green + .299 red (ITU-R BT.601).  Raises ImageError."""
-        pixels = self.pixels()
-        if pixels.ndim == 2:
-            return pixels
-        blue, green, red = (pixels[:, :, k].astype(np.uint32) for k in range(3))
-        return ((1868 * blue + 9617 * green + 4899 * red + 8192) >> 14).astype(np.uint8)
+        return _grey(self.pixels())
+
+    def right_grey(self) -> Any:
+        """Return the image of the right camera (H, W) likewise, None if there is none.  Raises ImageError."""
+        return None if self.right is None else _grey(self._read(self.right, _pixels))
 
     def depths(self) -> Array | None:
         """Return the depth (H, W) of the pixels in m, 0 where there is none; None if none was measured.
@@ -371,6 +375,13 @@ def _pixels(image: Any) -> Any:
     if pixels.dtype != np.uint8 or not pixels.size or not (pixels.ndim == 2 or pixels.shape[2:] == (3,)):
         raise EventError(f"the image is {pixels.dtype} {pixels.shape}, expected bytes (H, W) or (H, W, 3)")
     return np.ascontiguousarray(pixels)
+
+
+def _grey(pixels: Any) -> Any:
+    if pixels.ndim == 2:
+        return pixels
+    blue, green, red = (pixels[:, :, k].astype(np.uint32) for k in range(3))
+    return ((1868 * blue + 9617 * green + 4899 * red + 8192) >> 14).astype(np.uint8)
 
 
 def _depths(depth: Any) -> Array:

@@ -205,6 +205,16 @@ def test_kitti_odometry_has_the_left_camera_and_its_poses(tmp_path: Path) -> Non
     assert camera(log) == {"type": "pinhole", "fx_px": 700.0, "fy_px": 700.0, "cx_px": 30.0, "cy_px": 20.0,
                            "width_px": 64, "height_px": 48}  # fmt: skip
     assert log.truth["robot"].poses[2] == pytest.approx([2, 0, 4, 0, 0, 0, 1])
+    for k in (0, 2):  # the second of the right images is missing
+        put(folder / "image_1" / f"{k:06}.png", picture(k + 5))
+    pair = km.open_log(folder)
+    assert (camera(pair)["type"], camera(pair)["baseline_m"]) == ("stereo", pytest.approx(380 / 700))
+    rights = [f.right_grey() for f in frames(pair)]
+    assert rights[1] is None
+    assert np.array_equal(rights[2], picture(7))
+    assert camera(km.open_log(folder, right="none"))["type"] == "pinhole"
+    (folder / "calib.txt").write_text("P0: 700 0 30 0 0 700 20 0 0 0 1 0\nP1: 700 0 30 380 0 700 20 0 0 0 1 0\n")
+    assert "camera 1 is -0.542857 m to the right of 0, expected more than 0" in refused(folder)
     (folder / "calib.txt").write_text("P1: 700 0 30\n")
     assert "calib.txt: no row P0:" in refused(folder)
 

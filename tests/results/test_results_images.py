@@ -11,7 +11,7 @@ from PIL import Image
 
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.events import Frame
-from kalmark.logs import Log, write_native
+from kalmark.logs import Log, open_log, write_native
 from kalmark.results.pictures import Pictures
 from kalmark.results.record import record
 from kalmark.results.report import report_html
@@ -68,3 +68,17 @@ def test_a_run_without_images_has_no_pictures() -> None:
     log = simulate(world, 1)
     run = record(build_slam(world.config(), log), log, progress=False)
     assert Pictures(run).at(run.history.cameras[0], 1) is None
+
+
+def test_a_pair_shows_each_of_its_images_also_from_files(tmp_path: Path) -> None:
+    world = load_world("textured_room_stereo", ["steps=1", "world.pixel_m=0.02"])
+    log = simulate(world, 0)
+    write_native(log, tmp_path / "log")
+    again = open_log(tmp_path / "log")
+    run = record(build_slam(world.config(), again), again, progress=False)
+    camera, frames = run.history.cameras[0], [event for event in log.events if isinstance(event, Frame)]
+    for step, frame in enumerate(frames):
+        right = frame.right_grey()
+        assert not (right == frame.grey()).all()
+        assert (Pictures(run).at(camera, step, "left") == frame.grey()).all()
+        assert (Pictures(run).at(camera, step, "right") == right).all()

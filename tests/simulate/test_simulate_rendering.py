@@ -137,8 +137,7 @@ def test_images_want_a_world_of_textures_and_a_camera() -> None:
     room = "world={type: random_box}"
     with pytest.raises(ConfigError, match="expected images in a world of textures, textured_room or textured_planes"):
         load_world("textured_room", [room])
-    stereo = "robots.robot.sensors.camera={type: stereo, mount: {roll_deg: -90}}"
-    with pytest.raises(
-        ConfigError, match="expected images of pinhole or pixel_depth or omnidirectional, not of 'camera', a stereo"
-    ):
-        load_world("textured_room", [stereo])
+    laser = "robots.robot.sensors.camera={type: range_bearing_3d, mount: {roll_deg: -90}}"
+    kinds = "pinhole or pixel_depth or stereo or omnidirectional"
+    with pytest.raises(ConfigError, match=f"expected images of {kinds}, not of 'camera', a range_bearing_3d"):
+        load_world("textured_room", [laser])

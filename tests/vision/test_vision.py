@@ -16,6 +16,7 @@ from kalmark.tracks.prospect import Prospect
 from kalmark.vision.appearance import predicted, taken
 from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.matching import Searcher, correlation
+from kalmark.vision.pairs import with_pairs
 from kalmark.vision.selection import Search
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
@@ -383,3 +384,77 @@ def test_the_shipped_configuration_of_depth_images_runs_the_layout_of_tum(tmp_pa
     for event in log.events:
         slam.process(event)
     assert np.linalg.norm(minus(slam.mean("robot")[:7], true[-1])[:3]) < 0.01  # of .3 m, in metres
+
+
+PAIR = km.sensors.Stereo(
+    fx_px=250, fy_px=250, cx_px=159.5, cy_px=119.5, width_px=320, height_px=240, baseline_m=0.12,
+    sigma_ul_px=0.5, sigma_vl_px=0.5, sigma_ur_px=0.5, sigma_vr_px=0.5,
+)  # fmt: skip
+
+
+def with_right(frames: list[km.Frame], true: np.ndarray, shown: bool = True) -> list[km.Frame]:
+    """Return the frames with the image of a right camera, or one that shows nothing of what the left one does."""
+    renderer, rng, found = Renderer(sides(), CAMERA), np.random.default_rng(8), []
+    for frame, T in zip(frames, true, strict=True):
+        right = renderer.taken(compose(T, pose(PAIR.baseline_m, 0, 0, 0, 0, 0))[0], rng, noise=1.0, blur_px=0.6)[0]
+        right = right if shown else rng.integers(0, 256, right.shape).astype(np.uint8)
+        found.append(km.Frame(frame.t_s, "camera", "eye", frame.image, right=right))
+    return found
+
+
+def test_the_right_image_of_a_pair_measures_disparities_and_what_it_does_not_show_counts_alone() -> None:
+    frames, true = room(1)
+    (frame,) = with_right(frames, true)
+    image, right = frame.grey(), frame.right_grey()
+    y = corners(image, 30)
+    places = places_of(CAMERA, true[0], y)
+    on_wall = np.abs(places[:, :2]).max(axis=1) < 0.85  # the floor begins lower
+    y, true_e = y[on_wall], PAIR.expect(to_frame_many(true[0], places[on_wall])[0])[0]
+    inside = true_e[:, 2] > 10
+    y, true_e = y[inside], true_e[inside]
+    k = len(y) // 2
+    assert k > 4
+    landmark = km.landmarks.Homogeneous(prior_rho_per_m=0.5, sigma_rho_per_m=0.25)
+    e = true_e[:k] + np.array([0, 0, 2.0, 0])  # of the known ones the disparity is expected 2 px off
+    Z = np.tile(np.diag([1.0, 1.0, 4.0, 1.0]), (k, 1, 1))
+    out, R = with_pairs(cv2, PAIR, landmark, (image, right), y, e, Z, 6, ACCEPT)
+    good = R[:, 2, 2] < 1.0
+    assert good.mean() > 0.8
+    assert np.median(np.abs(out - true_e)[good], axis=0).max() < 0.15
+    assert np.abs(out - true_e)[good].max() < 1.0
+    alone, R = with_pairs(cv2, PAIR, landmark, (image, None), y, e, Z, 6, ACCEPT)
+    assert np.array_equal(alone[:, :2], y)
+    assert (R[:k, 2, 2] == 1e6).all()
+    ray, _ = PAIR.invert(alone[k:])
+    assert ray[:, 3] == pytest.approx(0.5)  # the prior of the distance
+    bare, _ = with_pairs(cv2, PAIR, km.landmarks.Point3D(), (image, None), y, e, Z, 6, ACCEPT)
+    assert np.isnan(bare[:, 2]).tolist() == [False] * k + [True] * (len(y) - k)
+
+
+def test_a_pair_knows_the_scale() -> None:
+    frames, true = room(60)
+    slam, off, nees, seen = searching(camera=PAIR), [], [], []
+    for frame, T in zip(with_right(frames, true), true, strict=True):
+        report = slam.process(frame)
+        error = minus(slam.mean("camera")[:7], T)
+        off.append(error[:3])
+        seen.append(sum(o.outcome == "associated" for o in report.observations))
+        P = slam.covariance("camera")[:6, :6]
+        if np.linalg.cond(P) < 1e12:
+            nees.append(error @ np.linalg.solve(P, error))
+    length = np.linalg.norm(np.diff(true[:, :3], axis=0), axis=1).sum()
+    assert np.mean(seen[1:]) > 20
+    assert np.sqrt(np.mean(np.sum(np.square(off), axis=1))) < 0.01 * length  # in metres, nothing aligned
+    assert np.mean(nees) < 12  # 6 degrees of freedom
+
+
+def test_a_pair_whose_right_image_shows_nothing_is_one_camera() -> None:
+    frames, true = room(8)
+    slam = searching(camera=PAIR)
+    for frame in with_right(frames, true, shown=False):
+        report = slam.process(frame)
+    assert sum(o.outcome == "associated" for o in report.observations) > 15
+    with pytest.raises(
+        km.errors.EventError, match=r"the right image is \(120, 160\), expected \(240, 320\) as the image"
+    ):
+        slam.process(km.Frame(9.0, "camera", "eye", frames[0].image, right=np.zeros((120, 160), np.uint8)))

@@ -375,6 +375,8 @@ class LogConfig(Section):
     """tum_rgbd: take the depth images (auto if absent)."""
     depth_scale: Positive | None = None
     """tum_rgbd: the number of 1 m in a depth image (5000 if absent)."""
+    right: Literal["auto", "none"] | None = None
+    """kitti_odometry: take the images of the right camera (auto if absent)."""
     topics: dict[str, Topic] | None = None
     """bag: topics by name, and what each of them is in the log, see below."""
 

@@ -38,6 +38,8 @@ from kalmark.declare import (
 )
 from kalmark.errors import ModelError
 from kalmark.events import MOST
+from kalmark.models.sensors import Stereo
+from kalmark.tracks.front_ends import SearchingDetector
 
 FAR = MOST["m"]
 Number = Annotated[float, Field(ge=-FAR, le=FAR, allow_inf_nan=False)]
@@ -193,8 +195,14 @@ class OneOf(Choice):
 
 
 def finds(detector: Any, sensor: Any) -> bool:
-    """Return whether a detector's class may find what a sensor's measures: if both are kalmark's, by their columns."""
-    return not (is_own(detector) and is_own(sensor)) or detector.columns[:2] == sensor.columns[:2]
+    """Return whether a detector's class may find what a sensor's measures: if both are kalmark's, by their columns.
+
+    One that searches images takes the left one of a pair, too.
+    """
+    if not (is_own(detector) and is_own(sensor)):
+        return True
+    pair = issubclass(detector, SearchingDetector) and sensor.columns[:2] == Stereo.columns[:2]
+    return bool(pair or detector.columns[:2] == sensor.columns[:2])
 
 
 def section_of(role: str, name: str, world: str = "") -> type[Section]:

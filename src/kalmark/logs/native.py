@@ -8,7 +8,7 @@
 `landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags;
                 in the plane id, x_m, y_m[, x2_m, y2_m]: points, both ends of walls
 `gps.csv`       t_s, robot, x_m, y_m, antenna_x_m, antenna_y_m: fixes that only score a run
-`frames.csv`    t_s, robot, sensor, image[, depth]: files beside it, depths of 16 bits, 5000 a metre
+`frames.csv`    t_s, robot, sensor, image[, depth][, right]: files beside it, depths of 16 bits, 5000 a metre
 `rig.yaml`      what the log describes of its robots and sensors, in the shape of a configuration
 
 A row of `scans.csv` whose id and values are all empty is a scan that saw nothing.
@@ -257,11 +257,11 @@ class _Reader:
             self.note(row)
             if not row.text("image"):
                 raise Refused("image is empty, expected a file beside this one")
-            depth = row.text("depth") if "depth" in row.table.index else ""
-            file, other = folder / row.text("image"), folder / depth if depth else None
-            return album.frame(row.t_ns, row.robot, row.sensor, file, other)
+            told = (row.text(name) if name in row.table.index else "" for name in ("depth", "right"))
+            depth, right = (folder / name if name else None for name in told)
+            return album.frame(row.t_ns, row.robot, row.sensor, folder / row.text("image"), depth, right)
 
-        table = read_table(path, ("t_s", "robot", "sensor", "image"), allowed=("depth",))
+        table = read_table(path, ("t_s", "robot", "sensor", "image"), allowed=("depth", "right"))
         yield from table.made(self.request, make, by_sensor=True)
         album.report(self.request)
 

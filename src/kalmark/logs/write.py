@@ -22,6 +22,7 @@ from kalmark.logs.table import CANONICAL, PARQUET, cov_columns
 Table = tuple[list[str], list[dict[str, str]]]
 POSITION = ("x_m", "y_m", "z_m")
 FRAMES, IMAGES = "frames.csv", "images"
+PICTURES = "image", "depth", "right"  # columns of FRAMES that name files
 EMPTY: Table = ([], [])  # measurements.csv: what has no id is written into scans.csv, too
 
 
@@ -115,8 +116,8 @@ def frames(log: Log, folder: Path) -> Table:
         if not isinstance(frame, Frame):
             continue
         row = start(frame) | {"sensor": name(frame.sensor)}
-        depth = frame.depths()
-        for column, pixels, write in (("image", frame.pixels(), write_image), ("depth", depth, write_depth)):
+        told = frame.pixels(), frame.depths(), frame.right_grey()
+        for column, pixels, write in zip(PICTURES, told, (write_image, write_depth, write_image), strict=True):
             if pixels is None:
                 continue
             place = Path(IMAGES, f"{frame.robot}_{frame.sensor}".replace("/", "_"), f"{frame.t_ns}_{column}.png")
@@ -124,7 +125,7 @@ def frames(log: Log, folder: Path) -> Table:
             write(folder / place, pixels)
             row[column] = place.as_posix()
         rows.append(row)
-    return ["t_s", "robot", "sensor", "image", *(["depth"] if any("depth" in row for row in rows) else [])], rows
+    return ["t_s", "robot", "sensor", *(c for c in PICTURES if c == "image" or any(c in row for row in rows))], rows
 
 
 def fixes(log: Log) -> Table:

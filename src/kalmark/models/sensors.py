@@ -704,6 +704,10 @@ class Stereo(_PinHole):
         """The intrinsics and the baseline (5,)."""
         return np.append(self.intrinsics, self.baseline_m)
 
+    def rays(self, y: Array) -> Array:
+        """Return the viewing rays (K, 3), unit vectors, of pixels y (K, 2) of the left image."""
+        return cameras.back_project_pinhole(np.ascontiguousarray(y), self.intrinsics, np.zeros(0))[0]
+
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return unit rays with their inverse distances (K, 4), and their Jacobian (K, 4, 4)."""
         return cameras.back_project_stereo(np.ascontiguousarray(y), self.intrinsics, self.baseline_m)

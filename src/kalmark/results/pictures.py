@@ -27,17 +27,20 @@ class Pictures:
         events = () if log is None else log.events
         self.frames = {(e.t_ns, e.robot, e.sensor): e for e in events if isinstance(e, Frame)}
 
-    def at(self, camera: Camera, step: int) -> Any | None:
-        """Return the image (H, W) in grey values that a camera took at a step, None if there is none."""
+    def at(self, camera: Camera, step: int, side: str = "") -> Any | None:
+        """Return the image (H, W) in grey values that a camera took at a step, None if there is none.
+
+        Of a pair, that of the right one where the `side` is "right".
+        """
         frame = self.frames.get((int(self.history.t_ns[step]), camera.robot, camera.sensor))
         try:
-            return None if frame is None else frame.grey()
+            return None if frame is None else frame.right_grey() if side == "right" else frame.grey()
         except KalmarkError:  # the run went on without it, too
             return None
 
-    def uri(self, camera: Camera, step: int) -> str:
+    def uri(self, camera: Camera, step: int, side: str = "") -> str:
         """Return that image as a data URI of a JPEG, not wider than WIDEST_PX, "" if there is none."""
-        image = self.at(camera, step)
+        image = self.at(camera, step, side)
         if image is None:
             return ""
         import cv2

@@ -199,9 +199,9 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     width = 9.0 if len(seen) == 1 else 14.0
     figure = Figure(figsize=(width, (width - 1.0) / len(seen) * shape + 1.5), layout="constrained", facecolor="white")
     grid = figure.subplots(1, len(seen), squeeze=False)[0]
-    picture = Pictures(run).at(camera, int(steps[-1]))
+    pictures = Pictures(run)
     for axes, image in zip(grid, seen, strict=True):
-        draw_image(axes, image, camera.size, picture)
+        draw_image(axes, image, camera.size, pictures.at(camera, int(steps[-1]), image.side))
     outcomes = Counter(s.outcome for s in seen[0].sightings)
     said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
     title = f"{robot} · {sensor} · t = {history.t_s[steps[-1]]:.3f} s · {said}"

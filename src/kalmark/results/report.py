@@ -220,10 +220,12 @@ def _camera(
     used = np.unique(last[last >= 0])
     scans = []
     for step in steps[used].tolist():
-        sides = images(run.history, camera, step)
-        seen = [{"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]} for image in sides]
-        picture = pictures.uri(camera, step)
-        scans.append({"t": round(float(t[step]), 3), "images": seen} | ({"picture": picture} if picture else {}))
+        seen = []
+        for image in images(run.history, camera, step):
+            picture = pictures.uri(camera, step, image.side)
+            seen.append({"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]}
+                        | ({"picture": picture} if picture else {}))  # fmt: skip
+        scans.append({"t": round(float(t[step]), 3), "images": seen})
     frames = [int(np.searchsorted(used, k)) if k >= 0 else None for k in last]
     size = [float(side) for side in camera.size]
     return {"name": f"{camera.robot} · {camera.sensor}", "size": size, "scans": scans, "frames": frames}

@@ -116,7 +116,7 @@ def _last_images(run: Recording, step: int, pictures: Pictures) -> list[tuple[st
         if not (steps <= step).any():
             continue
         at = int(steps[steps <= step][-1])
-        picture = pictures.at(camera, at)
-        last = images(run.history, camera, at)
-        out += [(f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size, picture) for image in last]
+        for image in images(run.history, camera, at):
+            picture = pictures.at(camera, at, image.side)
+            out.append((f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size, picture))
     return out[:MOST_IMAGES]

@@ -19,7 +19,6 @@ from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.rotations import matrix
 from kalmark.logs.images.pictures import DEPTH_SCALE
-from kalmark.models import cameras
 
 Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 Floats = np.ndarray[Any, np.dtype[np.float32]]
@@ -56,7 +55,7 @@ class Plane:
 
 
 class Renderer:
-    """Images of planes by a camera of any lens (a `PinHole`, an `Omnidirectional`).
+    """Images of planes by a camera of any lens (a `PinHole`, an `Omnidirectional`, the left one of a `Stereo` pair).
 
     The rays and the halved textures are made once.
     """
@@ -67,7 +66,7 @@ class Renderer:
         self.shape = int(height), int(width)
         v, u = np.mgrid[: self.shape[0], : self.shape[1]]
         pixels = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-        self.rays = cameras.back_project(camera.code, pixels, np.array(camera.parameters))[0]
+        self.rays = camera.rays(pixels)
         self.focal_px = 1.0 / float(np.nanmedian(np.linalg.norm(np.diff(self.rays, axis=0), axis=1)))
         self.sizes = np.array([[*plane.size_m, plane.pixel_m] for plane in planes]).reshape(-1, 3)
         self.levels = np.zeros((len(planes), LEVELS, 3), np.int64)

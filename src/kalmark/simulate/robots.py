@@ -42,7 +42,7 @@ from kalmark.models.protocols import (
     range_limit,
     true_control,
 )
-from kalmark.models.sensors import PixelDepth
+from kalmark.models.sensors import PixelDepth, Stereo
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
@@ -335,7 +335,11 @@ def taken(robot: SimRobot, name: str, carried: SimSensor, renderer: Renderer, t_
     image = partial(rendered, renderer, T, seed, sensing.noise_grey, sensing.blur_px)
     sigma = carried.sensor.sigma_rho_per_m if isinstance(carried.sensor, PixelDepth) else 0.0
     depth = partial(rendered_depth, renderer, T, seed + 1, sigma) if sensing.depth else None
-    return Frame(t_ns=t_ns, robot=robot.name, sensor=name, image=image, depth=depth)
+    right = None
+    if isinstance(carried.sensor, Stereo):
+        beside = composed(T, np.array([carried.sensor.baseline_m, 0, 0, 0, 0, 0, 1.0]))[0]
+        right = partial(rendered, renderer, beside, seed + 2, sensing.noise_grey, sensing.blur_px)
+    return Frame(t_ns=t_ns, robot=robot.name, sensor=name, image=image, depth=depth, right=right)
 
 
 def begun(robot: SimRobot, name: str, chance: Chance) -> Event:

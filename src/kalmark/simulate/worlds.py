@@ -32,7 +32,7 @@ from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import Sensing
 
 Count = Annotated[int, Field(ge=1)]
-IMAGING = ("pinhole", "pixel_depth", "omnidirectional")  # the types of sensors whose images can be rendered
+IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types of sensors whose images can be rendered
 EACH = "robots.each."  # how an override begins that is meant for all robots of a world
 
 

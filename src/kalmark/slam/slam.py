@@ -36,6 +36,7 @@ from kalmark.management.attention import left_out
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.protocols import Landmark, UnknownDepth
+from kalmark.models.sensors import Stereo
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import by_ids, locating, maintenance, moves, own_readings, starting, tentative
 from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
@@ -164,12 +165,14 @@ class Slam(Estimate):
     def _searched(self, event: Frame, front_end: FrontEnd) -> Report:
         """Search a frame for the landmarks that are expected in it.  [S] 2.4."""
         state, channel, image = self.state, self.state.channels[event.robot, event.sensor], event.grey()
-        depth = event.depths() if channel.finds_depth else None
-        if depth is not None and depth.shape != image.shape:
-            raise EventError(f"{when(event)}: the depths are {depth.shape}, expected {image.shape} as the image")
+        pair = isinstance(channel.sensor, Stereo)
+        beside = event.right_grey() if pair else event.depths() if channel.finds_depth else None
+        if beside is not None and beside.shape != image.shape:
+            what = "right image is" if pair else "depths are"
+            raise EventError(f"{when(event)}: the {what} {beside.shape}, expected {image.shape} as the image")
         state.t_ns = event.t_ns
         gaps = moves.advance(state, event.robot)
-        scan, removed = front_end.search(event, image, Prospect(state.map, state.tracks, channel, event.robot), depth)
+        scan, removed = front_end.search(event, image, Prospect(state.map, state.tracks, channel, event.robot), beside)
         for name, _ in removed:
             state.remove(name)
         report = self._found(scan)

@@ -23,12 +23,11 @@ class FrameDetector(Protocol):
 class FrontEnd(Protocol):
     """Searches the frames of one sensor for the landmarks that it should see."""
 
-    def search(
-        self, frame: Frame, image: Any, prospect: Prospect, depth: Array | None
-    ) -> tuple[Scan, list[tuple[Id, str]]]:
+    def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any) -> tuple[Scan, list[tuple[Id, str]]]:
         """Return what was found in an image (H, W), and the landmarks that are given up, each with the reason.
 
-        `depth` (H, W) is that of its pixels in m, 0 where there is none; None: the sensor, or the frame, has none.
+        `beside` (H, W) is the depth of its pixels in m, 0 where there is none, or the right image of a pair, as the
+        sensor has it; None: the sensor, or the frame, has none.
         """
         ...
 

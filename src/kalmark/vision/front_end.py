@@ -19,7 +19,7 @@ from kalmark.arrays import Array
 from kalmark.declare import Count, Positive, Within, register
 from kalmark.errors import ModelError
 from kalmark.events import Frame, Id, Scan
-from kalmark.models.sensors import PinHole, PixelDepth
+from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
 from kalmark.tracks.prospect import PIXEL, Prospect
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
@@ -27,6 +27,7 @@ from kalmark.vision.beginning import Beginning, Begun
 from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
 from kalmark.vision.matching import Searcher
+from kalmark.vision.pairs import with_pairs
 from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed import FirstLook
 
@@ -111,8 +112,11 @@ class FrontEnd:
         self.sighting: Sighting | None = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
-    def search(self, frame: Frame, image: Any, prospect: Prospect, depth: Array | None = None) -> Sighting:
-        """Search an image (H, W) for the landmarks of a prospect, and for new ones; `depth` (H, W) in m, 0: none."""
+    def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any = None) -> Sighting:
+        """Search an image (H, W) for the landmarks of a prospect, and for new ones.
+
+        `beside` (H, W) is the depth in m, 0: none, or the right image of a pair.
+        """
         t0 = perf_counter()
         settings, cv2 = self.settings, self.cv2
         self.frame += 1
@@ -133,8 +137,8 @@ class FrontEnd:
         ids += [self._name(frame) for _ in new]
         removed += self._room(len(new), {name for name, _ in removed}, prospect)
         y, cov = np.concatenate([y, new]), None
-        if self.sensor.columns == PixelDepth.columns:
-            y, cov = self._with_depths(y, rows, depth, prospect, found)
+        if isinstance(self.sensor, PixelDepth | Stereo):
+            y, cov = self._measured(y, rows, beside, prospect, found)
             there = np.flatnonzero(np.isfinite(y).all(axis=1))
             y, cov, ids = y[there], cov[there], [ids[k] for k in there.tolist()]
         t3 = perf_counter()
@@ -275,14 +279,17 @@ class FrontEnd:
         e = np.where(found.matched[:, None], found.y, found.belief.pixels)
         return self.cells.corners(image, e[np.isfinite(e).all(axis=1)], wanted, PATCH + 1, self.frame, self.random)
 
-    def _with_depths(
-        self, y: Array, rows: list[int], depth: Array | None, prospect: Prospect, found: Selection
+    def _measured(
+        self, y: Array, rows: list[int], beside: Any, prospect: Prospect, found: Selection
     ) -> tuple[Array, Array]:
-        """Return measurements (n, 3) and their noise (n, 3, 3) of pixels y (n, 2), the first of landmarks `rows`."""
-        sensor = prospect.sensor
-        rho = np.full(len(y), np.nan) if depth is None else inverse_depths(depth, y, sensor.sigma_rho_per_m)
+        """Return measurements (n, m) and their noise (n, m, m) of pixels y (n, 2), the first of landmarks `rows`."""
+        sensor, landmark, e = prospect.sensor, prospect.channel.landmark, found.belief.e[rows]
         Z = prospect.whole_innovations(found.belief, np.array(rows, dtype=np.int64))
-        return with_depths(sensor, prospect.channel.landmark, y, rho, found.belief.e[rows, 2], Z[:, 2, 2])
+        if isinstance(sensor, Stereo):
+            images = self.image, beside
+            return with_pairs(self.cv2, sensor, landmark, images, y, e, Z, TEMPLATE, self.settings.accept)
+        rho = np.full(len(y), np.nan) if beside is None else inverse_depths(beside, y, sensor.sigma_rho_per_m)
+        return with_depths(sensor, landmark, y, rho, e[:, 2], Z[:, 2, 2])
 
     def _count(self, prospect: Prospect, found: Selection) -> list[tuple[Id, str]]:
         """Count searches; return the landmarks that are given up, each with the reason."""

@@ -70,8 +70,10 @@ class Album:
         self.scale = scale
         self.count, self.flaws, self.first = 0, Counter[str](), ""
 
-    def frame(self, t_ns: int, robot: str, sensor: str, file: Path, depth: Path | None = None) -> Frame | None:
-        """Return the frame of a file, without a depth whose file cannot be used; None if the image cannot be."""
+    def frame(
+        self, t_ns: int, robot: str, sensor: str, file: Path, depth: Path | None = None, right: Path | None = None
+    ) -> Frame | None:
+        """Return the frame of a file, without a depth or right image that cannot be used; None if the image cannot."""
         self.count += 1
         wrong = flaw(file)
         if wrong:
@@ -79,7 +81,8 @@ class Album:
             self.first = self.first or str(file)
             return None
         taken = None if depth is None or flaw(depth) else partial(depth_of, depth, self.scale)
-        return Frame(t_ns=t_ns, robot=robot, sensor=sensor, image=partial(image_of, file), depth=taken)
+        other = None if right is None or flaw(right) else partial(image_of, right)
+        return Frame(t_ns=t_ns, robot=robot, sensor=sensor, image=partial(image_of, file), depth=taken, right=other)
 
     def report(self, request: Request) -> None:
         """List how many images were left out.  Raises LogError if none can be used."""
@@ -93,11 +96,12 @@ class Album:
 def frames_of(
     robot: str, sensor: str, t_ns: Iterable[int], files: Iterable[Path], request: Request,
     depths: Iterable[Path | None] = repeat(None), scale: float = DEPTH_SCALE,
+    rights: Iterable[Path | None] = repeat(None),
 ) -> list[Frame]:  # fmt: skip
     """Return the frames of image files at these times (ns), without those that cannot be used.  Raises LogError."""
     album = Album(scale)
-    rows = zip(t_ns, files, depths, strict=False)
-    frames = [album.frame(t, robot, sensor, file, depth) for t, file, depth in rows]
+    rows = zip(t_ns, files, depths, rights, strict=False)
+    frames = [album.frame(t, robot, sensor, file, depth, right) for t, file, depth, right in rows]
     album.report(request)
     return [frame for frame in frames if frame is not None]
 

@@ -223,11 +223,11 @@ function drawImage(id, camera, scan, image) {
   const dots = (points, name, marker) => ({x: points.map(p => p[0]), y: points.map(p => p[1]), text: points.map(p => p[2]), name,
     mode: "markers", marker, hovertemplate: `%{text} ${name}: %{x:.1f}, %{y:.1f}<extra></extra>`, showlegend: points.length > 0});
   const high = (el(id).clientWidth || 500) * size[1] / size[0];  /* below the image its ticks, then a legend of two rows at most */
-  const picture = scan?.picture ? [{source: scan.picture, xref: "x", yref: "y", x: -0.5, y: -0.5, sizex: size[0], sizey: size[1],
+  const picture = image.picture ? [{source: image.picture, xref: "x", yref: "y", x: -0.5, y: -0.5, sizex: size[0], sizey: size[1],
     sizing: "stretch", layer: "below"}] : [];
   const title = `${camera.name}${image.side ? " · " + image.side : ""}${scan ? ` · ${scan.t.toFixed(2)} s` : ""}`;
   Plotly.react(id, [
-    dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: scan?.picture ? "#ffd400" : MEASURED, width: 1.3}}), ...lines.values(),
+    dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: image.picture ? "#ffd400" : MEASURED, width: 1.3}}), ...lines.values(),
     dots(marks.new, "new", {symbol: "square-open", size: 10, color: "#1e4d2b"}),
     dots(marks.rejected, "rejected", {symbol: "x-thin", size: 9, line: {color: INK, width: 1.6}}),
     {...names, mode: "text", textfont: {size: 10, color: "#1e4d2b"}, hoverinfo: "skip", showlegend: false}],
