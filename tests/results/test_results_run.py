@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -334,3 +336,24 @@ def test_the_name_of_a_robot_may_be_longer_than_that_of_a_file() -> None:
     assert file_name("rover-1.b") == "rover-1.b"
     assert len({file_name(name) for name in ("a/b", "a_b", "a b", "x" * 300, "x" * 301)}) == 5
     assert len(file_name("\u6f22" * 300).encode()) <= 100
+
+
+def test_of_two_programs_that_save_into_one_folder_the_second_one_waits(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inside: list[str] = []
+
+    def slowly(self: Run, folder: Path) -> None:
+        inside.append("begins")
+        time.sleep(0.2)
+        inside.append("ends")
+
+    run.evaluate()
+    monkeypatch.setattr(Run, "save_files", slowly)
+    monkeypatch.setattr(Run, "report", lambda self, folder: [])
+    threads = [threading.Thread(target=run.save, args=(tmp_path,)) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert inside == ["begins", "ends"] * 3

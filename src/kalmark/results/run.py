@@ -10,7 +10,7 @@ from typing import Any
 
 from kalmark.results.evaluate import evaluate
 from kalmark.results.history import Camera, Measuring
-from kalmark.results.recording import Recording, file_name, replace_file, write
+from kalmark.results.recording import Recording, file_name, only_writer, replace_file, write
 from kalmark.results.scene import steps_of
 
 
@@ -35,15 +35,17 @@ class Run(Recording):
     def save(self, folder: str | Path) -> Path:
         """Write the run folder of the contract; files of an earlier run in it are replaced, all others stay.
 
-        ``summary.json`` goes first and comes last: a folder that has one is complete.
+        ``summary.json`` goes first and comes last: a folder that has one is complete.  Of two programs that save into
+        one folder the second one waits, so that all files are of one run.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "summary.json").unlink(missing_ok=True)
         summary = self.summary or self.evaluate()
-        self.save_files(folder)
-        self.report(folder)
-        write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+        with only_writer(folder):
+            (folder / "summary.json").unlink(missing_ok=True)
+            self.save_files(folder)
+            self.report(folder)
+            write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
         return folder
 
     def report(self, folder: str | Path) -> list[Path]:
