@@ -344,7 +344,7 @@ def storms() -> Iterator[Figure]:
                  "python benchmarks/fuzz.py --caches 200", row("total", "{0} / {1} / {2}"))  # fmt: skip
     for name in ("native", "mrclam", "config", "map", "process", "parquet", "mcap", "ros1", "sqlite", "matlab", "g2o", "carmen",
                  "tum", "kitti", "freiburg", "dlr", "plaza"):  # fmt: skip
-        limit = "" if name in ("mcap", "ros1", "sqlite", "process", "native") else " --timeout 400"  # s an input
+        limit = "" if name in ("mcap", "ros1", "sqlite", "native") else " --timeout 400"  # s an input
         yield Figure("Bad events", f"Fuzzing `{name}` guided by coverage, 10 minutes: inputs / crashes, hangs, tracebacks", "all / 0",
                      f"python benchmarks/fuzz.py --seconds 600{limit} {name}", row("total", "{0} / {2}"))  # fmt: skip
     for kind in ("dense", "postponed"):
