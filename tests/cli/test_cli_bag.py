@@ -180,6 +180,7 @@ def test_the_numbers_of_a_camera_are_those_of_its_info(tmp_path: Path) -> None:
     )
     assert "landmarks: {type: tag}" in text and "motion: {type: constant_velocity_3d" in text
     assert "CameraInfo; GUESS: the images were not rectified" in text
+    assert "GUESS: the edge of the tags" in text, "a wrong one is a map of a wrong scale"
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,10 @@ class _Writer:
         for topic in topics:
             if topic.name not in used and (entry_and_why := self.place(topic)) is not None:
                 used[topic.name] = entry_and_why
-        return used | {topic.name: (entry_of(topic, space), told(topic)) for topic in scans}
+        for topic in scans:
+            entry = entry_of(topic, space)
+            used[topic.name] = entry, told(topic) + (f"; {GUESS} the edge of the tags" if "size_m" in entry else "")
+        return used
 
     # -------------------------------------------------------------- controls
     def control(
