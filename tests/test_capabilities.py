@@ -10,6 +10,7 @@ import pytest
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import HEADING, RHO, VECTOR, Space
 from kalmark.models import landmarks
+from kalmark.models.check import check_model
 from kalmark.models.pointwise import jacobian
 from kalmark.models.protocols import place_of
 from kalmark.models.sensors import RangeBearing
@@ -75,3 +76,28 @@ def test_a_misspelt_capability_is_refused_with_both_names() -> None:
     Mount(Short())  # it has `sees`, by inheritance
     with pytest.raises(ModelError, match="Deaf has 'find_depth', expected 'finds_depth'"):
         Mount(Deaf())
+
+
+def test_a_sensor_of_the_state_that_would_be_taken_for_one_of_landmarks_is_refused() -> None:
+    class Compass:
+        columns, angular, views, pass_share = ("north_rad",), (True,), "pose", 0.999
+
+        def expect(self, v: Any) -> Any:
+            return v[:, 2:3], np.tile([[[0.0, 0.0, 1.0]]], (len(v), 1, 1))
+
+        def noise(self, y: Any) -> Any:
+            return np.tile([[0.01]], (len(y), 1, 1))
+
+    Mount(Compass())
+    assert all(finding.ok for finding in check_model(Compass(), np.random.default_rng(0)))
+    Compass.views = "poze"
+    with pytest.raises(ModelError, match=r"Compass\.views is 'poze', expected 'pose', 'change' or 'twist'"):
+        Mount(Compass())
+    with pytest.raises(ModelError, match=r"Compass\.views is 'poze'"):
+        check_model(Compass(), np.random.default_rng(0))
+    Compass.views = "pose"
+    del Compass.pass_share
+    with pytest.raises(ModelError, match="Compass has views and no pass_share"):
+        Mount(Compass())
+    with pytest.raises(ModelError, match="Compass has views and no pass_share"):
+        check_model(Compass(), np.random.default_rng(0))

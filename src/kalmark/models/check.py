@@ -123,6 +123,7 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
 # ------------------------------------------------------------------ sensors
 def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
     m, spatial = len(model.columns), isinstance(model, Spatial)
+    protocols.refuse_other_views(model, "sensor")
     if len(model.angular) != m:
         raise ModelError(f"angular has {len(model.angular)} entries for {m} columns, expected one each")
     plain = Space("y", tuple(ANGLE if angle else SCALAR for angle in model.angular))

@@ -537,6 +537,20 @@ def refuse_misspelt(model: object, what: str) -> None:
             raise ModelError(f"{what}: {type(model).__name__} has {name!r}, expected {near[0]!r}, or another name")
 
 
+def refuse_other_views(sensor: object, what: str) -> None:
+    """Refuse a sensor with `views` that there are not, or without the share that passes its gate.
+
+    Without that it would be taken for a sensor of landmarks.
+    """
+    if not hasattr(sensor, "views"):
+        return
+    name = type(sensor).__name__
+    if sensor.views not in (POSE, CHANGE, TWIST):
+        raise ModelError(f"{what}: {name}.views is {sensor.views!r}, expected {POSE!r}, {CHANGE!r} or {TWIST!r}")
+    if not hasattr(sensor, "pass_share"):
+        raise ModelError(f"{what}: {name} has views and no pass_share, expected the share of good readings that pass")
+
+
 def _members(protocol: type) -> set[str]:
     """Return the public names that a Protocol and its bases declare."""
     parts = [cls for cls in protocol.__mro__ if cls.__module__ == __name__]

@@ -19,7 +19,15 @@ from kalmark.management.delayed import Delayed
 from kalmark.management.hypotheses import Hypotheses
 from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.protocols import Landmark, Motion, OfState, Sensor, parameter_covariance, refuse_misspelt
+from kalmark.models.protocols import (
+    Landmark,
+    Motion,
+    OfState,
+    Sensor,
+    parameter_covariance,
+    refuse_misspelt,
+    refuse_other_views,
+)
 from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
 from kalmark.slam.gaps import ACTIONS, Gaps
 from kalmark.tracks.channel import ROBUST
@@ -75,6 +83,7 @@ class Mount:
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
         refuse_misspelt(self.sensor, "Mount: sensor")
+        refuse_other_views(self.sensor, "Mount: sensor")
         if self.landmark is not None:
             instance(self.landmark, Landmark, "Mount: landmark", "a landmark model")
             refuse_misspelt(self.landmark, "Mount: landmark")
