@@ -71,3 +71,14 @@ def test_a_run_comes_back_from_its_graph_with_the_same_map(space: bool, kalmark:
         np.testing.assert_allclose(np.linalg.eigvalsh(P)[-1], sigma**2, rtol=0.3)
     refused = kalmark("convert", "log", "log.g2o")
     assert refused.status == 2 and "not the folder of a run" in refused.err
+
+
+def test_a_run_without_scans_has_no_graph(kalmark: Kalmark, tmp_path: Path) -> None:
+    write_log(tmp_path / "log")
+    (tmp_path / "log" / "scans.csv").unlink()
+    (tmp_path / "own.yaml").write_text("log: {path: log}\n")
+    done = kalmark("run", "own.yaml", "--out", "run")
+    assert done.status == 0, done.err
+    refused = kalmark("convert", "run", "run.g2o")
+    assert refused.status == 2 and "the run has no scan, expected some" in refused.err
+    assert not (tmp_path / "run.g2o").exists()

@@ -52,6 +52,8 @@ def g2o_text(run: Run, log: Log, robots: Mapping[str, Robot]) -> str:
             node = chain.node_at(event.robot, event.t_ns)
             nodes[node] = history.poses[step]
             sights += [(node, *seen) for seen in _observed(event, robots[event.robot], history, rows.get(step, []))]
+    if not nodes:
+        raise RunError("the run has no scan, expected some: the graph has a pose for each of them")
     known = dict(zip(map(str, run.landmarks.ids), run.landmarks.means, strict=True))
     number = {name: len(chain.nodes) + k for k, name in enumerate(name for name in known if len(known[name]) == d)}
     lines = [*_vertices(chain, nodes, robots), *_landmarks(number, known, d), *_moves(chain)]
