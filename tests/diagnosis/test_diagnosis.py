@@ -15,6 +15,7 @@ from hall import hall, mapped
 import kalmark as km
 from kalmark.batch.data import replayed
 from kalmark.batch.solver import optimum
+from kalmark.batch.state import LANDMARKS
 from kalmark.cli.app import main
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.breakdown import breakdown, nees_parts
@@ -593,3 +594,23 @@ def test_bearings_alone_accuse_no_odometry() -> None:
     world = load_world("random_field", settings)
     log, config = simulate(world, 1), world.config()
     assert not km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config))).causes
+
+
+def test_a_gate_that_is_tight_makes_no_noise_too_large() -> None:
+    """Innovations that are cut off at a gate of .9 have .74 of their variance."""
+    run = run_of(settings=("filter.association={type: identity, gate: 0.9}",))
+    assert (run.history.outcome == "rejected").mean() > 0.08
+    told = {cause.name for cause in km.diagnose(run).causes}
+    assert not told & {"range_sigma", "bearing_sigma"}, told
+    assert not run.summary["advice"]
+
+
+def test_the_accuracy_that_is_told_has_what_a_systematic_error_does_to_the_map() -> None:
+    verdict = km.diagnose(run_of(*FAULTS["range_scale"][:2]))
+    assert verdict.search is not None
+    linear = verdict.search.linear
+    places = linear.state.groups[LANDMARKS][:, :2]
+    off = 0.05 * np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1)))
+    assert verdict.shift_m == pytest.approx(off, rel=0.25)
+    assert verdict.accuracy_m is not None
+    assert verdict.accuracy_m > 0.7 * off

@@ -12,6 +12,7 @@ from hall import hall, mapped
 
 import kalmark as km
 from kalmark.diagnosis import sightings
+from kalmark.diagnosis.verdict import SHORT
 from kalmark.events import Scan
 
 NEAR, FAR, POST = (5.0, 0.0), (5.2, 0.0), (0.0, 5.0)
@@ -41,9 +42,10 @@ def test_two_sides_of_a_wall_and_scans_of_single_landmarks_say_nothing() -> None
 
 def test_landmarks_vanish_at_once_or_one_after_the_other() -> None:
     places = dict.fromkeys("abcdefgh", NEAR)
-    assert sightings.vanished(seen(*9 * ("abcd",), *9 * ("efgh",), **places), 9.0) == 4
-    assert not sightings.vanished(seen(*9 * ("abcd",), *9 * ("defg",), **places), 9.0)
-    assert not sightings.vanished(seen(*9 * ("abc",), *9 * ("efgh",), **places), 9.0)
+    for start_s in (9.0, 12.0):
+        assert sightings.vanished(seen(*9 * ("abcd",), *9 * ("efgh",), **places), start_s) == (9.0, 4)
+        assert not sightings.vanished(seen(*9 * ("abcd",), *9 * ("defg",), **places), start_s)[1]
+        assert not sightings.vanished(seen(*9 * ("abc",), *9 * ("efgh",), **places), start_s)[1]
 
 
 @pytest.mark.parametrize("carried_m", [0.0, 5.0])
@@ -81,3 +83,15 @@ def test_a_noise_that_is_stated_too_small_splits_landmarks() -> None:
     verdict = km.diagnose(mapped(replace(log, events=events)))
     assert verdict.map != "ok"
     assert "split_landmarks" in [cause.name for cause in verdict.causes[:3]]
+
+
+def test_scans_that_are_late_are_named_before_the_map_that_they_double_by_the_verdict_of_a_run() -> None:
+    log = hall(2, bad_wheel=False)
+    late = [
+        Scan(t_ns=e.t_ns + 200_000_000, robot="rover", sensor="laser", y=e.y) if isinstance(e, Scan) else e
+        for e in log.events
+    ]
+    verdict = km.diagnose(mapped(replace(log, events=sorted(late, key=km.events.order))), SHORT)
+    names = [cause.name for cause in verdict.causes]
+    assert (verdict.map, names[0]) == ("wrong", "time_offset")
+    assert "map_repeats" in names

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from kalmark.results.evaluate import scale_figures
+from kalmark.results.evaluate import of_a_free_scale, scale_figures, scale_is_free
 from kalmark.results.measures import identity, rigid, rigid_robust, rmse, similarity
 
 
@@ -109,3 +112,30 @@ def test_alignment_and_error_agree_with_evo() -> None:
         assert rmse(fit(estimate) - truth) == pytest.approx(
             aligned.get_statistic(metrics.StatisticsType.rmse), abs=1e-9
         )
+
+
+def test_a_path_whose_scale_nothing_tells_has_no_nees_and_diverges_by_its_shape_alone() -> None:
+    rng = np.random.default_rng(4)
+    truth = np.column_stack([np.cumsum(rng.normal(size=(60, 3)), axis=0), np.tile([0.0, 0.0, 0.0, 1.0], (60, 1))])
+    P = np.tile(1e-4 * np.eye(6), (60, 1, 1))
+    small = np.column_stack([0.3 * truth[:, :3], truth[:, 3:]])
+    assert of_a_free_scale(small, P, truth) == {"pose_nees": None, "pose_nees_world": None, "diverged": False}
+    lost = small + np.r_[np.zeros(40), np.full(20, 15.0)][:, None] * np.r_[1.0, np.zeros(6)]
+    assert of_a_free_scale(lost, P, truth)["diverged"]
+
+
+def test_one_camera_alone_has_a_free_scale() -> None:
+    camera = SimpleNamespace(robot="r", sensor="camera", columns=("u_px", "v_px"))
+    history: dict[str, Any] = {"cameras": [camera], "robots": ["r"], "fixes": (), "priors": (), "controls": {}}
+
+    def free(sensors: Any = ("camera",), **other: Any) -> bool:
+        stub: Any = SimpleNamespace(
+            history=SimpleNamespace(**history | other), sections=lambda _: dict.fromkeys(sensors)
+        )
+        return scale_is_free(stub, "r")
+
+    assert free()
+    assert not free(sensors=("camera", "laser"))
+    assert not free(controls={"r": object()})
+    assert not free(fixes=(object(),))
+    assert not free(cameras=[SimpleNamespace(robot="r", sensor="camera", columns=("u_px", "v_px", "depth_m"))])

@@ -9,6 +9,7 @@ Bar-Shalom, Li, Kirubarajan 2001, section 5.4, for the whiteness of residuals.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -18,7 +19,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.problem import Linearized, Problem
+from kalmark.batch.problem import Factor, Linearized, Problem
 from kalmark.batch.solver import Reduced, followers
 from kalmark.batch.state import LANDMARKS, POSES, Ints, State
 
@@ -53,7 +54,8 @@ class Linear:
     """A problem linearised at `base`, with some of it taken out of the data and its noise made larger or smaller.
 
     `noise` (N,) and `errors` (r,) are factors of the noise of the residuals and of the motion's errors, `z` (N,) and
-    `w` (q n,) are what was taken out of the data, as whitened by the problem.
+    `w` (q n,) are what was taken out of the data, as whitened by the problem.  `within` are the factors of the noise
+    of each sensor (robot, name) that a gate leaves, by column; all of it where there is none.
     """
 
     problem: Problem
@@ -62,12 +64,14 @@ class Linear:
     errors: Array
     z: Array
     w: Array
+    within: Mapping[tuple[str, str], Array]
 
     @classmethod
-    def of(cls, problem: Problem, state: State) -> Linear:
+    def of(cls, problem: Problem, state: State, within: Mapping[tuple[str, str], Array] | None = None) -> Linear:
         """Return the problem at a state, as it is."""
         at, r = problem.at(state), problem.motions.root.shape[1]
-        return cls(problem, at, np.ones(len(at.z)), np.ones(r), np.zeros(len(at.z)), np.zeros(len(at.w)))
+        none = np.zeros(len(at.z)), np.zeros(len(at.w))
+        return cls(problem, at, np.ones(len(at.z)), np.ones(r), *none, within or {})
 
     @property
     def state(self) -> State:
@@ -181,8 +185,15 @@ class Linear:
     def simulated(self, number: int, seed: int = 0) -> Left:
         """Return what is left of data of which everything is as configured, a column a set."""
         rng = np.random.default_rng(seed)
+        within = np.concatenate([self._within(factor) for factor in self.problem.factors])
         z, e = rng.normal(size=(len(self.at.z), number)), rng.normal(size=(self.root.shape[1], number))
-        return self.left(z, self.root @ e)
+        return self.left(z * within[:, None], self.root @ e)
+
+    def _within(self, factor: Factor) -> Array:
+        """Return what a gate leaves of the noise of each row of a factor."""
+        k, p = factor.R.shape[:2]
+        left = self.within.get(factor.sensor, np.ones(p))
+        return np.tile(left if len(left) == p else np.full(p, left.mean()), k)
 
     def errors_of(self, left: Left) -> Array:
         """Return the estimates of the white errors of the motion (r, ...), of unit variance or less."""

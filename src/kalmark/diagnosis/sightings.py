@@ -90,11 +90,17 @@ def _in_turn(a: Ints, b: Ints) -> int:
     return 0 if (gaps == 0).any() else int((changes & (gaps <= NEAR_SCANS)).sum())
 
 
-def vanished(run: Run, start_s: float) -> int:
-    """Return how many landmarks were seen until a time of the log if none of them is seen just after it, else 0."""
+def vanished(run: Run, start_s: float) -> tuple[float, int]:
+    """Return since when none of the landmarks that were seen until then is seen, and how many these are, else 0.
+
+    `start_s` [s of the log] is when some landmarks had been mapped anew: it was that scan, or one of the last before.
+    """
     h = run.history
-    now = int(np.searchsorted(h.t_ns, round(start_s * 1e9)))
-    used = np.isin(h.outcome, ("associated", "new"))
-    before = set(h.landmark[used & (h.step >= now - NEAR_SCANS) & (h.step < now)].tolist())
-    after = set(h.landmark[used & (h.step >= now) & (h.step < now + NEAR_SCANS)].tolist())
-    return len(before) if len(before) >= LEAST_SEEN and after and not before & after else 0
+    last = int(np.searchsorted(h.t_ns, round(start_s * 1e9)))
+    used, at = np.isin(h.outcome, ("associated", "new")), (start_s, 0)
+    for now in range(max(last - NEAR_SCANS, 1), min(last + 1, len(h.t_ns))):
+        before = set(h.landmark[used & (h.step >= now - NEAR_SCANS) & (h.step < now)].tolist())
+        after = set(h.landmark[used & (h.step >= now) & (h.step < now + NEAR_SCANS)].tolist())
+        if len(before) >= max(LEAST_SEEN, at[1] + 1) and after and not before & after:
+            at = float(h.t_ns[now]) * 1e-9, len(before)
+    return at

@@ -28,7 +28,7 @@ from kalmark.models.protocols import Calibrated
 from kalmark.models.sensors import Wall
 from kalmark.results.batch import filtered_map, given_by, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters
-from kalmark.results.measures import rigid, rmse
+from kalmark.results.measures import cut_off, rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.warnings import window_warnings
@@ -50,7 +50,6 @@ SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
 SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to associations comes after it
-LOSES_TRACK = ("kidnapped", "gap")
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped anew because of it
 COPIES = "copies"  # the cause that events come twice
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
@@ -128,9 +127,11 @@ def _of_mistake(mistake: Mistake) -> Cause:
 
 def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first = _structural(run, log)
+    first, landmarks = _structural(run, log), most // SEEN
+    if len(run.landmarks) <= landmarks and any(not cause.harmless for cause in first):
+        most = max(most, MOST)  # its reason may show in all of the log only
     try:
-        found = _searched(run, log, most, most // SEEN, progress)
+        found = _searched(run, log, most, landmarks, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
@@ -143,8 +144,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         causes += odd_controls(run, log)
     twice = any(cause.name == COPIES for cause in first)  # then the filter is too sure for that
     causes = sorted([*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, -c.score))
-    lost = any(c.name in LOSES_TRACK and not c.harmless for c in first)
-    if not lost:  # else it is that what doubles maps
+    if not any(c.name == "gap" and not c.harmless for c in first):  # else it is that what doubles maps
         steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
         first = [*(c for c in causes if c.name in steady and c.score > SURELY), *first]
     causes = [*first, *(c for c in causes if c not in first)]
@@ -189,7 +189,8 @@ def _searched(run: Run, log: Log, most: int, landmarks: int, progress: bool) -> 
         if given is every or len(set(given.associations.landmark)) > landmarks:
             raise
         return _searched(run, log, MORE * most, landmarks, progress)
-    search = Search(Linear.of(problem, batch.state), sensors_of(run), given.robot, given.t_ns)
+    linear = Linear.of(problem, batch.state, within_gates(run))
+    search = Search(linear, sensors_of(run), given.robot, given.t_ns)
     search.run(progress)
     return Searched(search, batch, given)
 
@@ -232,6 +233,24 @@ def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
     for key, sensor in (((r.name, name), m.sensor) for r in robots for name, m in r.sensors.items()):
         columns = tuple(sensor.columns)
         found[key] = tuple(c for c in columns if f"sigma_{c}" in sensor.sigmas) if isinstance(sensor, Wall) else columns
+    return found
+
+
+def within_gates(run: Run) -> dict[Where, Array]:
+    """Return by what factor (p,) the noise that a sensor's gate leaves is smaller than that of all its observations.
+
+    A gate leaves innovations of covariance k Z (`cut_off`).  Their noise has then R - (1 - k) R Z^-1 R, of which the
+    shares that R has of Z on the diagonals are taken here.
+    """
+    h, found = run.history, {}
+    robots = h.robot[h.step]
+    for key, channel in run.final_slam().state.channels.items():
+        mine = (h.outcome == "associated") & (robots == key[0]) & (h.sensor == key[1])
+        k = cut_off(channel.gate, channel.dof)
+        if k < 1.0 and mine.any():
+            share = h.noise[mine] ** 2 / np.diagonal(h.Z[mine], axis1=1, axis2=2)
+            share = share[:, np.isfinite(share).any(axis=0)]
+            found[key] = np.sqrt(1.0 - (1.0 - k) * np.nanmean(np.minimum(share, 1.0), axis=0))
     return found
 
 
@@ -445,7 +464,7 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
     for part in run.summary.get("repeats", ())[:1]:
         since_s, shift_m = part["start_s"] or 0.0, float(np.linalg.norm(part["shift_m"]))
         stopped = any(gap["start_s"] <= since_s <= gap["end_s"] + STOPPED_S for gap in run.summary.get("gaps", ()))
-        number = 0 if stopped else sightings.vanished(run, since_s)
+        since_s, number = (since_s, 0) if stopped else sightings.vanished(run, since_s)
         if number and shift_m > sightings.spacing(run):
             told = f"it sees none of the {number} landmarks that it saw just before, and maps them again"
             evidence = f"the robot was elsewhere by {figure(shift_m)} m from t={since_s:.1f} s on: {told}"
@@ -500,11 +519,13 @@ def effect_of(run: Run, found: Searched) -> Effect:
     mine, its = (np.array(column) for column in zip(*rows, strict=True))
     d, first, cured = found.batch.state.d, found.search.first, found.search.linear
     places, moved = (state.groups[LANDMARKS][its, :d] for state in (found.batch.state, cured.moved()))
+    steady = replace(first, z=cured.z, w=cured.w).moved().groups[LANDMARKS][its, :d]  # the noise as it was stated
     off, extent = rigid(places, moved)(places) - moved, rmse(moved - moved.mean(axis=0))
+    by_steady = rmse(rigid(places, steady)(places) - steady)  # of causes that are sure: no noise explains it
     mapped = filtered_map(run)
     filtered = _sigma(np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine]))
     stated, honest = (_sigma(linear.reduced.covariances()[its, :d, :d]) for linear in (first, cured))
-    shift_m = float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0)))
+    shift_m = max(float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0))), by_steady)
     share, free = shift_m / max(extent, TINY_M), (filtered > 0) & (stated > 0)
     if not free.any():
         return Effect(shift_m=shift_m)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -38,6 +39,7 @@ from kalmark.results.words import count, figure
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0
+PIXEL = 2  # numbers that a camera without depth measures of a point
 SETTLED = 0.01  # of the map's extent: the sigma below which a point that is not Euclidean yet is compared
 
 
@@ -93,8 +95,14 @@ def evaluate(run: Recording) -> dict[str, Any]:
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
     summary["advice"] = advice(run, summary)
-    summary["notes"] = [*gap_notes(summary["gaps"]), *repeat_notes(history)]
+    summary["notes"] = [*gap_notes(summary["gaps"]), *repeat_notes(history), *_scale_notes(run, robots)]
     return summary
+
+
+def _scale_notes(run: Recording, robots: dict[str, Any]) -> Iterator[str]:
+    for name, figures in robots.items():
+        if figures.get("scale") is not None and scale_is_free(run, name):
+            yield f"nothing tells the scale of {name}'s path: compared after a similarity, and without pose NEES"
 
 
 def summary_of(run: Recording) -> dict[str, Any]:
@@ -153,6 +161,8 @@ def robot_figures(run: Recording, name: str) -> dict[str, Any]:
             figures["diverged"] = pose_figures(mean[later], P[later], truth[later], run.coordinates)["diverged"]
         if any(isinstance(s, dict) and s.get("detector") for s in run.sections(name).values()) and mean.shape[1] == 7:
             figures |= scale_figures(mean[known, :3], truth[known, :3])
+            if scale_is_free(run, name):
+                figures |= of_a_free_scale(mean[known], P[known], truth[known])
     elif name in run.truth.fixes:
         figures |= fix_figures(fix_distances(run, name))
     return figures
@@ -176,6 +186,30 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
         "path_m": path_m(truth[:, :d]),
         "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, truth[:, :d]),
     }
+
+
+def scale_is_free(run: Recording, name: str) -> bool:
+    """Return whether nothing tells the scale of what a robot sees: it has cameras of two numbers, nothing else."""
+    h = run.history
+    cameras = {camera.sensor for camera in h.cameras if camera.robot == name and len(camera.columns) == PIXEL}
+    return (
+        bool(cameras) and set(run.sections(name)) <= cameras and len(h.robots) == 1
+        and not h.fixes and not h.priors and h.controls.get(name) is None
+    )  # fmt: skip
+
+
+def of_a_free_scale(mean: Array, P: Array, truth: Array) -> dict[str, Any]:
+    """Return the figures of a path (N, 7) that compare it with the truth in units of its sigmas (N, 6, 6).
+
+    The covariance is of a world whose scale begins with a guess, so there is no NEES; it has diverged if it does after
+    the similarity.
+    """
+    fit, scale = similarity(mean[:, :3], truth[:, :3])
+    error = fit(scale * mean[:, :3]) - truth[:, :3]
+    turn = scale * fit.rotation
+    sigmas = turn @ P[:, :3, :3] @ turn.T
+    lost = diverged(error, sigmas, np.linalg.norm(error, axis=1), truth[:, :3])
+    return {"pose_nees": None, "pose_nees_world": None, "diverged": lost}
 
 
 def scale_figures(path: Array, truth: Array) -> dict[str, float]:

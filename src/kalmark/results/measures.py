@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import chdtr
 
 from kalmark.arrays import Array
 from kalmark.geometry.angles import wrap
@@ -199,6 +200,14 @@ def nis(z: Array, Z: Array) -> tuple[Array, Ints]:
         rows = dof == m
         value[rows] = nees(z[rows, :m], Z[rows, :m, :m])
     return value, np.where(np.isfinite(value), dof, 0)
+
+
+def cut_off(gate: float, dof: int) -> float:
+    """Return the variance of whitened innovations of `dof` numbers of which a gate on d2 leaves out the rest.
+
+    That of a Gaussian without what is farther than the gate: F(dof + 2) / F(dof), F of chi-square at the gate.
+    """
+    return float(chdtr(dof + 2, gate) / chdtr(dof, gate)) if np.isfinite(gate) else 1.0
 
 
 def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tuple[float, float]:

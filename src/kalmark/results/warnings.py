@@ -30,7 +30,7 @@ from kalmark.results.calibration import mount_warnings
 from kalmark.results.gaps import gap_warnings
 from kalmark.results.history import History, Ints, UsedFix
 from kalmark.results.matching import LEAST, no_ids
-from kalmark.results.measures import nis
+from kalmark.results.measures import cut_off, nis
 from kalmark.results.recording import Recording
 from kalmark.results.repeats import repeat_warnings
 from kalmark.results.restarts import restarts
@@ -398,13 +398,20 @@ def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[st
         if mine.sum() >= NUMBER and len(set(history.step[mine].tolist())) >= SCANS:
             sections = [run.section(robot, sensor) for robot in run.config.get("robots") or {}]
             columns = next((COLUMNS.get(str(section.get("type")), ()) for section in sections if section), ())
-            yield from _compared(history, sensor, mine, columns)
+            yield from _compared(history, sensor, mine, columns, _cut_off(run, sensor))
 
 
-def _compared(history: History, sensor: str, mine: Any, columns: tuple[str, ...]) -> Iterator[str]:
+def _cut_off(run: Recording, sensor: str) -> float:
+    """Return the variance of innovations that a sensor's gates leave of one."""
+    channels = [c for (_, name), c in run.final_slam().state.channels.items() if name == sensor]
+    return min((cut_off(channel.gate, channel.dof) for channel in channels), default=1.0)
+
+
+def _compared(history: History, sensor: str, mine: Any, columns: tuple[str, ...], left: float) -> Iterator[str]:
+    """Compare the squares with those of the noise that is stated, of which the gate leaves so much."""
     size = int(np.isfinite(history.noise[mine]).sum(axis=1).max())  # the padding after its numbers is that of others
     z, sigma = history.z[mine], history.noise[mine]
-    squares = np.nanmean((z[:, :size] / sigma[:, :size]) ** 2, axis=0)
+    squares = np.nanmean((z[:, :size] / sigma[:, :size]) ** 2, axis=0) / left
     low = np.flatnonzero(squares < LOW)
     if not len(low):
         return
