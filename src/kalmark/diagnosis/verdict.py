@@ -42,8 +42,8 @@ NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
 EVENTS = 4  # times as many as observations are taken
 SEGMENT = 30  # successive scans that are taken together where not all are
-MORE = 4  # times as many are taken if the segments do not determine the map
-SEEN = 3  # observations a landmark, at first: with fewer a larger problem would take minutes
+MORE = 4  # times as many are taken if the segments do not determine the map, up to `MOST` at the end of a run
+SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
@@ -127,11 +127,11 @@ def _of_mistake(mistake: Mistake) -> Cause:
 
 def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first, landmarks = _structural(run, log), most // SEEN
-    if len(run.landmarks) <= landmarks and any(not cause.harmless for cause in first):
+    first, limit = _structural(run, log), max(MOST, MORE * most)
+    if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
         most = max(most, MOST)  # its reason may show in all of the log only
     try:
-        found = _searched(run, log, most, landmarks, progress)
+        found = _searched(run, log, most, limit, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
@@ -173,10 +173,10 @@ class Searched(NamedTuple):
     given: Given
 
 
-def _searched(run: Run, log: Log, most: int, landmarks: int, progress: bool) -> Searched:
+def _searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
     """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none.
 
-    Where `most` observations do not determine it, more are tried, but for a problem of more `landmarks` than that.
+    Where `most` observations do not solve it, more are tried, up to a `limit`: all of a long log take minutes.
     """
     every = calibrated(run, once(run, given_by(run)))
     given = thinned(run, every, most)
@@ -186,9 +186,9 @@ def _searched(run: Run, log: Log, most: int, landmarks: int, progress: bool) -> 
             raise KalmarkError("no observation was of a landmark in the map")
         batch = optimum(problem, tolerance=NEAR)
     except KalmarkError:
-        if given is every or len(set(given.associations.landmark)) > landmarks:
+        if given is every or min(MORE * most, len(every.associations.landmark)) > limit:
             raise
-        return _searched(run, log, MORE * most, landmarks, progress)
+        return _searched(run, log, MORE * most, limit, progress)
     linear = Linear.of(problem, batch.state, within_gates(run))
     search = Search(linear, sensors_of(run), given.robot, given.t_ns)
     search.run(progress)
