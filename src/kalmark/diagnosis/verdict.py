@@ -525,12 +525,13 @@ def effect_of(run: Run, found: Searched) -> Effect:
     mapped = filtered_map(run)
     filtered = _sigma(np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine]))
     stated, honest = (_sigma(linear.reduced.covariances()[its, :d, :d]) for linear in (first, cured))
-    shift_m = max(float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0))), by_steady)
+    shift_m = float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0)))
     share, free = shift_m / max(extent, TINY_M), (filtered > 0) & (stated > 0)
     if not free.any():
         return Effect(shift_m=shift_m)
     off_it = share > LEAST and shift_m > SIGMAS * float(np.median(filtered[free]))
     status = "ok" if not off_it else "doubtful" if share < WRONG else "wrong"
+    shift_m = max(shift_m, by_steady)  # told, but no alarm: under noise that is stated too small it is too much
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     same_data = not waited and not of_the_filter_alone(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data
