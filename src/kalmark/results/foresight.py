@@ -48,8 +48,8 @@ class Foresight:
     def _ask(self, robot: str, sensor: str) -> None:
         self._asked, count = None, len(self._slam.tracks.confirmed)
         self._saved = min(self._saved + LOOKED_AT, max(count, LOOKED_AT))
-        affords = self._scans in self._at and self._saved >= count
-        if affords or self._scans in self._shown:
+        affords = self._saved >= count
+        if self._scans in self._at and (affords or self._scans in self._shown):
             self._saved -= count if affords else 0
             start = time.perf_counter_ns()
             self._asked = self._slam.expect(robot, sensor, in_view=True)

@@ -24,6 +24,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import registered_name
+from kalmark.filter.estimators import Ekf
 from kalmark.geometry.gaussian import gate, quantile
 from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
@@ -398,13 +399,17 @@ def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[st
         if mine.sum() >= NUMBER and len(set(history.step[mine].tolist())) >= SCANS:
             sections = [run.section(robot, sensor) for robot in run.config.get("robots") or {}]
             columns = next((COLUMNS.get(str(section.get("type")), ()) for section in sections if section), ())
-            yield from _compared(history, sensor, mine, columns, _cut_off(run, sensor))
+            dof = int(np.isfinite(history.z[mine]).sum(axis=1).max())
+            yield from _compared(history, sensor, mine, columns, _cut_off(run, sections, dof))
 
 
-def _cut_off(run: Recording, sensor: str) -> float:
-    """Return the variance of innovations that a sensor's gates leave of one."""
-    channels = [c for (_, name), c in run.final_slam().state.channels.items() if name == sensor]
-    return min((cut_off(channel.gate, channel.dof) for channel in channels), default=1.0)
+def _cut_off(run: Recording, sections: list[dict[str, Any]], dof: int) -> float:
+    """Return the variance of innovations of `dof` numbers that the gate of a sensor's association leaves of one."""
+    own = next((section["association"] for section in sections if section.get("association")), None)
+    share = (own or run.config.get("association") or {}).get("gate")
+    if share == "default" and (run.config.get("estimator") or {}).get("type") == "ekf":
+        return cut_off(Ekf.default_gate, dof)
+    return cut_off(gate(share, dof), dof) if isinstance(share, float) else 1.0
 
 
 def _compared(history: History, sensor: str, mine: Any, columns: tuple[str, ...], left: float) -> Iterator[str]:
