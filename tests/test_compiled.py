@@ -119,6 +119,9 @@ for file in (index, data):
     assert anew() == 0 and anew() == 1, "another file under its name is not loaded"
     file.unlink()
     assert anew() == 0 and anew() == 1
+    file.unlink()
+    file.mkdir()
+    assert anew() == 0 and anew() == 1, "a folder under its name is no reason to stop"
 print(cases)
 """
 

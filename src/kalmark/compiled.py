@@ -21,6 +21,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -90,6 +91,8 @@ class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc, unused-ignore]
 
     @contextmanager
     def _open_for_write(self, filepath: str) -> Iterator[BinaryIO]:
+        if os.path.isdir(filepath):  # by some damage
+            shutil.rmtree(filepath, ignore_errors=True)
         with super()._open_for_write(filepath) as file:
             content = io.BytesIO()
             yield content

@@ -182,3 +182,15 @@ def test_a_scan_of_more_observations_than_a_map_can_take_is_refused_and_changes_
     with pytest.raises(EventError, match="1000000 observations, expected at most 5000 in one scan"):
         slam.process(km.Scan(t_s=1.0, robot="a", sensor="lidar", y=np.ones((1_000_000, 2))))
     assert digest(slam) == before
+
+
+def test_a_large_variance_hides_no_negative_one() -> None:
+    slam = km.Slam(km.Robot("r", km.motion.Odometry3D()))
+    before = slam.covariance("r")
+    cov = np.diag([-1.0, 1e-300, 1e-12, 1e6, 1e9, 1.0])
+    with pytest.raises(EventError, match="has the eigenvalue -1, expected a positive semidefinite"):
+        slam.process(km.Control(t_s=0.0, robot="r", u=np.ones(6), cov=cov))
+    np.testing.assert_array_equal(slam.covariance("r"), before)
+    cov[0] = 0.0
+    slam.process(km.Control(t_s=0.0, robot="r", u=np.ones(6), cov=cov))
+    assert np.linalg.eigvalsh(slam.covariance("r"))[0] > -1e-9 * np.abs(slam.covariance("r")).max()

@@ -16,6 +16,7 @@ from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
 LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
 MOST_OBSERVATIONS = 5000  # of one scan: a map of as many takes 2 GB, and a scan of all of them half a minute
 ROUNDING = 1e-3  # of a correlation
+SEMIDEFINITE = 1e-9  # in units of its own sigmas, by which rounding may take an eigenvalue below zero
 
 
 def covariance(value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError) -> Array:
@@ -67,11 +68,15 @@ def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[Kalma
         skewed = np.abs(covs - covs.swapaxes(1, 2)).max(axis=(1, 2), initial=0.0) > 1e-9 * scale
     if skewed.any():
         raise error(f"{what} is {shown(covs[np.argmax(skewed)].tolist())}, expected a symmetric matrix")
-    lowest = np.linalg.eigvalsh(covs).min(axis=1)
-    bad = ~(lowest > 0) if definite else ~(lowest >= -1e-9 * scale)
+    variances = np.diagonal(covs, axis1=1, axis2=2)
+    sigma = np.sqrt(np.maximum(variances, LEAST_VARIANCE))  # in units of these: no large variance hides another
+    lowest = np.linalg.eigvalsh(covs / sigma[:, :, None] / sigma[:, None, :]).min(axis=1)
+    lowest = np.minimum(lowest, np.where(variances < -LEAST_VARIANCE, variances, np.inf).min(axis=1))
+    bad = ~(lowest > 0) if definite else ~(lowest >= -SEMIDEFINITE) | (variances < -LEAST_VARIANCE).any(axis=1)
     if bad.any():
         kind = "positive definite" if definite else "positive semidefinite"
-        raise error(f"{what} has the eigenvalue {lowest[np.argmax(bad)]:.3g}, expected a {kind} matrix")
+        own = np.linalg.eigvalsh(covs[np.argmax(bad)]).min()
+        raise error(f"{what} has the eigenvalue {min(own, 0.0):.3g}, expected a {kind} matrix")
 
 
 def fault_of(P: Array) -> str:

@@ -60,7 +60,9 @@ def first_config(found: Survey, file: Path | None = None) -> str:
         "  format: bag",
     ]
     if found.holds_log:
-        return "\n".join([*head, "  # kalmark wrote this bag: it holds a whole log, and no topics are needed", ""])
+        head.append("  # kalmark wrote this bag: it holds a whole log, and no topics are needed")
+        head.append("# robots and sensors are in its configuration: kalmark run CONFIG --log FILE --set log.format=bag")
+        return "\n".join([*head, ""])
     writer = _Writer(found)
     lines = writer.lines()
     out = [*head, *lines.log, "  topics:", *(f"    {line}" for line in lines.topics)]
