@@ -27,7 +27,7 @@ KNOWN = ("associated", "new", "rejected")
 class Foresight:
     """Asks a filter before its scans what is in view; a context, within which it is asked.
 
-    The scans in `shown` are asked whatever it costs.
+    Of the scans that may be asked, those in `shown` are, whatever it costs.
     """
 
     def __init__(self, slam: Slam, scans: int, shown: Iterable[int] = ()) -> None:

@@ -71,8 +71,8 @@ def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[Kalma
     variances = np.diagonal(covs, axis1=1, axis2=2)
     sigma = np.sqrt(np.maximum(variances, LEAST_VARIANCE))  # in units of these: no large variance hides another
     lowest = np.linalg.eigvalsh(covs / sigma[:, :, None] / sigma[:, None, :]).min(axis=1)
-    lowest = np.minimum(lowest, np.where(variances < -LEAST_VARIANCE, variances, np.inf).min(axis=1))
-    bad = ~(lowest > 0) if definite else ~(lowest >= -SEMIDEFINITE) | (variances < -LEAST_VARIANCE).any(axis=1)
+    lowest[(variances < -LEAST_VARIANCE).any(axis=1)] = -np.inf
+    bad = ~(lowest > 0) if definite else ~(lowest >= -SEMIDEFINITE)
     if bad.any():
         kind = "positive definite" if definite else "positive semidefinite"
         own = np.linalg.eigvalsh(covs[np.argmax(bad)]).min()

@@ -95,7 +95,7 @@ def save(path: Path, state: State) -> None:
         try:
             with zipfile.ZipFile(temporary, "w") as archive:
                 for name, data in (members | {SUMS: sums}).items():  # without the clock: equal maps are equal files
-                    small = len(data) < LARGE  # a large covariance is of digits that do not compress
+                    small = len(data) < LARGE
                     archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED if small else zipfile.ZIP_STORED)
             os.replace(temporary, path)
         finally:
