@@ -23,7 +23,7 @@ from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.copies import copied
 from kalmark.diagnosis.gross import elsewhere, fit
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.verdict import Verdict, causes_of
+from kalmark.diagnosis.verdict import SEGMENT, Verdict, causes_of, thinned
 from kalmark.diagnosis.words import words
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.frames import compose, inverse
@@ -545,13 +545,34 @@ def test_scans_that_come_twice_are_named_and_count_once() -> None:
     assert 1.04 < (verdict.sigma_factor or 0.0) < np.sqrt(2)
 
 
+def test_segments_of_a_long_log_have_scans_enough_of_each_robot() -> None:
+    world = load_world("two_robots", ["steps=400"])
+    log = simulate(world, 0)
+    run = km.record(build_slam(world.config(), log), log, progress=False)
+    given = thinned(run, given_by(run), 600)
+    assert given.segments is not None and len(given.segments) > 1
+    for begin, end in given.segments.tolist():
+        robots = given.robot[(given.t_ns >= begin) & (given.t_ns <= end)]
+        assert all((robots == name).sum() >= SEGMENT - 1 for name in given.robots)
+
+
 def test_copies_come_in_pairs_and_a_sensor_that_repeats_itself_for_long_has_none() -> None:
-    noise = [np.array([float(k)]) for k in range(1, 21)]
-    assert copied([a for value in noise for a in (value, value)]).sum() == 20
-    assert not copied(noise).any()
-    assert not copied([np.ones(2)] * 40).any()
-    assert not copied([np.zeros(2), np.ones(2)] * 40).any()
-    assert not copied([]).any()
+    def copies_in(values: list[float]) -> int:
+        return int(copied(np.array(values).reshape(-1, 1), np.arange(len(values))).sum())
+
+    noise = [float(k) for k in range(1, 21)]
+    assert copies_in([a for value in noise for a in (value, value)]) == 20
+    assert [copies_in(values) for values in (noise, [1.0] * 40, [0.0, 1.0] * 40, [])] == [0, 0, 0, 0]
+
+
+def test_a_scan_is_a_copy_if_all_its_rows_are() -> None:
+    first = np.arange(0, 80, 2)  # scans of two rows, the second of each pair a copy
+    y = np.repeat(np.arange(80.0).reshape(20, 4), 2, axis=0).reshape(-1, 2)
+    assert copied(y, first).sum() == 20
+    y[7, 1] += 1e-12
+    assert copied(y, first).sum() == 19
+    with_more = np.delete(first, 1)  # one scan of four rows: the next is no copy of it
+    assert copied(y, with_more).sum() == 18
 
 
 def test_noise_of_several_columns_is_no_outliers() -> None:

@@ -6,13 +6,11 @@ be the same for long; copies come in pairs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags
+from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Control
 from kalmark.logs.log import Log
 from kalmark.results.run import Run
@@ -32,13 +30,21 @@ class Copies(NamedTuple):
     since_s: float
 
 
-def copied(values: Sequence[Array]) -> Flags:
-    """Return which (N,) of successive measurements or controls are copies of the one before; none, if they are few."""
-    same = np.array([False, *(len(b) > 0 and np.array_equal(a, b) for a, b in pairwise(values))])[: len(values)]
-    zero = np.array([not np.any(value) for value in values], dtype=np.bool_)
-    same &= ~zero
+def copied(values: Array, first: Index) -> Flags:
+    """Return which (S,) of successive measurements are copies of the one before; none, if they are few.
+
+    `values` (K, m) are the rows of all measurements, `first` (S,) is the first row of each.
+    """
+    if not len(first):
+        return np.zeros(0, dtype=np.bool_)
+    rows, count = np.nan_to_num(values), np.diff([*first, len(values)])
+    back = np.arange(len(rows)) - np.repeat(count, count)  # the row of the same place in the one before
+    equal = (rows == rows[back]).all(axis=1)
+    same = np.logical_and.reduceat(equal, first) & (count == np.roll(count, 1))
+    same &= np.logical_or.reduceat(rows.any(axis=1), first)
+    same[0] = False
     alone = same[1:-1] & ~same[:-2] & ~same[2:]
-    enough = same.sum() >= max(LEAST, SHARE * len(values)) and alone.sum() >= PAIRS * same[1:-1].sum()
+    enough = same.sum() >= max(LEAST, SHARE * len(first)) and alone.sum() >= PAIRS * same[1:-1].sum()
     return same if enough else np.zeros_like(same)
 
 
@@ -48,10 +54,8 @@ def of_scans(run: Run) -> Flags:
     robot = h.robot[h.step]
     for key in sorted({*zip(robot.tolist(), h.sensor.tolist(), strict=True)}):
         rows = np.flatnonzero((robot == key[0]) & (h.sensor == key[1]))
-        _, first = np.unique(h.step[rows], return_index=True)
-        scans = np.split(rows, first[1:])
-        for scan, same in zip(scans, copied([np.nan_to_num(h.y[scan]) for scan in scans]), strict=True):
-            out[scan] = same
+        _, first, count = np.unique(h.step[rows], return_index=True, return_counts=True)
+        out[rows] = np.repeat(copied(h.y[rows], first), count)
     return out
 
 
@@ -66,7 +70,7 @@ def copies(run: Run, log: Log) -> list[Copies]:
         found.append(Copies(*key, len(steps), len(np.unique(h.step[mine])), since_s))
     for name in run.final_slam().robots:
         mine_ = [e for e in log.events if isinstance(e, Control) and e.robot == name]
-        twice = np.flatnonzero(copied([e.u for e in mine_]))
+        twice = np.flatnonzero(copied(np.array([e.u for e in mine_]), np.arange(len(mine_))))
         if len(twice):
             found.append(Copies(name, "", len(twice), len(mine_), mine_[twice[0]].t_s))
     return found

@@ -31,6 +31,7 @@ from kalmark.results.gaps import RULED_OUT, left_out, matters
 from kalmark.results.measures import cut_off, rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
+from kalmark.results.verdict import INNOVATIONS
 from kalmark.results.warnings import window_warnings
 from kalmark.results.words import count, figure
 from kalmark.slam.robot import Mount
@@ -41,7 +42,7 @@ from kalmark.tracks.surveys import MISFITS
 NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
 EVENTS = 4  # times as many as observations are taken
-SEGMENT = 30  # successive scans that are taken together where not all are
+SEGMENT = 30  # successive scans of each robot that are taken together where not all are
 MORE = 4  # times as many are taken if the segments do not determine the map, up to `MOST` at the end of a run
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
@@ -136,7 +137,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
         why = str(error).removeprefix("batch solution: ")
-        checked = f"innovations alone, no batch solution: {why}"
+        checked = f"{INNOVATIONS}, no batch solution: {why}"
         return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
     effect = effect_of(run, found)
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
@@ -179,11 +180,11 @@ def _searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Sear
     Where `most` observations do not solve it, more are tried, up to a `limit`: all of a long log take minutes.
     """
     every = calibrated(run, once(run, given_by(run)))
+    if not every.associations.landmark:
+        raise KalmarkError("no observation was of a landmark in the map")
     given = thinned(run, every, most)
     try:
         problem = replayed(given, log)
-        if not problem.factors:
-            raise KalmarkError("no observation was of a landmark in the map")
         batch = optimum(problem, tolerance=NEAR)
     except KalmarkError:
         if given is every or min(MORE * most, len(every.associations.landmark)) > limit:
@@ -264,12 +265,13 @@ def thinned(run: Run, given: Given, most: int) -> Given:
     share = most / max(len(used.landmark), events / EVENTS, 1)
     if share >= 1.0:
         return given
-    number = max(len(t_ns) // SEGMENT, 2)
+    segment = SEGMENT * len(given.robots)
+    number = max(len(t_ns) // segment, 2)
     even = np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)
     worst = misfits(run)[1]
-    with_worst = [*dict.fromkeys(np.minimum(worst // SEGMENT, number - 1).tolist())][:LOOKED_INTO]
-    first = np.unique([*even, *with_worst]) * SEGMENT
-    last = np.minimum(first + SEGMENT, len(t_ns)) - 1
+    with_worst = [*dict.fromkeys(np.minimum(worst // segment, number - 1).tolist())][:LOOKED_INTO]
+    first = np.unique([*even, *with_worst]) * segment
+    last = np.minimum(first + segment, len(t_ns)) - 1
     begins = np.maximum(first - np.isin(first, worst), 0)  # with the scan before, or there is no step
     last[:-1] = np.minimum(last[:-1], begins[1:] - 1)
     segments = np.stack([t_ns[begins], t_ns[last]], axis=1)

@@ -9,6 +9,7 @@ from kalmark.results.words import count, figure
 
 SHOWN = 3  # causes in a short verdict
 ROUNDING_M = 1e-9
+INNOVATIONS = "innovations alone"  # how a map was checked that has no batch solution
 SEEN = 0.02  # by which a factor of the sigmas is worth a word
 
 
@@ -43,6 +44,6 @@ def _trust(verdict: Mapping[str, Any]) -> str:
     if verdict["map"] != "ok":
         return f": its shape is off by {figure(shift)} m" if shift and shift > ROUNDING_M else ""
     if factor is None:
-        return ""
+        return f", by {checked}" if (checked := str(verdict["checked"])).startswith(INNOVATIONS) else ""
     said = f"{figure(factor, 2)} times what the filter states" if abs(factor - 1.0) > SEEN else "as the filter states"
     return f": its landmarks are good to {figure(accuracy, 2)} m (1 sigma, {said})"
