@@ -119,6 +119,18 @@ def test_good_fixes_are_counted_with_their_nis_and_bring_no_warning() -> None:
     assert summary["warnings"] == []
 
 
+def test_of_fixes_whose_noise_is_far_too_large_it_is_advised_by_how_much() -> None:
+    log = circle(steps=300)
+    for stated_m, told in ((0.1, []), (0.4, [1.5, 4.2])):
+        events = [replace(e, cov=np.eye(2) * stated_m**2) if isinstance(e, Fix) else e for e in fixed(log, (0.0, 0.0))]
+        lines = record(slam_for(log), replace(log, events=events), progress=False).evaluate()["advice"]
+        found = [
+            re.match(r"fixes: NIS \S+ where 1 is expected: their sigma is stated at least (\S+) times", x)
+            for x in lines
+        ]
+        assert [told[0] < float(one[1]) < told[1] for one in found if one] == [True] * bool(told)
+
+
 def test_a_first_fix_far_from_the_start_says_which_setting_to_change() -> None:
     log = circle(steps=50)
     lines = warned(log, fixed(log, (11.0, 2.0)))

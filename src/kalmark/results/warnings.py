@@ -202,8 +202,11 @@ def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
 
 
 def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
-    """Return a line for each sensor whose noise is stated far too large; one if the NIS is tiny for another reason."""
-    lines, nis_ = list(_stated_too_large(run, summary)), summary["nis_per_dof"]
+    """Return a line for each sensor, and for fixes, whose noise is stated far too large.
+
+    One if the NIS is tiny for another reason.
+    """
+    lines, nis_ = [*_stated_too_large(run, summary), *_fixes_stated_too_large(summary)], summary["nis_per_dof"]
     if not lines and nis_ is not None and nis_ < TINY_NIS and summary["associated"] >= NUMBER // 2:
         lines = [f"NIS per degree of freedom {figure(nis_, 2)} where 1 is consistent: the noise is set too large"]
     return lines
@@ -401,6 +404,15 @@ def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[st
             columns = next((COLUMNS.get(str(section.get("type")), ()) for section in sections if section), ())
             dof = int(np.isfinite(history.z[mine]).sum(axis=1).max())
             yield from _compared(history, sensor, mine, columns, _cut_off(run, sections, dof))
+
+
+def _fixes_stated_too_large(summary: Mapping[str, Any]) -> Iterator[str]:
+    value = summary.get("fix_nis_per_dof")
+    if value is not None and value < LOW and summary["fixes"] - summary["fixes_rejected"] >= NUMBER // 2:
+        yield (
+            f"fixes: NIS {figure(value, 2)} where 1 is expected: their sigma is stated at least "
+            f"{figure(value**-0.5, 2)} times too large, unless their errors last from one to the next"
+        )
 
 
 def _cut_off(run: Recording, sections: list[dict[str, Any]], dof: int) -> float:
