@@ -17,6 +17,7 @@ from kalmark.vision.appearance import predicted, taken
 from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.matching import Searcher, correlation
 from kalmark.vision.pairs import with_pairs
+from kalmark.vision.planes import Plane as Surroundings
 from kalmark.vision.selection import Search
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
@@ -64,7 +65,8 @@ def test_a_patch_is_found_to_a_tenth_of_a_pixel_where_it_appears_from_elsewhere(
     y = corners(image, 40)
     views = [[taken(cv2, image, one, first, camera, 12)] for one in y]
     places = places_of(camera, first, y)
-    looks = predicted(cv2, views, places, then, camera, 6)
+    facing = [Surroundings(view.rays[4]) for (view,) in views]
+    looks = predicted(cv2, views, facing, places, then, camera, 6)
     true = pixels(camera, then, places)
     inside = looks.told[((true > 25) & (true < np.array(now.shape[::-1]) - 25))[looks.told].all(axis=1)]
     assert len(inside) > 12

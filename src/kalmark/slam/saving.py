@@ -51,7 +51,7 @@ from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 11
+VERSION = 12
 DESCRIPTION, SUMS = "slam.json", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
 OF_TRACKS = (

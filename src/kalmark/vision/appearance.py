@@ -1,9 +1,9 @@
 """How a landmark looked, and how it must look from elsewhere: patches warped by the homography of their plane.
 
-The landmark at p lies on a plane whose normal points to the camera at c from which a patch was taken, (c - p)/|c - p|.
-A corner of the patch, seen along the unit ray m, is at X = m (x.x)/(m.x) in that camera's frame, x = p in it.  From
-where the camera is now the four corners appear at four pixels, which determine the homography, whatever the lens.  The
-centre of the patch is the landmark, wherever the estimate has it by now: pixels count from where the centre appears.
+The landmark at p lies on a plane with normal N (`planes`).  A corner of a patch, seen along the unit ray m, is at
+X = m (N.x)/(N.m) in the frame of the camera that took it, x = p in it.  From where the camera is now the four corners
+appear at four pixels, which determine the homography, whatever the lens.  The centre of the patch is the landmark,
+wherever the estimate has it by now: pixels count from where the centre appears.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.geometry.rotations import matrix
+from kalmark.vision.planes import Plane
 
 MOST_SCALE = 2.0  # a patch is not enlarged or reduced by more
 LEAST_COSINE = 0.5  # of the angle between the directions of view, then and now: 60 deg
 ANOTHER_COSINE, ANOTHER_SCALE = 0.94, 1.4  # a view is taken where the best one differs by more: 20 deg
 MOST_VIEWS = 4
+DIFFERENCE, STEPS = 1e-3, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of slopes, for rates
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +41,13 @@ class Looks(NamedTuple):
     """How K landmarks must look: `templates` (K, s, s), of which those `told` (n,) hold.
 
     `likeness` (K, 2) is the cosine of the angle between the directions of view and the scale, of the best view of each.
+    `rates` (K, 2, 2, 2): the slopes of the plane move what appears at x from the centre by rates x.
     """
 
     templates: Any
     told: Index
     likeness: Array
+    rates: Array
 
 
 def corners(y: Array, q: float) -> Array:
@@ -80,31 +84,44 @@ def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[V
     return best, likeness
 
 
-def predicted(cv2: Any, views: list[list[View]], places: Array, T: Array, sensor: Any, h: int) -> Looks:
+def predicted(
+    cv2: Any, views: list[list[View]], planes: list[Plane | None], places: Array, T: Array, sensor: Any, h: int
+) -> Looks:  # fmt: skip
     """Return how landmarks at `places` (K, 3) must look from T: templates of half width h."""
     best, likeness = best_views(views, places, T)
     templates, done = np.zeros((len(best), 2 * h + 1, 2 * h + 1), np.uint8), []
+    rates = np.zeros((len(best), 2, 2, 2))
     told = [
         k for k, view in enumerate(best)
         if view is not None and likeness[k, 0] > LEAST_COSINE and 1 / MOST_SCALE < likeness[k, 1] < MOST_SCALE
     ]  # fmt: skip
     if not told:
-        return Looks(templates, np.zeros(0, np.int64), likeness)
-    X = np.empty((len(told), 5, 3))
-    for i, k in enumerate(told):
-        view = best[k]
-        assert view is not None
-        turn = matrix(view.T[3:])
-        x = (places[k] - view.T[:3]) @ turn
-        along = view.rays @ x
-        X[i] = view.T[:3] + (view.rays * (x @ x / along)[:, None]) @ turn.T
+        return Looks(templates, np.zeros(0, np.int64), likeness, rates)
+    shown = [(view, plane) for view, plane in ((best[k], planes[k]) for k in told) if view and plane]
+    turns = np.array([matrix(view.T[3:]) for view, _ in shown])
+    normals = np.array([plane.normal for _, plane in shown])[:, None] + DIFFERENCE * (
+        STEPS @ np.array([plane.across for _, plane in shown]).transpose(0, 2, 1)
+    )  # (n, 3, 3): of the plane, and of it with either slope changed
+    c, rays = (
+        np.array([view.T[:3] for view, _ in shown]),
+        np.array([view.rays for view, _ in shown]) @ turns.transpose(0, 2, 1),
+    )
+    along = normals @ rays.transpose(0, 2, 1)
+    far = normals @ (places[told] - c)[:, :, None]
+    X = c[:, None, None] + rays[:, None] * (far / np.where(along > 0.0, along, np.nan))[..., None]
     seen = (X.reshape(-1, 3) - T[:3]) @ matrix(T[3:])
-    pixels = sensor.expect(np.ascontiguousarray(seen))[0][:, :2].reshape(-1, 5, 2)
+    pixels = sensor.expect(np.ascontiguousarray(seen))[0][:, :2].reshape(-1, 3, 5, 2)
+    offsets = pixels[:, :, :4] - pixels[:, :, 4:]
+    finite = np.isfinite(offsets).all(axis=(1, 2, 3))
+    from_centre = offsets[finite, :1].transpose(0, 1, 3, 2)  # (n, 1, 2, 4)
+    moved = (offsets[finite, 1:] - offsets[finite, :1]) / DIFFERENCE
+    fitted = np.linalg.solve(from_centre @ from_centre.transpose(0, 1, 3, 2), from_centre @ moved)
+    rates[np.array(told)[finite]] = fitted.transpose(0, 1, 3, 2)
     for i, k in enumerate(told):
         view = best[k]
         assert view is not None
-        to = pixels[i, :4] - pixels[i, 4] + h
-        if not np.isfinite(to).all():
+        to = offsets[i, 0] + h
+        if not finite[i]:
             continue
         size = view.patch.shape[0] - 1.0
         source = np.array([[0.0, 0.0], [size, 0.0], [size, size], [0.0, size]], dtype=np.float32)
@@ -112,4 +129,4 @@ def predicted(cv2: Any, views: list[list[View]], places: Array, T: Array, sensor
         flags, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
         done.append(k)
         templates[k] = cv2.warpPerspective(view.patch, warp, (2 * h + 1, 2 * h + 1), flags=flags, borderMode=border)
-    return Looks(templates, np.array(done, dtype=np.int64), likeness)
+    return Looks(templates, np.array(done, dtype=np.int64), likeness, rates)

@@ -8,6 +8,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 
+BLOCK = 5  # px: surroundings of a corner, small so that it is in the middle of its patch
 FORGIVEN = 15  # frames until a cell in which no corner was found is looked at again
 
 
@@ -53,16 +54,16 @@ class Cells:
         """Return the pixel of a part of the image whose surroundings differ most from any near it."""
         h = self.half
         part = image[top - h : bottom + h, left - h : right + h]
-        response = responses(self.cv2, part, 2 * h + 1)[h:-h, h:-h]
+        response = responses(self.cv2, part)[h:-h, h:-h]
         j, i = divmod(int(response.argmax()), response.shape[1])
         if not response[j, i] >= self.contrast**2:
             return None
         return float(left + i), float(top + j)
 
 
-def responses(cv2: Any, image: Any, block: int) -> Any:
+def responses(cv2: Any, image: Any) -> Any:
     """Return for each pixel of an image (H, W) the mean square of the gradient around it, where that is least.
 
-    Of all directions, over a square of `block` pixels: in (grey values a pixel)^2.
+    Of all directions, over a square of `BLOCK` pixels: in (grey values a pixel)^2.
     """
-    return cv2.cornerMinEigenVal(image, block, ksize=3) * (255.0**2 / 4.0)  # OpenCV's is 4 / 255^2 times that
+    return cv2.cornerMinEigenVal(image, BLOCK, ksize=3) * (255.0**2 / 4.0)  # OpenCV's is 4 / 255^2 times that

@@ -19,6 +19,7 @@ from kalmark.arrays import Array
 from kalmark.declare import Count, Positive, Within, register
 from kalmark.errors import ModelError
 from kalmark.events import Frame, Id, Scan
+from kalmark.geometry.rotations import matrix
 from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
 from kalmark.tracks.prospect import PIXEL, Prospect
@@ -28,6 +29,7 @@ from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
 from kalmark.vision.matching import Searcher
 from kalmark.vision.pairs import with_pairs
+from kalmark.vision.planes import NUMBERS, Plane, measured, shown
 from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed import FirstLook
 
@@ -84,6 +86,7 @@ class Look:
     fitted: int = 0
     missed: int = 0  # searches since it last fitted
     seen: int = -1  # frame of the last
+    plane: Plane | None = None  # about it; none as long as it has no view
     surveyed: bool = False  # known beforehand: it has no view until it is first seen, and is not given up
 
 
@@ -122,8 +125,9 @@ class FrontEnd:
         self.frame += 1
         self.image, self.prospect = image, prospect
         views = [self._views(name) for name in prospect.names]
-        looks = predicted(cv2, views, prospect.places, prospect.T, prospect.sensor, TEMPLATE)
-        self.likeness = looks.likeness
+        planes = [self.looks[name].plane if name in self.looks else None for name in prospect.names]
+        looks = self.likely = predicted(cv2, views, planes, prospect.places, prospect.T, prospect.sensor, TEMPLATE)
+        self.beside = beside if isinstance(self.sensor, PixelDepth) else None
         t1 = perf_counter()
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
         found = self.found = Search(prospect, looks.told, searcher, settings.updates).run(self.random)
@@ -156,20 +160,26 @@ class FrontEnd:
         at = {name: k for k, name in enumerate(self.prospect.names)}
         for o in report.observations:
             name = o.landmark
-            if name is None:
+            if name is None or o.outcome not in ("new", "associated"):
                 continue
+            y = report.y[o.index, :PIXEL]
             if o.outcome == "new":
-                view = taken(self.cv2, self.image, report.y[o.index, :PIXEL], T, self.sensor, PATCH, self.frame - 1)
+                view = self._taken(y, T)
                 if view is not None:
-                    self.looks[name] = Look([view], seen=self.frame)
-            elif o.outcome == "associated":
-                look = self.looks[name]
-                look.fitted, look.missed, look.seen = look.fitted + 1, 0, self.frame
-                cosine, scale = self.likeness[at[name]]  # 0 where there is no view yet
-                other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
-                if other and len(look.views) < MOST_VIEWS:
-                    view = taken(self.cv2, self.image, report.y[o.index, :PIXEL], T, self.sensor, PATCH, self.frame - 1)
-                    look.views += [view] if view is not None else []
+                    look = self.looks[name] = Look([view], seen=self.frame)
+                    look.plane = self._plane(y, view)
+                continue
+            look, k = self.looks[name], at[name]
+            look.fitted, look.missed, look.seen = look.fitted + 1, 0, self.frame
+            cosine, scale = self.likely.likeness[k]  # 0 where there is no view yet
+            if look.plane is not None and cosine:
+                shown(self.image, self.likely.templates[k], y, look.plane.slopes, self.likely.rates[k], look.plane)
+            other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
+            if other and len(look.views) < MOST_VIEWS:
+                view = self._taken(y, T)
+                if view is not None:
+                    look.views.append(view)
+                    look.plane = look.plane or self._plane(y, view)
         for name, _ in report.removed:
             self.looks.pop(name, None)
         if self.beginning is not None:
@@ -199,6 +209,7 @@ class FrontEnd:
         self.looks = {name: look for name, look in self.looks.items() if name in names}
         for look in self.looks.values():
             look.views = [replace(view, T=poses[view.frame]) for view in look.views]
+            look.plane = Plane(matrix(look.views[0].T[3:]) @ look.views[0].rays[4]) if look.views else None
 
     def settle(self) -> None:
         """Take the map as it is: something else than frames has changed it."""
@@ -224,13 +235,15 @@ class FrontEnd:
         }  # fmt: skip
 
     def arrays(self) -> dict[str, Array]:
-        """Return patches, poses and rays of all views, landmark after landmark."""
+        """Return patches, poses and rays of all views, landmark after landmark, and planes of those that have any."""
         views, side = [view for look in self.looks.values() for view in look.views], 2 * PATCH + 1
+        planes = [look.plane.numbers for look in self.looks.values() if look.plane is not None]
         return {
             "patches": np.array([view.patch for view in views], dtype=np.float64).reshape(-1, side, side),
             "poses": np.array([view.T for view in views]).reshape(-1, 7),
             "rays": np.array([view.rays for view in views]).reshape(-1, 5, 3),
             "frames": np.array([view.frame for view in views], dtype=np.float64),
+            "planes": np.array(planes).reshape(-1, NUMBERS),
         }
 
     def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
@@ -239,10 +252,13 @@ class FrontEnd:
         patches = read("patches", (count, side, side)).astype(np.uint8)
         frames = read("frames", (count,)).astype(np.int64).tolist()
         views = list(map(View, patches, read("poses", (count, 7)), read("rays", (count, 5, 3)), frames))
+        known = sum(int(look[1]) > 0 for look in state["looks"])
+        planes = iter(read("planes", (known, NUMBERS)))
         self.looks, at = {}, 0
         for name, own, *counts, surveyed in state["looks"]:
             searched, found, fitted, missed, seen = map(int, counts)
-            self.looks[name] = Look(views[at : at + own], searched, found, fitted, missed, seen, bool(surveyed))
+            plane = Plane.of(next(planes)) if own else None
+            self.looks[name] = Look(views[at : at + own], searched, found, fitted, missed, seen, plane, bool(surveyed))
             at += own
         self.frame, self.named = int(state["frame"]), int(state["named"])
         self.random.bit_generator.state = state["random"]
@@ -251,6 +267,16 @@ class FrontEnd:
         self.beginning = None if begun is None else Beginning.restored(begun)
 
     # ------------------------------------------------------------------ landmarks
+    def _taken(self, y: Array, T: Array) -> View | None:
+        return taken(self.cv2, self.image, y, T, self.sensor, PATCH, self.frame - 1)
+
+    def _plane(self, y: Array, view: View) -> Plane:
+        """Return the plane about the pixel y (2,) of a first view."""
+        plane = Plane(matrix(view.T[3:]) @ view.rays[4])
+        if self.beside is not None:
+            measured(self.beside, y, self.sensor, view.T, TEMPLATE, plane)
+        return plane
+
     def _views(self, name: Id) -> list[View]:
         look = self.looks.get(name)
         return [] if look is None else look.views

@@ -20,7 +20,6 @@ AT_ONCE = 12  # landmarks that are looked for in a frame
 BASES = 4  # of them that are tried as the first one
 CORNERS = 30  # the strongest in an ellipse
 SURE = 9.0  # by so much in d2 any other trial must fit worse
-BLOCK = 5  # px: surroundings of a corner
 APART = 4  # px: a corner is the strongest so far around
 
 
@@ -29,7 +28,7 @@ class FirstLook:
 
     def __init__(self, cv2: Any, image: Any, prospect: Prospect, contrast: float) -> None:
         self.prospect = prospect
-        response = responses(cv2, image, BLOCK)
+        response = responses(cv2, image)
         top = cv2.dilate(response, np.ones((2 * APART + 1, 2 * APART + 1), np.uint8))
         v, u = np.nonzero((response == top) & (response >= contrast**2))
         order = np.argsort(-response[v, u], kind="stable")

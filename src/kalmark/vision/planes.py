@@ -1,0 +1,140 @@
+"""The plane about a landmark, by which its patch is warped.  Molton, Davison and Reid 2004.
+
+A patch is seldom on a plane that faces the camera.  Where what it shows is beside its centre, it then moves against the
+centre as the camera goes round: as if the landmark moved, in each frame anew.  So the plane is estimated,
+
+    N.(X - p) = 0,  N = m + B s,
+
+m the direction in which p was first seen, B (3, 2) across it, s (2,) the slopes.  Where the patch appears at x from p,
+slopes changed by ds move it by x_s ds.  What a match shows about its pixel is I(x) = g T(x) + o - T_x (x_s ds + t):
+least squares over template and image give ds, beside gain g, offset o and shift t, all frames together those of most
+parallax.  A depth image shows the plane at once: 1 / z = N.v of the rays v with z = 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.compiled import compiled
+from kalmark.geometry.rotations import matrix
+from kalmark.vision.depths import EDGE
+
+SIGMA_SLOPE = 1.0  # of the prior: 45 deg
+STEEPEST = 2.0  # 63 deg
+REPEATED = 10.0  # frames whose errors of interpolation are the same: what each one of them adds is so much less
+NUMBERS = 9  # of a plane in files
+LEAST_VARIANCE = 4.0  # of grey values about a template
+
+
+@dataclass
+class Plane:
+    """A plane by the direction m (3,) it was first seen in, slopes (2,) and their information (2, 2)."""
+
+    m: Array
+    slopes: Array = field(default_factory=lambda: np.zeros(2))
+    information: Array = field(default_factory=lambda: np.eye(2) / SIGMA_SLOPE**2)
+    across: Array = field(init=False)  # B (3, 2): unit vectors at right angles to m and each other
+
+    def __post_init__(self) -> None:
+        a = np.cross(self.m, np.eye(3)[int(np.abs(self.m).argmin())])
+        a /= np.sqrt(a @ a)
+        self.across = np.column_stack([a, np.cross(self.m, a)])
+
+    @staticmethod
+    def of(numbers: Array) -> Plane:
+        """Return the plane of these `numbers` (9,)."""
+        return Plane(numbers[:3], numbers[3:5], numbers[5:].reshape(2, 2))
+
+    @property
+    def numbers(self) -> Array:
+        """Return what it is, (9,), for files."""
+        return np.concatenate([self.m, self.slopes, self.information.ravel()])
+
+    @property
+    def normal(self) -> Array:
+        """Return N (3,), not of unit length."""
+        return self.m + self.across @ self.slopes
+
+    def add(self, slopes: Array, information: Array) -> None:
+        """Fuse other slopes (2,) with their information (2, 2)."""
+        whole = self.information + information
+        found = np.linalg.solve(whole, self.information @ self.slopes + information @ slopes)
+        steep = float(np.sqrt(found @ found))
+        self.slopes, self.information = np.asarray(found * (STEEPEST / max(steep, STEEPEST)), dtype=np.float64), whole
+
+
+def measured(depth: Array, y: Array, sensor: Any, T: Array, half: int, plane: Plane) -> None:
+    """Fuse what the depth image (H, W) shows of the plane about the pixel y (2,), from T; nothing at an edge."""
+    u, v = np.rint(y).astype(np.int64).tolist()
+    window = depth[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1].ravel()
+    if len(window) != (2 * half + 1) ** 2 or not (window > 0).all():
+        return
+    offsets = np.arange(-half, half + 1.0)
+    pixels = np.column_stack([np.tile(offsets + u, len(offsets)), np.repeat(offsets + v, len(offsets))])
+    rays = sensor.rays(pixels)
+    rays /= rays[:, 2:]
+    N, *_ = np.linalg.lstsq(rays, 1.0 / window, rcond=None)
+    sigma = sensor.sigma_rho_per_m
+    if np.abs(rays @ N - 1.0 / window).max() > EDGE * sigma:
+        return
+    turn, B = matrix(T[3:]), plane.across
+    along = float(turn @ N @ plane.m)
+    if along > 0.0:
+        C = B.T @ turn @ np.linalg.inv(rays.T @ rays) @ turn.T @ B * (sigma / along) ** 2
+        plane.add(B.T @ turn @ N / along, np.linalg.inv(C))
+
+
+def shown(image: Any, template: Any, y: Array, slopes: Array, rates: Array, plane: Plane) -> None:
+    """Fuse what a match at y (2,) shows of the plane: a template (s, s) that holds with `slopes`, x_s = `rates`.
+
+    rates (2, 2, 2): of x by each slope, as a matrix that multiplies x.
+    """
+    step, information = slopes_shown(image, template, y, rates)
+    if np.isfinite(step).all():
+        plane.add(slopes + step, information)
+
+
+@compiled
+def slopes_shown(image: Any, template: Any, y: Array, rates: Array) -> tuple[Array, Array]:
+    """Return ds (2,) and its information (2, 2), NaN where the image (H, W) about y (2,) shows nothing."""
+    s = template.shape[0]
+    h, column = s // 2, np.empty(6)
+    A, b, whole, n = np.zeros((6, 6)), np.zeros(6), 0.0, 0
+    none = np.full(2, np.nan), np.zeros((2, 2))
+    left, above = int(np.floor(y[0])), int(np.floor(y[1]))
+    du, dv = y[0] - left, y[1] - above
+    if left < h or above < h or left + h + 1 >= image.shape[1] or above + h + 1 >= image.shape[0]:
+        return none
+    for j in range(1, s - 1):
+        for i in range(1, s - 1):
+            u, v = left + i - h, above + j - h
+            value = (1.0 - dv) * ((1.0 - du) * image[v, u] + du * image[v, u + 1])
+            value += dv * ((1.0 - du) * image[v + 1, u] + du * image[v + 1, u + 1])
+            T_u = 0.5 * (float(template[j, i + 1]) - float(template[j, i - 1]))
+            T_v = 0.5 * (float(template[j + 1, i]) - float(template[j - 1, i]))
+            x, w = float(i - h), float(j - h)
+            column[0], column[1], column[2], column[3] = float(template[j, i]), 1.0, -T_u, -T_v
+            for a in range(2):
+                column[4 + a] = -T_u * (rates[a, 0, 0] * x + rates[a, 0, 1] * w)
+                column[4 + a] -= T_v * (rates[a, 1, 0] * x + rates[a, 1, 1] * w)
+            for p in range(6):
+                b[p] += column[p] * value
+                for q in range(p + 1):
+                    A[p, q] += column[p] * column[q]
+            whole += value * value
+            n += 1
+    for p in range(6):
+        for q in range(p):
+            A[q, p] = A[p, q]
+        A[p, p] += 1e-6 * (1.0 + A[p, p])
+    found = np.linalg.solve(A, b)
+    variance = max(float(whole - found @ b) / (n - 6), LEAST_VARIANCE)
+    gain = found[0]
+    if not gain > 0.1:
+        return none
+    C = np.linalg.inv(A)[4:, 4:].copy() * (REPEATED * variance / gain**2)
+    return found[4:] / gain, np.linalg.inv(C)
