@@ -159,7 +159,7 @@ def print_rendered(name: str, seeds: int) -> None:
         nees.append(found[1] / 6)
         ms.append(found[2])
         print(f"seed {seed}: position {off[-1]:.4f} m, NEES {np.nanmean(nees[-1]):.2f}", flush=True)
-    low, high = anees_interval(6, seeds)
+    low, high = (bound / 6 for bound in anees_interval(6, seeds))
     mean = np.mean(nees, axis=0)
     mean = mean[np.isfinite(mean)]
     inside = 100 * float(np.mean((mean > low) & (mean < high)))
