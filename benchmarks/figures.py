@@ -398,6 +398,12 @@ def diagnosis() -> Iterator[Figure]:
                  "85 %, 97 %", command, read)  # fmt: skip
     yield Figure(section, "clean simulated logs that are accused of anything (200)", "1 % at most", command,
                  row("clean:", "{0} of {2}"))  # fmt: skip
+    further = "python benchmarks/diagnosis_worlds.py"
+    yield Figure(section, "planted faults, further worlds: first / among three", "85 %, 97 %", further, read)
+    yield Figure(section, "planted faults, further worlds: clean logs that are accused of anything", "1 % at most", further,
+                 row("clean:", "{0} of {2}"))  # fmt: skip
+    yield Figure(section, "planted faults, further worlds: maps that are off by the truth and called ok", "none", further,
+                 row("off:", "{0} of {2}"))  # fmt: skip
     yield Figure(section, "shipped real logs whose verdict is as they are known to be", "all",
                  "python benchmarks/diagnosis.py --real", row("real:", "{0} of {2}"))  # fmt: skip
 

@@ -14,7 +14,8 @@ from kalmark.batch.data import Given
 from kalmark.batch.problem import sightings
 from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis import causes
-from kalmark.diagnosis.causes import MOST_SCALE, Column, Finding
+from kalmark.diagnosis.causes import MOST_SCALE, Finding
+from kalmark.diagnosis.columns import Column, columns_of, rates_of
 from kalmark.diagnosis.keys import Keys, Path_
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.search import LEAST_GAIN
@@ -36,7 +37,7 @@ def calibrations(
     All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
     Those that it determines are estimated again without scales and places of mounts, which are not linear.
     """
-    columns = causes.columns_of(linear, sensors_of(run), causes.rates_of(linear, given.robot, given.t_ns))
+    columns = columns_of(linear, sensors_of(run), rates_of(linear, given.t_ns))
     columns += _mounts(linear, given)
     paths = [keys.calibration(run, column) for column in columns]
     joined: dict[Any, Column] = {}

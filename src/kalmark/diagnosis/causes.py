@@ -9,16 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtr, chdtrc, chdtri, expit, ndtr
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.course import START, UNKNOWN
-from kalmark.batch.state import LANDMARKS, POSES, Ints
+from kalmark.batch.state import LANDMARKS, Ints
+from kalmark.diagnosis.columns import Column, Where
 from kalmark.diagnosis.linear import OUT, Left, Linear
-from kalmark.results.measures import pose_error
 
 BLOCKS = 40  # stretches of a run, whose scores tell how much a sum of them varies
 LEAST_INFORMATION = 1e-9
@@ -31,7 +30,6 @@ SEEN = 8  # times a landmark that can be judged by itself
 LOOKED_AT = 20  # landmarks
 MOST_CONDITION = 1e12
 SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the end
-SLOW_S = 1e-3
 MOST_STEPS = 0.9  # share of steps without a jump
 FAR_STEPS, FAR_S = 3.0, 5.0  # no driving: farther than so many long steps, and than it drives in this time
 SELDOM = 1e-3
@@ -41,8 +39,6 @@ ALIKE = 0.85  # of what another one explains: they are alike
 SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
 TIMES = "times"  # the unit of noise
 JUMPS = ("odometry_jump", "kidnapped")
-
-Where = tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,89 +73,6 @@ class Finding:
     def overstated(self) -> bool:
         """Whether it is a noise that is smaller than stated."""
         return self.unit == TIMES and self.value < 1.0
-
-
-class Column(NamedTuple):
-    """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,)."""
-
-    name: str
-    of: tuple[str, ...]
-    unit: str
-    Z: Array
-    W: Array
-
-    @property
-    def group(self) -> tuple[str, ...]:
-        """Robot, sensor and column, or robot and column of its controls: errors of the same column share it."""
-        return self.of[:2] if self.W.any() else self.of
-
-
-def columns_of(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: Array) -> list[Column]:
-    """Return the systematic errors that data may have.
-
-    `sensors` are the columns that each sensor measures, `rates` (n, q) the velocities of the poses, in the world.
-    """
-    found = [*_of_sensors(linear, sensors, rates), *_of_controls(linear)]
-    return [column for column in found if np.isfinite(column.Z).all() and (column.Z.any() or column.W.any())]
-
-
-def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: Array) -> Iterator[Column]:
-    factors, none = linear.problem.factors, np.zeros(len(linear.at.w))
-    for f, factor in enumerate(factors):
-        names, (k, p) = sensors.get(factor.sensor, ()), factor.R.shape[:2]
-        if len(names) != p:
-            continue
-        z, E = factor.term.at(linear.state)
-
-        def added(part: Array, f: int = f) -> Array:
-            parts = [np.zeros(other.R.shape[:2]) for other in factors]
-            parts[f] += part
-            return linear.whitened(parts)
-
-        for c, name in enumerate(names):
-            one = np.eye(p)[c]
-            if name.startswith(("range", "distance")):
-                yield Column(
-                    "range_scale", (*factor.sensor, name), "", added((factor.y[:, c] - z[:, c])[:, None] * one), none
-                )
-                yield Column("range_offset", (*factor.sensor, name), "m", added(np.tile(one, (k, 1))), none)
-            elif name.endswith("_rad"):
-                offset = "bearing_offset" if name == "normal_rad" else f"{name.removesuffix('_rad')}_offset"
-                yield Column(offset, (*factor.sensor, name), "rad", added(np.tile(one, (k, 1))), none)
-        pose = factor.term.blocks[0]
-        moving = np.einsum("kij,kj->ki", E[:, :, : pose.space.dof], rates[pose.rows])
-        yield Column("time_offset", factor.sensor, "s", added(moving), none)
-
-
-def _of_controls(linear: Linear) -> Iterator[Column]:
-    """Yield the systematic errors of the controls.
-
-    A scale is that of the control as estimated.  The measured one has its noise in it: its scale would come out short.
-    """
-    motions, nothing = linear.problem.motions, np.zeros(len(linear.at.z))
-    e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds)
-    for k, error in enumerate(motions.errors):
-        turns = error.column.endswith(("_rad", "_radps"))
-        name = "odometry_turn" if turns else "odometry_scale" if error.kind == "scale" else "odometry_offset"
-        if error.column == "steering_rad":
-            name = "steering_offset"
-        W = motions.systematic[:, k]
-        if error.kind == "scale":
-            W = W + linear.root @ np.where(kinds == f"{error.robot}.{error.column}", e, 0.0)
-        yield Column(name, (error.robot, error.column, error.kind), error.unit, nothing, W)
-
-
-def rates_of(linear: Linear, robot: Any, t_ns: Ints) -> Array:
-    """Return the velocities (n, q) of the poses at the scans, of `robot` (S,) at `t_ns` (S,), zero of all others."""
-    nodes, poses = linear.problem.nodes, linear.state.groups[POSES]
-    out = np.zeros((len(poses), linear.state.spaces[POSES].dof))
-    for name in dict.fromkeys(robot.tolist()):
-        mine = np.flatnonzero(robot == name)
-        node, first = np.unique(nodes[mine], return_index=True)
-        t = t_ns[mine][first] * 1e-9
-        after = np.maximum(t[2:] - t[:-2], SLOW_S)
-        out[node[1:-1]] = pose_error(poses[node[:-2]], poses[node[2:]]) / after[:, None]
-    return out
 
 
 def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:

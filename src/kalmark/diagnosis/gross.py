@@ -30,6 +30,7 @@ from kalmark.results.run import Run
 from kalmark.results.words import figure
 
 SCANS, OBSERVATIONS = 400, 3000  # of the log are filtered again
+DETECTED = 7  # observations in a raw scan, or so
 FEW_SCANS = 80  # of them at first: a log that does not fit shows it soon
 FEW_SKIPPED = 0.02  # of the events may be refused in a log that fits
 MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
@@ -37,6 +38,7 @@ FITS = 2.0  # below which a log fits
 MUCH = 3.0  # times better is the log without the mistake
 ALIKE = 0.95  # of what the likeliest mistake explains: the log does not tell them apart
 BETTER = 1.5  # times better it fits without the mistake
+FEWER = 2.0  # times fewer observations without an id fit nothing: the others are clutter
 LOST = 9.0  # what an observation without an id counts that is of no landmark in the map: as one at the gate
 MOST = 25.0  # that one observation counts, and what counts one that was left out
 REJECTED = 0.5  # of the fixes, from which on their robot is not where it should be
@@ -68,6 +70,12 @@ class Fit(NamedTuple):
         """The share of the observations that fit a landmark."""
         return float(np.mean(self.values < LOST)) if len(self.values) else 0.0
 
+    def fits(self, most: float, before: Fit) -> bool:
+        """Whether its mean is below `most`, or that of all that fits anything, which is far more than it was before."""
+        lost, were = self.values == LOST, before.values == LOST
+        some = FEWER * lost.sum() * len(were) < were.sum() * len(lost)
+        return self.mean < most or bool(some and self.values[~lost].mean() < most)
+
     def of(self, rows: slice) -> Fit:
         """Return that of some observations."""
         return Fit(self.values[rows], self.dof[rows])
@@ -79,13 +87,14 @@ REFUSED = Fit(np.zeros(0), np.zeros(0))
 def fit(run: Run) -> Fit:
     """Return how the observations of a run fit: what fits nothing counts `MOST`.
 
-    What has no id counts `LOST` where it is of a new landmark: a filter that is lost makes new ones all the time.
+    What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
+    time, and clutter fits none either.
     """
     history = run.history
     dof = np.maximum(np.isfinite(history.z).sum(axis=1), 1)
     d2 = np.minimum(np.nan_to_num(history.d2, nan=0.0) / dof, MOST)
-    d2 = np.where((history.id == "") & (history.outcome != "associated"), LOST, d2)
-    return Fit(np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2), dof)
+    d2 = np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2)
+    return Fit(np.where((history.id == "") & (history.outcome != "associated"), LOST, d2), dof)
 
 
 def explained(before: Fit, after: Fit) -> float:
@@ -106,7 +115,7 @@ def gross(run: Run, log: Log) -> Mistake | None:
     if now.mean < MISFIT and not run.stopped:
         found = exchanged(run, log, now)
     else:
-        found = likeliest(run, log, beginning(log), run.config) or exchanged(run, log, now)
+        found = likeliest(run, log, beginning(run, log), run.config) or exchanged(run, log, now)
         found = found or (None if first is None else kidnapped(run, log, now, first))
     return found or (None if first is None else later(run, log, first))
 
@@ -116,12 +125,13 @@ def likeliest(run: Run, log: Log, events: list[Event], config: Mapping[str, Any]
     as_it_is = fit_of(config, log, events)
     if as_it_is.mean < MISFIT:
         return None
-    few, made = beginning(events, FEW_SCANS), []
+    few, made = beginning(run, events, FEW_SCANS), []
+    few_as_they_are = fit_of(config, log, few)
     for mistake in mistakes(config, run):
-        if fit_without(mistake, log, few).mean >= MISFIT:
+        if not fit_without(mistake, log, few).fits(MISFIT, few_as_they_are):
             continue
         after = fit_without(mistake, log, events)
-        if after.mean < FITS and BETTER * after.mean < as_it_is.mean:
+        if after.fits(FITS, as_it_is) and BETTER * after.mean < as_it_is.mean:
             gain = explained(as_it_is, after) - as_it_is.share * shrinkage(mistake, events)
             made += [mistake._replace(gain=gain, since_s=events[0].t_s)] if gain > 0.0 else []
     if not made:
@@ -189,7 +199,7 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
     fixes = run.history.fixes
     if len(fixes) < LEAST_FIXES or run.history.in_space or np.mean([fix.used for fix in fixes]) > 1.0 - REJECTED:
         return None
-    events = beginning(log)
+    events = beginning(run, log)
     path = _filtered(run.config, log, [e for e in events if not isinstance(e, Fix)])
     found = []
     if path is None:
@@ -312,15 +322,18 @@ def _from(run: Run, log: Log, row: int) -> tuple[int, str, list[Event]]:
     """Return the time and robot of an observation, and the events of the log from there."""
     step = int(run.history.step[row])
     t_ns = int(run.history.t_ns[step])
-    return t_ns, str(run.history.robot[step]), beginning([e for e in log.events if e.t_ns >= t_ns])
+    return t_ns, str(run.history.robot[step]), beginning(run, [e for e in log.events if e.t_ns >= t_ns])
 
 
-def beginning(events: Log | list[Event], most: int = SCANS) -> list[Event]:
-    """Return the first events with so many scans and observations."""
+def beginning(run: Run, events: Log | list[Event], most: int = SCANS) -> list[Event]:
+    """Return the first events with so many scans and observations; in a raw scan are few, however many its beams."""
+    robots = run.final_slam().robots.values()
+    detected = {(r.name, name) for r in robots for name, m in r.sensors.items() if m.detector is not None}
     scans = observations = 0
     for n, event in enumerate(events):
         if isinstance(event, Scan):
-            scans, observations = scans + 1, observations + len(event.y)
+            number = DETECTED if (event.robot, event.sensor) in detected else len(event.y)
+            scans, observations = scans + 1, observations + number
             if scans >= most or observations >= OBSERVATIONS:
                 return list(events)[: n + 1]
     return list(events)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.config.opening import EACH
-from kalmark.diagnosis.causes import Column
+from kalmark.diagnosis.columns import Column
 from kalmark.diagnosis.components import Noise
 from kalmark.results.run import Run
 
@@ -88,7 +88,7 @@ class Keys:
         """Return the path of the key of a systematic error, None if it has none, or is in the map."""
         if column.name not in CALIBRATIONS:
             return None
-        robot, sensor, _ = column.of
+        robot, sensor = column.of[:2]
         path: Path_ = ("robots", self.section(robot if robot in self.config["robots"] else EACH), "sensors", sensor)
         section = run.section(robot, sensor)
         mount = section.get("mount") or {}

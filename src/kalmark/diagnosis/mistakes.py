@@ -87,8 +87,8 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
     names = next(iter(sensors.values()))
     of = ", ".join(".".join(where) for where in sensors)
     turned = [name for name in names if name.startswith(("bearing", "azimuth"))]
-    angles = turned + [name for name in names if name.startswith("elevation")]
-    lengths = [name for name in names if name == "range_m" or name in ("x_m", "y_m", "z_m")]
+    angles = turned + [name for name in names if name.startswith(("elevation", "normal"))]
+    lengths = [name for name in names if name in ("range_m", "x_m", "y_m", "z_m", "distance_m", "right_m", "left_m")]
 
     def made(name: str, evidence: str, which: list[str], factor: float) -> Mistake:
         cures = (corrected(config, "factors", (*where, column), factor) for where in sensors for column in which)
@@ -110,30 +110,40 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
 
 
 def _of_mounts(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
-    """Yield other directions in which the sensors of a robot may look."""
-    space = robot.motion.space.axes > 1
+    """Yield other directions in which the sensors of a robot may look; those with one mount look there together."""
+    space, at = robot.motion.space.axes > 1, ("robots", section_of(config, robot.name), "sensors")
+    places: dict[bytes, list[str]] = {}
     for sensor, mount in robot.sensors.items():
         names = tuple(mount.sensor.columns)
         camera = any(name.endswith("_px") for name in names)
-        looks = camera or mount.detector is not None or names[:2] == ("x_m", "y_m")
-        if not looks and not any(name.startswith(("bearing", "azimuth")) for name in names):
-            continue
-        of, path = f"{robot.name}.{sensor}", ("robots", section_of(config, robot.name), "sensors", sensor, "mount")
-        key, now = ".".join(("robots", robot.name, *path[2:])), stated(config, path) or {}
+        looks = mount.detector is not None or names[:2] == ("x_m", "y_m")
         if camera:
+            now = stated(config, (*at, sensor, "mount")) or {}
             if space and not any(now.get(name) for name in ("roll_deg", "pitch_deg", "yaw_deg")):
-                evidence = f"{of} fits only with its optical axis forward: its mount lacks that turn"
+                key = f"robots.{robot.name}.sensors.{sensor}.mount"
+                evidence = f"{robot.name}.{sensor} fits only with its optical axis forward: its mount lacks that turn"
                 cure = " ".join(f"--set {key}.{name}={value:g}" for name, value in OPTICAL.items())
-                yield Mistake("mount", evidence, cure, with_value(config, path, {**now, **OPTICAL}))
-            continue
-        name = "yaw_deg" if space else "theta_rad"
-        for turn in TURNS_DEG:
-            old = float(now.get(name) or 0.0)
-            angle = math.remainder(old + turn, 360.0) if space else math.remainder(old + turn * DEGREE, 2 * math.pi)
-            evidence = f"the sensor {of} looks {turn} deg away from where its mount says"
-            yield Mistake(
-                "mount", evidence, f"--set {key}.{name}={angle:.4f}", with_value(config, (*path, name), angle)
-            )
+                turned = with_value(config, (*at, sensor, "mount"), {**now, **OPTICAL})
+                yield Mistake("mount", evidence, cure, turned)
+        elif looks or any(name.startswith(("bearing", "azimuth", "normal")) for name in names):
+            places.setdefault(np.array(mount.at).tobytes(), []).append(sensor)
+    for together in places.values():
+        for sensors in [together, *([sensor] for sensor in together if len(together) > 1)]:
+            yield from (_turned(config, robot.name, sensors, turn, space) for turn in TURNS_DEG)
+
+
+def _turned(config: Mapping[str, Any], robot: str, sensors: list[str], turn: int, space: bool) -> Mistake:
+    """Return that sensors look so many degrees away from where their mounts say."""
+    name, cures = "yaw_deg" if space else "theta_rad", []
+    of = f"the sensor {robot}.{sensors[0]} looks" if len(sensors) == 1 else f"{' and '.join(sensors)} of {robot} look"
+    for sensor in sensors:
+        path = ("robots", section_of(config, robot), "sensors", sensor, "mount", name)
+        old = float(stated(config, path) or 0.0)
+        angle = math.remainder(old + turn, 360.0) if space else math.remainder(old + turn * DEGREE, 2 * math.pi)
+        config = with_value(config, path, angle)
+        cures.append(f"--set robots.{robot}.sensors.{sensor}.mount.{name}={angle:.4f}")
+    said = f"{of} {turn} deg away from where {'its mount says' if len(sensors) == 1 else 'their mounts say'}"
+    return Mistake("mount", said, " ".join(cures), config)
 
 
 def _of_controls(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:

@@ -15,7 +15,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.batch.problem import Factor
 from kalmark.batch.state import LANDMARKS, POSES, State
-from kalmark.diagnosis.causes import LEAST_INFORMATION, SEEN, SHOWS, Column, Finding, systematic
+from kalmark.diagnosis.causes import LEAST_INFORMATION, SEEN, SHOWS, Finding, systematic
+from kalmark.diagnosis.columns import Column
 from kalmark.diagnosis.linear import Linear
 from kalmark.geometry.rotations import matrix
 from kalmark.models.observe import MOUNT, composed

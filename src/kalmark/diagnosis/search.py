@@ -13,7 +13,8 @@ from scipy.special import bdtrc
 from kalmark.arrays import Array, Flags
 from kalmark.batch.state import LANDMARKS, looked
 from kalmark.diagnosis import causes
-from kalmark.diagnosis.causes import Finding, Where
+from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.columns import Where, columns_of, of_all_sensors, rates_of
 from kalmark.diagnosis.linear import OUT, Linear
 from kalmark.diagnosis.mounts import turned
 from kalmark.logs.progress import track
@@ -71,10 +72,10 @@ def _joined(same: list[Finding]) -> Finding:
 class Search:
     """The causes found so far, and the problem with these taken out."""
 
-    def __init__(self, linear: Linear, sensors: Mapping[Where, tuple[str, ...]], robot: Any, t_ns: Any) -> None:
+    def __init__(self, linear: Linear, sensors: Mapping[Where, tuple[str, ...]], t_ns: Any) -> None:
         self.first = self.linear = linear
         self.sensors = sensors
-        self.rates = causes.rates_of(linear, robot, t_ns)
+        self.rates = rates_of(linear, t_ns)
         order, poses = np.argsort(linear.problem.nodes, kind="stable"), np.arange(len(linear.problem.robots))
         at = np.searchsorted(linear.problem.nodes[order], poses)  # a pose at a fix has the time of the next scan
         self.t_s = ((t_ns - t_ns[:1].sum()) * 1e-9)[order[np.minimum(at, len(order) - 1)]]
@@ -98,7 +99,9 @@ class Search:
             lasting = lasting or (not harmful and bool(self.correlated()))
             if not sure or (lasting and not any(f.overstated for f in sure)):
                 break
-            first, *alike = best(harmful or [f for f in sure if f.overstated])
+            some = harmful or [f for f in sure if f.overstated]
+            first, *alike = best(some)
+            first = self._of_its_name(first, some)
             self.take(replace(first, alike=tuple(alike)))
         for finding in self.correlated():
             self.take(finding)
@@ -108,6 +111,23 @@ class Search:
             )
         return sorted(self.found, key=lambda f: -f.gain)
 
+    def _of_its_name(self, first: Finding, sure: list[Finding]) -> Finding:
+        """Return that of the systematic errors of one name, and of about one gain, which leaves least for others.
+
+        Where one sensor of two is long, the other is short beside it, and so are the ways of the robots.
+        """
+        same = [f for f in sure if f.name == first.name and f.at is None and f.gain > ALIKE * first.gain]
+        if first.Z is None or first.at is not None or len(same) < 2:
+            return first
+
+        def alone(f: Finding) -> float:
+            assert f.Z is not None and f.W is not None
+            linear = self.linear.without(f.Z * f.value, f.W * f.value)
+            others = causes.systematic(linear, columns_of(linear, self.sensors, self.rates))
+            return f.gain - max((other.gain for other in others), default=0.0)
+
+        return max(same, key=alone)
+
     def correlated(self) -> list[Finding]:
         """Return the errors that last from sighting to sighting."""
         found = causes.correlations(self.linear, self.simulated, self.sensors, self.t_s)
@@ -115,9 +135,9 @@ class Search:
 
     def candidates(self) -> list[Finding]:
         """Return all that may explain what is left."""
-        columns = causes.columns_of(self.linear, self.sensors, self.rates)
+        columns = columns_of(self.linear, self.sensors, self.rates)
         return [
-            *causes.systematic(self.linear, columns),
+            *causes.systematic(self.linear, [*columns, *of_all_sensors(columns)]),
             *causes.noise(self.linear, self.simulated, self.sensors),
             *causes.outliers(self.linear, self.t_s),
             *causes.landmarks(self.linear, self.t_s),
@@ -149,7 +169,7 @@ class Search:
         One that is no cause by itself may still do the opposite: of a speed that is .94 v + .02 m/s the offset alone
         would move the map.  Those that the data cannot tell from it, alone or with others, are left.
         """
-        every = causes.columns_of(self.linear, self.sensors, self.rates)
+        every = columns_of(self.linear, self.sensors, self.rates)
         mine = next((c for c in every if (c.name, c.of) == (finding.name, finding.of)), None)
         same = [c for c in every if mine and c is not mine and c.group == mine.group]
         if mine is None or not same:

@@ -14,8 +14,9 @@ from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.diagnosis import copies, sightings
-from kalmark.diagnosis.causes import JUMPS, Finding, Where
-from kalmark.diagnosis.gross import fit, gross, started_at, until
+from kalmark.diagnosis.causes import JUMPS, Finding
+from kalmark.diagnosis.columns import Where
+from kalmark.diagnosis.gross import LOST, fit, gross, started_at, until
 from kalmark.diagnosis.jumps import LISTED, OddControl, joined, odd_control
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import Mistake
@@ -32,7 +33,7 @@ from kalmark.results.measures import cut_off, rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict import INNOVATIONS
-from kalmark.results.warnings import window_warnings
+from kalmark.results.warnings import NO_ID, window_warnings
 from kalmark.results.words import count, figure
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
@@ -53,6 +54,8 @@ TINY_M = 1e-12
 SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to associations comes after it
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped anew because of it
 COPIES = "copies"  # the cause that events come twice
+MISFIT = "misfit"  # the cause that innovations look wrong, and nothing says why
+LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that says something
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
 LOOKED_INTO = 3  # segments with the worst scans
 
@@ -109,9 +112,8 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     summary = run.summary
     mistake = gross(run, log)
     if mistake is not None and mistake.share > FEW:
-        verdict = Verdict(
-            "wrong", (_of_mistake(mistake), *_structural(run, log)), "the log filtered again without the mistake"
-        )
+        others = (cause for cause in _structural(run, log) if cause.name != MISFIT)
+        verdict = Verdict("wrong", (_of_mistake(mistake), *others), "the log filtered again without the mistake")
     else:
         verdict = _judged(run, log, most, progress)
         if mistake is not None:
@@ -134,7 +136,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     try:
         found = _searched(run, log, most, limit, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
-        signs = [Cause("misfit", begin_s(run), 0.0, line) for line in window_warnings(run)]
+        signs = [Cause(MISFIT, begin_s(run), 0.0, line) for line in window_warnings(run)]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
         why = str(error).removeprefix("batch solution: ")
         checked = f"{INNOVATIONS}, no batch solution: {why}"
@@ -151,7 +153,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     causes = [*first, *(c for c in causes if c not in first)]
     causes.sort(key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(
-        c.name in ("misplaced_landmark", "split_landmarks") and not c.harmless for c in first
+        c.name in ("misplaced_landmark", "split_landmarks", MISFIT) and not c.harmless for c in first
     )
     if effect.status == "ok" and wrong:
         effect = replace(effect, status="doubtful")
@@ -191,7 +193,7 @@ def _searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Sear
             raise
         return _searched(run, log, MORE * most, limit, progress)
     linear = Linear.of(problem, batch.state, within_gates(run))
-    search = Search(linear, sensors_of(run), given.robot, given.t_ns)
+    search = Search(linear, sensors_of(run), given.t_ns)
     search.run(progress)
     return Searched(search, batch, given)
 
@@ -357,6 +359,7 @@ def _structural(run: Run, log: Log) -> list[Cause]:
         *repeats(run.summary),
         *split_landmarks(run),
         *misplaced_landmarks(run),
+        *fits_nothing(run),
         *gaps(run.summary),
         *given_up(run),
         *_started_elsewhere(run),
@@ -401,6 +404,17 @@ def misplaced_landmarks(run: Run) -> list[Cause]:
     cure = "leave out their first sightings, or use robust: huber instead of a gate"
     few = len(names) <= FEW * len(mapped) or len(rows) <= FEW * len(h.id)
     return [Cause("misplaced_landmark", since_s, score, evidence, cure, few)]
+
+
+def fits_nothing(run: Run) -> Iterator[Cause]:
+    """Yield that most observations without an id are of no landmark in the map: it says nothing of the place."""
+    h, now = run.history, fit(run)
+    mine = (h.id == "") & (h.reason != NO_ID)
+    share = float(np.mean(now.values[mine] < LOST)) if mine.any() else 1.0
+    if share < LEAST_SHARE:
+        evidence = f"{share:.0%} of the {int(mine.sum())} observations without an id are of a landmark in the map"
+        cure = "the scans contradict the controls: look at mounts, signs and units of both, and their times"
+        yield Cause(MISFIT, begin_s(run), 0.5 * LOST * float(mine.sum()), f"only {evidence}", cure)
 
 
 def _copied(run: Run, log: Log) -> list[Cause]:
@@ -522,8 +536,10 @@ def effect_of(run: Run, found: Searched) -> Effect:
     d, first, cured = found.batch.state.d, found.search.first, found.search.linear
     places, moved = (state.groups[LANDMARKS][its, :d] for state in (found.batch.state, cured.moved()))
     steady = replace(first, z=cured.z, w=cured.w).moved().groups[LANDMARKS][its, :d]  # the noise as it was stated
-    off, extent = rigid(places, moved)(places) - moved, rmse(moved - moved.mean(axis=0))
-    by_steady = rmse(rigid(places, steady)(places) - steady)  # of causes that are sure: no noise explains it
+    lines = np.array([run.landmarks.kinds[k] == "wall" for k in mine])
+    angle = np.where(lines, found.batch.state.groups[LANDMARKS][its, -1], np.nan)
+    off, extent = _off(places, moved, angle), rmse(moved - moved.mean(axis=0))
+    by_steady = rmse(_off(places, steady, angle))  # of causes that are sure: no noise explains it
     mapped = filtered_map(run)
     filtered = _sigma(np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine]))
     stated, honest = (_sigma(linear.reduced.covariances()[its, :d, :d]) for linear in (first, cured))
@@ -543,6 +559,17 @@ def effect_of(run: Run, found: Searched) -> Effect:
     factors = np.hypot(honest[free] / stated[free] * over, shift_m / filtered[free])
     accuracy_m = float(np.median(factors * filtered[free]))
     return Effect(status, float(np.median(factors)), accuracy_m, shift_m, claimed, d * int(free.sum()))
+
+
+def _off(places: Array, moved: Array, angle: Array) -> Array:
+    """Return by what (K, d) landmarks move beyond a rigid motion of all; lines with normals at an `angle` across."""
+    onto = rigid(places, moved)
+    off = onto(places) - moved
+    lines = np.isfinite(angle)
+    if lines.any():
+        n = np.column_stack([np.cos(angle), np.sin(angle)])[lines] @ onto.rotation.T
+        off[lines] = np.sum(off[lines] * n, axis=1, keepdims=True) * n
+    return off
 
 
 def _shared(run: Run, search: Search) -> Iterator[tuple[int, int]]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from kalmark.diagnosis.causes import TIMES, Finding
+from kalmark.diagnosis.columns import ALL
 from kalmark.diagnosis.jumps import LISTED, OddControl, size_of
 from kalmark.results.words import figure
 from kalmark.slam.gaps import MARGIN
@@ -16,6 +17,7 @@ from kalmark.slam.gaps import MARGIN
 Words = tuple[str, str]  # evidence, cure
 MOST_SIGMAS = 1e4
 RANGE = "range_m"  # the column whose scale and offset a sensor may have
+DISPARITY, INVERSE = "ur_px", "rho_per_m"  # columns that have the scale of distances through a baseline, and inversely
 UNKNOWN_IDS = "--set log.ids=hidden --set association.type=auto"
 CALIBRATIONS = {  # the keys that put an error of a column of the controls into the map, by its kind
     ("v_mps", "offset"): "sigma_v_bias_mps",
@@ -69,7 +71,17 @@ def _sure(finding: Finding) -> str:
 
 
 def _sensor(finding: Finding) -> str:
-    return f"{'.'.join(finding.of[:2])}"
+    return f"{ALL} of {finding.of[0]}" if finding.of[1] == ALL else ".".join(finding.of[:2])
+
+
+def _in_log(finding: Finding, config: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield the columns of a finding as they are in the log, where a detector measures ranges, by robot and sensor."""
+    robot, sensor, *columns = finding.of
+    sections = _current(config, robot, "sensors") or {}
+    of = [section for name, section in sections.items() if sensor in (ALL, name)]
+    raw = any(isinstance(section, Mapping) and section.get("detector") for section in of)
+    where = (robot,) if sensor == ALL else (robot, sensor)
+    yield from ((*where, column) for column in ([RANGE] if raw else columns))
 
 
 def _size(value: float, unit: str) -> str:
@@ -105,18 +117,25 @@ def corrected(config: Mapping[str, Any], option: str, path: tuple[str, ...], by:
 
 
 def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
-    robot, sensor, column = finding.of
-    scale = _current(config, robot, "sensors", sensor, "scale") or 1.0
+    robot, sensor, column = finding.of[:3]
     evidence = f"{_lengths(finding)} are {abs(finding.value):.2%} too {_how(finding)} ({_sure(finding)})"
-    cure = _set(robot, f"sensors.{sensor}.scale", scale * (1.0 + finding.value)) if column == RANGE else ""
-    return evidence, cure
+    by = 1.0 + finding.value
+    if column == RANGE and sensor != ALL:
+        scale = _current(config, robot, "sensors", sensor, "scale") or 1.0
+        return evidence, _set(robot, f"sensors.{sensor}.scale", scale * by)
+    if column == DISPARITY:
+        baseline_m = _current(config, robot, "sensors", sensor, "baseline_m")
+        return evidence, _set(robot, f"sensors.{sensor}.baseline_m", baseline_m / by) if baseline_m else ""
+    factor = by if column == INVERSE else 1.0 / by
+    return evidence, " ".join(corrected(config, "factors", of, factor) for of in _in_log(finding, config))
 
 
 def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
-    robot, sensor, column = finding.of
+    robot, sensor, column = finding.of[:3]
     bias = _current(config, robot, "sensors", sensor, "bias_m") or 0.0
     evidence = f"{_lengths(finding)} are {_size(abs(finding.value), 'm')} too {_how(finding)} ({_sure(finding)})"
-    return evidence, _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value) if column == RANGE else ""
+    known = column == RANGE and sensor != ALL
+    return evidence, _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value) if known else ""
 
 
 def _lengths(finding: Finding) -> str:
@@ -128,16 +147,18 @@ def _how(finding: Finding) -> str:
 
 
 def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
-    robot, sensor, _ = finding.of
-    theta = _current(config, robot, "sensors", sensor, "mount", "theta_rad") or 0.0
-    evidence = f"bearings of {_sensor(finding)} are off by {_value(finding)} ({_sure(finding)})"
-    return evidence, _set(robot, f"sensors.{sensor}.mount.theta_rad", theta - finding.value)
+    robot, cures = finding.of[0], []
+    for sensor in (_current(config, robot, "sensors") or {}) if finding.of[1] == ALL else finding.of[1:2]:
+        theta = _current(config, robot, "sensors", sensor, "mount", "theta_rad") or 0.0
+        cures.append(_set(robot, f"sensors.{sensor}.mount.theta_rad", theta - finding.value))
+    return f"bearings of {_sensor(finding)} are off by {_value(finding)} ({_sure(finding)})", " ".join(cures)
 
 
 def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
     evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say ({_sure(finding)})"
-    return evidence, corrected(config, "shift_s", finding.of[:2], finding.value)
+    where = finding.of[:1] if finding.of[1] == ALL else finding.of[:2]
+    return evidence, corrected(config, "shift_s", where, finding.value)
 
 
 def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:

@@ -1,0 +1,84 @@
+"""Are the causes named in worlds of several robots, of several sensors and of stereo cameras?"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.arrays import Array
+from kalmark.config import build_slam
+from kalmark.diagnosis.verdict import Verdict
+from kalmark.events import Event, Scan, order
+from kalmark.logs.log import Log
+from kalmark.simulate import load_world, simulate
+
+Plant = Callable[[Log], Log]
+
+
+def scans(change: Callable[[Array], Array], robot: str = "", late_s: float = 0.0) -> Plant:
+    def of(e: Event) -> Event:
+        if not isinstance(e, Scan) or (robot and e.robot != robot):
+            return e
+        t_ns = e.t_ns + round(late_s * 1e9)
+        return Scan(t_ns=t_ns, robot=e.robot, sensor=e.sensor, y=change(e.y.copy()), ids=e.ids)
+
+    return lambda log: replace(log, events=sorted(map(of, log.events), key=order))
+
+
+def verdict_on(world: str, plant: Plant, *settings: str) -> Verdict:
+    made = load_world(world, settings)
+    log = plant(simulate(made, 0))
+    return km.diagnose(km.record(build_slam(made.config(), log), log, progress=False))
+
+
+def disparity(y: Array) -> Array:
+    return np.column_stack([y[:, :2], y[:, 0] - 1.05 * (y[:, 0] - y[:, 2]), y[:, 3]])
+
+
+CASES: dict[str, tuple[str, Plant, tuple[str, ...], str, str, str]] = {
+    # one robot's ranges are long: not the other's short, and the ways of both
+    "ranges of one": (
+        "two_robots", scans(lambda y: y * [1.05, 1.0], "alpha"), ("steps=250",),
+        "doubtful", "ranges of alpha.lidar are 4", "alpha.sensors.lidar.scale=1.0",
+    ),
+    # the robots that it sees are where they were, too
+    "times of one": (
+        "two_robots", scans(lambda y: y, "beta", 0.3), ("steps=300",),
+        "ok", "scans of beta.camera were made 0.1", "log.shift_s.beta.camera=-0.1",
+    ),
+    "a laser that looks aside": (
+        "hall_of_walls", scans(lambda y: np.add(y, [0.0, math.pi / 2])), ("steps=150",),
+        "wrong", "walls and corners of robot look -90 deg away", "corners.mount.theta_rad=-1.5708",
+    ),
+    "a laser that looks where none of the mistakes is": (
+        "hall_of_walls", scans(lambda y: np.add(y, [0.0, 0.8])), ("steps=150",),
+        "doubtful", "of the .* observations without an id are of a landmark", "mounts",
+    ),
+    "a laser with a scale": (
+        "hall_of_walls", scans(lambda y: y * [1.05, 1.0]), ("steps=600",),
+        "doubtful", "ranges of all sensors of robot are [56][.].* too long", "log.factors.robot.range_m=0.9",
+    ),
+    "a laser with a small turn": (
+        "hall_of_walls", scans(lambda y: np.add(y, [0.0, 0.1])), ("steps=300",),
+        "wrong", "bearings of all sensors of robot are off by 5", "walls.mount.theta_rad=-0.1",
+    ),
+    "a baseline": (
+        "thick_cloister_stereo", scans(disparity), (),
+        "doubtful", "distances of robot.stereo are 5[.].* too short", "sensors.stereo.baseline_m=0.31",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_cause_is_named_first(case: str) -> None:
+    world, plant, settings, status, evidence, cure = CASES[case]
+    verdict = verdict_on(world, plant, *settings)
+    assert verdict.map == status, verdict.causes
+    assert re.search(evidence, verdict.causes[0].evidence), verdict.causes
+    assert cure in verdict.causes[0].cure, verdict.causes[0].cure
