@@ -157,7 +157,7 @@ class _Estimator:
         m, robot, _, here = map_.movable(robot, added)
         run: Any = prediction.compiled_predicted if isinstance(model, tuple) else prediction.predicted
         where = m.x, m.x_first, m.P, m.n, m.blocks, m.atoms, corrections.generator_address(m.axes)
-        return bool(run(where, (model, robot, here, *control), self.from_first))
+        return bool(run(where, (model, robot, here, *control), self.from_first, self.transports and m.axes == 6))
 
     def correct(self, map_: Map, update: Update) -> Correction:
         """Fuse a scan, where d2 is within the gate.

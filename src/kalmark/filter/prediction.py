@@ -15,7 +15,7 @@ from kalmark.compiled import compiled
 from kalmark.filter import kernels
 from kalmark.filter.corrections import call_generator
 from kalmark.geometry.rotations import matrix
-from kalmark.geometry.spaces import Table
+from kalmark.geometry.spaces import HOMOGENEOUS, KIND, P_AT, Table
 from kalmark.models.observe import step
 
 Map = tuple[Array, Array, Array, int, Table, Table, int]  # x, x_first, P, n, blocks, atoms, the generator's address
@@ -71,10 +71,34 @@ def transported(F: Array, now: Array, then: Array, at: int) -> Array:
     return out
 
 
-def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
+@compiled
+def spread_rays(P: Array, atoms: Table, Q: Array) -> None:
+    """Add Cov(rho_i, rho_j) Q_p to the covariance of h_i and h_j, of all homogeneous points (h, rho).
+
+    Q is that of a motion's noise n, Q_p that of its position.  It moves the rays h - rho p by -rho n, and the mean of
+    rho_i n n' rho_j is (rho_i rho_j + Cov(rho_i, rho_j)) Q_p: F and Q have its first term.  docs/bearing_only.md.
+    """
+    places = np.empty(len(atoms), np.int64)
+    count = 0
+    for i in range(len(atoms)):
+        if atoms[i, KIND] == HOMOGENEOUS:
+            places[count] = atoms[i, P_AT]
+            count += 1
+    for i in range(count):
+        for j in range(count):
+            k, l = places[i], places[j]
+            if l <= k:
+                c = P[k + 3, l + 3]
+                for a in range(3):
+                    for b in range(a + 1 if l == k else 3):
+                        P[k + a, l + b] += c * Q[a, b]
+
+
+def predicted(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     """Move a robot in a map; return whether all of it is finite: if not, nothing has changed.
 
     `from_first`: displacements count from the first estimates, F (I + (generator(x) - generator(x_first)) e_theta').
+    `spreads`: with the mean square of what the noise does to homogeneous points, `spread_rays`.
     """
     x, x_first, P, n, blocks, atoms, turns = map_
     model, robot, added, shared, B, u, N, D, dt_s = motion
@@ -105,6 +129,8 @@ def predicted(map_: Map, motion: Motion, from_first: bool) -> bool:
             for j in range(len(D)):
                 Q[i, j] += Q_D[i, j]
     kernels.predict(P, n, index, F, Q)  # [S] (15)-(17)
+    if spreads:
+        spread_rays(P, atoms, Q)
     for i in range(size):
         x[at + i] = x_first[at + i] = moved[i]
     return True
