@@ -114,12 +114,12 @@ function dart(r, at) {
 
 /* The map and the robots at a position of the slider. */
 function moving(frame) {
-  const map = DATA.maps[frame], traces = [], many = map.count > 100;
+  const map = DATA.maps[frame], traces = [], many = map.count > 100, corners = !SPACE || !many ? 24 : map.count > 1000 ? 4 : 8;
   GROUPS.forEach(([color, name], group) => {
     const rows = map.group.flatMap((g, i) => SPACE && g !== group ? [] : [i]), pick = k => rows.map(i => map[k][i]);
     const sigma = rows.map(i => map.pxx[i] === null ? null : Math.sqrt(Math.max(AXES.reduce((sum, k) => sum + map["p" + k + k][i], 0), 0)));
     const shown = rows.length > 0 || DATA.maps.some(m => m.group.includes(group)), width = SPACE ? (many ? 0.4 : 0.8) : many ? 0.7 : 1.1;
-    traces.push(stroke(contours(map, rows, many && SPACE ? 8 : 24), color, width,
+    traces.push(stroke(contours(map, rows, corners), color, width,
                        {name, legendgroup: name, showlegend: shown, opacity: SPACE ? 0.6 : 1}));
     traces.push(marks({...boxed(along(pick)), text: pick("id"), customdata: sigma}, {color, symbol: many && SPACE ? "square" : "circle"}, many ? [3, 1.8] : [5, 3],
                       {legendgroup: name, ...quiet, hovertemplate: `%{text}: ${WHERE}<br>sigma %{customdata:.3g} m<extra></extra>`}));
