@@ -34,6 +34,7 @@ from kalmark.slam.motion import bias_name
 WORLDS = (
     "differential_drive", "tricycle", "omnidirectional", "mecanum", "slipping_unicycle", "constant_velocity",
     "constant_turn_rate", "compass_and_gyro", "diver", "radar", "radar_in_space", "radio", "microphones", "lever_arm",
+    "wheels_and_gyro",
 )  # fmt: skip
 BOUND = 0.9973  # of three sigmas
 

@@ -29,7 +29,6 @@ from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.observe import step, step_of
 from kalmark.models.protocols import (
     Motion,
-    NonlinearCalibration,
     SelfCalibrating,
     StateDiffusion,
     calibrating,
@@ -41,13 +40,15 @@ from kalmark.slam.gaps import Gaps
 from kalmark.slam.replacing import LeftOut
 
 NO_NOISE = np.zeros((0, 0))
+MOST, CHANGED = 30, 4.0  # controls in their mean, and sigmas by which noise alone moves hardly any
 
 
 class Part(NamedTuple):
     """One piece of motion: the control, the covariance N of its error, and its duration.
 
     `first` and `last` say whether it begins and ends its control's interval: if not both, the error is shared.
-    `unknown` (dof, dof) is the covariance of what the robot may have moved besides, without a control.
+    `unknown` (dof, dof) is the covariance of what the robot may have moved besides, without a control.  `usual` is the
+    control as earlier ones tell it, None where no constants of controls are in the map.
     """
 
     u: Array
@@ -56,6 +57,21 @@ class Part(NamedTuple):
     first: bool
     last: bool
     unknown: Array | None = None
+    usual: Array | None = None
+
+
+class Mean(NamedTuple):
+    """The mean (k,) of the last controls, as rates: of a `number` of them that differ by their noise alone."""
+
+    rate: Array
+    number: int
+
+    def after(self, rate: Array, sigma: Array) -> Mean:
+        """Return the mean with one more, of a noise sigma (k,); it begins anew where the control has changed."""
+        if (np.abs(rate - self.rate) > CHANGED * sigma * math.sqrt(1.0 + 1.0 / self.number)).any():
+            return Mean(rate, 1)
+        number = min(self.number + 1, MOST)
+        return Mean(self.rate + (rate - self.rate) / number, number)
 
 
 class HeldInput:
@@ -66,22 +82,25 @@ class HeldInput:
     """
 
     def __init__(self, motion: Motion, gaps: Gaps | None = None, rests_until_ns: int | None = None) -> None:
-        self.motion, self.coasts = motion, coasts(motion)
+        self.motion, self.coasts, self.calibrates = motion, coasts(motion), calibrating(motion) is not None
         self.t_ns: int | None = None
         self.u: Array | None = None
         self.N: Array | None = None
+        self.usual: Array | None = None  # as earlier controls tell it,
+        self.mean: Mean | None = None  # which is their mean
         self.fresh = True
         self.gaps = None if self.coasts else gaps
         self.rests_until_ns = -math.inf if rests_until_ns is None else rests_until_ns
         self._before: tuple[Any, ...] = ()
 
     def __enter__(self) -> Self:
-        self._before = self.t_ns, self.u, self.N, self.fresh, None if self.gaps is None else vars(self.gaps).copy()
+        watched = None if self.gaps is None else vars(self.gaps).copy()
+        self._before = self.t_ns, self.u, self.N, self.usual, self.mean, self.fresh, watched
         return self
 
     def __exit__(self, kind: Any, *_: object) -> None:
         if kind is not None and issubclass(kind, EventError):
-            self.t_ns, self.u, self.N, self.fresh, watched = self._before
+            self.t_ns, self.u, self.N, self.usual, self.mean, self.fresh, watched = self._before
             if self.gaps is not None:
                 vars(self.gaps).update(watched)
 
@@ -100,7 +119,7 @@ class HeldInput:
         if self.u is None or self.N is None or self.t_ns is None or to_ns <= self.t_ns:
             return None
         unknown = None if self.gaps is None or to_ns <= self.gaps.late_ns else self.gaps.unknown(to_ns)
-        part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last, unknown)
+        part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last, unknown, self.usual)
         self.t_ns, self.fresh = to_ns, False
         return part
 
@@ -158,14 +177,29 @@ class HeldInput:
         N = self.motion.control_noise(control.u) if control.cov is None else control.cov
         if not self.motion.held:
             dt_s = 0.0 if self.t_ns is None else (control.t_ns - self.t_ns) * 1e-9
-            part, closing = self._lost(control.t_ns, control.u), [Part(control.u, N, dt_s, True, True)]
+            part = self._lost(control.t_ns, control.u)
+            closing = [Part(control.u, N, dt_s, True, True, None, self._usual(control.u, N, dt_s))]
             self.t_ns = control.t_ns
         else:
             part, closing = self.advance(control.t_ns, last=True), []
             self.t_ns, self.u, self.N, self.fresh = control.t_ns, control.u, N, True
+            self.usual = self._usual(control.u, N, 1.0)
         if self.gaps is not None:
             self.gaps.take(control)
         return closing if part is None else [part, *closing]
+
+    def _usual(self, u: Array, N: Array, dt_s: float) -> Array | None:
+        """Return a control u (k,) as the ones before tell it, and take it into their mean; itself where it has changed.
+
+        What a constant does is proportional to its control.  Of the measured control it would be correlated with the
+        control's noise, and where another sensor shows that noise the constant would be too small: errors in variables.
+        Earlier controls are as large and have other noise: an instrumental variable (Fuller 1987, section 1.4).
+        """
+        if not self.calibrates or dt_s <= 0.0:
+            return None
+        rate, before = u / dt_s, self.mean
+        self.mean = Mean(rate, 1) if before is None else before.after(rate, np.sqrt(np.diag(N)) / dt_s)
+        return u if before is None or self.mean.number == 1 else before.rate * dt_s
 
     def _left_out(self, control: Control, gaps: Gaps) -> list[Part]:
         """Leave out a control that is ruled out; return the motion up to then."""
@@ -207,19 +241,19 @@ class Moving:
     def added(self, map_: Map, part: Part) -> tuple[list[int], Array, Array]:
         """Return the slots of the blocks that change a control, how, B (m, c) by their numbers b, and u with u + B b.
 
-        Where the constants of a control do not enter linearly, that holds at their means.
+        That holds at the means of the constants, and B is that of the control as it usually is.
         """
         if self.error is None and self.bias is None:
             return [], nothing(len(part.u)), part.u
         slots, columns, u = [], [], part.u
         if self.error is not None:
             slots, columns = [self.error], [identity(len(u))]
-        if self.bias is not None and isinstance(self.motion, NonlinearCalibration):
+        if self.bias is not None and isinstance(self.motion, SelfCalibrating):
             a = map_.mean(self.bias)
             true, U_a = true_control(self.motion, u, a, part.dt_s)
+            if part.usual is not None:
+                U_a = true_control(self.motion, part.usual, a, part.dt_s)[1]
             slots, columns, u = [*slots, self.bias], [*columns, U_a], true - U_a @ a
-        elif self.bias is not None and isinstance(self.motion, SelfCalibrating):
-            slots, columns = [*slots, self.bias], [*columns, self.motion.calibration_effect(u, part.dt_s)]
         return slots, np.hstack(columns) if len(columns) > 1 else columns[0], u
 
     def leads_somewhere(self, map_: Map, parts: Sequence[Part]) -> bool:

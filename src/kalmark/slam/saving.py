@@ -40,7 +40,7 @@ from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
 from kalmark.slam.gaps import Gaps
-from kalmark.slam.motion import Moving, bias_block, bias_name
+from kalmark.slam.motion import Mean, Moving, bias_block, bias_name
 from kalmark.slam.reader import Reader
 from kalmark.slam.replacing import LeftOut
 from kalmark.slam.robot import Mount, Robot, mount_name
@@ -125,7 +125,13 @@ def _state(state: State) -> Description:
         "latest": state.clones.latest,
         "numbered": state.clones.numbered,
         "moving": {
-            name: [m.error, *(getattr(m.held, key) for key in OF_MOVING), _watched(m.held.gaps), _left_out(m)]
+            name: [
+                m.error,
+                *(getattr(m.held, key) for key in OF_MOVING),
+                _watched(m.held.gaps),
+                _left_out(m),
+                _number(m),
+            ]
             for name, m in state.moving.items()
         },
         "readers": [
@@ -143,6 +149,11 @@ def _state(state: State) -> Description:
             ],
         },
     }
+
+
+def _number(moving: Moving) -> int:
+    """Return the number of controls in the mean of a robot's."""
+    return 0 if moving.held.mean is None else moving.held.mean.number
 
 
 def _left_out(moving: Moving) -> list[list[Any]]:
@@ -189,6 +200,10 @@ def _arrays(state: State) -> Iterator[tuple[str, Array]]:
         if moving.held.u is not None and moving.held.N is not None:
             yield f"u{i}", moving.held.u
             yield f"N{i}", moving.held.N
+        if moving.held.usual is not None:
+            yield f"usual{i}", moving.held.usual
+        if moving.held.mean is not None:
+            yield f"rate{i}", moving.held.mean.rate
 
 
 def _npy(array: Array) -> bytes:
@@ -280,7 +295,7 @@ class Saved:
     def _fill_moving(self, state: State) -> None:
         """Fill in how the robots move."""
         for i, (name, m) in enumerate(state.moving.items()):
-            error, t_ns, fresh, watched, left_out = self._state["moving"][name]
+            error, t_ns, fresh, watched, left_out, number = self._state["moving"][name]
             d = 2 if m.motion.space.axes == 1 else 3
             m.left_out = [
                 LeftOut(_numbers(y).reshape(d), _numbers(R).reshape(d, d), _numbers(p).reshape(d))
@@ -291,6 +306,10 @@ class Saved:
             m.held.t_ns, m.held.fresh = _time(t_ns), bool(fresh)
             if f"u{i}.npy" in self._members:
                 m.held.u, m.held.N = _array(self._members, f"u{i}", (k,)), _array(self._members, f"N{i}", (k, k))
+            if f"usual{i}.npy" in self._members:
+                m.held.usual = _array(self._members, f"usual{i}", (k,))
+            if f"rate{i}.npy" in self._members:
+                m.held.mean = Mean(_array(self._members, f"rate{i}", (k,)), max(int(number), 1))
             if m.held.gaps is not None:
                 m.held.gaps.restore(_watching(watched, k))
 
