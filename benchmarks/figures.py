@@ -190,6 +190,7 @@ def motions() -> Iterator[Figure]:
         ("radio", 3, "invariant"),
         ("microphones", 3, "invariant"),
         ("lever_arm", 3, "invariant"),
+        ("wheels_and_gyro", 3, "invariant"),
     ):
         text = (
             "{1} / {5} / {9} / {11} of {13}" if world == "diver" else "{1} / {5} / {7} / {9} of {11}"
