@@ -294,10 +294,12 @@ def test_a_survey_that_is_right_is_not_accused(tmp_path: Path, sigma_m: float) -
 
 
 def with_fixes(log: Log) -> Log:
-    """Return a log with a fix of .3 m every two seconds."""
-    rng, truth = np.random.default_rng(0), log.truth["rover"]
+    """Return a log with a fix of .3 m of each robot at every tenth pose."""
+    rng = np.random.default_rng(0)
     fixes = [
-        km.Fix(t_ns=int(t), robot="rover", y=pose[:2] + rng.normal(size=2) * 0.3, cov=0.09 * np.eye(2))
+        km.Fix(t_ns=int(t), robot=name, y=pose[:d] + rng.normal(size=d) * 0.3, cov=0.09 * np.eye(d))
+        for name, truth in log.truth.items()
+        for d in (2 if truth.poses.shape[1] == 3 else 3,)
         for t, pose in [*zip(truth.t_ns, truth.poses, strict=True)][::10]
     ]
     return replace(log, events=sorted([*log.events, *fixes], key=order))
@@ -312,6 +314,24 @@ def test_a_wrong_first_heading_is_named_where_fixes_tell(heading: float) -> None
     assert "the map was moved onto them" in verdict.causes[0].evidence
     assert not [cause for cause in verdict.causes if not cause.harmless]
     cured = km.diagnose(recorded(log, verdict.causes[0].cure.removeprefix("--set ").strip("'")))
+    assert (cured.map, cured.causes) == ("ok", ())
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 70.0])
+def test_a_wrong_start_in_space_is_named_where_fixes_tell(yaw_deg: float) -> None:
+    settings = ("steps=200",)
+    log = with_fixes(simulate(load_world("thick_cloister", settings), 3))
+
+    def run_from(start: str) -> Run:
+        config = load_world("thick_cloister", (*settings, start)).config()
+        return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+
+    run = run_from(f"robots.robot.start={{x_m: 5, y_m: -5, z_m: 2, roll_deg: 0, yaw_deg: {yaw_deg}}}")
+    verdict = km.diagnose(run)
+    assert (verdict.map, [(c.name, c.harmless) for c in verdict.causes]) == ("ok", [("start", True)])
+    assert not run.summary["robots"]["robot"]["diverged"]
+    assert run.summary["landmark_rmse_raw_m"] < 0.3
+    cured = km.diagnose(run_from(verdict.causes[0].cure.removeprefix("--set ").strip("'")))
     assert (cured.map, cured.causes) == ("ok", ())
 
 

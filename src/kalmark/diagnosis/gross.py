@@ -22,9 +22,10 @@ from kalmark.diagnosis.mistakes import Mistake, mistakes, section_of, with_value
 from kalmark.diagnosis.words import UNKNOWN_IDS
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Fix, Scan
+from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
 from kalmark.results.history import Start
-from kalmark.results.measures import Rigid, rigid, rigid_robust
+from kalmark.results.measures import Rigid, level_sigmas, rigid, rigid_robust
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.words import figure
@@ -212,7 +213,8 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
             continue
         at = np.column_stack([np.interp([e.t_ns for e in seen], t_ns, x) for x in p.T])
         onto = rigid(at, np.array([e.y for e in seen]))
-        changed, evidence, cure = started_at(run.config, start, onto)
+        variance = float(np.mean([np.diag(e.cov) for e in seen]))
+        changed, evidence, cure = started_at(run.config, start, onto, np.array([e.y for e in seen]), variance)
         after = _filtered(changed, log, events)
         if after is not None and fit(after).mean < FITS and np.mean([f.used for f in after.history.fixes]) > REJECTED:
             gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
@@ -220,22 +222,47 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
     return max(found, key=lambda f: f.gain, default=None)
 
 
-def started_at(config: Mapping[str, Any], start: Start, onto: Rigid) -> tuple[dict[str, Any], str, str]:
-    """Return a configuration with a start that is moved, and that in words and as a line that makes it."""
-    x, y = onto(start.mean[None, :2])[0].tolist()
-    theta = math.remainder(start.mean[2] + math.atan2(onto.rotation[1, 0], onto.rotation[0, 0]), 2 * math.pi)
+def started_at(
+    config: Mapping[str, Any], start: Start, onto: Rigid, fixes: Array, variance: float
+) -> tuple[dict[str, Any], str, str]:
+    """Return a configuration with a start that is moved, and that in words and as a line that makes it.
+
+    It is as uncertain as `fixes` (N, d) of a variance leave it.
+    """
+    before = start.mean[: 3 if len(onto.shift) == 2 else 7]
     robots = config.get("robots") or {}
     key = start.robot if start.robot in robots else "each"
-    moved = {"x_m": x, "y_m": y, "theta_rad": theta}
+    moved = onto.poses(before[None])[0]
+    sigma_m, sigma_rad = level_sigmas(fixes, variance, moved[: len(onto.shift)])
+    if len(onto.shift) == 2:
+        sigmas: dict[str, Any] = {"sigma_xy_m": sigma_m, "sigma_theta_rad": sigma_rad}
+    else:
+        sigmas = {"sigma_position_m": sigma_m, "sigma_rotation_deg": [0.0, 0.0, math.degrees(sigma_rad)]}
+    was, now = _as_stated(before), _as_stated(moved)
     stated = (robots.get(key) or {}).get("start") or {}
-    changed = with_value(config, ("robots", key, "start"), {**stated, **moved})
-    was, now = (
-        f"at ({figure(float(a))}, {figure(float(b))}) m with a heading of {math.degrees(c):.0f} deg"
-        for a, b, c in (start.mean[:3], (x, y, theta))
-    )
-    evidence = f"{start.robot} starts {now}, not {was}: then its path fits its fixes"
-    said = ", ".join(f"{name}: {figure(value)}" for name, value in moved.items())
+    changed = with_value(config, ("robots", key, "start"), {**stated, **now, **sigmas})
+    evidence = f"{start.robot} starts {_at(now)}, not {_at(was)}: then its path fits its fixes"
+    said = ", ".join(f"{name}: {_said(value)}" for name, value in (now | sigmas).items())
     return changed, evidence, f"--set 'robots.{key}.start={{{said}}}'"
+
+
+def _as_stated(pose: Array) -> dict[str, float]:
+    """Return a pose (3,) or (7,) by the keys of a configuration."""
+    if len(pose) == 3:
+        return {"x_m": float(pose[0]), "y_m": float(pose[1]), "theta_rad": math.remainder(pose[2], 2 * math.pi)}
+    position, angles = pose[:3].tolist(), np.degrees(to_euler_pose(pose)[0][3:]).tolist()
+    return dict(zip(("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg"), (*position, *angles), strict=True))
+
+
+def _said(value: float | list[float]) -> str:
+    return f"[{', '.join(map(figure, value))}]" if isinstance(value, list) else figure(value)
+
+
+def _at(stated: Mapping[str, float]) -> str:
+    """Return a pose in words."""
+    position = ", ".join(figure(stated[key]) for key in ("x_m", "y_m", "z_m") if key in stated)
+    heading = stated["yaw_deg"] if "yaw_deg" in stated else math.degrees(stated["theta_rad"])
+    return f"at ({position}) m with a heading of {heading:.0f} deg"
 
 
 def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:

@@ -372,7 +372,7 @@ def _started_elsewhere(run: Run) -> Iterator[Cause]:
     for start in run.history.starts:
         restart = restarts(run.history).get(start.robot)
         if restart is not None:
-            _, evidence, cure = started_at(run.config, start, restart.onto)
+            _, evidence, cure = started_at(run.config, start, restart.onto, restart.agreed, restart.variance)
             evidence += f"; the map was moved onto them at t={restart.t_ns * 1e-9:.1f} s"
             first = run.history.fixes[: restart.fixes]
             score = 0.5 * sum(float(fix.z @ np.linalg.solve(fix.Z, fix.z)) for fix in first)

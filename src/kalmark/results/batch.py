@@ -203,9 +203,11 @@ def _start(start: Start, again: Restart | None) -> tuple[Array, Array]:
     """Return mean and covariance of a robot at its start; a start that was wrong says nothing."""
     if again is None:
         return start.mean, start.covariance
-    mean, cov = start.mean.copy(), start.covariance.copy()
-    mean[:3] = again.onto.poses(mean[None, :3])[0]
-    cov[:3, :3] = np.diag([max(again.moved_m, 1.0) ** 2] * 2 + [1.0])
+    mean, cov, d = start.mean.copy(), start.covariance.copy(), len(again.onto.shift)
+    size, place = (3, [0, 1, 2]) if d == 2 else (7, [0, 1, 2, 5])  # position and heading
+    mean[:size] = again.onto.poses(mean[None, :size])[0]
+    cov[place, :] = cov[:, place] = 0.0
+    cov[place, place] = [max(again.moved_m, 1.0) ** 2] * d + [1.0]
     return mean, cov
 
 

@@ -72,6 +72,21 @@ def rigid(source: Array, target: Array, weights: Array | None = None) -> Rigid:
     return Rigid(rotation, mean_t - rotation @ mean_s)
 
 
+def level(source: Array, target: Array) -> Rigid:
+    """Fit a turn about the vertical axis and a shift that take `source` (N, d) onto `target` (N, d), d = 2 or 3."""
+    rotation = np.eye(source.shape[1])
+    rotation[:2, :2] = rigid(source[:, :2], target[:, :2]).rotation
+    return Rigid(rotation, np.mean(target - source @ rotation.T, axis=0))
+
+
+def level_sigmas(target: Array, variance: float, point: Array) -> tuple[float, float]:
+    """Return the sigmas of a point (d,) moved by `level`, m, and of its turn, rad, for `target` (N, d) of a variance."""
+    arms = (target - target.mean(axis=0))[:, :2]
+    turn = variance / max(float(np.sum(arms**2)), variance)
+    off = point[:2] - target[:, :2].mean(axis=0)
+    return float(np.sqrt(variance / len(target) + turn * (off @ off))), float(np.sqrt(turn))
+
+
 def similarity(source: Array, target: Array) -> tuple[Rigid, float]:
     """Fit the scale s, then the rotation and shift, that take `source` (N, d) onto `target` (N, d).  Umeyama 1991.
 

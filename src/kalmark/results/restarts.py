@@ -1,4 +1,4 @@
-"""Robots of the plane whose start was wrong: their first fixes did not fit, until the map was moved onto them."""
+"""Robots alone in a map whose start was wrong: their first fixes did not fit, until the map was moved onto them."""
 
 from __future__ import annotations
 
@@ -6,24 +6,30 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.results.history import History
-from kalmark.results.measures import Rigid, rigid
+from kalmark.results.measures import Rigid, level
 from kalmark.slam.replacing import NEEDED
 
 
 class Restart(NamedTuple):
-    """When the map was moved onto the first fixes, how (`onto`), how far, m, and how many fixes that were."""
+    """When the map was moved onto the first fixes, how (`onto`), how far, m, and how many fixes that were.
+
+    `agreed` (N, d) are the fixes that it was moved onto, of the `variance`, m^2.
+    """
 
     t_ns: int
     onto: Rigid
     moved_m: float
     fixes: int
+    agreed: Array
+    variance: float
 
 
 def restarts(history: History) -> dict[str, Restart]:
     """Return the robots that too few fixes fitted before the map was moved onto the others (`slam/replacing.py`)."""
     found: dict[str, Restart] = {}
-    for robot in () if history.in_space or len(history.robots) > 1 else history.robots:
+    for robot in () if len(history.robots) > 1 else history.robots:
         mine = [fix for fix in history.fixes if fix.robot == robot]
         first = next((k for k, fix in enumerate(mine) if fix.moved_m > 0), None)
         if first is None or history.priors or sum(fix.used for fix in mine[:first]) >= NEEDED:
@@ -31,6 +37,7 @@ def restarts(history: History) -> dict[str, Restart]:
         begin = max((k + 1 for k in range(first) if mine[k].used), default=0)
         agreed = mine[begin : first + 1]
         there = np.array([fix.y for fix in agreed])
-        onto = rigid(there - [fix.z for fix in agreed], there)
-        found[robot] = Restart(mine[first].t_ns, onto, mine[first].moved_m, first + 1)
+        variance = float(np.mean([np.diag(fix.Z) for fix in agreed]))
+        onto = level(there - [fix.z for fix in agreed], there)
+        found[robot] = Restart(mine[first].t_ns, onto, mine[first].moved_m, first + 1, there, variance)
     return found
