@@ -317,22 +317,52 @@ def test_a_wrong_first_heading_is_named_where_fixes_tell(heading: float) -> None
     assert (cured.map, cured.causes) == ("ok", ())
 
 
-@pytest.mark.parametrize("yaw_deg", [0.0, 70.0])
-def test_a_wrong_start_in_space_is_named_where_fixes_tell(yaw_deg: float) -> None:
-    settings = ("steps=200",)
-    log = with_fixes(simulate(load_world("thick_cloister", settings), 3))
+APART = ("steps=400", "sight_robots=false", "world.size_m=60", "world.count=200",
+         "robots.beta.start={x_m: 35, y_m: 35}",
+         "robots.beta.route.points_m=[[55,35],[55,55],[35,55],[35,35]]")  # fmt: skip
+
+
+def by_fixes(world: str, *settings: str) -> Callable[[str], Run]:
+    """Return how a log with fixes is run from a start."""
+    log = with_fixes(simulate(load_world(world, ["steps=200", *settings]), 3))
 
     def run_from(start: str) -> Run:
-        config = load_world("thick_cloister", (*settings, start)).config()
+        config = load_world(world, [*settings, start]).config()
         return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
 
+    return run_from
+
+
+def cure_of(verdict: Verdict) -> str:
+    return verdict.causes[0].cure.removeprefix("--set ").strip("'")
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 70.0])
+def test_a_wrong_start_in_space_is_named_where_fixes_tell(yaw_deg: float) -> None:
+    run_from = by_fixes("thick_cloister")
     run = run_from(f"robots.robot.start={{x_m: 5, y_m: -5, z_m: 2, roll_deg: 0, yaw_deg: {yaw_deg}}}")
     verdict = km.diagnose(run)
     assert (verdict.map, [(c.name, c.harmless) for c in verdict.causes]) == ("ok", [("start", True)])
     assert not run.summary["robots"]["robot"]["diverged"]
     assert run.summary["landmark_rmse_raw_m"] < 0.3
-    cured = km.diagnose(run_from(verdict.causes[0].cure.removeprefix("--set ").strip("'")))
+    cured = km.diagnose(run_from(cure_of(verdict)))
     assert (cured.map, cured.causes) == ("ok", ())
+
+
+@pytest.mark.parametrize(
+    ("robot", "x_m", "settings"), [("alpha", 5.0, ()), ("beta", 8.0, ()), ("beta", 40.0, APART)], ids=str
+)
+def test_the_robot_of_two_that_starts_elsewhere_is_named_where_fixes_tell(
+    robot: str, x_m: float, settings: tuple[str, ...]
+) -> None:
+    run_from = by_fixes("two_robots", *settings)
+    verdict = km.diagnose(run_from(f"robots.{robot}.start.x_m={x_m}"))
+    assert (verdict.map, verdict.causes[0].name) == ("wrong", "start")
+    assert verdict.causes[0].evidence.startswith(f"{robot} starts at")
+    run = run_from(cure_of(verdict))
+    cured = km.diagnose(run)
+    assert (cured.map, cured.causes) == ("ok", ())
+    assert run.summary["landmark_rmse_raw_m"] < 0.3
 
 
 def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ A mistake is named where the log fits the filter as it should once the mistake i
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from kalmark.events import Event, Fix, Scan
 from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
 from kalmark.results.history import Start
-from kalmark.results.measures import Rigid, level_sigmas, rigid, rigid_robust
+from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_robust
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.words import figure
@@ -193,33 +193,50 @@ def misfits_from(now: Fit) -> int | None:
 
 
 def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
-    """Return that a robot of the plane starts elsewhere, or turned, if most of its fixes were rejected and then fit.
+    """Return that a robot starts elsewhere, or turned, if most of its fixes were rejected and then fit.
 
-    Its path without fixes, moved rigidly onto them, says from where.
+    The path of each robot without fixes and the others, moved about the vertical axis onto its fixes, says from where.
     """
-    fixes = run.history.fixes
-    if len(fixes) < LEAST_FIXES or run.history.in_space or np.mean([fix.used for fix in fixes]) > 1.0 - REJECTED:
-        return None
-    events = beginning(run, log)
-    path = _filtered(run.config, log, [e for e in events if not isinstance(e, Fix)])
-    found = []
-    if path is None:
-        return None
+    d, events, found = run.history.d, beginning(run, log), []
     for start in run.history.starts:
-        mine = path.history.robot == start.robot
-        t_ns, p = path.history.t_ns[mine], path.history.poses[mine, :2]
+        if _used(run, start.robot) > 1.0 - REJECTED:
+            continue
+        path = _filtered(run.config, log, list(_alone(events, start.robot, run.history.robots)))
+        mine = np.zeros(0, np.bool_) if path is None else path.history.robot == start.robot
+        if path is None or not mine.any():
+            continue
+        t_ns, p = path.history.t_ns[mine], path.history.poses[mine, :d]
         seen = [e for e in events if isinstance(e, Fix) and e.robot == start.robot and t_ns[0] <= e.t_ns <= t_ns[-1]]
         if len(seen) < LEAST_FIXES:
             continue
         at = np.column_stack([np.interp([e.t_ns for e in seen], t_ns, x) for x in p.T])
-        onto = rigid(at, np.array([e.y for e in seen]))
+        y = np.array([e.y for e in seen])
         variance = float(np.mean([np.diag(e.cov) for e in seen]))
-        changed, evidence, cure = started_at(run.config, start, onto, np.array([e.y for e in seen]), variance)
+        changed, evidence, cure = started_at(run.config, start, level(at, y), y, variance)
         after = _filtered(changed, log, events)
-        if after is not None and fit(after).mean < FITS and np.mean([f.used for f in after.history.fixes]) > REJECTED:
+        if after is not None and fit(after).mean < FITS and _used(after, start.robot) > REJECTED:
             gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
             found.append(Mistake("start", evidence, cure, changed, None, gain, start.t_ns * 1e-9))
     return max(found, key=lambda f: f.gain, default=None)
+
+
+def _used(run: Run, robot: str) -> float:
+    """Return the share of a robot's fixes that the filter used; all of few."""
+    used = [fix.used for fix in run.history.fixes if fix.robot == robot]
+    return float(np.mean(used)) if len(used) >= LEAST_FIXES else 1.0
+
+
+def _alone(events: list[Event], robot: str, robots: Sequence[str]) -> Iterator[Event]:
+    """Yield the events of a robot without its fixes and its sightings of others."""
+    for e in events:
+        if e.robot != robot or isinstance(e, Fix):
+            continue
+        if not isinstance(e, Scan) or e.ids is None or not {*robots}.intersection(e.ids):
+            yield e
+            continue
+        rows = [k for k, name in enumerate(e.ids) if name not in robots]
+        cov = e.cov[rows] if e.cov is not None and e.cov.ndim == 3 else e.cov
+        yield Scan(t_ns=e.t_ns, robot=robot, sensor=e.sensor, y=e.y[rows], ids=[e.ids[k] for k in rows], cov=cov)
 
 
 def started_at(

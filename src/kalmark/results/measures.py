@@ -80,7 +80,7 @@ def level(source: Array, target: Array) -> Rigid:
 
 
 def level_sigmas(target: Array, variance: float, point: Array) -> tuple[float, float]:
-    """Return the sigmas of a point (d,) moved by `level`, m, and of its turn, rad, for `target` (N, d) of a variance."""
+    """Return the sigmas, m and rad, of a point (d,) moved by `level` and its turn: `target` (N, d) has a variance."""
     arms = (target - target.mean(axis=0))[:, :2]
     turn = variance / max(float(np.sum(arms**2)), variance)
     off = point[:2] - target[:, :2].mean(axis=0)
