@@ -51,7 +51,7 @@ NO_CONTROL = np.zeros(0)  # the noise of controls does not depend on them
 
 PREDICT = signature_of(
     "b1(Tuple((f8[::1], f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8)), "
-    "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1)"
+    "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1, b1)"
 )
 CORRECT = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], b1[::1], b1))({corrections.TO_CORRECT}, Tuple((i8, f8)))"
@@ -370,7 +370,7 @@ def filtered(
         n = 3 + 2 * count
         D = density * dt_s[k] if len(density) and u[k].any() else nothing
         map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
-        ok = call_predict(ways[0], (map_, (motion, robot, none, never, no_effect, u[k], N, D, dt_s[k]), never))
+        ok = call_predict(ways[0], (map_, (motion, robot, none, never, no_effect, u[k], N, D, dt_s[k]), never, never))
         slots, y_known = known_ones(slot_of, things[low:high], y[low:high])
         if ok and len(slots):
             whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines
