@@ -19,7 +19,7 @@ from kalmark.results.history import padded_all, texts
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
-SCANS, LANDMARKS = 1_000, 32  # at most so many scans of a run, and of each so many landmarks
+SCANS, LANDMARKS = 500, 32  # at most so many scans of a run, and of each so many landmarks
 LOOKED_AT = 200  # landmarks of the map that are looked at, a scan: of a larger map, not every scan is asked
 KNOWN = ("associated", "new", "rejected")
 

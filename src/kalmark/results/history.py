@@ -192,7 +192,7 @@ class History:
     `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks
     `share_landmark` with weights `share_weight`.
 
-    Of some 1,000 scans spread over the run, `unmeasured_step` (U,) are the steps of landmarks that should be in view
+    Of some 500 scans spread over the run, `unmeasured_step` (U,) are the steps of landmarks that should be in view
     of the sensor `unmeasured_sensor` and were not measured, at most 32 in a scan, the most certain ones:
     `unmeasured_landmark`, their kinds, expectations `unmeasured_e` (U, m) before the scan and the covariances
     `unmeasured_Z` (U, p, p) that their innovations would have had.

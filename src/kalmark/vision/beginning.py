@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from kalmark.arrays import Array, Flags
 from kalmark.events import Id, Scan
@@ -169,6 +168,8 @@ def fitted(sensor: Any, rays: Array, y: Array, w: Array, t: Array, rho: Array, p
 
     Residuals of more than a pixel count less (Huber 1964); rho is kept about the prior +- the same.
     """
+    from scipy.optimize import least_squares
+
     seen = np.isfinite(y[..., 0])
     frames = len(w)
     start = np.concatenate([w.ravel(), t.ravel(), rho])
