@@ -97,10 +97,17 @@ def test_a_doubled_a_split_a_lost_landmark_and_wrong_observations_are_found(know
         np.testing.assert_allclose(mine[other], place, atol=0.1)
 
 
-def test_the_second_opinion_on_a_hall_without_ids_agrees_with_a_right_map() -> None:
-    log = hall(1)
+def test_the_second_opinion_on_a_hall_without_ids_agrees_with_a_right_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    log, bars = hall(1), list[str]()
     run = mapped(log)
+
+    def tracked(items: Any, what: str, **_: Any) -> Any:
+        bars.append(what)
+        return items
+
+    monkeypatch.setattr("kalmark.results.batch.track", tracked)
     entry = batch_entry(run, log)
+    assert bars == ["second opinion: round of association"]  # a long log takes minutes
     assert entry["landmarks"] == 24 and entry["association_settled"]
     assert entry["landmarks_merged"] == entry["landmarks_split"] == entry["landmarks_found"] == 0
     assert entry["observations_changed"] <= 0.001 * entry["observations"]

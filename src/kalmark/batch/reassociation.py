@@ -10,7 +10,7 @@ against another, so it can end in another maximum than the best.  Derivation of 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -56,16 +56,17 @@ class Reassociated:
     settled: bool
 
 
-def reassociated(replay: Replay, may_change: Flags) -> Reassociated:
+def reassociated(replay: Replay, may_change: Flags, numbers: Iterable[int] = range(1, ROUNDS + 1)) -> Reassociated:
     """Decide again which landmark the observations (O,) are of that `may_change`, beginning at those of the replay.
 
-    At most 12 rounds, each of O(observations log landmarks) beside the optimum.  Raises KalmarkError as `optimum` does.
+    Takes a round a number of `numbers` until nothing changes, each of O(observations log landmarks) beside the optimum.
+    Raises KalmarkError as `optimum` does.
     """
     names, merged, new = list(replay.given.associations.landmark), dict[Id, Id](), list[Id]()
     problem = replay.problem()
     batch = optimum(problem, tolerance=NEAR)
     rounds, settled, iterations = 0, False, batch.iterations
-    while rounds < ROUNDS and not settled:
+    for _ in numbers:
         rounds += 1
         look = _Look(replay, batch, may_change)
         decided = look.decided(names)
@@ -79,13 +80,14 @@ def reassociated(replay: Replay, may_change: Flags) -> Reassociated:
         merged = {one: same.get(other, other) for one, other in merged.items()} | same
         decided = [same.get(name, name) if name is not None else None for name in decided]
         settled = decided == names
-        if not settled:
-            names = decided
-            known = {name: (place, np.zeros((0, 0))) for name, place in look.landmarks.items()}
-            replay = replay.reassociated(names, batch.poses, known)
-            problem = replay.problem()
-            batch = optimum(problem, tolerance=NEAR)
-            iterations += batch.iterations
+        if settled:
+            break
+        names = decided
+        known = {name: (place, np.zeros((0, 0))) for name, place in look.landmarks.items()}
+        replay = replay.reassociated(names, batch.poses, known)
+        problem = replay.problem()
+        batch = optimum(problem, tolerance=NEAR)
+        iterations += batch.iterations
     batch = optimum(problem, batch.state)
     batch = replace(batch, iterations=iterations + batch.iterations)
     merged = {one: other for one, other in merged.items() if one not in new}

@@ -15,7 +15,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.data import Associations, Given, Known, Replay, replayed
 from kalmark.batch.problem import Problem
-from kalmark.batch.reassociation import Reassociated, reassociated
+from kalmark.batch.reassociation import ROUNDS, Reassociated, reassociated
 from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, POSES, State
 from kalmark.errors import KalmarkError
@@ -103,7 +103,8 @@ def second_opinion(run: Recording, log: Log | Iterable[Event], *, known: Known |
     open_ = unknown(run)
     rows = np.flatnonzero(run.history.fused | open_)
     given = given_by(run, known, rows)
-    found = reassociated(Replay.of(given, log), open_[rows])
+    numbers = track(range(1, ROUNDS + 1), "second opinion: round of association")
+    found = reassociated(Replay.of(given, log), open_[rows], numbers)
     changed = added = left_out = 0
     made_of: dict[Id, list[bool]] = {name: [] for name in found.new}
     for before, after in zip(given.associations.landmark, found.landmark, strict=True):
