@@ -192,7 +192,7 @@ class HeldInput:
         """Return a control u (k,) as the ones before tell it, and take it into their mean; itself where it has changed.
 
         What a constant does is proportional to its control.  Of the measured control it would be correlated with the
-        control's noise, and where another sensor shows that noise the constant would be too small: errors in variables.
+        control's noise, and where another sensor shows that noise the constant would be wrong: errors in variables.
         Earlier controls are as large and have other noise: an instrumental variable (Fuller 1987, section 1.4).
         """
         if not self.calibrates or dt_s <= 0.0:

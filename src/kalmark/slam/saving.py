@@ -130,7 +130,7 @@ def _state(state: State) -> Description:
                 *(getattr(m.held, key) for key in OF_MOVING),
                 _watched(m.held.gaps),
                 _left_out(m),
-                _number(m),
+                0 if m.held.mean is None else m.held.mean.number,
             ]
             for name, m in state.moving.items()
         },
@@ -149,11 +149,6 @@ def _state(state: State) -> Description:
             ],
         },
     }
-
-
-def _number(moving: Moving) -> int:
-    """Return the number of controls in the mean of a robot's."""
-    return 0 if moving.held.mean is None else moving.held.mean.number
 
 
 def _left_out(moving: Moving) -> list[list[Any]]:

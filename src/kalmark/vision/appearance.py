@@ -102,10 +102,8 @@ def predicted(
     normals = np.array([plane.normal for _, plane in shown])[:, None] + DIFFERENCE * (
         STEPS @ np.array([plane.across for _, plane in shown]).transpose(0, 2, 1)
     )  # (n, 3, 3): of the plane, and of it with either slope changed
-    c, rays = (
-        np.array([view.T[:3] for view, _ in shown]),
-        np.array([view.rays for view, _ in shown]) @ turns.transpose(0, 2, 1),
-    )
+    c = np.array([view.T[:3] for view, _ in shown])
+    rays = np.array([view.rays for view, _ in shown]) @ turns.transpose(0, 2, 1)
     along = normals @ rays.transpose(0, 2, 1)
     far = normals @ (places[told] - c)[:, :, None]
     X = c[:, None, None] + rays[:, None] * (far / np.where(along > 0.0, along, np.nan))[..., None]
