@@ -15,6 +15,7 @@ and mounts, whose inverse is their covariance.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,6 +36,7 @@ NEAR = 1e-2  # relative step below which Newton's method is tried
 ROUNDING = 1e-6  # relative step below which the cost cannot tell any more which of two states is better
 DAMPING = 1e-4  # the first of Levenberg's method
 CHUNK = 128  # columns of the Schur complement at once: bounds the memory
+KEPT = 10_000_000  # numbers of what the path makes of landmarks and mounts, up to which they are kept for each solution
 FLAT = 1e-12  # least ratio of a squared pivot of S to the information of its block: below, it is not determined
 
 
@@ -198,9 +200,13 @@ class Reduced:
                 "batch solution: the path is not determined by its motion and its sightings"
             ) from None
         self.at, self.S = at, A[self.rest][:, self.rest].toarray()
+        self.through = np.empty(self.coupling.shape if math.prod(self.coupling.shape) <= KEPT else (0, 0))
         for first in range(0, len(self.rest), CHUNK):
             columns = slice(first, first + CHUNK)
-            self.S[:, columns] -= self.coupling.T @ self.lu.solve(self.coupling[:, columns].toarray())
+            solved = self.lu.solve(self.coupling[:, columns].toarray())
+            self.S[:, columns] -= self.coupling.T @ solved
+            if self.through.size:
+                self.through[:, columns] = solved
 
     def step(self) -> tuple[Array, Array]:
         """Return the step (N,) of the whole state and the multipliers after it.  Raises UndeterminedError."""
@@ -213,9 +219,10 @@ class Reduced:
         """
         g = self.at.H.T @ z
         rhs = np.concatenate([g[self.path], -w])[self.order]
-        d_l = self._solved(g[self.rest] - self.coupling.T @ self.lu.solve(rhs))
+        alone = self.lu.solve(rhs)
+        d_l = self._solved(g[self.rest] - self.coupling.T @ alone)
         x, step = np.empty_like(rhs), np.zeros_like(g)
-        x[self.order] = self.lu.solve(rhs - self.coupling @ d_l)
+        x[self.order] = alone - self.through @ d_l if self.through.size else self.lu.solve(rhs - self.coupling @ d_l)
         step[self.path], step[self.rest] = x[: len(self.path)], d_l
         return step, x[len(self.path) :]
 

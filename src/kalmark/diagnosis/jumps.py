@@ -36,22 +36,28 @@ class OddControl(NamedTuple):
     usual: float
 
 
-def odd_control(log: Log, columns: Sequence[str], robot: str, t_s: float) -> OddControl | None:
-    """Return the control near a time of the log that is far larger than the others of its robot, None if none is."""
-    mine = [e for e in log.events if isinstance(e, Control) and e.robot == robot]
-    u, t = np.abs([e.u for e in mine]), np.array([e.t_s for e in mine])
-    near = np.flatnonzero(np.abs(t - t_s) <= NEAR_S)
-    if not len(near):
-        return None
-    usual = np.quantile(u, USUAL, axis=0)
-    times = u[near] / np.maximum(usual, 1e-300) * (usual > 0)
-    row, column = divmod(int(np.argmax(times)), times.shape[1])
-    if times[row, column] < TIMES:
-        return None
-    k = int(near[row])
-    lasts_s = 1.0 if columns[column].endswith("ps") else float(np.median(np.diff(t)))
-    value, most = float(mine[k].u[column]), float(usual[column]) / max(lasts_s, 1e-9)
-    return OddControl(float(t[k]), columns[column], value, float(times[row, column]), most)
+class Controls:
+    """All controls of a robot, to find those among them that are far larger than the others."""
+
+    def __init__(self, log: Log, columns: Sequence[str], robot: str) -> None:
+        mine = [e for e in log.events if isinstance(e, Control) and e.robot == robot]
+        self.columns, self.t_s = columns, np.array([e.t_s for e in mine])
+        self.u = np.array([e.u for e in mine]).reshape(len(mine), -1)
+        self.usual = np.quantile(np.abs(self.u), USUAL, axis=0) if mine else np.zeros(0)
+
+    def odd(self, t_s: float) -> OddControl | None:
+        """Return the control near a time of the log that is far larger than the others, None if none is."""
+        near = np.flatnonzero(np.abs(self.t_s - t_s) <= NEAR_S)
+        if not len(near):
+            return None
+        times = np.abs(self.u[near]) / np.maximum(self.usual, 1e-300) * (self.usual > 0)
+        row, column = divmod(int(np.argmax(times)), times.shape[1])
+        if times[row, column] < TIMES:
+            return None
+        k = int(near[row])
+        lasts_s = 1.0 if self.columns[column].endswith("ps") else float(np.median(np.diff(self.t_s)))
+        value, most = float(self.u[k, column]), float(self.usual[column]) / max(lasts_s, 1e-9)
+        return OddControl(float(self.t_s[k]), self.columns[column], value, float(times[row, column]), most)
 
 
 def joined(found: Sequence[Finding], begin_s: float) -> list[Finding]:

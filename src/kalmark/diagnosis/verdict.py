@@ -17,7 +17,7 @@ from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
 from kalmark.diagnosis.columns import Where
 from kalmark.diagnosis.gross import LOST, fit, gross, started_at, until
-from kalmark.diagnosis.jumps import LISTED, OddControl, joined, odd_control
+from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import Mistake
 from kalmark.diagnosis.mounts import TURNED
@@ -304,7 +304,7 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
 
 def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.overstated
-    odd = _odd(run, log, finding.of[0], since_s) if finding.name in JUMPS and log is not None else None
+    odd = _controls(run, log, finding.of[0]).odd(since_s) if finding.name in JUMPS and log is not None else None
     name, told = finding.name, words(finding, run.config)
     if odd is not None:
         name, told = "odometry_jump", of_odd_control(finding, odd)
@@ -313,8 +313,8 @@ def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     return Cause(name, since_s, finding.gain, *told, harmless)
 
 
-def _odd(run: Run, log: Log, robot: str, t_s: float) -> OddControl | None:
-    return odd_control(log, tuple(run.final_slam().robots[robot].motion.columns), robot, t_s)
+def _controls(run: Run, log: Log, robot: str) -> Controls:
+    return Controls(log, tuple(run.final_slam().robots[robot].motion.columns), robot)
 
 
 def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
@@ -325,7 +325,8 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
     h, (chi2, worst) = run.history, misfits(run)
     for robot in dict.fromkeys(h.robot.tolist()):
         bad = [k for k in worst.tolist() if h.robot[k] == robot][:WORST]
-        odd = {o.t_s: (o, k) for k in bad if (o := _odd(run, log, robot, h.t_ns[k] * 1e-9)) is not None}
+        controls = _controls(run, log, robot)
+        odd = {o.t_s: (o, k) for k in bad if (o := controls.odd(h.t_ns[k] * 1e-9)) is not None}
         if odd:
             most, _ = max(odd.values(), key=lambda of: of[0].times)
             at = [f"{t_s:.1f}" for t_s in sorted(odd) if t_s != most.t_s]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import compress
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
@@ -399,11 +400,11 @@ def texts(values: list[Any]) -> Texts:
 def padded(blocks: list[Array], counts: list[int], width: int, matrices: bool = False) -> Array:
     """Stack blocks (K, m) or (K, m, m) of several sizes m, K by `counts`, padded with NaN; an empty one is all NaN."""
     out = np.full((sum(counts), width, width) if matrices else (sum(counts), width), np.nan)
-    at = 0
-    for block, count in zip(blocks, counts, strict=True):
-        if len(block) == count and block.size:
-            out[(slice(at, at + count), *(slice(m) for m in block.shape[1:]))] = block
-        at += count
+    whole = [len(block) == count and block.size > 0 for block, count in zip(blocks, counts, strict=True)]
+    for shape in {block.shape[1:] for block in compress(blocks, whole)}:
+        mine = [use and block.shape[1:] == shape for block, use in zip(blocks, whole, strict=True)]
+        rows: tuple[Any, ...] = (np.repeat(mine, counts), *(slice(m) for m in shape))
+        out[rows] = np.concatenate([*compress(blocks, mine)])
     return out
 
 

@@ -14,6 +14,7 @@ truth shows the filter to be too sure of itself already.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -148,13 +149,12 @@ def _windows(history: History, step: Ints, value: Array, weight: Ints, least: in
     _, scan = np.unique(step, return_inverse=True)
     counts = weight * np.minimum(1.0, least / scans / np.maximum(np.bincount(scan, weight), 1.0))[scan]
     number = ((np.cumsum(counts) - counts) / least + 1e-9).astype(np.int64)
+    ends = np.searchsorted(number, np.arange(number[-1] + 2))
     t, out = history.t_s, []
-    for i in range(int(number[-1]) + 1):
-        mine = number == i
-        if counts[mine].sum() >= 0.9 * least:
-            first, last = step[mine][0], step[mine][-1]
-            share = float(value[mine].sum() / weight[mine].sum())
-            out.append(Window(float(t[first]), float(t[last]), share, round(counts[mine].sum())))
+    for begin, end in itertools.pairwise(ends.tolist()):
+        if (total := counts[begin:end].sum()) >= 0.9 * least:
+            share = float(value[begin:end].sum() / weight[begin:end].sum())
+            out.append(Window(float(t[step[begin]]), float(t[step[end - 1]]), share, round(total)))
     return out
 
 
