@@ -15,6 +15,7 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Event, Scan, order
+from kalmark.logs.corrections import at_time
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
 
@@ -29,6 +30,13 @@ def scans(change: Callable[[Array], Array], robot: str = "", late_s: float = 0.0
         return Scan(t_ns=t_ns, robot=e.robot, sensor=e.sensor, y=change(e.y.copy()), ids=e.ids)
 
     return lambda log: replace(log, events=sorted(map(of, log.events), key=order))
+
+
+def carried(log: Log) -> Log:
+    """Leave out a fifth of the log: the robot is elsewhere when it comes again."""
+    begin, end = (log.events[k * len(log.events) // 5].t_ns for k in (2, 3))
+    rest = [at_time(e, e.t_ns - end + begin) for e in log.events if e.t_ns >= end]
+    return replace(log, events=[*(e for e in log.events if e.t_ns < begin), *rest])
 
 
 def verdict_on(world: str, plant: Plant, *settings: str) -> Verdict:
@@ -68,6 +76,15 @@ CASES: dict[str, tuple[str, Plant, tuple[str, ...], str, str, str]] = {
         "hall_of_walls", scans(lambda y: np.add(y, [0.0, 0.1])), ("steps=300",),
         "wrong", "bearings of all sensors of robot are off by 5", "walls.mount.theta_rad=-0.1",
     ),
+    # without ids, the scans of fast turns are of no landmark: that they are late shows in the others hardly
+    "a laser that is late": (
+        "hall_of_walls", scans(lambda y: y, late_s=0.1), ("steps=240",),
+        "doubtful", "scans of robot were made 0.1 s earlier", "log.shift_s.robot=-0.1",
+    ),
+    "a laser that is carried away": (
+        "hall_of_walls", carried, ("steps=400",),
+        "wrong", "robot was elsewhere from t=16", "log.to_s=1[56]",
+    ),
     "a baseline": (
         "thick_cloister_stereo", scans(disparity), (),
         "doubtful", "distances of robot.stereo are 5[.].* too short", "sensors.stereo.baseline_m=0.31",
@@ -81,4 +98,4 @@ def test_the_cause_is_named_first(case: str) -> None:
     verdict = verdict_on(world, plant, *settings)
     assert verdict.map == status, verdict.causes
     assert re.search(evidence, verdict.causes[0].evidence), verdict.causes
-    assert cure in verdict.causes[0].cure, verdict.causes[0].cure
+    assert re.search(cure, verdict.causes[0].cure), verdict.causes[0].cure

@@ -23,7 +23,7 @@ def seen(*scans: str, **places: tuple[float, float]) -> Any:
     step = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
     history = SimpleNamespace(
         t_ns=np.arange(len(scans)) * 10**9, step=step, landmark=np.array([*"".join(scans)]),
-        outcome=np.full(len(step), "associated"), id=np.full(len(step), ""),
+        outcome=np.full(len(step), "associated"), id=np.full(len(step), ""), robot=np.full(len(scans), "rover"),
     )  # fmt: skip
     means = [np.array(place) for place in places.values()]
     return SimpleNamespace(history=history, landmarks=SimpleNamespace(ids=[*places], means=means, in_space=False))
@@ -41,11 +41,24 @@ def test_two_sides_of_a_wall_and_scans_of_single_landmarks_say_nothing() -> None
 
 
 def test_landmarks_vanish_at_once_or_one_after_the_other() -> None:
-    places = dict.fromkeys("abcdefgh", NEAR)
-    for start_s in (9.0, 12.0):
-        assert sightings.vanished(seen(*9 * ("abcd",), *9 * ("efgh",), **places), start_s) == (9.0, 4)
-        assert not sightings.vanished(seen(*9 * ("abcd",), *9 * ("defg",), **places), start_s)[1]
-        assert not sightings.vanished(seen(*9 * ("abc",), *9 * ("efgh",), **places), start_s)[1]
+    def moments(*scans: str) -> list[tuple[float, int, bool]]:
+        found = sightings.vanished(seen(*scans, **dict.fromkeys("abcdefghijkl", NEAR)))
+        return [(moment.t_s, moment.number, moment.score > 0.0) for moment in found]
+
+    before, after = 90 * ("abcdef",), 90 * ("ghijkl",)
+    assert moments(*before, *after) == [(90.0, 6, True)]
+    assert moments(*before, *3 * ("ghijkl",), *before) == []  # a few bad scans
+    assert moments(*before, *9 * ("ghijkl",), *before)[0] == (90.0, 6, False)  # seen again
+    assert not moments(*before, *90 * ("fghijk",))
+    assert not moments(*9 * ("abc",), *after)
+    some = 60 * ("ab", "cd", "ef")  # of which only a third is in a scan: what is not in the next ones says less
+    assert all(number == 6 for _, number, _ in moments(*some, *after))
+
+
+def test_landmarks_that_ids_tell_do_not_vanish() -> None:
+    run = seen(*90 * ("abcdef",), *90 * ("ghijkl",))
+    run.history.id = run.history.landmark
+    assert sightings.vanished(run) == []
 
 
 @pytest.mark.parametrize("carried_m", [0.0, 5.0])

@@ -18,10 +18,10 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
-from kalmark.diagnosis.mistakes import Mistake, mistakes, section_of, with_value
+from kalmark.diagnosis.mistakes import Mistake, mistakes, section_of, shifted, with_value
 from kalmark.diagnosis.words import UNKNOWN_IDS
 from kalmark.errors import KalmarkError
-from kalmark.events import Event, Fix, Scan
+from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
 from kalmark.results.history import Start
@@ -47,6 +47,7 @@ LEAST_FIXES = 5
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
 IN_A_ROW = 8  # sightings of a landmark that do not fit: its id may mean another one from there on
 SAME = 0.25  # of the distance to the next landmark, within which two places are one
+DOUBLED, SHORTER = 3, 0.25  # steps to the time by which scans are late, and the shortest, of the time of a control
 COMMON = 4  # landmarks, of which most are where they were
 
 
@@ -132,9 +133,11 @@ def likeliest(run: Run, log: Log, events: list[Event], config: Mapping[str, Any]
         if not fit_without(mistake, log, few).fits(MISFIT, few_as_they_are):
             continue
         after = fit_without(mistake, log, events)
-        if after.fits(FITS, as_it_is) and BETTER * after.mean < as_it_is.mean:
+        if better(after, as_it_is):
             gain = explained(as_it_is, after) - as_it_is.share * shrinkage(mistake, events)
             made += [mistake._replace(gain=gain, since_s=events[0].t_s)] if gain > 0.0 else []
+    if not made:
+        made = [found for name in run.history.robots if (found := late(run, log, events, config, name, as_it_is))]
     if not made:
         return None
     most = max(mistake.gain for mistake in made)
@@ -142,6 +145,51 @@ def likeliest(run: Run, log: Log, events: list[Event], config: Mapping[str, Any]
     others = "; or: ".join(mistake.evidence for mistake in alike)
     told = f"; the log cannot tell this from: {others}" if others else ""
     return first._replace(evidence=f"{first.evidence}{told}")
+
+
+def better(after: Fit, before: Fit) -> bool:
+    """Whether a log fits without a mistake, and far better than with it."""
+    return after.fits(FITS, before) and BETTER * after.mean < before.mean
+
+
+def late(
+    run: Run, log: Log, events: list[Event], config: Mapping[str, Any], robot: str, as_it_is: Fit
+) -> Mistake | None:
+    """Return that the scans of a robot are late or early, if the events fit then.
+
+    Where ids are unknown, the scans that show it most are of no landmark, and no residual is left of them.  Steps from
+    as long as a control lasts, each twice as long, go to where the events fit best, then shorter ones: increments do
+    not show less than their interval.
+    """
+    mine = [[e.t_ns for e in events if isinstance(e, kind) and e.robot == robot] for kind in (Control, Scan)]
+    if min(map(len, mine)) < FEW_SCANS:
+        return None
+    control_s, scan_s = (float(np.median(np.diff(t_ns))) * 1e-9 for t_ns in mine)
+    tried = {0.0: as_it_is}
+
+    def near(step_s: float) -> float:
+        """Return the best of a time and those a step before and after it."""
+        some = [round(best + k * step_s, 6) for k in (0, -1, 1)]
+        for by_s in some:
+            if by_s not in tried:
+                tried[by_s] = fit_without(shifted(config, robot, by_s), log, events)
+        return min(some, key=lambda by_s: tried[by_s].mean)
+
+    best, step, least = 0.0, max(control_s, 0.5 * scan_s), control_s
+    for _ in range(DOUBLED):
+        last, best = best, near(step)
+        if best == last:
+            break
+        step *= 2.0
+    if run.final_slam().robots[robot].motion.held:
+        least *= SHORTER
+    while best != 0.0 and step > 1.5 * least:
+        step *= 0.5
+        best = near(step)
+    if not better(tried[best], as_it_is):
+        return None
+    gain = explained(as_it_is, tried[best])
+    return shifted(config, robot, best)._replace(gain=gain, since_s=events[0].t_s, share=0.0)
 
 
 def shrinkage(mistake: Mistake, events: list[Event]) -> float:
@@ -385,7 +433,7 @@ def beginning(run: Run, events: Log | list[Event], most: int = SCANS) -> list[Ev
 
 def fit_without(mistake: Mistake, log: Log, events: list[Event]) -> Fit:
     """Return how events fit without a mistake."""
-    return fit_of(mistake.config, log, [*map(mistake.change, events)] if mistake.change else events)
+    return fit_of(mistake.config, log, sorted(map(mistake.change, events), key=order) if mistake.change else events)
 
 
 def fit_of(config: Mapping[str, Any], log: Log, events: list[Event]) -> Fit:

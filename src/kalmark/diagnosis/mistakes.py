@@ -18,6 +18,7 @@ from kalmark.diagnosis.words import corrected
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.corrections import at_time
 from kalmark.results.run import Run
+from kalmark.results.words import figure
 from kalmark.slam.robot import Robot
 
 TURNS_DEG = (180, 90, -90)
@@ -26,6 +27,7 @@ LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6}
 TURNS = ("w_radps", "dtheta_rad", "steering_rad")  # of controls of the plane, to the left
 WHEELS = ("left_rad", "right_rad")
+LATE = "time_offset"
 OPTICAL = {"roll_deg": -90.0, "yaw_deg": -90.0}  # from the axes of a robot to those of a camera
 
 Change = Callable[[Event], Event]
@@ -167,6 +169,17 @@ def _of_controls(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
     lengths = [name for name in names if name.endswith(("_m", "_mps"))]
     for unit, factor in LENGTHS.items() if lengths else ():
         yield made("units", f"ways of the controls of {of} fit only if they are {unit}", lengths, factor)
+
+
+def shifted(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
+    """Return that the scans of a robot were made so much later than their stamps say."""
+    evidence = f"scans of {robot} were made {figure(abs(by_s))} s {'later' if by_s > 0 else 'earlier'} than stamped"
+    cure = corrected(config, "shift_s", (robot,), by_s)
+    by_ns = round(by_s * 1e9)
+    return Mistake(
+        LATE, evidence, cure, config,
+        lambda e: at_time(e, e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e,
+    )  # fmt: skip
 
 
 # ------------------------------------------------------------------ configurations and events without them

@@ -19,6 +19,20 @@ NEIGHBOURS = 3  # of a landmark that may be the same thing
 NEAR_SCANS = 5  # within which both of two landmarks in view would be seen
 SELDOM = 1e-4  # the probability, over all pairs, that two things are never seen together by chance
 LEAST_SEEN = 4  # landmarks that are seen until a robot is moved
+LATER, FEW_BACK, MOSTLY = 20, 0.25, 0.5  # scans after it, in which few of them are seen, and most landmarks are new
+
+
+class Moment(NamedTuple):
+    """The scan `step`, at `t_s` of the log, at which a robot lost sight of so many landmarks at once.
+
+    `score` is the logarithm of how seldom chance does that in a run; 0 if they are soon seen again, or nothing new is.
+    """
+
+    step: int
+    t_s: float
+    robot: str
+    number: int
+    score: float
 
 
 class Pair(NamedTuple):
@@ -90,17 +104,33 @@ def _in_turn(a: Ints, b: Ints) -> int:
     return 0 if (gaps == 0).any() else int((changes & (gaps <= NEAR_SCANS)).sum())
 
 
-def vanished(run: Run, start_s: float) -> tuple[float, int]:
-    """Return since when none of the landmarks that were seen until then is seen, and how many these are, else 0.
+def vanished(run: Run) -> list[Moment]:
+    """Return when of the landmarks that a robot saw until then none is seen any more, which no ids say.
 
-    `start_s` [s of the log] is when some landmarks had been mapped anew: it was that scan, or one of the last before.
+    Those of the last scans are compared with those of the next ones.  Of such landmarks a share p is seen again, so by
+    chance (1 - p)^n of n vanish together.
     """
-    h = run.history
-    last = int(np.searchsorted(h.t_ns, round(start_s * 1e9)))
-    used, at = np.isin(h.outcome, ("associated", "new")), (start_s, 0)
-    for now in range(max(last - NEAR_SCANS, 1), min(last + 1, len(h.t_ns))):
-        before = set(h.landmark[used & (h.step >= now - NEAR_SCANS) & (h.step < now)].tolist())
-        after = set(h.landmark[used & (h.step >= now) & (h.step < now + NEAR_SCANS)].tolist())
-        if len(before) >= max(LEAST_SEEN, at[1] + 1) and after and not before & after:
-            at = float(h.t_ns[now]) * 1e-9, len(before)
-    return at
+    h, found = run.history, list[Moment]()
+    used = (h.id == "") & np.isin(h.outcome, ("associated", "new"))
+    names, first = np.unique(h.landmark[used], return_index=True)
+    begun = dict(zip(names.tolist(), h.step[used][first].tolist(), strict=True))
+    for robot in dict.fromkeys(h.robot[h.step[used]].tolist()):
+        steps, mine = np.flatnonzero(h.robot == robot), used & (h.robot[h.step] == robot)
+        seen: list[set[str]] = [set() for _ in steps]
+        for k, name in zip(np.searchsorted(steps, h.step[mine]).tolist(), h.landmark[mine].tolist(), strict=True):
+            seen[k].add(name)
+        moments, total, again = list[tuple[int, set[str]]](), 1, 0
+        for k in range(1, len(steps)):
+            before, after = set().union(*seen[max(k - NEAR_SCANS, 0) : k]), set().union(*seen[k : k + NEAR_SCANS])
+            if len(before) >= LEAST_SEEN:
+                total, again = total + len(before), again + len(before & after)
+                if after and not before & after:
+                    moments.append((k, before))
+        for k, before in moments:
+            later = set().union(*seen[k : k + LATER])
+            anew = sum(begun[name] >= steps[k] for name in later)
+            gone = len(before & later) <= FEW_BACK * len(before) and anew >= max(LEAST_SEEN, MOSTLY * len(later))
+            score = -len(before) * np.log1p(-again / total) - np.log(len(steps) / SELDOM)
+            t_s = float(h.t_ns[steps[k]]) * 1e-9
+            found.append(Moment(int(steps[k]), t_s, robot, len(before), float(score) if gone else 0.0))
+    return found

@@ -19,7 +19,7 @@ from kalmark.diagnosis.columns import Where
 from kalmark.diagnosis.gross import LOST, fit, gross, started_at, until
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.mistakes import Mistake
+from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.mounts import TURNED
 from kalmark.diagnosis.search import LEAST_GAIN, Search
 from kalmark.diagnosis.words import of_odd_control, words
@@ -117,7 +117,10 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     else:
         verdict = _judged(run, log, most, progress)
         if mistake is not None:
-            verdict = replace(verdict, causes=(_of_mistake(mistake), *verdict.causes))
+            rest = [c for c in verdict.causes if (mistake.name, c.name) != (LATE, "kidnapped")]
+            verdict = replace(verdict, causes=(_of_mistake(mistake), *rest))
+            if mistake.name == LATE and verdict.map == "ok":  # in turns nothing was of a landmark: they vanish, too
+                verdict = replace(verdict, map="doubtful")
         if run.stopped or summary.get("diverged") or repeats(summary):
             verdict = replace(verdict, map="wrong")
     summary["verdict"] = verdict.as_dict()
@@ -140,7 +143,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
         why = str(error).removeprefix("batch solution: ")
         checked = f"{INNOVATIONS}, no batch solution: {why}"
-        return Verdict("doubtful" if signs else "ok", (*first, *signs), checked)
+        carried = any(cause.name == "kidnapped" for cause in first)
+        return Verdict("wrong" if carried else "doubtful" if signs else "ok", (*first, *signs), checked)
     effect = effect_of(run, found)
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     if found.given.segments is not None and not any(c.name in JUMPS for c in causes):  # between these it is not looked
@@ -155,7 +159,9 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     wrong = any(misplaced(run, f) for f in found.search.found) or any(
         c.name in ("misplaced_landmark", "split_landmarks", MISFIT) and not c.harmless for c in first
     )
-    if effect.status == "ok" and wrong:
+    if any(c.name == "kidnapped" for c in first):
+        effect = replace(effect, status="wrong")
+    elif effect.status == "ok" and wrong:
         effect = replace(effect, status="doubtful")
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
@@ -474,18 +480,26 @@ def repeats(summary: dict[str, Any]) -> list[Cause]:
 
 
 def carried_away(run: Run, log: Log) -> Iterator[Cause]:
-    """Yield that the robot was carried away where a place was mapped anew: what it saw until then vanished at once.
+    """Yield that a robot was carried away: what it saw until then vanished at once, and what it sees is mapped anew.
 
-    Not if its controls had stopped: then it may have driven.
+    Chance does not do that, or the place is in the map already.  Not if its controls had stopped: then it may have
+    driven.
     """
-    for part in run.summary.get("repeats", ())[:1]:
-        since_s, shift_m = part["start_s"] or 0.0, float(np.linalg.norm(part["shift_m"]))
-        stopped = any(gap["start_s"] <= since_s <= gap["end_s"] + STOPPED_S for gap in run.summary.get("gaps", ()))
-        since_s, number = (since_s, 0) if stopped else sightings.vanished(run, since_s)
-        if number and shift_m > sightings.spacing(run):
-            told = f"it sees none of the {number} landmarks that it saw just before, and maps them again"
-            evidence = f"the robot was elsewhere by {figure(shift_m)} m from t={since_s:.1f} s on: {told}"
-            yield Cause("kidnapped", since_s, part["score"], evidence, until(run, log, round(since_s * 1e9)))
+    h, repeat = run.history, next(iter(run.summary.get("repeats", ())), None)
+    stops = [(gap["robot"], gap["start_s"], gap["end_s"] + STOPPED_S) for gap in run.summary.get("gaps", ())]
+    moments = [m for m in sightings.vanished(run) if not any(m.robot == r and a <= m.t_s <= b for r, a, b in stops)]
+    far_m, again = float(np.linalg.norm(repeat["shift_m"])) if repeat else 0.0, list[sightings.Moment]()
+    if repeat and far_m > sightings.spacing(run):
+        last = int(np.searchsorted(h.t_ns, round((repeat["start_s"] or 0.0) * 1e9)))
+        again = [moment for moment in moments if last - sightings.NEAR_SCANS <= moment.step <= last]
+    first = max(again or moments, key=lambda moment: (moment.score, moment.number), default=None)
+    if first is None or not (again or first.score > 0.0):
+        return
+    far, others = (f" by {figure(far_m)} m", "them again") if again else ("", "others")
+    told = f"it sees none of the {first.number} landmarks that it saw just before, and maps {others}"
+    evidence = f"{first.robot} was elsewhere{far} from t={first.t_s:.1f} s on: {told}"
+    score = max(first.score, repeat["score"] if repeat and again else 0.0)
+    yield Cause("kidnapped", first.t_s, score, evidence, until(run, log, round(first.t_s * 1e9)))
 
 
 def split_landmarks(run: Run) -> Iterator[Cause]:
