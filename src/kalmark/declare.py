@@ -90,6 +90,8 @@ class Within:
 
 Number = Annotated[float, Within()]
 NotNegative = Annotated[float, Within(ge=0)]
+Estimated = Annotated[NotNegative, "; above 0 it is in the map and is estimated."]
+"""The sigma of what the filter may estimate; its line of documentation ends with this."""
 Positive = Annotated[float, Within(gt=0)]
 Limit = Annotated[float, Within(gt=0, infinite=True)]
 Probability = Annotated[float, Within(gt=0, lt=1)]
@@ -184,7 +186,7 @@ def _parameter(field: dataclasses.Field[Any], hint: Any) -> Parameter:
         NoneType in parts,
         words,
         bounds,
-        next((extra for extra in extras if isinstance(extra, str)), ""),
+        "".join(extra for extra in reversed(extras) if isinstance(extra, str)),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
-from kalmark.declare import NotNegative, declared
+from kalmark.declare import Estimated, NotNegative, declared
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import SE2, Space
@@ -141,15 +141,14 @@ def white_accelerations(v: Array, q: Array, dt: float) -> Array:
     return D
 
 
-Scale = Annotated[
-    NotNegative, "Share of the way that is missing in all controls; above 0 it is in the map and is estimated."
-]
-TurnScale = Annotated[
-    NotNegative, "Share of the turn that is missing in all controls; above 0 it is in the map and is estimated."
-]
-TurnPerMetre = Annotated[
-    NotNegative, "Turn that is missing for each metre (unequal wheels); above 0 it is in the map and is estimated."
-]
+Scale = Annotated[Estimated, "Share of the way that is missing in all controls"]
+TurnScale = Annotated[Estimated, "Share of the turn that is missing in all controls"]
+TurnPerMetre = Annotated[Estimated, "Turn that is missing for each metre (unequal wheels)"]
+WheelSpeedBias = Annotated[Estimated, "Constant part of the wheel speed's error"]
+SteeringNoise = Annotated[NotNegative, "Error of the steering angle held over its interval."]
+SteeringBias = Annotated[Estimated, "Constant part of the steering angle's error"]
+SteeringScale = Annotated[Estimated, "Share that the steering angle lacks"]
+TurnBias = Annotated[Estimated, "Constant part of the turn rate's error"]
 
 
 class MotionModel(Compiled):
@@ -224,12 +223,8 @@ class SpeedAndTurn(PlanarMotion):
 
     sigma_v_mps: Annotated[NotNegative, "Error of the speed held over its interval."] = 0.1
     sigma_w_radps: Annotated[NotNegative, "Error of the turn rate held over its interval."] = 0.05
-    sigma_v_bias_mps: Annotated[
-        NotNegative, "Constant part of the speed's error; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_w_bias_radps: Annotated[
-        NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_v_bias_mps: Annotated[Estimated, "Constant part of the speed's error"] = 0.0
+    sigma_w_bias_radps: TurnBias = 0.0
     sigma_v_scale: Scale = 0.0
     sigma_w_scale: TurnScale = 0.0
     sigma_turn_rad_per_m: TurnPerMetre = 0.0
@@ -247,3 +242,17 @@ class SpeedAndTurn(PlanarMotion):
 
     def _effects(self, u: Array, dt_s: float) -> Array:
         return np.array([[1.0, 0.0, u[0], 0.0, 0.0], [0.0, 1.0, 0.0, u[1], abs(u[0])]])
+
+
+class Steered(PlanarMotion):
+    """What a car and a tricycle share: the speed of a wheel and a steering angle, each held until the next control."""
+
+    columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
+    held: ClassVar[bool] = True
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_steering_rad")
+    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+        ("v_mps", "sigma_v_bias_mps"),
+        ("steering_rad", "sigma_steering_bias_rad"),
+        ("v_scale", "sigma_v_scale"),
+        ("steering_scale", "sigma_steering_scale"),
+    )

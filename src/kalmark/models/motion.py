@@ -20,12 +20,25 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
-from kalmark.declare import NotNegative, Number, Positive, register
+from kalmark.declare import Estimated, NotNegative, Number, Positive, register
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import exp, left_jacobian, left_jacobian_rate, matrix, multiply, skew
 from kalmark.geometry.spaces import ROTATION, SCALAR, SE3, VECTOR3, Space
-from kalmark.models.kinematics import MotionModel, PlanarMotion, Scale, SpeedAndTurn, TurnPerMetre, TurnScale, arc
+from kalmark.models.kinematics import (
+    MotionModel,
+    PlanarMotion,
+    Scale,
+    SpeedAndTurn,
+    Steered,
+    SteeringBias,
+    SteeringNoise,
+    SteeringScale,
+    TurnPerMetre,
+    TurnScale,
+    WheelSpeedBias,
+    arc,
+)
 from kalmark.models.observe import CompiledVelocity
 
 __all__ = [
@@ -147,9 +160,7 @@ class Odometry2D(PlanarMotion):
     sigma_theta_rad: Annotated[NotNegative, "Error of one increment, heading."] = 0.02
     sigma_scale: Scale = 0.0
     sigma_turn_scale: TurnScale = 0.0
-    sigma_turn_bias_radps: Annotated[
-        NotNegative, "Turn that all increments lack, in a second; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_turn_bias_radps: Annotated[Estimated, "Turn that all increments lack, in a second"] = 0.0
     sigma_turn_rad_per_m: TurnPerMetre = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
@@ -168,7 +179,7 @@ class Odometry2D(PlanarMotion):
 
 
 @register("motion", "ackermann")
-class Ackermann(PlanarMotion):
+class Ackermann(Steered):
     """A car: wheel speed and steering angle, each held until the next control.
 
     A control is u = (speed of the left rear wheel m/s, steering rad); the state is the rear axle's centre.
@@ -179,28 +190,13 @@ class Ackermann(PlanarMotion):
     wheelbase_m: Annotated[Positive, "Distance between the axles."] = 2.83
     encoder_offset_m: Annotated[Number, "Wheel encoder, left of the middle of the rear axle."] = 0.76
     sigma_v_mps: Annotated[NotNegative, "Error of the wheel speed held over its interval."] = 0.1
-    sigma_steering_rad: Annotated[NotNegative, "Error of the steering angle held over its interval."] = 0.02
-    sigma_v_bias_mps: Annotated[
-        NotNegative, "Constant part of the wheel speed's error; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_steering_bias_rad: Annotated[
-        NotNegative, "Constant part of the steering angle's error; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_steering_rad: SteeringNoise = 0.02
+    sigma_v_bias_mps: WheelSpeedBias = 0.0
+    sigma_steering_bias_rad: SteeringBias = 0.0
     sigma_v_scale: Scale = 0.0
-    sigma_steering_scale: Annotated[
-        NotNegative, "Share that the steering angle lacks; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_steering_scale: SteeringScale = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
-    held: ClassVar[bool] = True
     moves: ClassVar[Any] = ackermann
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_steering_rad")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("v_mps", "sigma_v_bias_mps"),
-        ("steering_rad", "sigma_steering_bias_rad"),
-        ("v_scale", "sigma_v_scale"),
-        ("steering_scale", "sigma_steering_scale"),
-    )
 
     @cached_property
     def parameters(self) -> Array:
@@ -221,9 +217,7 @@ class Odometry3D(MotionModel):
     sigma_rotation_rad: Annotated[NotNegative, "Error of one increment, rotation about each axis."] = 0.005
     sigma_scale: Scale = 0.0
     sigma_turn_scale: TurnScale = 0.0
-    sigma_turn_bias_radps: Annotated[
-        NotNegative, "Turn about each axis that they lack, in a second; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_turn_bias_radps: Annotated[Estimated, "Turn about each axis that they lack, in a second"] = 0.0
 
     space: ClassVar[Space] = SE3
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
@@ -253,13 +247,8 @@ class Velocity3D(MotionModel):
     sigma_wx_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about x."] = 0.05
     sigma_wy_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about y."] = 0.05
     sigma_wz_radps: Annotated[NotNegative, "Error of the turn rate held over its interval, about z."] = 0.05
-    sigma_v_bias_mps: Annotated[
-        NotNegative, "Constant part of the speed's error on each axis; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_w_bias_radps: Annotated[
-        NotNegative,
-        "Constant part of the turn rate's error about each axis; above 0 it is in the map and is estimated.",
-    ] = 0.0
+    sigma_v_bias_mps: Annotated[Estimated, "Constant part of the speed's error on each axis"] = 0.0
+    sigma_w_bias_radps: Annotated[Estimated, "Constant part of the turn rate's error about each axis"] = 0.0
     sigma_v_scale: Scale = 0.0
     sigma_w_scale: TurnScale = 0.0
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
-from kalmark.declare import Limit, NotNegative, Number, Positive, declared, register
+from kalmark.declare import Estimated, Limit, Number, Positive, declared, register
 
 __all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
 
@@ -101,12 +101,8 @@ class _SignalStrength(_Receiver):
     _: KW_ONLY
     strength_dbm: Annotated[Number, "Strength at a distance of 1 m."] = -40.0
     exponent: Annotated[Positive, "Of the path loss: 2 in free space, 2 to 4 indoors."] = 2.0
-    sigma_strength_db: Annotated[
-        NotNegative, "Standard deviation of the strength at 1 m; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_exponent: Annotated[
-        NotNegative, "Standard deviation of the exponent; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_strength_db: Annotated[Estimated, "Standard deviation of the strength at 1 m"] = 0.0
+    sigma_exponent: Annotated[Estimated, "Standard deviation of the exponent"] = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("rssi_dbm",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_db",)

@@ -15,7 +15,18 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
-from kalmark.declare import Limit, NotNegative, Number, Positive, Within, built_in, declared, refuse, register
+from kalmark.declare import (
+    Estimated,
+    Limit,
+    NotNegative,
+    Number,
+    Positive,
+    Within,
+    built_in,
+    declared,
+    refuse,
+    register,
+)
 from kalmark.errors import EventError
 from kalmark.geometry.directions import inv_spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
@@ -184,12 +195,8 @@ class _Ranging(_Planar):
     sigma_range_rel: Annotated[NotNegative, "Part b of the range noise, growing with range."] = 0.0
     scale: Annotated[Positive, "Measured range per metre of distance."] = 1.0
     bias_m: Annotated[Number, "Added to every range."] = 0.0
-    sigma_scale: Annotated[
-        NotNegative, "Standard deviation of the scale; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_bias_m: Annotated[
-        NotNegative, "Standard deviation of the bias; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_scale: Annotated[Estimated, "Standard deviation of the scale"] = 0.0
+    sigma_bias_m: Annotated[Estimated, "Standard deviation of the bias"] = 0.0
 
     def __post_init__(self) -> None:
         if not (self.sigma_range_m or self.sigma_range_rel):

@@ -13,7 +13,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
-from kalmark.declare import NotNegative, Positive, register
+from kalmark.declare import Estimated, NotNegative, Positive, register
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
 from kalmark.models.kinematics import (
     NODES,
@@ -21,8 +21,14 @@ from kalmark.models.kinematics import (
     PlanarMotion,
     Scale,
     SpeedAndTurn,
+    Steered,
+    SteeringBias,
+    SteeringNoise,
+    SteeringScale,
+    TurnBias,
     TurnPerMetre,
     TurnScale,
+    WheelSpeedBias,
     add_noise,
     arc,
     product,
@@ -121,9 +127,7 @@ class DifferentialDrive(PlanarMotion):
     sigma_radius_m: Annotated[
         NotNegative, "How well each radius is known; above 0 both are in the map and are estimated."
     ] = 0.0
-    sigma_track_m: Annotated[NotNegative, "How well the track is known; above 0 it is in the map and is estimated."] = (
-        0.0
-    )
+    sigma_track_m: Annotated[Estimated, "How well the track is known"] = 0.0
 
     columns: ClassVar[tuple[str, ...]] = ("left_rad", "right_rad")
     held: ClassVar[bool] = False
@@ -181,7 +185,7 @@ class DifferentialDrive(PlanarMotion):
 
 
 @register("motion", "tricycle")
-class Tricycle(PlanarMotion):
+class Tricycle(Steered):
     """A tricycle with a steered and driven front wheel: its speed and its angle, each held until the next control.
 
     A control is u = (speed of the front wheel m/s, steering rad); the state is the rear axle's centre.
@@ -189,28 +193,13 @@ class Tricycle(PlanarMotion):
 
     wheelbase_m: Annotated[Positive, "Distance from the rear axle to the front wheel."] = 1.0
     sigma_v_mps: Annotated[NotNegative, "Error of the wheel's speed held over its interval."] = 0.1
-    sigma_steering_rad: Annotated[NotNegative, "Error of the steering angle held over its interval."] = 0.02
-    sigma_v_bias_mps: Annotated[
-        NotNegative, "Constant part of the wheel speed's error; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_steering_bias_rad: Annotated[
-        NotNegative, "Constant part of the steering angle's error; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_steering_rad: SteeringNoise = 0.02
+    sigma_v_bias_mps: WheelSpeedBias = 0.0
+    sigma_steering_bias_rad: SteeringBias = 0.0
     sigma_v_scale: Scale = 0.0
-    sigma_steering_scale: Annotated[
-        NotNegative, "Share that the steering angle lacks; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_steering_scale: SteeringScale = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
-    held: ClassVar[bool] = True
     moves: ClassVar[Any] = tricycle
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_steering_rad")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
-        ("v_mps", "sigma_v_bias_mps"),
-        ("steering_rad", "sigma_steering_bias_rad"),
-        ("v_scale", "sigma_v_scale"),
-        ("steering_scale", "sigma_steering_scale"),
-    )
 
     @cached_property
     def parameters(self) -> Array:
@@ -228,12 +217,8 @@ class Omnidirectional(PlanarMotion):
     sigma_vx_mps: Annotated[NotNegative, "Error of the velocity held over its interval, forward."] = 0.1
     sigma_vy_mps: Annotated[NotNegative, "Error of the velocity held over its interval, to the left."] = 0.1
     sigma_w_radps: Annotated[NotNegative, "Error of the turn rate held over its interval."] = 0.05
-    sigma_v_bias_mps: Annotated[
-        NotNegative, "Constant part of the speed's error on each axis; above 0 it is in the map and is estimated."
-    ] = 0.0
-    sigma_w_bias_radps: Annotated[
-        NotNegative, "Constant part of the turn rate's error; above 0 it is in the map and is estimated."
-    ] = 0.0
+    sigma_v_bias_mps: Annotated[Estimated, "Constant part of the speed's error on each axis"] = 0.0
+    sigma_w_bias_radps: TurnBias = 0.0
     sigma_v_scale: Scale = 0.0
     sigma_w_scale: TurnScale = 0.0
     sigma_turn_rad_per_m: TurnPerMetre = 0.0
