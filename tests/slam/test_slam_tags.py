@@ -16,7 +16,7 @@ from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import from_euler, multiply
 from kalmark.management.tags import AGAIN, settle
-from kalmark.models.sensors import TELLING
+from kalmark.models.imaging import TELLING
 from kalmark.results.batch import tag_problem
 from kalmark.tracks.track import Pending
 

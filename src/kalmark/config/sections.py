@@ -38,7 +38,7 @@ from kalmark.declare import (
 )
 from kalmark.errors import ModelError
 from kalmark.events import MOST
-from kalmark.models.sensors import Stereo
+from kalmark.models.protocols import of_pair
 from kalmark.tracks.front_ends import SearchingDetector
 
 FAR = MOST["m"]
@@ -201,7 +201,7 @@ def finds(detector: Any, sensor: Any) -> bool:
     """
     if not (is_own(detector) and is_own(sensor)):
         return True
-    pair = issubclass(detector, SearchingDetector) and sensor.columns[:2] == Stereo.columns[:2]
+    pair = issubclass(detector, SearchingDetector) and of_pair(sensor)
     return bool(pair or detector.columns[:2] == sensor.columns[:2])
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.filter.estimators import Update
 from kalmark.management.pending import Step
+from kalmark.models.imaging import TELLING
 from kalmark.models.protocols import FarCorrected
-from kalmark.models.sensors import TELLING
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Pending

@@ -8,9 +8,8 @@ about is in `models/velocity_view.py`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import KW_ONLY
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from kalmark.declare import Limit, NotNegative, Positive, declared, register
 from kalmark.geometry.directions import inv_spherical_many, spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.models.seen import refuse_negative_ranges, residual
+from kalmark.models.sensing import Expecting
 
 __all__ = ["Radar2D", "Radar3D", "RangeRate2D", "RangeRate3D"]
 
@@ -52,7 +52,7 @@ def moving(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[A
 
 
 @declared
-class _Doppler:
+class _Doppler(Expecting):
     """What all of them share: limits of sight, and what they expect."""
 
     sigma_rate_mps: Annotated[Positive, "Noise of the range rate."] = 0.1
@@ -64,25 +64,9 @@ class _Doppler:
     world: ClassVar[str]
     columns: ClassVar[tuple[str, ...]] = ("range_rate_mps",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_rate_mps",)
-    expected: ClassVar[Callable[..., tuple[Array, Array, Array]]] = moving
+    expected: ClassVar[Any] = moving
     additive: ClassVar[bool] = True
     sees_velocity: ClassVar[bool] = True
-    code: ClassVar[int] = 0
-
-    @property
-    def angular(self) -> tuple[bool, ...]:
-        """Which components are angles: those in rad."""
-        return tuple(column.endswith("_rad") for column in self.columns)
-
-    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
-        """Return the expected measurements (K, m) of points and velocities v (K, 2 d), and E_v (K, m, 2 d)."""
-        angular, m = np.array(self.angular, dtype=np.bool_), len(self.columns)
-        e, _, E_v = moving(0, np.zeros(0), angular, np.ascontiguousarray(v, dtype=np.float64), np.zeros((len(v), m)))
-        return e, E_v
-
-    def noise(self, y: Array) -> Array:
-        """Return the noise R (K, m, m) of measurements y (K, m)."""
-        return np.tile(np.diag([vars(self)[name] ** 2 for name in self.sigmas]), (len(y), 1, 1))
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d or 2 d), which begin with points, are within the limits of sight."""

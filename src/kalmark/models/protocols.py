@@ -118,6 +118,11 @@ class _FindsDepth(Protocol):
 
 
 @runtime_checkable
+class _OfPair(Protocol):
+    of_pair: bool
+
+
+@runtime_checkable
 class _SeesKinds(Protocol):
     sees_kinds: tuple[str, ...]
 
@@ -208,6 +213,11 @@ class _InnovationSize(Protocol):
 def finds_depth(sensor: object) -> bool:
     """Return whether one measurement determines how far the landmark is; by default it does."""
     return sensor.finds_depth if isinstance(sensor, _FindsDepth) else True
+
+
+def of_pair(sensor: object) -> bool:
+    """Return whether a frame of the sensor has the image of a second camera, to the right; by default not."""
+    return sensor.of_pair if isinstance(sensor, _OfPair) else False
 
 
 def sees_kinds(sensor: object) -> tuple[str, ...] | None:
@@ -510,7 +520,7 @@ _OF: dict[type, tuple[type, ...]] = {
         Motion, _OfWorld, _Coasts, NonlinearCalibration, StateDiffusion, _StateColumns, HasVelocity,
     ),
     Sensor: (
-        FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
+        FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _OfPair, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
         _InnovationSize, _NamesParameters, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous,
         FarCorrected, OwnNoise, StartNoise, Checked, SeesVelocity, OfState, TimedNoise, Drifting,
     ),

@@ -6,16 +6,16 @@ Neither finds where a landmark is at once: they correct landmarks that other sen
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self, cast
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, Limit, Number, Positive, declared, register
+from kalmark.models.sensing import Expecting
 
 __all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
 
@@ -66,28 +66,13 @@ def difference(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tup
 
 
 @declared
-class _Receiver:
+class _Receiver(Expecting):
     """What both share: a point of either world, and a largest distance."""
 
     _: KW_ONLY
     range_max_m: Annotated[Limit, "Farthest landmark that is heard."] = math.inf
 
-    columns: ClassVar[tuple[str, ...]]
-    sigmas: ClassVar[tuple[str, ...]]
-    expected: ClassVar[Callable[..., tuple[Array, Array, Array]]]
-    angular: ClassVar[tuple[bool, ...]] = (False,)
     additive: ClassVar[bool] = True
-    code: ClassVar[int] = 0
-
-    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
-        """Return the expected measurements (K, 1) of v (K, d), and E_v (K, 1, d)."""
-        v, nothing, of = np.ascontiguousarray(v, dtype=np.float64), np.zeros((len(v), 1)), cast(Any, self)
-        e, _, E_v = type(self).expected(0, np.array(of.parameters), np.zeros(1, dtype=np.bool_), v, nothing)
-        return e, E_v
-
-    def noise(self, y: Array) -> Array:
-        """Return the noise R (K, 1, 1) of measurements y (K, 1)."""
-        return np.full((len(y), 1, 1), vars(self)[self.sigmas[0]] ** 2)
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d) are near enough."""

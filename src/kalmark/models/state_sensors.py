@@ -22,6 +22,13 @@ from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew,
 from kalmark.models import seen
 from kalmark.models.protocols import CHANGE, POSE, TWIST
 from kalmark.models.seen import residual
+from kalmark.models.sensing import Sensing
+
+__all__ = [
+    "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
+    "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D", "Speed", "ZeroVelocity2D",
+    "ZeroVelocity3D",
+]  # fmt: skip
 
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
@@ -197,7 +204,7 @@ Walk = Annotated[NotNegative, "Random walk of the bias; above 0 it is in the map
 
 
 @declared
-class StateSensor:
+class StateSensor(Sensing):
     """What all sensors of the state share.
 
     `constants` are, for each number that `expected` takes, the parameter, that of its sigma, and that of its walk.
@@ -206,23 +213,12 @@ class StateSensor:
     _: KW_ONLY
     pass_share: Annotated[Probability, "Share of good readings that pass the gate; others are left out."] = 0.9999
 
-    columns: ClassVar[tuple[str, ...]]
-    sigmas: ClassVar[tuple[str, ...]]
     views: ClassVar[str]
     expected: ClassVar[Any]
     varied: ClassVar[Any] = None
     constants: ClassVar[tuple[tuple[str, str, str], ...]] = ()
     code: ClassVar[int] = 0
     sees_kinds: ClassVar[tuple[str, ...]] = ()
-
-    @property
-    def angular(self) -> tuple[bool, ...]:
-        """Which components are angles: those in rad."""
-        return tuple(column.endswith("_rad") for column in self.columns)
-
-    def noise(self, y: Array) -> Array:
-        """Return the noise R (1, p, p) of a reading y (1, m)."""
-        return np.tile(np.diag([vars(self)[name] ** 2 for name in self.sigmas]), (len(y), 1, 1))
 
     def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
         """Return the expected readings (K, m) of views v (K, d), and E_v (K, p, errors of the view)."""

@@ -29,7 +29,8 @@ from kalmark.models.protocols import (
     image_size,
     range_limit,
 )
-from kalmark.models.sensors import Spatial, Wall
+from kalmark.models.sensing import Spatial
+from kalmark.models.sensors import Wall
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.merging import make_equal
 from kalmark.slam.robot import IDENTITY, Mount, Robot

@@ -36,7 +36,6 @@ from kalmark.management.attention import left_out
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.protocols import Landmark, UnknownDepth
-from kalmark.models.sensors import Stereo
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import by_ids, locating, maintenance, moves, own_readings, starting, tentative
 from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
@@ -165,7 +164,7 @@ class Slam(Estimate):
     def _searched(self, event: Frame, front_end: FrontEnd) -> Report:
         """Search a frame for the landmarks that are expected in it.  [S] 2.4."""
         state, channel, image = self.state, self.state.channels[event.robot, event.sensor], event.grey()
-        pair = isinstance(channel.sensor, Stereo)
+        pair = channel.of_pair
         beside = event.right_grey() if pair else event.depths() if channel.finds_depth else None
         if beside is not None and beside.shape != image.shape:
             what = "right image is" if pair else "depths are"

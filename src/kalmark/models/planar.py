@@ -1,0 +1,278 @@
+"""Sensors of the plane: each measures something at v = (x, y[, signature]) in its frame.  [S] A.4, Table 2."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import KW_ONLY, replace
+from typing import Annotated, Any, ClassVar, Self
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags
+from kalmark.compiled import compiled
+from kalmark.declare import Estimated, Limit, NotNegative, Number, Positive, declared, refuse, register
+from kalmark.geometry.frames import inv_scan_many, scan_many
+from kalmark.geometry.gaussian import intersection
+from kalmark.models import seen
+from kalmark.models.seen import refuse_negative_ranges
+from kalmark.models.sensing import Sensing
+
+__all__ = ["Bearing", "Position2D", "Range", "RangeBearing", "RangeBearingSignature"]
+
+RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE = range(1, 6)  # codes of the sensors
+BearingNoise = Annotated[Positive, "Noise of the bearing."]
+
+
+@compiled
+def measured_in_plane(code: int, v: Array) -> tuple[Array, Array]:
+    """Return the measurements (K, m) that the built-in sensor `code` makes of v (K, d), and E_v (K, m, d)."""
+    k, d = v.shape
+    if code == POSITION:
+        e, E_v = np.empty((k, 2)), np.zeros((k, 2, d))
+        for i in range(k):
+            e[i, 0], e[i, 1] = v[i, 0], v[i, 1]
+            E_v[i, 0, 0] = E_v[i, 1, 1] = 1.0
+        return e, E_v
+    y, Y_p = scan_many(v)
+    first, last = (1, 2) if code == BEARING else (0, 1 if code == RANGE else 2)
+    m = last - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
+    e, E_v = np.empty((k, m)), np.zeros((k, m, d))
+    for i in range(k):
+        for j in range(first, last):
+            e[i, j - first] = y[i, j]
+            E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
+        if code == RANGE_BEARING_SIGNATURE:
+            e[i, 2], E_v[i, 2, 2] = v[i, 2], 1.0
+    return e, E_v
+
+
+@compiled
+def in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e (K, m), the innovations z (K, m) of y (K, m), and E_v (K, m, d)."""
+    e, E_v = measured_in_plane(code, v)
+    if len(par) == 2:  # gain and offset of the range
+        for i in range(len(e)):
+            e[i, 0] = (e[i, 0] + par[1]) / par[0]
+            for j in range(E_v.shape[2]):
+                E_v[i, 0, j] /= par[0]
+    return e, seen.residual(y, e, angular), E_v
+
+
+@compiled
+def by_gain_and_offset(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+    """Return E_p (K, m, 2): how measurements e (K, m), the first a range, change with its gain and offset."""
+    E_p = np.zeros((len(e), e.shape[1], 2))
+    for i in range(len(e)):
+        E_p[i, 0, 0], E_p[i, 0, 1] = -e[i, 0] / par[0], 1.0 / par[0]
+    return E_p
+
+
+@declared
+class _Planar(Sensing):
+    """What the planar sensors share: limits of sight, built-in expectation."""
+
+    _: KW_ONLY
+    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
+    fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
+
+    world: ClassVar[str] = "plane"
+    expected: ClassVar[Any] = in_plane
+    code: ClassVar[int]
+
+    def expect(self, v: Array) -> tuple[Array, Array]:
+        """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
+        return measured_in_plane(self.code, np.ascontiguousarray(v, dtype=np.float64))
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, d) lie within the sensor's range limits and field of view."""
+        distance, bearing = np.hypot(v[:, 0], v[:, 1]), np.abs(np.arctan2(v[:, 1], v[:, 0]))
+        inside: Flags = (self.range_min_m <= distance) & (distance <= self.range_max_m)
+        return inside & (bearing <= self.fov_rad / 2)
+
+
+@declared
+class _Ranging(_Planar):
+    """Sensors whose first component is a range, scale * distance + bias: its noise may grow with it.  [F].
+
+    Where the scale or the bias has a sigma they are in the map, as the `parameters` gain = 1 / scale and offset =
+    bias / scale of distance = gain * range - offset: so what a wrong scale does to landmarks is linear in its error,
+    and the filter stays consistent (docs/range_only.md).
+    """
+
+    sigma_range_m: Annotated[NotNegative, "Constant part a of the range noise sqrt(a^2 + (b r)^2)."] = 0.1
+    _: KW_ONLY
+    sigma_range_rel: Annotated[NotNegative, "Part b of the range noise, growing with range."] = 0.0
+    scale: Annotated[Positive, "Measured range per metre of distance."] = 1.0
+    bias_m: Annotated[Number, "Added to every range."] = 0.0
+    sigma_scale: Annotated[Estimated, "Standard deviation of the scale"] = 0.0
+    sigma_bias_m: Annotated[Estimated, "Standard deviation of the bias"] = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.sigma_range_m or self.sigma_range_rel):
+            raise refuse(self, "sigma_range_m", "a positive number")
+
+    varied: ClassVar[Any] = by_gain_and_offset
+    parameter_names: ClassVar[tuple[str, ...]] = ("gain", "offset")
+
+    @property
+    def parameters(self) -> Array:
+        """Gain and offset of the range (2,)."""
+        return np.array([1.0, self.bias_m]) / self.scale
+
+    @property
+    def parameter_cov(self) -> Array | None:
+        """The covariance (2, 2) of gain and offset, None if both are known."""
+        if not (self.sigma_scale or self.sigma_bias_m):
+            return None
+        J = np.array([[-1.0 / self.scale, 0.0], [-self.bias_m / self.scale, 1.0]]) / self.scale
+        return np.asarray(J @ np.diag([self.sigma_scale**2, self.sigma_bias_m**2]) @ J.T)
+
+    def with_parameters(self, parameters: Array) -> Self:
+        """Return the sensor with another gain and offset (2,)."""
+        gain, offset = parameters.tolist()
+        return replace(self, scale=1.0 / gain, bias_m=offset / gain)
+
+    def expect(self, v: Array) -> tuple[Array, Array]:
+        """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
+        e, E_v = super().expect(v)
+        e[:, 0] = self.scale * e[:, 0] + self.bias_m
+        E_v[:, 0] *= self.scale
+        return e, E_v
+
+    def parameters_jacobian(self, v: Array) -> Array:
+        """Return E_p (K, m, 2): how the measurements of v (K, d) change with gain and offset."""
+        e, _ = self.expect(v)
+        E_p = np.zeros((*e.shape, 2))
+        E_p[:, 0, 0], E_p[:, 0, 1] = -self.scale * e[:, 0], self.scale
+        return E_p
+
+    def distances(self, y: Array) -> Array:
+        """Return the distances (K,) that measurements y (K, m) stand for."""
+        return np.asarray((y[:, 0] - self.bias_m) / self.scale)
+
+    def points(self, y: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
+        seen = y[:, :2].copy()
+        if self.scale == 1.0 and self.bias_m == 0.0:
+            return inv_scan_many(seen)
+        seen[:, 0] = self.distances(y)
+        p, P_y = inv_scan_many(seen)
+        P_y[:, :, 0] /= self.scale
+        return p, P_y
+
+    @property
+    def additive(self) -> bool:
+        """Whether the range's noise does not grow with it."""
+        return self.sigma_range_rel == 0.0
+
+    def range_variance(self, y: Array) -> Array:
+        """Return a^2 + (b range)^2 (K,) of measurements y (K, m)."""
+        return np.asarray(self.sigma_range_m**2 + (self.sigma_range_rel * y[:, 0]) ** 2)
+
+    def noise(self, y: Array) -> Array:
+        """Return the noise R (K, m, m) of measurements y (K, m)."""
+        R = super().noise(y)
+        if not self.additive:
+            R[:, 0, 0] = self.range_variance(y)
+        return R
+
+    def noise_at(self, v: Array) -> Array:
+        """Return the noise R (K, m, m) of measuring v (K, d): of the expected range, not of the noisy one."""
+        return self.noise(self.expect(v)[0])
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
+@register("sensor", "range_bearing")
+class RangeBearing(_Ranging):
+    """Distance and direction of a landmark: a laser.
+
+    sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61).
+    """
+
+    sigma_bearing_rad: BearingNoise = 0.02
+
+    code: ClassVar[int] = RANGE_BEARING
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad")
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return points v (K, 2) and V_y (K, 2, 2).  [S] (62)."""
+        return self.points(y)
+
+
+@register("sensor", "bearing")
+class Bearing(_Planar):
+    """Direction of a landmark: a camera, a radio direction finder."""
+
+    sigma_bearing_rad: BearingNoise = 0.02
+
+    code: ClassVar[int] = BEARING
+    columns: ClassVar[tuple[str, ...]] = ("bearing_rad",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_bearing_rad",)
+    finds_depth: ClassVar[bool] = False
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point", "inverse_depth_2d")
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return rays v (K, 2) of length 1 and V_y (K, 2, 1)."""
+        c, s = np.cos(y), np.sin(y)
+        return np.hstack([c, s]), np.stack([-s, c], axis=1)
+
+    def meet(self, T: Array, y: Array, y2: Array) -> Array:
+        """Return where the rays y (K, 1) from the origin and y2 (K, 1) from T meet: (K, 1, 2), NaN if nowhere."""
+        at_origin = np.column_stack([np.zeros((len(y), 2)), y])
+        at_T = np.column_stack([np.tile(T[:2], (len(y2), 1)), T[2] + y2])
+        return intersection(at_origin, at_T)[0][:, None]
+
+
+@register("sensor", "range")
+class Range(_Ranging):
+    """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
+
+    code: ClassVar[int] = RANGE
+    columns: ClassVar[tuple[str, ...]] = ("range_m",)
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m",)
+
+
+@register("sensor", "position")
+class Position2D(_Planar):
+    """Position of a landmark (x, y) in the sensor's frame.
+
+    [F]'s second measurement model.
+    """
+
+    sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1
+    sigma_y_m: Annotated[Positive, "Noise, to the left."] = 0.1
+
+    code: ClassVar[int] = POSITION
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m")
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2) and the identities (K, 2, 2)."""
+        return y.copy(), np.tile(np.eye(2), (len(y), 1, 1))
+
+
+@register("sensor", "range_bearing_signature")
+class RangeBearingSignature(_Ranging):
+    """Distance, direction and signature of a landmark, a number that differs from landmark to landmark.
+
+    [T] 3: a landmark is (x, y, s).
+    """
+
+    sigma_bearing_rad: BearingNoise = 0.02
+    sigma_signature: Annotated[Positive, "Noise of the signature."] = 0.1
+
+    code: ClassVar[int] = RANGE_BEARING_SIGNATURE
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "signature")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad", "sigma_signature")
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return (x, y, signature) (K, 3) and V_y (K, 3, 3)."""
+        p, P_y = self.points(y)
+        V_y = np.zeros((len(y), 3, 3))
+        V_y[:, :2, :2], V_y[:, 2, 2] = P_y, 1.0
+        return np.column_stack([p, y[:, 2]]), V_y

@@ -1,0 +1,149 @@
+"""Sensors of space that look along x, x forward, y left, z up; and the one of walls in the plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import KW_ONLY
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags
+from kalmark.declare import Limit, NotNegative, Positive, declared, register
+from kalmark.errors import EventError
+from kalmark.geometry.directions import inv_spherical_many
+from kalmark.models import seen, walls
+from kalmark.models.seen import refuse_negative_ranges
+from kalmark.models.sensing import Spatial
+
+__all__ = ["Position3D", "RangeBearing3D", "TagPose", "Wall"]
+
+
+@register("sensor", "wall")
+class Wall(Spatial):
+    """Walls seen by a laser: distance of the line, direction of its normal, and what is seen of it.
+
+    The ends of the segment, right and left, are abscissas from the foot of the perpendicular on.  Innovations and noise
+    have two numbers: the ends are where the laser's view ends, not where the wall does.  docs/walls.md.
+    """
+
+    sigma_distance_m: Annotated[Positive, "Noise of the distance of the line."] = 0.02
+    sigma_normal_rad: Annotated[Positive, "Noise of the direction of its normal."] = 0.01
+    _: KW_ONLY
+    range_min_m: Annotated[NotNegative, "Nearest part of a wall the sensor sees."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest part of a wall the sensor sees."] = math.inf
+    fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
+    min_length_m: Annotated[NotNegative, "Shortest segment that counts as seen."] = 0.5
+
+    world: ClassVar[str] = "plane"
+    expected: ClassVar[Any] = walls.wall
+    cov_size: ClassVar[int] = 2
+    columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad", "right_m", "left_m")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_distance_m", "sigma_normal_rad")
+    sees_kinds: ClassVar[tuple[str, ...]] = ("wall",)
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the segments themselves (K, 4), and V_y (K, 4, 2)."""
+        return y.copy(), np.tile(np.eye(4, 2), (len(y), 1, 1))
+
+    def sees(self, v: Array) -> Flags:
+        """Return (K,) that all lines are in view: a line has no end."""
+        return np.ones(len(v), dtype=np.bool_)
+
+    def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
+        """Return which segments from p1 to p2 (K, 2) are seen from T, and their measurements (K, 4)."""
+        limits = self.range_min_m, self.range_max_m, self.fov_rad / 2
+        return walls.visible_wall(T, p1, p2, limits, self.min_length_m)
+
+    def check(self, y: Array) -> None:
+        """Refuse negative distances, and segments y (K, 4) whose right end is not to the right of the left one."""
+        for i, row in enumerate(y):
+            if row[0] < 0:
+                raise EventError(f"observation {i}: distance_m is {row[0]}, expected at least 0")
+            if not row[2] < row[3]:
+                raise EventError(f"observation {i}: right_m is {row[2]}, expected less than left_m, {row[3]}")
+
+
+@declared
+class _Cone(Spatial):
+    """Range sensors: limits of sight about x."""
+
+    _: KW_ONLY
+    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
+    fov_rad: Annotated[Positive, "Field of view, a cone about the sensor's x axis."] = 2 * math.pi
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, 3) lie within the range limits and the cone of sight about x."""
+        distance = np.linalg.norm(v, axis=1)
+        off = np.arctan2(np.hypot(v[:, 1], v[:, 2]), v[:, 0])
+        return (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
+
+
+@register("sensor", "range_bearing_3d")
+class RangeBearing3D(_Cone):
+    """Distance, azimuth and elevation of a landmark; x is forward, z up: a 3-D laser, a radar."""
+
+    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.1
+    sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
+    sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
+
+    expected: ClassVar[Any] = seen.range_bearing
+    columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad")
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return points v (K, 3) and V_y (K, 3, 3)."""
+        return inv_spherical_many(np.ascontiguousarray(y))
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges in y (K, 3)."""
+        refuse_negative_ranges(y)
+
+
+@register("sensor", "position_3d")
+class Position3D(_Cone):
+    """Position of a landmark (x, y, z) in the sensor's frame; x is forward, z up: an RGB-D camera, a lidar."""
+
+    sigma_x_m: Annotated[Positive, "Noise, along x."] = 0.1
+    sigma_y_m: Annotated[Positive, "Noise, along y."] = 0.1
+    sigma_z_m: Annotated[Positive, "Noise, along z."] = 0.1
+
+    expected: ClassVar[Any] = seen.position
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the points (K, 3) and the identities (K, 3, 3)."""
+        return y.copy(), np.tile(np.eye(3), (len(y), 1, 1))
+
+
+@register("sensor", "tag_pose")
+class TagPose(Spatial):
+    """The poses of square tags (x, y, z, qx, qy, qz, qw) in the sensor's frame.
+
+    Innovations and noise have 6 numbers.
+    """
+
+    sigma_position_m: Annotated[Positive, "Noise of each coordinate."] = 0.02
+    sigma_rotation_rad: Annotated[Positive, "Noise of the rotation about each axis."] = 0.02
+
+    expected: ClassVar[Any] = seen.tag_pose
+    cov_size: ClassVar[int] = 6
+    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    sigmas: ClassVar[tuple[str, ...]] = (*3 * ("sigma_position_m",), *3 * ("sigma_rotation_rad",))
+    sees_kinds: ClassVar[tuple[str, ...]] = ("tag",)
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return the poses themselves and the identity (K, 6, 6)."""
+        return y.copy(), np.tile(np.eye(6), (len(y), 1, 1))
+
+    def sees(self, v: Array) -> Flags:
+        """Return (K,) that all tags are in view."""
+        return np.ones(len(v), dtype=np.bool_)
+
+    def check(self, y: Array) -> None:
+        """Refuse poses y (K, 7) whose quaternion is not of norm 1."""
+        for i, row in enumerate(y):
+            if abs(np.linalg.norm(row[3:]) - 1) > 1e-6:
+                raise EventError(f"observation {i}: the quaternion is {row[3:].tolist()}, expected one of length 1")
