@@ -17,6 +17,7 @@ from kalmark.batch.data import replayed
 from kalmark.batch.solver import optimum
 from kalmark.batch.state import LANDMARKS
 from kalmark.cli.app import main
+from kalmark.cli.run import run_log
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.breakdown import breakdown, nees_parts
 from kalmark.diagnosis.causes import Finding
@@ -28,6 +29,7 @@ from kalmark.diagnosis.words import words
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import SE3
+from kalmark.logs import write_native
 from kalmark.logs.log import Log
 from kalmark.results.batch import given_by
 from kalmark.results.run import Run
@@ -322,6 +324,10 @@ APART = ("steps=400", "sight_robots=false", "world.size_m=60", "world.count=200"
          "robots.beta.route.points_m=[[55,35],[55,55],[35,55],[35,35]]")  # fmt: skip
 
 
+ALIKE = ("robots.beta.motion={type: unicycle, sigma_v_mps: 0.05, sigma_w_radps: 0.05}",
+         "robots.beta.sensors={lidar: {type: range_bearing, sigma_range_m: 0.1, sigma_bearing_rad: 0.02}}")  # fmt: skip
+
+
 def by_fixes(world: str, *settings: str) -> Callable[[str], Run]:
     """Return how a log with fixes is run from a start."""
     log = with_fixes(simulate(load_world(world, ["steps=200", *settings]), 3))
@@ -360,6 +366,26 @@ def test_the_robot_of_two_that_starts_elsewhere_is_named_where_fixes_tell(
     assert (verdict.map, verdict.causes[0].name) == ("wrong", "start")
     assert verdict.causes[0].evidence.startswith(f"{robot} starts at")
     run = run_from(cure_of(verdict))
+    cured = km.diagnose(run)
+    assert (cured.map, cured.causes) == ("ok", ())
+    assert run.summary["landmark_rmse_raw_m"] < 0.3
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_several_robots_that_start_elsewhere_are_named_together(each: bool, tmp_path: Path) -> None:
+    log = with_fixes(simulate(load_world("two_robots", ["steps=200", *(ALIKE if each else ())]), 3))
+    robots = config_dict(load_world("two_robots").config())["robots"]
+    for name, x_m in (("alpha", 5.0), ("beta", 8.0)):
+        robots[name]["start"]["x_m"] = x_m
+    write_native(log, tmp_path / "log")
+    path = tmp_path / "config.yaml"
+    robots = {"each": robots["alpha"]} if each else robots
+    path.write_text(json.dumps({"log": {"path": "log"}, "robots": robots}))
+    verdict = km.diagnose(run_log(path, progress=False))
+    assert (verdict.map, verdict.causes[0].name) == ("wrong", "start")
+    cures = [cure.strip().strip("'") for cure in verdict.causes[0].cure.split("--set ")[1:]]
+    assert [cure.split("=")[0] for cure in cures] == ["robots.alpha.start", "robots.beta.start"]
+    run = run_log(path, overrides=cures, progress=False)
     cured = km.diagnose(run)
     assert (cured.map, cured.causes) == ("ok", ())
     assert run.summary["landmark_rmse_raw_m"] < 0.3

@@ -25,7 +25,7 @@ from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
 from kalmark.results.history import Start
-from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_robust
+from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_robust, rmse
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.words import figure
@@ -241,31 +241,45 @@ def misfits_from(now: Fit) -> int | None:
 
 
 def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
-    """Return that a robot starts elsewhere, or turned, if most of its fixes were rejected and then fit.
+    """Return that robots start elsewhere, or turned, if most of their fixes were rejected and then fit.
 
     The path of each robot without fixes and the others, moved about the vertical axis onto its fixes, says from where.
     """
-    d, events, found = run.history.d, beginning(run, log), []
-    for start in run.history.starts:
-        if _used(run, start.robot) > 1.0 - REJECTED:
-            continue
-        path = _filtered(run.config, log, list(_alone(events, start.robot, run.history.robots)))
-        mine = np.zeros(0, np.bool_) if path is None else path.history.robot == start.robot
-        if path is None or not mine.any():
-            continue
-        t_ns, p = path.history.t_ns[mine], path.history.poses[mine, :d]
-        seen = [e for e in events if isinstance(e, Fix) and e.robot == start.robot and t_ns[0] <= e.t_ns <= t_ns[-1]]
-        if len(seen) < LEAST_FIXES:
-            continue
-        at = np.column_stack([np.interp([e.t_ns for e in seen], t_ns, x) for x in p.T])
-        y = np.array([e.y for e in seen])
-        variance = float(np.mean([np.diag(e.cov) for e in seen]))
-        changed, evidence, cure = started_at(run.config, start, level(at, y), y, variance)
-        after = _filtered(changed, log, events)
-        if after is not None and fit(after).mean < FITS and _used(after, start.robot) > REJECTED:
-            gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
-            found.append(Mistake("start", evidence, cure, changed, None, gain, start.t_ns * 1e-9))
-    return max(found, key=lambda f: f.gain, default=None)
+    events, config, told, begin_s = beginning(run, log), run.config, [], math.inf
+    lost = [start for start in run.history.starts if _used(run, start.robot) <= 1.0 - REJECTED]
+    for start in lost:
+        found = _onto_its_fixes(run, log, events, start)
+        if found is not None:
+            config, *words = started_at(config, start, *found)
+            told.append(words)
+            begin_s = min(begin_s, start.t_ns * 1e-9)
+    after = _filtered(config, log, events) if told else None
+    if after is None or fit(after).mean > FITS or any(_used(after, start.robot) <= REJECTED for start in lost):
+        return None
+    gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
+    evidence, cure = (sep.join(parts) for sep, parts in zip(("; ", " "), zip(*told, strict=True), strict=True))
+    return Mistake("start", evidence, cure, config, None, gain, begin_s)
+
+
+def _onto_its_fixes(run: Run, log: Log, events: list[Event], start: Start) -> tuple[Rigid, Array, float] | None:
+    """Return what moves the path of a robot alone onto its fixes, these (N, d), and their variance, m^2.
+
+    None if the path fits them nearly as well as it is: then it was another robot that started elsewhere.
+    """
+    path = _filtered(run.config, log, list(_alone(events, start.robot, run.history.robots)))
+    mine = np.zeros(0, np.bool_) if path is None else path.history.robot == start.robot
+    if path is None or not mine.any():
+        return None
+    t_ns, p = path.history.t_ns[mine], path.history.poses[mine, : run.history.d]
+    seen = [e for e in events if isinstance(e, Fix) and e.robot == start.robot and t_ns[0] <= e.t_ns <= t_ns[-1]]
+    if len(seen) < LEAST_FIXES:
+        return None
+    at = np.column_stack([np.interp([e.t_ns for e in seen], t_ns, x) for x in p.T])
+    y = np.array([e.y for e in seen])
+    onto = level(at, y)
+    if rmse(at - y) < MUCH * rmse(onto(at) - y):
+        return None
+    return onto, y, float(np.mean([np.diag(e.cov) for e in seen]))
 
 
 def _used(run: Run, robot: str) -> float:
@@ -296,7 +310,6 @@ def started_at(
     """
     before = start.mean[: 3 if len(onto.shift) == 2 else 7]
     robots = config.get("robots") or {}
-    key = start.robot if start.robot in robots else "each"
     moved = onto.poses(before[None])[0]
     sigma_m, sigma_rad = level_sigmas(fixes, variance, moved[: len(onto.shift)])
     if len(onto.shift) == 2:
@@ -304,11 +317,12 @@ def started_at(
     else:
         sigmas = {"sigma_position_m": sigma_m, "sigma_rotation_deg": [0.0, 0.0, math.degrees(sigma_rad)]}
     was, now = _as_stated(before), _as_stated(moved)
-    stated = (robots.get(key) or {}).get("start") or {}
-    changed = with_value(config, ("robots", key, "start"), {**stated, **now, **sigmas})
+    section = robots.get(start.robot, robots.get("each")) or {}
+    stated = {**(section.get("start") or {}), **now, **sigmas}
+    changed = with_value(config, ("robots", start.robot), {**section, "start": stated})
     evidence = f"{start.robot} starts {_at(now)}, not {_at(was)}: then its path fits its fixes"
     said = ", ".join(f"{name}: {_said(value)}" for name, value in (now | sigmas).items())
-    return changed, evidence, f"--set 'robots.{key}.start={{{said}}}'"
+    return changed, evidence, f"--set 'robots.{start.robot}.start={{{said}}}'"
 
 
 def _as_stated(pose: Array) -> dict[str, float]:
