@@ -27,10 +27,11 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.angles import wrap
+from kalmark.logs.columns import BEAM, INCREMENT2
 from kalmark.logs.log import Log
 from kalmark.logs.source import Format, Request, nanoseconds, number, one_robot, rows
 
-ROBOT, INCREMENT, BEAM = "robot", ("dx_m", "dy_m", "dtheta_rad"), ("range_m", "bearing_rad")
+ROBOT = "robot"
 LASERS = {"FLASER": "front_laser", "RLASER": "rear_laser", "ROBOTLASER1": "front_laser", "ROBOTLASER2": "rear_laser"}
 OFFSETS = {"robot_frontlaser_offset": "front_laser", "robot_rearlaser_offset": "rear_laser"}
 MOST_M = 80.0  # of an old laser, which gives this, or a little more, for no return
@@ -124,7 +125,7 @@ def read(path: Path, request: Request) -> Log:
         mounts[sensor] = {"mount": {"x_m": reader.offsets.get(sensor, 0.0)} | behind}
     told: dict[str, Any] = {"motion": {"type": "odometry_2d"}} | ({"sensors": mounts} if mounts else {})
     return one_robot(
-        "carmen", path, request, ROBOT, reader.events(), INCREMENT, dict.fromkeys(sensors, BEAM),
+        "carmen", path, request, ROBOT, reader.events(), INCREMENT2, dict.fromkeys(sensors, BEAM),
         name=path.stem, describes={"robots": {ROBOT: told}},
     )  # fmt: skip
 

@@ -36,6 +36,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix
+from kalmark.logs.columns import INCREMENT2, INCREMENT3, POSITION
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     STEP_NS,
@@ -50,8 +51,6 @@ from kalmark.logs.source import (
 )
 
 ROBOT, SENSOR = "robot", "sensor"
-INCREMENT2, INCREMENT3 = ("dx_m", "dy_m", "dtheta_rad"), ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
-POSITION = ("x_m", "y_m", "z_m")
 LENGTH = 1e-3
 POSES = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
 PLACES = {"VERTEX_XY": 2, "VERTEX_TRACKXYZ": 3}
@@ -198,8 +197,7 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
         told["sensors"] = {SENSOR: sensor}
     rest: dict[str, Any] = {"describes": {"robots": {ROBOT: told}}, "name": path.stem}
     if true and graph.poses:
-        known = sorted(graph.poses)
-        path_ = Trajectory(np.array([t_ns[one] for one in known]), np.array([graph.poses[one] for one in known]))
+        path_ = Trajectory.of({t_ns[one]: graph.poses[one] for one in sorted(graph.poses)})
         rest |= {"truth": {ROBOT: path_}, "landmarks": graph.places}
     columns = {SENSOR: POSITION[:d]} if graph.sights else {}
     return one_robot("g2o", path, request, ROBOT, events, INCREMENT3 if space else INCREMENT2, columns, **rest)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,11 @@ class Trajectory:
             raise LogError(f"trajectory: t_ns goes from {t_ns[first]} to {t_ns[first + 1]}, expected increasing times")
         object.__setattr__(self, "t_ns", t_ns)
         object.__setattr__(self, "poses", poses)
+
+    @classmethod
+    def of(cls, poses: Mapping[int, Any]) -> Trajectory:
+        """Return the trajectory of poses (3,) or (7,) by their times (ns), which increase."""
+        return cls(np.array([*poses]), np.array([*poses.values()]))
 
     def __len__(self) -> int:
         return len(self.t_ns)

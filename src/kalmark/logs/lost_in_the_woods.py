@@ -13,11 +13,12 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.logs.arrays import arrays, events_of, find_variables, times
+from kalmark.logs.columns import BEAM
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, one_robot, quantity
 
 ROBOT, SENSOR, FILE = "robot", "laser", "dataset2.mat"
-COLUMNS = {"range_bearing": ("range_m", "bearing_rad"), "bearing": ("bearing_rad",)}
+COLUMNS = {"range_bearing": BEAM, "bearing": ("bearing_rad",)}
 NAMES = ("t", "v", "om", "r", "b", "l", "x_true", "y_true", "th_true", "true_valid")
 
 

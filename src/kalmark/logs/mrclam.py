@@ -9,10 +9,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order, shown
+from kalmark.logs.columns import BEAM
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, nearest, quantity, read_points, rows, timed_rows
 
@@ -72,7 +71,7 @@ def read(path: Path, request: Request, bearing_shift_s: Any = 0.0, robot_sightin
         path.name, robots, sorted(events, key=order), "mrclam", path, truth,
         read_points(landmarks, request.refuse, int, (3, 4, 5), "subject, x, y and their deviations"),
         skipped=request.skipped, control_columns=dict.fromkeys(robots, ("v_mps", "w_radps")),
-        sensor_columns={(robot, SENSOR): ("range_m", "bearing_rad") for robot in robots},
+        sensor_columns={(robot, SENSOR): BEAM for robot in robots},
     )  # fmt: skip
 
 
@@ -126,7 +125,7 @@ def read_truth(path: Path, request: Request) -> Trajectory:
             poses[t_ns] = pose
     if not poses:
         raise LogError(f"{path}: no row that can be used, expected true poses")
-    return Trajectory(np.array([*poses]), np.array([*poses.values()]))
+    return Trajectory.of(poses)
 
 
 MRCLAM = Format("mrclam", "a folder with Barcodes.dat and RobotN_Odometry.dat, RobotN_Measurement.dat", find, read,

@@ -37,20 +37,20 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, in_order, order, shown
+from kalmark.logs.columns import CONTROL, GPS, OBSERVATION, POSE2, POSE3, POSITION, READING
 from kalmark.logs.geodesy import Globe, origin_of
 from kalmark.logs.images.pictures import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
-from kalmark.logs.table import CONTROL, OBSERVATION, PARQUET, READING, Refused, Row, Sheet, read_table
+from kalmark.logs.table import PARQUET, Refused, Row, Sheet, read_table
 
 RIG = "rig.yaml"
 FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv",
          "frames.csv")  # fmt: skip
 EVENTS = ("controls.csv", "scans.csv", "fixes.csv", "measurements.csv", "frames.csv")
-LANDMARK3 = ("x_m", "y_m", "z_m", "x2_m", "y2_m", "z2_m", "qx", "qy", "qz", "qw")
-POSE2, POSE3 = ("x_m", "y_m", "theta_rad"), ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+LANDMARK3 = (*POSITION, "x2_m", "y2_m", "z2_m", *POSE3[3:])
 WALL = ("x_m", "y_m", "x2_m", "y2_m")
-LANDMARKS = (LANDMARK3[:2], WALL, LANDMARK3[:3], LANDMARK3[:6], POSE3)
+LANDMARKS = (POSITION[:2], WALL, POSITION, LANDMARK3[:6], POSE3)
 """The columns of a point and a wall of the plane, and of a point, a line and a tag, as `Log.landmarks` has them."""
 
 Places = dict[tuple[Path, str, str], int]
@@ -301,7 +301,7 @@ class _Reader:
             paths.setdefault(row.robot, {})[row.t_ns] = pose
 
         table.each(self.request, take, strictly=True)
-        self.truth = {robot: Trajectory(np.array([*p]), np.array([*p.values()])) for robot, p in paths.items()}
+        self.truth = {robot: Trajectory.of(p) for robot, p in paths.items()}
 
     def read_landmarks(self, path: Path | Sheet) -> None:
         """Read `landmarks.csv`: true positions, both ends of lines (6,), poses of tags (7,)."""
@@ -322,18 +322,17 @@ class _Reader:
 
     def read_gps(self, path: Path | Sheet) -> None:
         """Read `gps.csv`: position fixes that only score a run."""
-        columns = ("x_m", "y_m", "antenna_x_m", "antenna_y_m")
         tracks: dict[str, tuple[list[int], list[list[float]]]] = {}
 
         def take(row: Row) -> None:
-            values = row.numbers(columns)
+            values = row.numbers(GPS)
             times, rows = tracks.setdefault(row.robot, ([], []))
             if rows and values[2:] != rows[0][2:]:
                 raise Refused(f"antenna is {values[2:]}, expected {rows[0][2:]} as in the robot's first row")
             times.append(row.t_ns)
             rows.append(values)
 
-        read_table(path, ("t_s", "robot", *columns), allowed=(), globe=self.globe).each(self.request, take)
+        read_table(path, ("t_s", "robot", *GPS), allowed=(), globe=self.globe).each(self.request, take)
         for robot, (times, rows) in tracks.items():
             track = np.array(rows)
             self.gps[robot] = PositionTrack(np.array(times), track[:, :2], track[0, 2:])

@@ -16,6 +16,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown
 from kalmark.logs.arrays import arrays
+from kalmark.logs.columns import INCREMENT2
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Refuse, Request, nanoseconds, number, one_robot, rows, timed_rows
 
@@ -40,7 +41,7 @@ def read(path: Path, request: Request) -> Log:
     events: list[Event] = [Control(t_ns=t_ns, robot=ROBOT, u=increment(*u)) for _, t_ns, u in steps]
     events += scans(path.with_name(name + RANGES), request)
     truth, beacons = read_truth(path.with_name(name + TRUTH))
-    columns, sensors = ("dx_m", "dy_m", "dtheta_rad"), {SENSOR: ("range_m",)}
+    columns, sensors = INCREMENT2, {SENSOR: ("range_m",)}
     return one_robot("plaza", path.parent, request, ROBOT, events, columns, sensors,
                      name=name.lower(), truth=truth, landmarks=beacons)  # fmt: skip
 

@@ -15,6 +15,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.geometry.rotations import matrix
+from kalmark.logs.columns import POSE3
 from kalmark.logs.log import Log, Times, Trajectory
 from kalmark.logs.source import (
     Format,
@@ -30,7 +31,6 @@ from kalmark.logs.source import (
 )
 
 ROBOT = "robot"
-TUM_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 TUM_CELLS, KITTI_CELLS = 8, 12
 ENDINGS = (".tum", ".kitti", ".txt")
 LENGTH = 1e-3  # a quaternion is of length 1, and a matrix a rotation, up to this: the files are rounded
@@ -53,14 +53,14 @@ def read_path(path: Path, request: Request) -> Trajectory:
             found = dict(reader(path, request))
             if not found:
                 raise LogError(f"{path}: no pose that can be used, expected {entry.what}")
-            return Trajectory(np.array([*found]), np.array([*found.values()]))
+            return Trajectory.of(found)
     raise LogError(f"{path}: no file of poses, expected {TUM.what}, or {KITTI.what}")
 
 
 def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
     """Yield times (ns), which increase, and poses (7,)."""
     last_ns = None
-    for line, t_ns, values in timed_rows(path, TUM_COLUMNS, request.refuse):
+    for line, t_ns, values in timed_rows(path, POSE3, request.refuse):
         norm = float(np.linalg.norm(values[3:]))
         if abs(norm - 1) > LENGTH:
             request.refuse(f"{path}:{line}: quaternion has length {norm:.6g}, expected 1")
@@ -116,7 +116,7 @@ def kitti_times(path: Path) -> Times:
 # ------------------------------------------------------------------ to text
 def in_space(poses: Array) -> Array:
     """Return poses (N, 3) or (N, 7) as those of space (N, 7), at z = 0."""
-    if poses.shape[1] == len(TUM_COLUMNS):
+    if poses.shape[1] == len(POSE3):
         return poses
     flat, half = np.zeros(len(poses)), poses[:, 2] / 2
     return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])

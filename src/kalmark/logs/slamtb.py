@@ -21,13 +21,14 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.gaussian import sigma_probability
+from kalmark.logs.columns import CORNERS, INCREMENT3, TWIST3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, placed
 
 NAME = "slamtb"
 CONTROLS = {
-    "odometry": ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad"),
-    "constVel": ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps"),
+    "odometry": INCREMENT3,
+    "constVel": tuple(f"d{name}" for name in TWIST3),
 }
 WXYZ_TO_XYZW = [0, 1, 2, 4, 5, 6, 3]
 LANDMARKS = {
@@ -37,8 +38,7 @@ LANDMARKS = {
 }  # fmt: skip
 PLUECKER = ("plkLin", "aplLin")
 BORDER = 25.0  # no landmark starts nearer to the image's border than its width / 25
-VELOCITY = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
-POINTS, SEGMENTS = ("u_px", "v_px"), ("u1_px", "v1_px", "u2_px", "v2_px")
+POINTS, SEGMENTS = ("u_px", "v_px"), CORNERS[:4]
 
 
 def find(path: Path) -> Path | None:
@@ -217,7 +217,7 @@ def start(settings: dict[str, Any], state: Array) -> dict[str, Any]:
         "sigma_rotation_deg": numbers(settings["orientationStd"]),
     }
     if len(state) == 13:
-        section |= dict(zip(VELOCITY, state[7:].tolist(), strict=True))
+        section |= dict(zip(TWIST3, state[7:].tolist(), strict=True))
         section |= {"sigma_v_mps": numbers(settings["velStd"])}
         section |= {"sigma_w_radps": np.radians(settings["angVelStd"]).tolist()}
     return section

@@ -26,6 +26,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown
+from kalmark.logs.columns import BEAM, INCREMENT2, POSITION
 from kalmark.logs.log import Log
 from kalmark.logs.source import (
     STEP_NS,
@@ -40,7 +41,7 @@ from kalmark.logs.source import (
     rows,
 )
 
-ROBOT, INCREMENT = "robot", ("dx_m", "dy_m", "dtheta_rad")
+ROBOT = "robot"
 M = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 ORDER = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])  # of the file's cXX cXY cYY cXPhi cYPhi cPhiPhi in a covariance
 SPURIOUS = -1
@@ -110,7 +111,7 @@ def read_dlr(path: Path, request: Request, covariance_scale: Any = None) -> Log:
         " or LANDMARK_C pX pY quality cXX cXY cYY id, with covariances that are positive definite"
     )
     events = events_of(path, request, "camera", partial(dlr_record, scale=scale), expected, "STEP lines")
-    return one_robot("dlr", path, request, ROBOT, events, INCREMENT, {"camera": ("x_m", "y_m")})
+    return one_robot("dlr", path, request, ROBOT, events, INCREMENT2, {"camera": POSITION[:2]})
 
 
 def dlr_record(where: str, cells: list[str], scale: float) -> Record:
@@ -136,8 +137,7 @@ def read_freiburg(path: Path, request: Request) -> Log:
     record = partial(freiburg_record, request=request)
     events = events_of(path, request, "sensor", record, expected, "ODOMETRY r1 t r2")
     landmarks = read_points(path.parent / "world.dat", request.refuse, landmark_id, (3,), "id, x and y")
-    sensors = {"sensor": ("range_m", "bearing_rad")}
-    return one_robot("freiburg_course", path, request, ROBOT, events, INCREMENT, sensors, landmarks=landmarks)
+    return one_robot("freiburg_course", path, request, ROBOT, events, INCREMENT2, {"sensor": BEAM}, landmarks=landmarks)
 
 
 def freiburg_record(where: str, cells: list[str], request: Request) -> Record | None:

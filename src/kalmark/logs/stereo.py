@@ -16,11 +16,11 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.logs.arrays import arrays, events_of, find_variables, refuse_shapes, times
+from kalmark.logs.columns import TWIST3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, choice, frame, one_robot, placed, quantity
 
 SENSOR = "stereo"
-RATES = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
 PIXELS = ("ul_px", "vl_px", "ur_px", "vr_px")
 SIGMAS_OF_KITTI = (0.3, 0.3, 0.3, 0.05, 0.05, 0.05)  # of the rates
 
@@ -38,7 +38,7 @@ def described(camera: tuple[Any, ...], size: tuple[int, int], pixels: Any, mount
     stereo = {"type": "stereo"} | dict(zip(names, map(float, camera), strict=True))
     stereo |= dict(zip(("width_px", "height_px"), size, strict=True))
     stereo |= {f"sigma_{name}": float(sigma) for name, sigma in zip(PIXELS, pixels, strict=True)}
-    motion = {f"sigma_{name}": float(sigma) for name, sigma in zip(RATES, rates, strict=True)}
+    motion = {f"sigma_{name}": float(sigma) for name, sigma in zip(TWIST3, rates, strict=True)}
     return {"motion": {"type": "velocity_3d"} | motion, "sensors": {SENSOR: stereo | {"mount": placed(mount)}}}
 
 
@@ -50,7 +50,7 @@ def log_of(
     each = ((y[:, ids, k].T, (ids + first).tolist()) for k, ids in enumerate(map(np.flatnonzero, seen.T)))
     rig = {"robots": {robot: section}, "landmarks": {"type": "point"}}
     events = events_of(robot, SENSOR, t_ns, u, each)
-    return one_robot(format, path, request, robot, events, RATES, {SENSOR: PIXELS}, describes=rig, **rest)
+    return one_robot(format, path, request, robot, events, TWIST3, {SENSOR: PIXELS}, describes=rig, **rest)
 
 
 def read_starry_night(path: Path, request: Request) -> Log:

@@ -23,50 +23,12 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import MOST, Id, bound, most, shown
 from kalmark.logs import geodesy
+from kalmark.logs.columns import CANONICAL, FACTORS, GLOBE, NAMES, NOT_NEGATIVE, OTHER_UNITS, UNITS
 from kalmark.logs.geodesy import Globe
 from kalmark.logs.progress import track
 from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
 
 T = TypeVar("T")
-NAMES = ("t_s", "robot", "sensor", "id")
-CONTROL = (
-    "v_mps", "vx_mps", "vy_mps", "vz_mps", "w_radps", "wx_radps", "wy_radps", "wz_radps",
-    "ax_mps2", "ay_mps2", "az_mps2", "steering_rad",
-    "dv_mps", "dvx_mps", "dvy_mps", "dvz_mps", "dw_radps", "dwx_radps", "dwy_radps", "dwz_radps",
-    "dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad", "dtheta_rad", "left_rad", "right_rad",
-    "front_left_radps", "front_right_radps", "rear_left_radps", "rear_right_radps",
-)  # fmt: skip
-OBSERVATION = (
-    "range_m", "bearing_rad", "azimuth_rad", "elevation_rad", "signature",
-    "distance_m", "normal_rad", "right_m", "left_m",
-    "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "x2_m", "y2_m", "z2_m",
-    "u_px", "v_px", "rho_per_m", "ul_px", "vl_px", "ur_px", "vr_px",
-    "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
-)  # fmt: skip
-READING = (  # of a robot itself by its own sensors, and of senders
-    "heading_rad", "theta_rad", "rssi_dbm", "difference_m", "roll_rad", "pitch_rad",
-    "speed_mps", "range_rate_mps",
-)  # fmt: skip
-CANONICAL = (*CONTROL, *OBSERVATION, *READING)
-"""The order in which known columns make a control or an observation, whatever their order in the file."""
-NOT_NEGATIVE = {"range_m": "range", "size_m": "size"}
-UNITS = {
-    "s": "seconds", "m": "metres", "rad": "radians", "px": "pixels", "mps": "m/s", "radps": "rad/s", "mps2": "m/s^2",
-}  # fmt: skip
-"""The units of columns, by the end of their names."""
-OTHER_UNITS = {
-    "ms", "us", "ns", "sec", "secs", "seconds", "min", "h", "mm", "cm", "dm", "km", "in", "ft", "meter", "meters",
-    "metre", "metres", "deg", "degree", "degrees", "rads", "radian", "radians", "mrad", "kmh", "kph", "mph", "dps",
-    "degps", "degs", "rpm", "pixel", "pixels", "pix",
-}  # fmt: skip
-FACTORS = {
-    "mm": ("m", 1e-3), "cm": ("m", 1e-2), "km": ("m", 1e3), "deg": ("rad", math.pi / 180), "mrad": ("rad", 1e-3),
-    "mmps": ("mps", 1e-3), "cmps": ("mps", 1e-2), "kmh": ("mps", 1 / 3.6), "degps": ("radps", math.pi / 180),
-    "dps": ("radps", math.pi / 180),
-}  # fmt: skip
-"""Units of columns that are taken, too: each the unit that it becomes, and by what it is multiplied."""
-GLOBE = {"lat_deg": "x_m", "lon_deg": "y_m", "height_m": "z_m"}
-"""Columns of positions on the globe, and those of the tangent plane whose place in a row they take."""
 TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
 CSV, PARQUET = ".csv", ".parquet"
 BATCH = 65_536  # rows of Parquet at a time

@@ -21,6 +21,7 @@ from kalmark.events import Control, Event, Id, Scan, order
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag.reading import Bag, stamp
 from kalmark.logs.calibration import lens
+from kalmark.logs.columns import CORNERS, INCREMENT3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     Format,
@@ -37,8 +38,6 @@ from kalmark.logs.source import (
 
 ROBOT = "rig"
 FILES = ("tagslam.yaml", "cameras.yaml", "camera_poses.yaml", "tag_detections.bag", "tag_detections.bag.bz2")
-CORNERS = ("u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m")
-INCREMENT = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
 MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3}
 VELOCITY = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
 MOUNT_SIGMAS = {"sigma_position_m": 0.05, "sigma_rotation_deg": 3.0}  # of a camera whose pose is not given
@@ -223,7 +222,7 @@ def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
         if child.startswith("tag_") and (parent == world or (world == "map" and ("map", parent) in last))
     }
     cameras = {child: pose for (parent, child), pose in last.items() if parent == rig and not child.startswith("tag_")}
-    path = Trajectory(np.array([t for t, _ in track]), np.array([p for _, p in track])) if track else None
+    path = Trajectory(*map(np.array, zip(*track, strict=True))) if track else None
     return Reference(path, tags, cameras)
 
 
@@ -336,7 +335,7 @@ def read(
     rig = {"robots": {ROBOT: robot(sections, reference, scans, moved)}, "landmarks": {"type": "tag"}}
     truth = {ROBOT: reference.path} if reference.path is not None else {}
     columns = dict.fromkeys(sections, CORNERS)
-    return one_robot("tagslam", path, request, ROBOT, events, INCREMENT if moved else (), columns,
+    return one_robot("tagslam", path, request, ROBOT, events, INCREMENT3 if moved else (), columns,
                      name=path.name, truth=truth, landmarks=reference.tags, describes=rig)  # fmt: skip
 
 

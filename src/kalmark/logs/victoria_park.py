@@ -16,6 +16,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.arrays import arrays, times
+from kalmark.logs.columns import BEAM
 from kalmark.logs.log import Log, PositionTrack, Times
 from kalmark.logs.source import Format, Request, choice, folder_of, nanoseconds, one_robot, read_text, timed_rows
 
@@ -30,7 +31,6 @@ ASCII_BEHIND_NS = 20_967_000_000
 ANTENNA = np.array([3.78, 0.5])
 """Laser and GPS antenna from the centre of the rear axle, m: a + L ahead (0.95 + 2.83), b to the left."""
 IGNORE = -1
-RANGE_BEARING = ("range_m", "bearing_rad")
 
 
 def find(path: Path) -> Path | None:
@@ -53,7 +53,7 @@ def read(path: Path, request: Request, detections: Any = "slsjf", steering: Any 
     else:
         events += rfs_scans(path / RFS, request) if wanted == "rfs" else laser_scans(path)
     gps = {ROBOT: read_gps(path / GPS)} if (path / GPS).is_file() else {}
-    sensors = {SENSOR: RANGE_BEARING + (("signature",) if wanted == "rfs" else ())}
+    sensors = {SENSOR: BEAM + (("signature",) if wanted == "rfs" else ())}
     return one_robot("victoria_park", path, request, ROBOT, events, ("v_mps", "steering_rad"), sensors, gps=gps)
 
 
@@ -131,7 +131,7 @@ def rfs_scans(path: Path, request: Request) -> list[Event]:
     """Return the scans of trees of unknown identity: range, bearing with 0 forward, and radius, half of column 4."""
     events: list[Event] = []
     table = []
-    for line, t_ns, y in timed_rows(path, (*RANGE_BEARING, "diameter_m"), request.refuse):
+    for line, t_ns, y in timed_rows(path, (*BEAM, "diameter_m"), request.refuse):
         if y[0] < 0 or y[2] < 0:
             request.refuse(f"{path}:{line}: range {y[0]} m, diameter {y[2]} m, expected numbers of at least 0")
         else:

@@ -13,14 +13,14 @@ from ruamel.yaml import YAML
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan
+from kalmark.logs.columns import CANONICAL, GPS, POSE2, POSE3, POSITION
 from kalmark.logs.images.pictures import write_depth, write_image
 from kalmark.logs.log import Log
-from kalmark.logs.native import FILES, LANDMARKS, POSE2, POSE3, RIG
+from kalmark.logs.native import FILES, LANDMARKS, RIG
 from kalmark.logs.source import landmark_id, nanoseconds, seconds
-from kalmark.logs.table import CANONICAL, PARQUET, cov_columns
+from kalmark.logs.table import PARQUET, cov_columns
 
 Table = tuple[list[str], list[dict[str, str]]]
-POSITION = ("x_m", "y_m", "z_m")
 FRAMES, IMAGES = "frames.csv", "images"
 PICTURES = "image", "depth", "right"  # columns of FRAMES that name files
 EMPTY: Table = ([], [])  # measurements.csv: what has no id is written into scans.csv, too
@@ -162,12 +162,11 @@ def landmarks(log: Log) -> Table:
 
 def gps(log: Log) -> Table:
     """Return header and rows of gps.csv."""
-    columns = ["x_m", "y_m", "antenna_x_m", "antenna_y_m"]
     rows = [
-        {"t_s": seconds(int(t)), "robot": name(robot)} | named(columns, [*xy, *track.antenna])
+        {"t_s": seconds(int(t)), "robot": name(robot)} | named(GPS, [*xy, *track.antenna])
         for robot, track in log.gps.items() for t, xy in zip(track.t_ns, track.xy, strict=True)
     ]  # fmt: skip
-    return ["t_s", "robot", *columns], rows
+    return ["t_s", "robot", *GPS], rows
 
 
 def start(event: Event) -> dict[str, str]:

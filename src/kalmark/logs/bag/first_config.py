@@ -14,8 +14,8 @@ from kalmark.logs.bag.first_start import POSE_M, start_of
 from kalmark.logs.bag.first_words import GUESS, mapping, quoted, told
 from kalmark.logs.bag.frames import BASES
 from kalmark.logs.bag.importer import DAY_NS, short
-from kalmark.logs.bag.messages import BEAM, CORNERS, POSE
 from kalmark.logs.bag.survey import Survey, TopicSummary, yaw
+from kalmark.logs.columns import BEAM, CORNERS, POSE3
 
 TRUE = ("truth", "vicon", "mocap", "optitrack", "/gt", "gt_", "_gt")
 LATER = ("filtered", "global", "map", "gps")  # odometry of these names has been corrected by something else
@@ -166,7 +166,7 @@ class _Writer:
             lines += ["sensors:", *(f"  {line}" for line in readings.sensors)]
         for topic in scans:
             lines.append(f"  {line_of(self.found, topic, control, space)}")
-            if topic.columns == CORNERS or (space and topic.columns == POSE and is_tag(topic)):
+            if topic.columns == CORNERS or (space and topic.columns == POSE3 and is_tag(topic)):
                 self.tail = ["landmarks: {type: tag}"]
         if lines:
             out.robots[robot] = lines

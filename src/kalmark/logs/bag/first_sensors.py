@@ -9,9 +9,9 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.logs.bag.first_words import GUESS, mapping
 from kalmark.logs.bag.importer import sensor_name
-from kalmark.logs.bag.messages import BEAM, CORNERS, POSE
 from kalmark.logs.bag.survey import Survey, TopicSummary
 from kalmark.logs.bag.topics import Scans
+from kalmark.logs.columns import BEAM, CORNERS, POSE3, POSITION
 from kalmark.logs.source import placed
 
 CAMERA = {"fx_px": 600.0, "fy_px": 600.0, "cx_px": 640.0, "cy_px": 512.0, "width_px": 1280, "height_px": 1024}
@@ -34,8 +34,8 @@ def entry_of(topic: TopicSummary, space: bool) -> dict[str, Any]:
         entry["size_m"] = 0.16
     if topic.columns == ("range_m",):
         entry["landmark"] = sensor_name(topic.name, Scans())
-    if topic.columns == POSE and not is_tag(topic):
-        entry["take"] = [*POSE[:3]] if space else [*POSE[:2]]
+    if topic.columns == POSE3 and not is_tag(topic):
+        entry["take"] = [*POSITION] if space else [*POSITION[:2]]
     return entry
 
 

@@ -22,11 +22,8 @@ from kalmark.logs.bag import tables
 from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.inertial import GRAVITY, GYRO, HEADING, INCLINATION, heading_of, heading_of_field, means
 from kalmark.logs.bag.messages import (
-    BEAM,
     MESSAGES,
     NO_ROTATION,
-    POINT,
-    POSE,
     Measured,
     Message,
     Place,
@@ -51,6 +48,7 @@ from kalmark.logs.bag.topics import (
     Truths,
     topic_of,
 )
+from kalmark.logs.columns import BEAM, POSE3, POSITION
 from kalmark.logs.geodesy import fault, local
 from kalmark.logs.images.pictures import Forward
 from kalmark.logs.log import Log, PositionTrack, Trajectory
@@ -225,7 +223,8 @@ class _Importer:
         return Log(
             name=self.bag.path.name.partition(".")[0], format="bag", path=self.bag.path,
             robots=tuple(robot for robot in robots if any(event.robot == robot for event in self.events)),
-            events=sorted(self.events, key=order), truth=_trajectories(self.paths), skipped=self.request.skipped,
+            events=sorted(self.events, key=order), skipped=self.request.skipped,
+            truth={robot: Trajectory.of(path) for robot, path in self.paths.items()},
             gps={robot: _track(positions) for robot, positions in self.positions.items()},
             control_columns=self.columns, sensor_columns=self.sensor_columns, describes=self.describes(),
         )  # fmt: skip
@@ -359,7 +358,7 @@ class _Importer:
         Those outside the path are left out: how the robot moved to them is not known.
         """
         for name, way in self.ways.items():
-            topic, path = self.topics[name], Trajectory(np.array([*way]), np.array([*way.values()]))
+            topic, path = self.topics[name], Trajectory.of(way)
             first, last, every = path.t_ns[0], path.t_ns[-1], len(self.events)
             self.events = [e for e in self.events if e.robot != topic.robot or first <= e.t_ns <= last]
             if len(self.events) < every:
@@ -558,12 +557,12 @@ class _Importer:
         """Return the columns to take, and the observations (K, m), for a robot of the plane made level."""
         y = np.asarray(seen.y, dtype=np.float64).reshape(-1, len(seen.columns))
         R, turned = self.level.get(name, (np.eye(3), False))
-        space, points = self.in_space(topic.robot), seen.columns[:3] == POINT
+        space, points = self.in_space(topic.robot), seen.columns[:3] == POSITION
         if points and not space:
             y = np.column_stack([y[:, :3] @ R.T, y[:, 3:]])
         if turned:
             y = (y * np.where(np.array(seen.columns) == BEAM[1], -1.0, 1.0))[::-1]
-        default = seen.columns if space or not points else POINT[:2]
+        default = seen.columns if space or not points else POSITION[:2]
         wanted = tuple(topic.take) if topic.take is not None else default
         if wanted == seen.columns:
             return wanted, turned_at_all(wanted, y)
@@ -571,7 +570,7 @@ class _Importer:
         if points:
             given |= polar(y, space)
         for column in wanted:
-            if column not in given or (column in POSE[3:] and not space):
+            if column not in given or (column in POSE3[3:] and not space):
                 raise Refused(f"take has {column}, expected some of {', '.join(given)}")
         return wanted, turned_at_all(wanted, np.column_stack([given[column] for column in wanted]))
 
@@ -581,8 +580,8 @@ beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].see
 
 def turned_at_all(columns: tuple[str, ...], y: Array) -> Array:
     """Return observations (K, m) whose rotations, if they are taken, are there.  Raises Refused."""
-    if np.isnan(y[:, [column in POSE[3:] for column in columns]]).any():
-        raise Refused(f"{NO_ROTATION}, or `take: [{', '.join(POINT)}]`")
+    if np.isnan(y[:, [column in POSE3[3:] for column in columns]]).any():
+        raise Refused(f"{NO_ROTATION}, or `take: [{', '.join(POSITION)}]`")
     return y
 
 
@@ -644,10 +643,6 @@ def flat(cov: Array) -> Array:
     """Return the covariance (3, 3) of x, y and yaw of one of (x, y, z, rotation)."""
     own = [0, 1, 5]
     return cov[np.ix_(own, own)]
-
-
-def _trajectories(paths: Mapping[str, Mapping[int, Array]]) -> dict[str, Trajectory]:
-    return {robot: Trajectory(np.array([*path]), np.array([*path.values()])) for robot, path in paths.items()}
 
 
 def _track(positions: Mapping[int, Array]) -> PositionTrack:

@@ -20,12 +20,9 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.calibration import lens
+from kalmark.logs.columns import BEAM, CORNERS, POSE3, POSITION
 from kalmark.logs.table import Refused
 
-POINT = ("x_m", "y_m", "z_m")
-POSE = (*POINT, "qx", "qy", "qz", "qw")
-BEAM = ("range_m", "bearing_rad")
-CORNERS = ("u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m")
 LENGTH = 1e-3  # a quaternion is of length 1 up to this
 NO_FIX = 0  # of NavSatStatus: what is below has no fix
 UNKNOWN_COVARIANCE = 0
@@ -319,7 +316,7 @@ def cloud(m: Any, scan: Scans) -> Seen:
     points = np.ascontiguousarray(rows[:, : m.width * m.point_step]).view(kind).reshape(-1)
     xyz = np.column_stack([points[axis].astype(np.float64) for axis in "xyz"])
     whole = np.isfinite(xyz).all(axis=1)
-    seen = Seen(POINT)
+    seen = Seen(POSITION)
     if not whole.all():
         seen.left_out["points without coordinates"] += int((~whole).sum())
     named, xyz = points[name][whole], xyz[whole]
@@ -359,7 +356,7 @@ def boxes(m: Any, scan: Scans) -> Seen:
 
 def boxes_of_space(m: Any, scan: Scans) -> Seen:
     """Return the poses of the boxes of a vision_msgs/Detection3DArray."""
-    seen = Seen(POSE)
+    seen = Seen(POSE3)
     for each in m.detections:
         seen.add(pose_frame(each.bbox.center).tolist(), detection_id(each, scan))
     return seen
@@ -367,7 +364,7 @@ def boxes_of_space(m: Any, scan: Scans) -> Seen:
 
 def markers(listed: Iterable[Any], scan: Scans) -> Seen:
     """Return the poses of visualization_msgs/Markers; ids are `namespace/id` where there are namespaces."""
-    seen = Seen(POSE)
+    seen = Seen(POSE3)
     listed = list(listed)
     several = len({each.ns for each in listed}) > 1
     for each in listed:
@@ -394,7 +391,7 @@ def _corners(scan: Scans, tags: Iterable[Any]) -> Seen:
 
 def tag_poses(m: Any, scan: Scans) -> Seen:
     """Return the poses of tags of apriltag_ros (ROS 1), aruco_msgs, aruco_opencv and fiducial_msgs, by their ids."""
-    seen = Seen(POSE)
+    seen = Seen(POSE3)
     for tag in getattr(m, "detections", getattr(m, "markers", getattr(m, "transforms", ()))):
         id_ = next(getattr(tag, name) for name in ("id", "marker_id", "fiducial_id") if hasattr(tag, name))
         if np.size(id_) != 1:
@@ -410,7 +407,7 @@ def tag_poses(m: Any, scan: Scans) -> Seen:
 
 def listed_poses(m: Any, scan: Scans) -> Seen:
     """Return the poses of a ros2_aruco_interfaces/ArucoMarkers, whose ids are a list of their own."""
-    seen = Seen(POSE)
+    seen = Seen(POSE3)
     for id_, pose in zip(m.marker_ids, m.poses, strict=True):
         seen.add(pose_frame(pose).tolist(), int(id_))
     return seen

@@ -28,17 +28,17 @@ from kalmark.errors import EventError, LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, order, when
 from kalmark.logs.bag.reading import Bag, Received
 from kalmark.logs.bag.write import RECORD, Outgoing, header
+from kalmark.logs.columns import GPS as GPS_COLUMNS
+from kalmark.logs.columns import POSE2, POSE3, POSITION
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.native import POSE2, POSE3
 from kalmark.logs.source import Request, landmark_id
-from kalmark.logs.write import POSITION, id_text
+from kalmark.logs.write import id_text
 
 ROOT = "/kalmark/"
 LOG = ROOT + "log"
 CONTROLS, SCANS, FIXES, TRUTH, LANDMARKS, GPS = (
     ROOT + name for name in ("controls", "scans", "fixes", "truth", "landmarks", "gps")
 )
-GPS_COLUMNS = ("x_m", "y_m", "antenna_x_m", "antenna_y_m")
 
 
 def holds_log(bag: Bag) -> bool:
@@ -139,7 +139,7 @@ def read(bag: Bag, request: Request) -> Log:
         return Log(
             name=about["name"], format="bag", path=bag.path, robots=tuple(about["robots"]),
             events=sorted(events, key=order), skipped=request.skipped, landmarks=landmarks,
-            truth={robot: Trajectory(np.array([*p]), np.array([*p.values()])) for robot, p in truth.items()},
+            truth={robot: Trajectory.of(p) for robot, p in truth.items()},
             gps={robot: _track(rows) for robot, rows in gps.items()},
             control_columns={robot: tuple(columns) for robot, columns in about["control_columns"].items()},
             sensor_columns={(robot, sensor): tuple(columns) for robot, sensor, columns in about["sensor_columns"]},

@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from kalmark.declare import Number, Within, class_of, classes, declared, parameters, refuse, register
 from kalmark.errors import LogError, ModelError
 from kalmark.events import Id, shown
+from kalmark.logs.columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 from kalmark.logs.source import landmark_id, nanoseconds, nearest
 
 
@@ -70,14 +71,14 @@ class Moved(Posed, Noisy):
 class Odometry2DTopic(Moved):
     """Increments of odometry in the plane: differences of successive poses."""
 
-    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
+    columns: ClassVar[tuple[str, ...]] = INCREMENT2
 
 
 @register("topic", "odometry_3d")
 class Odometry3DTopic(Moved):
     """Increments of odometry in space: differences of successive poses."""
 
-    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    columns: ClassVar[tuple[str, ...]] = INCREMENT3
     space: ClassVar[bool] = True
 
 
@@ -94,7 +95,7 @@ class Velocity3DTopic(Topic, Noisy):
     """Velocities in space, held until the next message: Odometry, Twist, TwistStamped, TwistWithCovarianceStamped."""
 
     wants: ClassVar[tuple[str, ...]] = ("twist",)
-    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    columns: ClassVar[tuple[str, ...]] = TWIST3
     space: ClassVar[bool] = True
 
 
@@ -111,7 +112,7 @@ class InertialTopic(Topic):
     """Rates and specific forces of an Imu, held until the next one: controls of a robot whose frame is the Imu's."""
 
     wants: ClassVar[tuple[str, ...]] = ("force",)
-    columns: ClassVar[tuple[str, ...]] = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
+    columns: ClassVar[tuple[str, ...]] = INERTIAL
     space: ClassVar[bool] = True
 
 

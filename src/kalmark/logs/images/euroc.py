@@ -17,13 +17,13 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Frame, shown
 from kalmark.logs.calibration import read_calibration
+from kalmark.logs.columns import INERTIAL, TWIST3
 from kalmark.logs.images.pictures import frames_of
 from kalmark.logs.images.rigs import MOTION, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Times, Trajectory, interpolate
 from kalmark.logs.source import Format, Request, choice, nearest, number, placed, read_text
 
 TRUE_STATES = "state_groundtruth_estimate0/data.csv"
-READING = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
 ADIS16448 = {  # the data sheet in EuRoC's imu0/sensor.yaml
     "gyroscope_noise_density_rad_per_sqrt_s": 1.6968e-4,
     "gyroscope_random_walk_radps_per_sqrt_s": 1.9393e-5,
@@ -39,8 +39,7 @@ SURE = {
     "sigma_bias_a_mps2": 0.1,
 }
 AT_REST = {"at_rest": True, "sigma_bias_w_radps": 0.1, "sigma_bias_a_mps2": 0.1}
-VELOCITY = ("vx_mps", "vy_mps", "vz_mps")
-BIASES = ("bias_wx_radps", "bias_wy_radps", "bias_wz_radps", "bias_ax_mps2", "bias_ay_mps2", "bias_az_mps2")
+BIASES = tuple(f"bias_{name}" for name in INERTIAL)
 
 
 def find(path: Path) -> Path | None:
@@ -77,7 +76,7 @@ def read(path: Path, request: Request, cameras: Any = ("cam0",), imu: Any = "aut
     times = np.maximum(readings.t_ns[kept], begin) if start is not None else readings.t_ns[kept]  # held from then on
     controls = [Control(t_ns=t, robot=ROBOT, u=u) for t, u in zip(times.tolist(), readings.rows[kept], strict=True)]
     motion = {"type": "inertial"} | data_sheet(path / "imu0" / "sensor.yaml")
-    return camera_log("euroc", path, request, [*frames, *controls], sections, motion, READING, name=name, truth=truth,
+    return camera_log("euroc", path, request, [*frames, *controls], sections, motion, INERTIAL, name=name, truth=truth,
                       start=AT_REST if start is None else start)  # fmt: skip
 
 
@@ -168,7 +167,7 @@ def started(states: Table, t_ns: int) -> dict[str, Any] | None:
     a, b = states.rows[before], states.rows[after]
     pose = interpolate(a[None, :7], b[None, :7], np.array([share]))[0]
     rest = a[7:] + share * (b[7:] - a[7:])
-    return placed(pose) | dict(zip((*VELOCITY, *BIASES), map(float, rest), strict=True)) | SURE
+    return placed(pose) | dict(zip((*TWIST3[:3], *BIASES), map(float, rest), strict=True)) | SURE
 
 
 def data_sheet(file: Path) -> dict[str, float]:

@@ -136,8 +136,7 @@ def true_path(file: Path, t_ns: list[int], request: Request) -> Trajectory:
     if file.name == TRUE_POSES[0]:
         return read_path(file, request)
     if file.name == TRUE_POSES[1]:
-        found = dict(kitti_rows(file, request, np.array(t_ns)))
-        return Trajectory(np.array([*found]), np.array([*found.values()]))
+        return Trajectory.of(dict(kitti_rows(file, request, np.array(t_ns))))
     poses = []
     for line, cells in rows(file):
         try:

@@ -41,7 +41,7 @@ def read(path: Path, request: Request, right: Any = "auto") -> Log:
     own, shared = path / "poses.txt", path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt"
     file = next((file for file in (own, shared) if file.is_file()), None)
     found = {} if file is None else dict(kitti_rows(file, request, np.array(t_ns)))
-    truth = {ROBOT: Trajectory(np.array([*found]), np.array([*found.values()]))} if found else {}
+    truth = {ROBOT: Trajectory.of(found)} if found else {}
     section = camera(frames, projection(path / CALIBRATION, f"P{folder.name[-1]}:")[0])
     if pair:
         section |= {"type": "stereo", "baseline_m": baseline(path / CALIBRATION, folder.name[-1], other.name[-1])}
