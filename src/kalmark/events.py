@@ -181,8 +181,20 @@ def _rows(y: Array) -> Array:
     return y
 
 
+class _Timed:
+    """What happens at a time, of which `t_ns` are the nanoseconds."""
+
+    __slots__ = ()
+    t_ns: int
+
+    @property
+    def t_s(self) -> float:
+        """The time in seconds."""
+        return self.t_ns * 1e-9
+
+
 @dataclass(frozen=True, slots=True, init=False, eq=False)
-class Control:
+class Control(_Timed):
     """A robot's control: a velocity held from `t_s` on, or an increment that ended at `t_s`.
 
     `u` has the motion model's shape and units; `cov` (same size, squared) overrides the model's own noise.
@@ -210,14 +222,9 @@ class Control:
         except EventError as error:
             raise EventError(f"control of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
 
-    @property
-    def t_s(self) -> float:
-        """The time in seconds."""
-        return self.t_ns * 1e-9
-
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
-class Scan:
+class Scan(_Timed):
     """What one sensor of one robot saw at one instant: K observations `y` of shape (K, m).
 
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
@@ -262,14 +269,9 @@ class Scan:
             what = f"scan of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
             raise EventError(f"{what}: {error}") from None
 
-    @property
-    def t_s(self) -> float:
-        """The time in seconds."""
-        return self.t_ns * 1e-9
-
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
-class Fix:
+class Fix(_Timed):
     """An absolute position of a robot, `y` = (x, y[, z]) in metres in the map's frame, with covariance `cov`."""
 
     t_ns: int
@@ -292,14 +294,9 @@ class Fix:
         except EventError as error:
             raise EventError(f"fix of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
 
-    @property
-    def t_s(self) -> float:
-        """The time in seconds."""
-        return self.t_ns * 1e-9
-
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
-class Frame:
+class Frame(_Timed):
     """What one camera of one robot took at one instant: an image, and the depth of its pixels where that is measured.
 
     The detector of its sensor makes a scan of it.  `image` (H, W) or (H, W, 3) of bytes, blue, green and red, `right`,
@@ -338,11 +335,6 @@ class Frame:
         except EventError as error:
             what = f"frame of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
             raise EventError(f"{what}: {error}") from None
-
-    @property
-    def t_s(self) -> float:
-        """The time in seconds."""
-        return self.t_ns * 1e-9
 
     def pixels(self) -> Any:
         """Return the image (H, W) or (H, W, 3) as bytes.  Raises ImageError."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
@@ -396,6 +396,13 @@ class _AnyRobot(Section):
     max_turn_radps: Positive | None = None
     """Greatest turn rate in a gap; from the controls so far if absent."""
 
+    @model_validator(mode="after")
+    def _start_fits(self) -> Self:
+        robot: Any = self
+        if robot.start is not None:
+            refuse_odd_start(robot.motion, robot.start)
+        return self
+
 
 class RobotConfig(_AnyRobot):
     """One robot: how it moves, where it starts, what it carries.  Its motion decides: in the plane or in space."""
@@ -405,12 +412,6 @@ class RobotConfig(_AnyRobot):
     sensors: dict[str, PlaneSensor] = Field(default_factory=dict)
     """Sensors by the log's name of each."""
 
-    @model_validator(mode="after")
-    def _start_fits(self) -> RobotConfig:
-        if self.start is not None:
-            refuse_odd_start(self.motion, self.start)
-        return self
-
 
 class SpaceRobotConfig(_AnyRobot):
     """One robot of space."""
@@ -419,12 +420,6 @@ class SpaceRobotConfig(_AnyRobot):
     """Start; if absent, the log's truth, or else the origin."""
     sensors: dict[str, SpaceSensor] = Field(default_factory=dict)
     """Sensors by the log's name of each."""
-
-    @model_validator(mode="after")
-    def _start_fits(self) -> SpaceRobotConfig:
-        if self.start is not None:
-            refuse_odd_start(self.motion, self.start)
-        return self
 
 
 def robot_world(robot: Any) -> str:
@@ -467,8 +462,27 @@ def _each() -> dict[str, AnyRobot]:
     return {"each": RobotConfig()}
 
 
-class Config(Section):
+class OfFile(Section):
+    """What is read from a file; its name is that of the file, or of the folder of a file that is `called` so."""
+
+    called: ClassVar[str]
+    _file: Path | None = PrivateAttr(None)
+
+    @property
+    def file(self) -> Path | None:
+        """The file this was read from, or None."""
+        return self._file
+
+    @property
+    def name(self) -> str:
+        """The file's name without its ending, its folder's for a ``config.yaml`` or ``world.yaml``, or `called`."""
+        return name_of(self._file, self.called)
+
+
+class Config(OfFile):
     """Everything that decides a run.  A saved run's config.yaml is one of these and can be run again."""
+
+    called: ClassVar[str] = "config"
 
     version: str | None = None
     """kalmark version that saved this file."""
@@ -491,18 +505,7 @@ class Config(Section):
     map: MapConfig = MapConfig()
     """Covariance storage."""
 
-    _file: Path | None = PrivateAttr(None)
     _where: dict[tuple[str, ...], str] = PrivateAttr(default_factory=dict)
-
-    @property
-    def file(self) -> Path | None:
-        """The file this was read from, or None."""
-        return self._file
-
-    @property
-    def name(self) -> str:
-        """The file's name without its ending, its folder's name for a ``config.yaml``, or "config"."""
-        return name_of(self._file, "config")
 
     def overridden(self, *path: str) -> bool:
         """Return whether an override gave the value at `path`."""

@@ -6,7 +6,7 @@ import io
 from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
@@ -18,6 +18,7 @@ from kalmark.config.reading import resolve_name, run_plugins, shipped_configs, v
 from kalmark.config.schema import (
     TRUTH,
     Config,
+    OfFile,
     Plugins,
     RobotConfig,
     SpaceRobotConfig,
@@ -26,7 +27,7 @@ from kalmark.config.schema import (
     robot_world,
 )  # fmt: skip
 from kalmark.config.sections import Positive, Section, expected, model_of
-from kalmark.config.tree import Tree, name_of, read_tree
+from kalmark.config.tree import Tree, read_tree
 from kalmark.simulate.layouts import Layout, TexturedPlanes, TexturedRoom
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import Sensing
@@ -79,8 +80,10 @@ AnySimulatedRobot = Annotated[
 ]
 
 
-class World(Section):
+class World(OfFile):
     """A world to simulate: landmarks, robots, noise, and how long."""
+
+    called: ClassVar[str] = "world"
 
     world: Layout
     """Where the landmarks are."""
@@ -107,7 +110,6 @@ class World(Section):
     plugins: Plugins = ()
     """Python files with models of your own.  This runs the code of those files."""
 
-    _file: Path | None = PrivateAttr(None)
     _tree: Tree | None = PrivateAttr(None)
 
     @model_validator(mode="after")
@@ -127,16 +129,6 @@ class World(Section):
     def dimensions(self) -> int:
         """2 in the plane, 3 in space."""
         return 3 if isinstance(next(iter(self.robots.values())), SpaceSimulatedRobot) else 2
-
-    @property
-    def file(self) -> Path | None:
-        """The file this was read from, or None."""
-        return self._file
-
-    @property
-    def name(self) -> str:
-        """The file's name without its ending, its folder's name for a ``world.yaml``, or "world"."""
-        return name_of(self._file, "world")
 
     @property
     def has_signatures(self) -> bool:

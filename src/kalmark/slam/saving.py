@@ -39,7 +39,6 @@ from kalmark.filter.maps import restored as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
-from kalmark.slam.gaps import Gaps
 from kalmark.slam.motion import Mean, Moving, bias_block, bias_name
 from kalmark.slam.reader import Reader
 from kalmark.slam.replacing import LeftOut
@@ -54,18 +53,10 @@ Description = dict[str, Any]
 VERSION = 12
 DESCRIPTION, SUMS = "slam.json", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
-OF_TRACKS = (
-    "recent",
-    "last_scan",
-    "changes",
-    "searched",
-    "unnamed",
-    "experience",
-)  # what `Tracks` knows beside the tracks
+OF_TRACKS = ("recent", "last_scan", "changes", "searched", "unnamed", "experience")  # beside the tracks
 PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 MODELS = ("association", "estimator", "landmarks", "upkeep")  # among the settings
-OF_MOVING = ("t_ns", "fresh")
 OF_ROBOT = ("gaps", "max_speed_mps", "max_turn_radps", "rests_until_ns")
 
 
@@ -124,16 +115,7 @@ def _state(state: State) -> Description:
         "clones": [[number, _record(clone)] for number, clone in state.clones.clones.items()],
         "latest": state.clones.latest,
         "numbered": state.clones.numbered,
-        "moving": {
-            name: [
-                m.error,
-                *(getattr(m.held, key) for key in OF_MOVING),
-                _watched(m.held.gaps),
-                _left_out(m),
-                0 if m.held.mean is None else m.held.mean.number,
-            ]
-            for name, m in state.moving.items()
-        },
+        "moving": {name: _moving(m) for name, m in state.moving.items()},
         "readers": [
             [*key, reader.t_ns, None if reader.standing is None else reader.standing.state()]
             for key, reader in state.readers.items()
@@ -151,8 +133,10 @@ def _state(state: State) -> Description:
     }
 
 
-def _left_out(moving: Moving) -> list[list[Any]]:
-    return [[part.tolist() for part in one] for one in moving.left_out]
+def _moving(m: Moving) -> list[Any]:
+    gaps = None if m.held.gaps is None else m.held.gaps.state()
+    number = 0 if m.held.mean is None else m.held.mean.number
+    return [m.error, m.held.t_ns, m.held.fresh, gaps, [[part.tolist() for part in one] for one in m.left_out], number]
 
 
 def _record(value: Any) -> Description:
@@ -433,10 +417,6 @@ def _measurement(record: Description) -> Measurement:
     if m.y.ndim != 1 or m.R.ndim != 2 or m.R.shape[0] != m.R.shape[1]:
         raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} has the noise {m.R.tolist()}")
     return m
-
-
-def _watched(gaps: Gaps | None) -> Description | None:
-    return None if gaps is None else gaps.state()
 
 
 def _watching(record: Description, k: int) -> Description:
