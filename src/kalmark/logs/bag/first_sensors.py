@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.logs.bag.asked import sensor_name
 from kalmark.logs.bag.first_words import GUESS, mapping
-from kalmark.logs.bag.importer import sensor_name
 from kalmark.logs.bag.survey import Survey, TopicSummary
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.columns import BEAM, CORNERS, POSE3, POSITION

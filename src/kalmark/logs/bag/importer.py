@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -14,29 +13,26 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Event, Fix, Frame, Scan, order
+from kalmark.events import Control, Fix, Frame, Scan, order
 from kalmark.geometry import rotations
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag import tables
-from kalmark.logs.bag.frames import Frames
-from kalmark.logs.bag.inertial import GRAVITY, GYRO, HEADING, INCLINATION, heading_of, heading_of_field, means
+from kalmark.logs.bag.asked import Asked, sensor_name, short
 from kalmark.logs.bag.messages import (
     MESSAGES,
     NO_ROTATION,
-    Measured,
     Message,
     Place,
     Pose,
     Seen,
 )
+from kalmark.logs.bag.mounts import Mounts
+from kalmark.logs.bag.own_readings import Gathered, OwnReadings
 from kalmark.logs.bag.reading import Bag, Received, declared, find_bag, has_header, stamp
 from kalmark.logs.bag.topics import (
-    Carried,
-    Compass,
     Fixes,
     Images,
-    Imu,
     InertialTopic,
     Moved,
     Noisy,
@@ -52,10 +48,9 @@ from kalmark.logs.columns import BEAM, POSE3, POSITION
 from kalmark.logs.geodesy import fault, local
 from kalmark.logs.images.pictures import Forward
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.source import Format, Request, placed, seconds
+from kalmark.logs.source import Format, Request, seconds
 from kalmark.logs.table import Refused
 
-LEVEL = math.cos(math.radians(5))  # a sensor tilted by less is taken as level
 FOREVER_S = 1e9
 DAY_NS = 86_400_000_000_000
 _AXES2, _AXES3 = [0, 1], [0, 1, 2]
@@ -73,148 +68,39 @@ def read(path: Path, request: Request, topics: Mapping[str, Any] | None = None) 
             there = ", ".join(bag.topics) or "none"
             hint = f"topics {there}; `kalmark bag {path} --out config.yaml` writes a configuration to start from"
             raise LogError(f"{path}: log.topics is missing, expected what they are: {hint}")
-        return _Importer(bag, {name: topic_of(name, section) for name, section in topics.items()}, request).log()
-
-
-def offered(bag: Bag, name: str, topic: Topic) -> Message:
-    """Return what the messages of a topic offer.  Raises LogError if that is not what the topic is to be."""
-    kind, known = bag.topics[name].type, MESSAGES.get(bag.topics[name].type)
-    if known is None or not any(getattr(known, want) for want in topic.wants):
-        types = ", ".join(sorted({short(k) for k, m in MESSAGES.items() if any(getattr(m, w) for w in topic.wants)}))
-        what = short(kind) if known is None else f"{short(kind)} ({known.what})"
-        raise LogError(f"{bag.path}: topic {name} has messages of the type {what}, expected one of {types}")
-    if known.transforms is not None and not (isinstance(topic, Posed) and topic.frame and topic.child_frame):
-        raise LogError(f"{bag.path}: topic {name} has many frames, expected `frame` and `child_frame`: two of them")
-    return known
-
-
-def short(kind: str) -> str:
-    """Return a type's name as users write it."""
-    return kind.replace("/msg/", "/")
+        asked = Asked(bag, {name: topic_of(name, section) for name, section in topics.items()})
+        return _Importer(asked, request).log()
 
 
 class _Importer:
     """Takes messages one by one and gathers what becomes of them."""
 
-    def __init__(self, bag: Bag, topics: Mapping[str, Topic], request: Request) -> None:
-        self.bag, self.request = bag, request
-        self.topics = {name if topic.topic else bag.find(name): topic for name, topic in topics.items()}
-        self.named = {name: bag.find(topic.topic) if topic.topic else name for name, topic in self.topics.items()}
-        self.offers = {name: offered(bag, self.named[name], topic) for name, topic in self.topics.items()}
-        self.columns = self._controls()
-        for name, topic in self.topics.items():
-            self._refuse_other_world(name, topic)
-        self.events: list[Event] = []
-        self.sensor_columns: dict[tuple[str, str], tuple[str, ...]] = {}
+    def __init__(self, asked: Asked, request: Request) -> None:
+        self.asked, self.bag, self.request = asked, asked.bag, request
+        self.topics, self.named, self.in_space = asked.topics, asked.named, asked.in_space
+        self.out, self.mounts = Gathered(), Mounts(asked, request)
+        self.own = OwnReadings(self.out, self.mounts.level, self.in_space)
         self.paths: dict[str, dict[int, Array]] = {}
         self.positions: dict[str, dict[int, Array]] = {}
         self.last: dict[str, tuple[int, Array]] = {}
         self.ways: dict[str, dict[int, Array]] = {}
         self.origins: dict[str, Array] = {}
-        self.left_out: Counter[tuple[str, str]] = Counter()
         self.received: Counter[str] = Counter()
         self.images: dict[str, Forward] = {}
         self.cameras: dict[tuple[str, str], dict[str, Any]] = {}
         self.clocks: dict[bool, tuple[str, int]] = {}
-        self.frames, self.of_sensor, self.base = Frames(), dict[str, str](), dict[str, str]()
-        self.mounts: dict[tuple[str, str], dict[str, float]] = {}
-        self.level: dict[str, tuple[Array, bool]] = {}
-        self.rates: dict[tuple[str, str], dict[int, Array]] = {}
-        self.read_ns: dict[tuple[str, str], int] = {}
-
-    def entries(self, received: Received) -> list[str]:
-        """Return the entries of the configuration that a message's topic has."""
-        return [name for name, topic in self.named.items() if topic == received.topic]
-
-    def _controls(self) -> dict[str, tuple[str, ...]]:
-        """Return the columns of each robot's controls.  Raises LogError if two topics are those of one robot."""
-        columns: dict[str, tuple[str, ...]] = {}
-        named: dict[str, str] = {}
-        for name, topic in self.topics.items():
-            if topic.columns and topic.robot in columns:
-                both = f"{named[topic.robot]} and {name} are both controls of {topic.robot!r}"
-                raise LogError(f"{self.bag.path}: topics {both}, expected one topic of controls for each robot")
-            if topic.columns:
-                columns[topic.robot], named[topic.robot] = topic.columns, name
-        return columns
-
-    def _refuse_other_world(self, name: str, topic: Topic) -> None:
-        """Refuse readings that robots of the plane, or of space, do not have.  Raises LogError."""
-        space = self.in_space(topic.robot)
-        if isinstance(topic, Compass) and space:
-            what, wanted = "headings by a magnetic field", "one of the plane"
-        elif isinstance(topic, Imu) and (topic.inclination or topic.gravity) and not space:
-            what, wanted = "inclinations or gravity", "one of space"
-        else:
-            return
-        raise LogError(f"{self.bag.path}: topic {name} gives {what} to {topic.robot!r}, expected {wanted}")
-
-    def in_space(self, robot: str) -> bool:
-        """Return whether a robot moves in space: by its controls; one without any does if it has no laser scanner."""
-        mine = {name: topic for name, topic in self.topics.items() if topic.robot == robot}
-        own = [topic.space for topic in mine.values() if topic.columns]
-        return own[0] if own else not any(self.offers[name].seen is beams_of for name in mine)
-
-    # -------------------------------------------------------------- mounts
-    def look_ahead(self) -> None:
-        """Note the frames of sensors and robots, and those of tf that stand still: for the mounts of sensors."""
-        scans = {name for name, topic in self.topics.items() if isinstance(topic, Carried)}
-        if not scans:
-            return
-        tf = {
-            name
-            for name, topic in self.bag.topics.items()
-            if topic.type in MESSAGES and MESSAGES[topic.type].transforms
-        }
-        moves = {n for n, t in self.topics.items() if isinstance(t, Posed | InertialTopic) and t.columns}
-        for received in self.bag.messages(tf | {self.named[name] for name in scans | moves}):
-            if received.topic in tf:
-                self.frames.take(MESSAGES[received.type].transforms(received.message))  # type: ignore[misc]
-                continue
-            for name in self.entries(received):
-                topic = self.topics[name]
-                if name in scans and not self.of_sensor.get(name):
-                    self.of_sensor[name] = frame_id(received.message)  # none in markers that list nothing
-                elif isinstance(topic, InertialTopic):
-                    self.base.setdefault(topic.robot, frame_id(received.message))
-                elif name in moves:
-                    self.base.setdefault(topic.robot, getattr(received.message, "child_frame_id", ""))
-        for name in sorted(scans):
-            self._mount(name, self.topics[name])
-
-    def _mount(self, name: str, scan: Topic) -> None:
-        """Note where a sensor is mounted, if tf says so; in the plane also how its points are made level."""
-        assert isinstance(scan, Carried)
-        frame = self.of_sensor.get(name, "")
-        base = self.frames.base((scan.base_frame, self.base.get(scan.robot)), frame)
-        mount = None if base is None else self.frames.fixed(base, frame)
-        if mount is None:
-            return
-        keys = [(scan.robot, sensor) for sensor in scan.sensors(name)]
-        if self.in_space(scan.robot):
-            self.mounts |= dict.fromkeys(keys, placed(mount))
-            return
-        R = rotations.matrix(mount[3:])
-        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
-        raw = self.offers[name].seen is beams_of
-        if raw and abs(R[2, 2]) < LEVEL:
-            tilt = math.degrees(math.acos(min(1.0, abs(R[2, 2]))))
-            self.request.skipped.append(f"{self.bag.path}: {name} is tilted by {tilt:.0f} deg in tf, taken as level")
-        self.level[name] = (np.eye(3) if raw else R, bool(raw and R[2, 2] < 0))
-        flat = {"x_m": float(mount[0]), "y_m": float(mount[1]), "theta_rad": yaw if raw else 0.0}
-        self.mounts |= dict.fromkeys(keys, flat)
 
     # -------------------------------------------------------------- messages
     def log(self) -> Log:
         """Return the log."""
-        self.look_ahead()
+        self.mounts.look_ahead()
         self.calibrate()
         for received in self.bag.messages({*self.named.values()}):
-            for name in self.entries(received):
+            for name in self.asked.entries(received):
                 self.take(received._replace(topic=name))
         self.interpolated()
-        self.averaged()
-        for (name, reason), count in sorted(self.left_out.items()):
+        self.own.averaged(self.bag.path)
+        for (name, reason), count in sorted(self.out.left_out.items()):
             self.request.leave_out(count, f"{self.bag.path}: {name}: {count} {reason}")
         for name in self.topics:
             if not self.bag.topics[self.named[name]].number:
@@ -222,11 +108,11 @@ class _Importer:
         robots = tuple(dict.fromkeys(topic.robot for topic in self.topics.values()))
         return Log(
             name=self.bag.path.name.partition(".")[0], format="bag", path=self.bag.path,
-            robots=tuple(robot for robot in robots if any(event.robot == robot for event in self.events)),
-            events=sorted(self.events, key=order), skipped=self.request.skipped,
+            robots=tuple(robot for robot in robots if any(event.robot == robot for event in self.out.events)),
+            events=sorted(self.out.events, key=order), skipped=self.request.skipped,
             truth={robot: Trajectory.of(path) for robot, path in self.paths.items()},
             gps={robot: _track(positions) for robot, positions in self.positions.items()},
-            control_columns=self.columns, sensor_columns=self.sensor_columns, describes=self.describes(),
+            control_columns=self.asked.columns, sensor_columns=self.out.sensor_columns, describes=self.describes(),
         )  # fmt: skip
 
     def describes(self) -> dict[str, Any]:
@@ -237,17 +123,17 @@ class _Importer:
                 robots.setdefault(topic.robot, {})["motion"] = {"type": type_of(topic)}
         for (robot, sensor), camera in self.cameras.items():
             robots.setdefault(robot, {}).setdefault("sensors", {})[sensor] = camera
-        for (robot, sensor), mount in self.mounts.items():
+        for (robot, sensor), mount in self.mounts.mounts.items():
             robots.setdefault(robot, {}).setdefault("sensors", {}).setdefault(sensor, {})["mount"] = mount
         return {"robots": robots} if robots else {}
 
     def take(self, received: Received) -> None:
         """Take one message; what is bad in it is refused, with its topic and time."""
-        topic, offer = self.topics[received.topic], self.offers[received.topic]
+        topic, offer = self.topics[received.topic], self.asked.offers[received.topic]
         self.received[received.topic] += 1
         t_ns = self.time(received, topic)
         if t_ns is None:
-            self.left_out[received.topic, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
+            self.out.left_out[received.topic, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
             return
         try:
             with declared():
@@ -263,9 +149,9 @@ class _Importer:
         elif isinstance(topic, Images):
             self.image(received, topic, t_ns)
         elif isinstance(topic, InertialTopic):
-            self.inertial(received, topic, offer, t_ns)
+            self.own.inertial(received, topic, offer, t_ns)
         elif isinstance(topic, Sparse):
-            self.of_robot(received, topic, offer, t_ns)
+            self.own.take(received, topic, offer, t_ns)
         elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
             self.globe(received, topic, offer.globe(received.message), t_ns)
         elif isinstance(topic, Posed):
@@ -317,18 +203,15 @@ class _Importer:
             self.fix(topic, t_ns, pose.frame[:3], None if pose.cov is None else pose.cov[:3, :3])
         elif isinstance(topic, Truths):
             own = pose.frame if self.in_space(topic.robot) else in_plane(pose.frame)
-            self.kept(self.paths, received.topic, topic.robot, t_ns, own)
+            self.kept(self.paths, received, topic.robot, t_ns, own)
         else:
             self.moved(received, topic, offer, pose, t_ns)
 
     def moved(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
         """Take a pose of odometry: the increment from the one before it."""
         before = self.last.get(received.topic)
-        if before is not None and t_ns <= before[0]:
-            if t_ns == before[0]:
-                self.left_out[received.topic, "poses at the time of the one before"] += 1
-                return
-            raise Refused(f"time after {seconds(before[0])} s, expected times that never run backwards")
+        if not self.out.is_next(received, before and before[0], t_ns, "poses"):
+            return
         self.last[received.topic] = (t_ns, pose.frame)
         if isinstance(topic, Moved) and topic.at == "scans":
             self.ways.setdefault(received.topic, {})[t_ns] = pose.frame
@@ -359,11 +242,11 @@ class _Importer:
         """
         for name, way in self.ways.items():
             topic, path = self.topics[name], Trajectory.of(way)
-            first, last, every = path.t_ns[0], path.t_ns[-1], len(self.events)
-            self.events = [e for e in self.events if e.robot != topic.robot or first <= e.t_ns <= last]
-            if len(self.events) < every:
-                self.left_out[name, "scans and fixes outside the odometry"] += every - len(self.events)
-            t_ns = sorted({event.t_ns for event in self.events if event.robot == topic.robot})
+            first, last, every = path.t_ns[0], path.t_ns[-1], len(self.out.events)
+            self.out.events = [e for e in self.out.events if e.robot != topic.robot or first <= e.t_ns <= last]
+            if len(self.out.events) < every:
+                self.out.left_out[name, "scans and fixes outside the odometry"] += every - len(self.out.events)
+            t_ns = sorted({event.t_ns for event in self.out.events if event.robot == topic.robot})
             for t, (a, b) in zip(t_ns[1:], pairwise(path.at(t_ns, max_gap_s=FOREVER_S)), strict=True):
                 self.control(topic, t, self.step(topic, a, b), None)
 
@@ -383,27 +266,12 @@ class _Importer:
                 raise Refused(f"noise {cov.tolist()}, expected finite numbers")
             if np.linalg.eigvalsh(cov)[0] < -1e-12 * np.abs(cov).max(initial=0.0):
                 raise Refused(f"noise {cov.tolist()}, expected it positive semidefinite")
-        self.events.append(Control(t_ns=t_ns, robot=topic.robot, u=u, cov=cov))
-
-    def inertial(self, received: Received, topic: InertialTopic, offer: Message, t_ns: int) -> None:
-        """Take rates and specific forces, held from now on; times must increase."""
-        w = self.measured(received, "rates", offer.rates(received.message))  # type: ignore[misc]
-        a = self.measured(received, "accelerations", offer.force(received.message))  # type: ignore[misc]
-        if w is None or a is None:
-            return
-        before = self.read_ns.get((topic.robot, ""), t_ns - 1)
-        if t_ns == before:
-            self.left_out[received.topic, "readings at the time of the one before"] += 1
-            return
-        if t_ns < before:
-            raise Refused(f"time after {seconds(before)} s, expected times that never run backwards")
-        self.read_ns[topic.robot, ""] = t_ns
-        self.control(topic, t_ns, np.concatenate([w, a]), None)
+        self.out.events.append(Control(t_ns=t_ns, robot=topic.robot, u=u, cov=cov))
 
     def globe(self, received: Received, topic: Placed, place: Place | None, t_ns: int) -> None:
         """Take a position on the globe: as a fix, or to score only."""
         if place is None:
-            self.left_out[received.topic, "messages without a fix"] += 1
+            self.out.left_out[received.topic, "messages without a fix"] += 1
             return
         if wrong := fault(place.lla):
             raise Refused(wrong)
@@ -413,7 +281,7 @@ class _Importer:
         if isinstance(topic, Fixes):
             self.fix(topic, t_ns, enu, place.cov)
         else:
-            self.kept(self.positions, received.topic, topic.robot, t_ns, enu[:2])
+            self.kept(self.positions, received, topic.robot, t_ns, enu[:2])
 
     def fix(self, topic: Fixes, t_ns: int, p: Array, cov: Array | None) -> None:
         """Take a position as a fix, with the noise of the topic or else its own."""
@@ -424,32 +292,27 @@ class _Importer:
         if N is None or not np.isfinite(N).all() or np.linalg.eigvalsh(N)[0] <= 0:
             told = "no covariance" if N is None else f"the covariance {N.tolist()}"
             raise Refused(f"the position has {told}, expected a positive definite one, or sigma_m of the topic")
-        self.events.append(Fix(t_ns=t_ns, robot=topic.robot, y=p[own], cov=N))
+        self.out.events.append(Fix(t_ns=t_ns, robot=topic.robot, y=p[own], cov=N))
 
-    def kept(self, table: dict[str, dict[int, Array]], name: str, robot: str, t_ns: int, value: Array) -> None:
+    def kept(self, table: dict[str, dict[int, Array]], received: Received, robot: str, t_ns: int, value: Array) -> None:
         """Keep a true pose or position; times must increase."""
         mine = table.setdefault(robot, {})
-        last = next(reversed(mine), None)
-        if last is not None and t_ns <= last:
-            if t_ns == last:
-                self.left_out[name, "poses at the time of the one before"] += 1
-                return
-            raise Refused(f"time after {seconds(last)} s, expected times that never run backwards")
-        mine[t_ns] = value
+        if self.out.is_next(received, next(reversed(mine), None), t_ns, "poses"):
+            mine[t_ns] = value
 
     def scan(self, received: Received, topic: Scans, offer: Message, t_ns: int) -> None:
         """Take what a sensor saw."""
         seen = offer.seen(received.message, topic)  # type: ignore[misc]
         seen = seen.without([topic.ignores(id_, t_ns) for id_ in seen.ids])
         for reason, count in seen.left_out.items():
-            self.left_out[received.topic, reason] += count
+            self.out.left_out[received.topic, reason] += count
         columns, y = self.chosen(received.topic, topic, seen)
         sensor = sensor_name(received.topic, topic)
-        known = self.sensor_columns.setdefault((topic.robot, sensor), columns)
+        known = self.out.sensor_columns.setdefault((topic.robot, sensor), columns)
         if known != columns and len(y):
             raise Refused(f"columns {', '.join(columns)}, expected {', '.join(known)} as in its first message")
         ids = seen.ids if seen.ids else None
-        self.events.append(Scan(t_ns=t_ns, robot=topic.robot, sensor=sensor, y=y, ids=ids))
+        self.out.events.append(Scan(t_ns=t_ns, robot=topic.robot, sensor=sensor, y=y, ids=ids))
 
     def image(self, received: Received, topic: Images, t_ns: int) -> None:
         """Take an image, whose pixels are read from the bag when they are needed."""
@@ -457,7 +320,7 @@ class _Importer:
         if name not in self.images:
             self.images[name] = Forward(partial(images_of, self.bag.path, self.named[name]))
         read, sensor = partial(self.images[name].at, self.received[name] - 1), sensor_name(name, topic)
-        self.events.append(Frame(t_ns=t_ns, robot=topic.robot, sensor=sensor, image=read))
+        self.out.events.append(Frame(t_ns=t_ns, robot=topic.robot, sensor=sensor, image=read))
 
     def calibrate(self) -> None:
         """Take the calibrations of the cameras whose images are taken.  Raises LogError."""
@@ -476,87 +339,10 @@ class _Importer:
                 raise LogError(f"{self.bag.path}: {info}: {refused}") from None
             self.cameras[topic.robot, sensor_name(name, topic)] = {"type": "pinhole"} | numbers
 
-    def of_robot(self, received: Received, topic: Sparse, offer: Message, t_ns: int) -> None:
-        """Take what an inertial unit or a compass measured of its robot; in the plane made level."""
-        m, R = received.message, self.level.get(received.topic, (np.eye(3), False))[0]
-        if isinstance(topic, Compass):
-            b = self.measured(received, "field", offer.field(m))  # type: ignore[misc]
-            heading = None if b is None else heading_of_field(R @ b)
-            if heading is not None:
-                self.now_and_then(received, topic, topic.sensors(received.topic)[0], t_ns, HEADING, [heading])
-            elif b is not None:
-                self.left_out[received.topic, "fields that are steep"] += 1
-        elif isinstance(topic, Imu):
-            if topic.gyro:
-                self.turned(received, topic, topic.gyro, t_ns, self.measured(received, "rates", offer.rates(m)), R)  # type: ignore[misc]
-            if topic.heading or topic.inclination:
-                q = self.measured(received, "an orientation", offer.attitude(m))  # type: ignore[misc]
-                self.oriented(received, topic, t_ns, q, R)
-            a = self.measured(received, "accelerations", offer.force(m)) if topic.gravity else None  # type: ignore[misc]
-            if topic.gravity and a is not None:
-                self.now_and_then(received, topic, topic.gravity, t_ns, GRAVITY, a)
-
-    def turned(self, received: Received, topic: Imu, sensor: str, t_ns: int, w: Array | None, R: Array) -> None:
-        """Take rates (3,) about the axes of an inertial unit, or keep them for their means."""
-        if w is None:
-            return
-        space = self.in_space(topic.robot)
-        w = w if space else (R @ w)[2:]
-        if topic.at == "controls":
-            self.rates.setdefault((topic.robot, sensor), {})[t_ns] = w
-        else:
-            self.reading(received, topic.robot, sensor, t_ns, GYRO[space], w)
-
-    def oriented(self, received: Received, topic: Imu, t_ns: int, q: Array | None, R: Array) -> None:
-        """Take heading and inclination of an orientation (4,)."""
-        if q is not None and topic.heading:
-            self.now_and_then(received, topic, topic.heading, t_ns, HEADING, [heading_of(q, R)])
-        if q is not None and topic.inclination:
-            level = rotations.to_euler(np.ascontiguousarray(q))[0][:2]
-            self.now_and_then(received, topic, topic.inclination, t_ns, INCLINATION, level)
-
-    def measured(self, received: Received, what: str, told: Measured | None) -> Array | None:
-        """Return what a message measured; None, and counted, if it did not."""
-        if told is None:
-            self.left_out[received.topic, f"messages without {what}"] += 1
-            return None
-        if not np.isfinite(told.v).all():
-            raise Refused(f"{what} {told.v.tolist()}, expected finite numbers")
-        return told.v
-
-    def now_and_then(
-        self, received: Received, topic: Sparse, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any
-    ) -> None:
-        """Take a reading if the last one of its sensor was long enough before."""
-        last = self.read_ns.get((topic.robot, sensor))
-        if last is None or t_ns - last >= topic.every_s * 1e9:
-            self.reading(received, topic.robot, sensor, t_ns, columns, y)
-
-    def reading(self, received: Received, robot: str, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any) -> None:
-        """Take a reading of a sensor of the robot itself: one at a time."""
-        if self.read_ns.get((robot, sensor)) == t_ns:
-            self.left_out[received.topic, f"readings of {sensor} at the time of the one before"] += 1
-            return
-        self.read_ns[robot, sensor] = t_ns
-        self.sensor_columns.setdefault((robot, sensor), columns)
-        self.events.append(Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=[[*map(float, y)]]))
-
-    def averaged(self) -> None:
-        """Add the means of rates from one control of the robot to the next.  Raises LogError if it has none."""
-        for (robot, sensor), rates in self.rates.items():
-            ends = sorted({event.t_ns for event in self.events if isinstance(event, Control) and event.robot == robot})
-            if not ends:
-                wanted = "controls of this robot, or `at: messages`"
-                raise LogError(f"{self.bag.path}: {sensor} of {robot!r} has `at: controls`, expected {wanted}")
-            t_ns = np.array(sorted(rates))
-            found = means(t_ns, np.array([rates[t] for t in t_ns.tolist()]), ends)
-            self.sensor_columns[robot, sensor] = GYRO[self.in_space(robot)]
-            self.events += [Scan(t_ns=t, robot=robot, sensor=sensor, y=w[None]) for t, w in found]
-
     def chosen(self, name: str, topic: Scans, seen: Seen) -> tuple[tuple[str, ...], Any]:
         """Return the columns to take, and the observations (K, m), for a robot of the plane made level."""
         y = np.asarray(seen.y, dtype=np.float64).reshape(-1, len(seen.columns))
-        R, turned = self.level.get(name, (np.eye(3), False))
+        R, turned = self.mounts.level.get(name, (np.eye(3), False))
         space, points = self.in_space(topic.robot), seen.columns[:3] == POSITION
         if points and not space:
             y = np.column_stack([y[:, :3] @ R.T, y[:, 3:]])
@@ -573,9 +359,6 @@ class _Importer:
             if column not in given or (column in POSE3[3:] and not space):
                 raise Refused(f"take has {column}, expected some of {', '.join(given)}")
         return wanted, turned_at_all(wanted, np.column_stack([given[column] for column in wanted]))
-
-
-beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].seen
 
 
 def turned_at_all(columns: tuple[str, ...], y: Array) -> Array:
@@ -601,11 +384,6 @@ def type_of(topic: Topic) -> str:
     return registered_name(type(topic)) or type(topic).__name__
 
 
-def sensor_name(name: str, scan: Carried) -> str:
-    """Return the name of a topic's sensor."""
-    return scan.sensors(name)[0]
-
-
 def images_of(path: Path, name: str) -> Iterator[Any]:
     """Yield the images of a topic in grey values (H, W); an OSError instead of one that cannot be decoded."""
     with Bag(path) as bag:
@@ -616,14 +394,6 @@ def images_of(path: Path, name: str) -> Iterator[Any]:
                 yield decode(received.message)
             except OSError as error:
                 yield error
-
-
-def frame_id(message: Any) -> str:
-    """Return the frame of a message; of markers that of the first."""
-    if has_header(message):
-        return str(getattr(message.header, "frame_id", ""))
-    markers = getattr(message, "markers", ())
-    return str(markers[0].header.frame_id) if markers else ""
 
 
 def in_plane(frame: Array) -> Array:

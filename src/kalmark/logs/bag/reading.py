@@ -152,6 +152,14 @@ def has_header(message: Any) -> bool:
     return hasattr(getattr(getattr(message, "header", None), "stamp", None), "nanosec")
 
 
+def frame_id(message: Any) -> str:
+    """Return the frame of a message; of markers that of the first."""
+    if has_header(message):
+        return str(getattr(message.header, "frame_id", ""))
+    markers = getattr(message, "markers", ())
+    return str(markers[0].header.frame_id) if markers else ""
+
+
 @contextmanager
 def declared() -> Iterator[None]:
     """Raise Refused where a field is read that the bag's definition of a message does not have."""

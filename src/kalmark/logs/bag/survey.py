@@ -11,9 +11,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.geometry import rotations
 from kalmark.logs.bag.frames import Frames
-from kalmark.logs.bag.importer import frame_id
 from kalmark.logs.bag.messages import MESSAGES, Measured, Message, Pose
-from kalmark.logs.bag.reading import Bag, declared, has_header, stamp
+from kalmark.logs.bag.reading import Bag, declared, frame_id, has_header, stamp
 from kalmark.logs.bag.tables import holds_log
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.table import Refused
