@@ -7,6 +7,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+from kalmark.config.images import complete, with_images
 from kalmark.config.reading import ENDINGS, config_of, did_you_mean, resolve_config, shipped_configs
 from kalmark.config.schema import COMMON, TRUTH, Config
 from kalmark.config.tree import OVERRIDE, Tree, read_tree, tree_of
@@ -37,8 +38,11 @@ def open_run(
     log = open_config_log(alone, progress=progress)
     refuse_idle(tree, log)
     for_each(tree, log)
-    config = config_of(laid_over(tree, log), path)
+    whole = laid_over(tree, log)
+    complete(whole)
+    config = config_of(whole, path)
     found = {"known": str(known_path(config))} if config.map.known not in (None, TRUTH) else {}
+    log = with_images(config, log)
     return config.model_copy(update={"log": alone.log, "map": config.map.model_copy(update=found)}), log
 
 

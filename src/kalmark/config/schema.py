@@ -235,6 +235,8 @@ class PlaneMounted(Mounted):
 class SpaceMounted(Mounted):
     """What every sensor of space has."""
 
+    images: str | None = None
+    """Take the images of this camera of the robot, straightened; intrinsics and mount are that camera's if absent."""
     mount: SpaceMountConfig = SpaceMountConfig()
     """Where the sensor sits on the robot."""
 

@@ -260,6 +260,10 @@ class Segments(_PinHole):
         both[:, :3, :2], both[:, 3:, 2:] = A_y, B_y
         return np.column_stack([a, b]), both
 
+    def rays(self, y: Array) -> Array:
+        """Return the viewing rays (K, 3), unit vectors, of pixels y (K, 2)."""
+        return cameras.back_project_pinhole(np.ascontiguousarray(y), self.intrinsics, np.zeros(0))[0]
+
     def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
         """Return which segments from p1 to p2 (K, 3) of the world are seen from T, and their pixels in the image."""
         size = np.array(self.image, dtype=np.float64)

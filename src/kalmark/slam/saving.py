@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -531,6 +532,9 @@ def restored(kind: str, description: Description, what: str, argument: str) -> A
     if "python" in description:
         raise MapError(f"{what} is {_name(description)}, a model of your own: give the {argument} to load() again")
     model = by_class_name(kind, description["type"])
+    if model is None and kind == "detector":
+        import_module("kalmark.vision")  # by name: it stands above
+        model = by_class_name(kind, description["type"])
     if model is None:
         raise MapError(f"{what} is {description['type']!r}, expected one of kalmark's, or of a plugin that is loaded")
     parameters = {k: v for k, v in description.items() if k != "type"}

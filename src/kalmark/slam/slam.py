@@ -48,7 +48,6 @@ from kalmark.slam.robot import Robot, robots_given
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import CURE, Settings, State
 from kalmark.tracks.front_ends import FrameDetector, FrontEnd, SearchingDetector
-from kalmark.tracks.prospect import Prospect
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track
 
@@ -163,6 +162,8 @@ class Slam(Estimate):
 
     def _searched(self, event: Frame, front_end: FrontEnd) -> Report:
         """Search a frame for the landmarks that are expected in it.  [S] 2.4."""
+        if front_end.waits and self.state.begins:
+            return self._found(Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor))
         state, channel, image = self.state, self.state.channels[event.robot, event.sensor], event.grey()
         pair = channel.of_pair
         beside = event.right_grey() if pair else event.depths() if channel.finds_depth else None
@@ -171,7 +172,8 @@ class Slam(Estimate):
             raise EventError(f"{when(event)}: the {what} {beside.shape}, expected {image.shape} as the image")
         state.t_ns = event.t_ns
         gaps = moves.advance(state, event.robot)
-        scan, removed = front_end.search(event, image, Prospect(state.map, state.tracks, channel, event.robot), beside)
+        prospect = front_end.prospect_of(state.map, state.tracks, channel, event.robot)
+        scan, removed = front_end.search(event, image, prospect, beside)
         for name, _ in removed:
             state.remove(name)
         report = self._found(scan)

@@ -70,10 +70,15 @@ class State:
         self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}
         for robot in robots.values():
             self._place(robot)
-        if len(robots) == 1 and all(len(robot.sensors) == 1 for robot in robots.values()):
-            for front_end in self.front_ends.values():
-                front_end.watch_beginning()
+        alone = [front_end for front_end in self.front_ends.values() if not front_end.waits]
+        if len(robots) == 1 and len(alone) == 1 and len(self.front_ends) == len(next(iter(robots.values())).sensors):
+            alone[0].watch_beginning()
         self.may_grow = settings.map == "auto" and not any(policy.averages for policy in self.policies.values())
+
+    @property
+    def begins(self) -> bool:
+        """Whether a front end still keeps the first frames, which alone are to move the map."""
+        return any(front_end.beginning is not None for front_end in self.front_ends.values())
 
     @property
     def estimator(self) -> Estimator:

@@ -7,8 +7,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from kalmark.arrays import Array
 from kalmark.events import Frame, Id, Scan
+from kalmark.filter.map import Map
 from kalmark.report import Report
-from kalmark.tracks.prospect import Prospect
+from kalmark.tracks.channel import Channel
+from kalmark.tracks.track import Tracks
 
 
 @runtime_checkable
@@ -21,9 +23,19 @@ class FrameDetector(Protocol):
 
 
 class FrontEnd(Protocol):
-    """Searches the frames of one sensor for the landmarks that it should see."""
+    """Searches the frames of one sensor for the landmarks that it should see.
 
-    def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any) -> tuple[Scan, list[tuple[Id, str]]]:
+    One that `waits` begins when no other keeps first frames any more, as `beginning` of that has it; None: none kept.
+    """
+
+    waits: bool
+    beginning: Any
+
+    def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Any:
+        """Return what it wants to know before it searches: what the sensor should measure of the landmarks in view."""
+        ...
+
+    def search(self, frame: Frame, image: Any, prospect: Any, beside: Any) -> tuple[Scan, list[tuple[Id, str]]]:
         """Return what was found in an image (H, W), and the landmarks that are given up, each with the reason.
 
         `beside` (H, W) is the depth of its pixels in m, 0 where there is none, or the right image of a pair, as the

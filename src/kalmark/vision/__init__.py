@@ -2,5 +2,6 @@
 
 from kalmark.vision.front_end import ActiveSearch
 from kalmark.vision.overlay import overlay
+from kalmark.vision.segments import LineSearch
 
-__all__ = ["ActiveSearch", "overlay"]
+__all__ = ["ActiveSearch", "LineSearch", "overlay"]

@@ -17,35 +17,27 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import Count, Positive, Within, register
-from kalmark.errors import ModelError
 from kalmark.events import Frame, Id, Scan
+from kalmark.filter.map import Map
 from kalmark.geometry.rotations import matrix
 from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
+from kalmark.tracks.channel import Channel
 from kalmark.tracks.prospect import PIXEL, Prospect
+from kalmark.tracks.track import Tracks
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
 from kalmark.vision.beginning import Beginning, Begun
 from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
 from kalmark.vision.matching import Searcher
+from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import NUMBERS, Plane, measured, shown
+from kalmark.vision.searches import Searches
 from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed import FirstLook
 
 PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
-TRIAL = 10  # searches after which a landmark may be given up
-LEAST_SHARE = 0.5  # of its searches in which one is found and fits; fewer: it is given up
-
-
-def opencv() -> Any:
-    """Return OpenCV, on one thread.  Raises ModelError."""
-    try:
-        import cv2
-    except ImportError:
-        raise ModelError("ActiveSearch: OpenCV is not installed, expected it: pip install 'kalmark[opencv]'") from None
-    cv2.setNumThreads(1)
-    return cv2
 
 
 @register("detector", "active_search")
@@ -77,15 +69,10 @@ class ActiveSearch:
 
 
 @dataclass
-class Look:
+class Look(Searches):
     """How a landmark looked, and how often it was searched, found, and fitted."""
 
     views: list[View] = field(default_factory=list)
-    searched: int = 0
-    found: int = 0
-    fitted: int = 0
-    missed: int = 0  # searches since it last fitted
-    seen: int = -1  # frame of the last
     plane: Plane | None = None  # about it; none as long as it has no view
     surveyed: bool = False  # known beforehand: it has no view until it is first seen, and is not given up
 
@@ -99,6 +86,8 @@ class Sighting(NamedTuple):
 
 class FrontEnd:
     """Searches the frames of one sensor; `looks` has how each landmark looked, `times` what the parts took, s."""
+
+    waits: ClassVar[bool] = False
 
     def __init__(self, settings: ActiveSearch, sensor: Any) -> None:
         self.settings, self.sensor, self.cv2 = settings, sensor, opencv()
@@ -114,6 +103,10 @@ class FrontEnd:
         self.beginning: Beginning | None = None
         self.sighting: Sighting | None = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
+
+    def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Prospect:
+        """Return what the sensor should measure of the landmarks in view, jointly."""
+        return Prospect(map_, tracks, channel, robot)
 
     def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any = None) -> Sighting:
         """Search an image (H, W) for the landmarks of a prospect, and for new ones.
@@ -166,7 +159,7 @@ class FrontEnd:
             if o.outcome == "new":
                 view = self._taken(y, T)
                 if view is not None:
-                    look = self.looks[name] = Look([view], seen=self.frame)
+                    look = self.looks[name] = Look(views=[view], seen=self.frame)
                     look.plane = self._plane(y, view)
                 continue
             look, k = self.looks[name], at[name]
@@ -258,7 +251,7 @@ class FrontEnd:
         for name, own, *counts, surveyed in state["looks"]:
             searched, found, fitted, missed, seen = map(int, counts)
             plane = Plane.of(next(planes)) if own else None
-            self.looks[name] = Look(views[at : at + own], searched, found, fitted, missed, seen, plane, bool(surveyed))
+            self.looks[name] = Look(searched, found, fitted, missed, seen, views[at : at + own], plane, bool(surveyed))
             at += own
         self.frame, self.named = int(state["frame"]), int(state["named"])
         self.random.bit_generator.state = state["random"]
@@ -321,18 +314,10 @@ class FrontEnd:
         """Count searches; return the landmarks that are given up, each with the reason."""
         removed: list[tuple[Id, str]] = []
         for k in np.flatnonzero(found.searched).tolist():
-            name = prospect.names[k]
-            look = self.looks[name]
-            look.searched, look.missed = look.searched + 1, look.missed + 1
-            if found.matched[k]:
-                look.found += 1
-                continue
-            if look.surveyed:
-                continue
-            if look.searched >= TRIAL and look.fitted < LEAST_SHARE * look.searched:
-                removed.append((name, f"fitted in {look.fitted} of {look.searched} searches"))
-            elif look.searched < TRIAL and look.missed >= 3:
-                removed.append((name, f"not found in {look.missed} searches, {look.fitted} before"))
+            look = self.looks[prospect.names[k]]
+            reason = look.searched_for(bool(found.matched[k]))
+            if reason and not look.surveyed:
+                removed.append((prospect.names[k], reason))
         if self.settings.keep == "odometry":
             gone = {name for name, _ in removed}
             view = set(prospect.names)

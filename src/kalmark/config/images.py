@@ -1,0 +1,68 @@
+"""Sensors that look at the images of another camera of their robot, straightened: lines beside points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from kalmark.config.reading import did_you_mean
+from kalmark.config.schema import Config
+from kalmark.config.sections import model_of
+from kalmark.config.tree import Tree
+from kalmark.events import Event, Frame
+from kalmark.logs.log import Log
+from kalmark.vision.straight import Straightened
+
+TAKEN = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px", "mount")
+
+
+def complete(tree: Tree) -> None:
+    """Give sensors that take the images of a camera what they do not say: its intrinsics and its mount, in place."""
+    robots: Any = tree.values.get("robots")
+    for robot in robots.values() if isinstance(robots, dict) else ():
+        sensors: Any = robot.get("sensors") if isinstance(robot, dict) else None
+        for name, sensor in sensors.items() if isinstance(sensors, dict) else ():
+            camera = sensors.get(sensor.get("images")) if isinstance(sensor, dict) else None
+            if isinstance(camera, dict):
+                sensors[name] = {key: camera[key] for key in TAKEN if key in camera} | sensor
+
+
+def with_images(config: Config, log: Log) -> Log:
+    """Return a log in which each frame of a camera is one of the sensors, too, that take its images.
+
+    Raises ConfigError.
+    """
+    taken = {name: _cameras(config, name if name in config.robots else "each") for name in log.robots}
+    if not any(taken.values()):
+        return log
+    events = list[Event]()
+    for event in log.events:
+        events.append(event)
+        if not isinstance(event, Frame):
+            continue
+        for name, straight in taken[event.robot].get(event.sensor, ()):
+            image = event.image if straight is None else partial(straight.of, event)
+            events.append(Frame(t_ns=event.t_ns, robot=event.robot, sensor=name, image=image))
+    return replace(log, events=events)
+
+
+def _cameras(config: Config, robot: str) -> dict[str, list[tuple[str, Straightened | None]]]:
+    """Return by camera the sensors that take its images, and how these are straightened, None if they are straight."""
+    found: dict[str, list[tuple[str, Straightened | None]]] = {}
+    sensors: Mapping[str, Any] = config.robots[robot].sensors if robot in config.robots else {}
+    for name, sensor in sensors.items():
+        camera = getattr(sensor, "images", None)
+        if camera is None:
+            continue
+        others = [other for other in sensors if other != name]
+        if camera not in others:
+            what = f"got {camera!r}, expected another sensor of the robot: one of {', '.join(others)}"
+            raise config.error(("robots", robot, "sensors", name, "images"), what + did_you_mean(camera, others))
+        source, model = (model_of(sensors[of], "space") for of in (camera, name))
+        numbers = [[getattr(of, key, None) for key in TAKEN[:-1]] for of in (source, model)]
+        bent = numbers[0] != numbers[1] or bool(getattr(source, "distortion", None))
+        straight = Straightened(source, model.intrinsics, model.image) if bent else None
+        found.setdefault(camera, []).append((name, straight))
+    return found

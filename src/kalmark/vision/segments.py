@@ -1,0 +1,280 @@
+"""Line segments of an image, matched to the lines that the filter expects in it.  [S] 2.4, [TB] 4.3 and Fig. 9.
+
+Segments are detected in the whole image (LSD, Grompone von Gioi and others 2010), each with the dark side on its left.
+One can be of a line if it lies along the expected segment within the uncertainty of that, the same way round; of those
+the one whose profile of grey values across is alike counts.  The ends of a segment say nothing: an edge may be hidden,
+or break, anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from dataclasses import astuple, dataclass
+from time import perf_counter
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags, Index
+from kalmark.declare import Count, Positive, Within, register
+from kalmark.events import Frame, Id, Scan
+from kalmark.filter.map import Map
+from kalmark.geometry.gaussian import gate
+from kalmark.models.sensors import Segments
+from kalmark.report import Expectations, Report
+from kalmark.tracks.channel import Channel
+from kalmark.tracks.expecting import expectations
+from kalmark.tracks.track import Tracks
+from kalmark.vision.opencv import opencv
+from kalmark.vision.searches import TRIAL, Searches
+
+GATE = gate(0.99, 2)
+TURNED = np.sin(np.radians(20.0))  # a segment may be turned against what is expected, at most
+OVERLAP = 0.3  # of the shorter one of the two
+REACH_PX, ALONG = 6, 16  # of a profile to either side, and places along the segment of which it is the mean
+APART_PX = 8.0  # a new line from those expected
+WIDE_PX, HALVED, FULL = 600, 0.5, 0.8  # from this width on, segments are detected at half the resolution
+
+
+@register("detector", "line_search")
+class LineSearch:
+    """Lines of an image without distortion: segments are detected and matched to the lines that are expected.
+
+    Each frame, `in_view` lines are kept in view, at most `starts` new ones, the longest first, of at least
+    `min_length_px`.  A match has a profile of grey values across that correlates by `accept` with that of the line.  A
+    line that leaves the view before it has fitted often is given up: little is known of it, perhaps not the side of the
+    camera it is on.  Of more than `most` lines those out of view that fitted least make room.
+    """
+
+    columns: ClassVar[tuple[str, ...]] = Segments.columns
+
+    in_view: Annotated[Count, "So many lines are wanted in view."] = 20
+    starts: Annotated[int, Within(ge=0), "At most so many new ones in a frame."] = 5
+    min_length_px: Annotated[Positive, "Shortest segment that begins a line."] = 40.0
+    most: Annotated[Count, "At most so many lines in the map: the least useful out of view make room."] = 100
+    accept: Annotated[float, Within(gt=0, lt=1), "Correlation of the profiles of a match, at least."] = 0.8
+
+    def front_end(self, sensor: Any) -> LineFrontEnd:
+        """Return what searches the frames of one sensor."""
+        return LineFrontEnd(self, sensor)
+
+
+@dataclass
+class LineLook(Searches):
+    """How often a line was searched, found and fitted, and its `profile` (2 REACH_PX + 1,) when it last fitted."""
+
+    profile: Array | None = None
+
+
+class Matches(NamedTuple):
+    """The segments (M, 4) of an image with their profiles (M, .), and of each line expected the segment's number.
+
+    -1 where it was not found.
+    """
+
+    segments: Array
+    profiles: Array
+    of: Index
+
+
+class LineFrontEnd:
+    """Searches the frames of one sensor for lines; `looks` has how each looked, `times` what the parts took, s."""
+
+    waits: ClassVar[bool] = True
+
+    def __init__(self, settings: LineSearch, sensor: Any) -> None:
+        self.settings, self.sensor, self.cv2 = settings, sensor, opencv()
+        width = sensor.image[0]
+        self.detector = self.cv2.createLineSegmentDetector(
+            self.cv2.LSD_REFINE_STD, HALVED if width >= WIDE_PX else FULL
+        )
+        self.beginning: None = None
+        self.looks: dict[Id, LineLook] = {}
+        self.frame = self.named = 0
+        self.expected: Expectations | None = None
+        self.found: Matches | None = None
+        self.image: Any = None
+        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
+
+    def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Expectations:
+        """Return what the sensor should measure of the lines in view."""
+        return expectations(map_, tracks, channel, robot, "", only_in_view=True)
+
+    def search(self, frame: Frame, image: Any, expected: Expectations, beside: Any = None
+    ) -> tuple[Scan, list[tuple[Id, str]]]:  # fmt: skip
+        """Search an image (H, W) for the lines expected, and for new ones."""
+        t0 = perf_counter()
+        self.frame, self.image, self.expected = self.frame + 1, image, expected
+        segments = self._detected(image)
+        across = profiles(self.cv2, image, segments)
+        t1 = perf_counter()
+        known = [self.looks.get(name) for name in expected.names]
+        mine = np.array([np.zeros(across.shape[1]) if look is None or look.profile is None else look.profile
+                         for look in known]).reshape(len(known), across.shape[1])  # fmt: skip
+        may, length = compatible(expected.e, expected.Z, segments, self.sensor.sigma_px)
+        alike = mine @ across.T
+        of = paired(np.where(may & (alike >= self.settings.accept), alike * length, 0.0))
+        self.found = Matches(segments, across, of)
+        removed = []
+        for name, look, number in zip(expected.names, known, of.tolist(), strict=True):
+            if look is not None and (reason := look.searched_for(number >= 0)):
+                removed.append((name, reason))
+        removed += [(name, f"out of view, {look.fitted} fits before") for name, look in self.looks.items()
+                    if look.fitted < TRIAL and name not in expected.names]  # fmt: skip
+        t2 = perf_counter()
+        rows = np.flatnonzero(of >= 0)
+        new = self._new(expected, len(rows))
+        removed += self._room(len(new), {name for name, _ in removed})
+        ids: list[Id] = [expected.names[k] for k in rows.tolist()]
+        for _ in new:
+            self.named += 1
+            ids.append(f"{frame.robot}.{frame.sensor} {self.named}")
+        y = segments[np.concatenate([of[rows], new]).astype(np.int64)]
+        for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", perf_counter() - t2)):
+            self.times[part] += spent
+        scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None)
+        self._numbers = [*of[rows].tolist(), *new]
+        return scan, removed
+
+    def learn(self, report: Report, T: Array) -> None:
+        """Learn from what became of a frame: profiles of new lines, and which lines fitted."""
+        t0 = perf_counter()
+        assert self.found is not None
+        for o in report.observations:
+            if o.landmark is None or o.outcome not in ("new", "associated"):
+                continue
+            look = self.looks.setdefault(o.landmark, LineLook())
+            look.profile = self.found.profiles[self._numbers[o.index]]
+            if o.outcome == "associated":
+                look.fitted, look.missed = look.fitted + 1, 0
+            look.seen = self.frame
+        for name, _ in report.removed:
+            self.looks.pop(name, None)
+        self.times["learn"] += perf_counter() - t0
+
+    def _detected(self, image: Any) -> Array:
+        """Return the segments (M, 4) of an image."""
+        found = self.detector.detect(np.ascontiguousarray(image))[0]
+        segments = np.asarray([] if found is None else found, dtype=np.float64).reshape(-1, 4)
+        high = np.array([image.shape[1], image.shape[0]] * 2) - 1.0
+        inside = np.clip(segments, 0.0, high)
+        length = np.hypot(inside[:, 2] - inside[:, 0], inside[:, 3] - inside[:, 1])
+        return inside[length >= self.sensor.min_length_px]
+
+    def _new(self, expected: Expectations, count: int) -> list[int]:
+        """Return the numbers of the segments that begin lines: long ones where none is expected."""
+        assert self.found is not None
+        segments, of = self.found.segments, self.found.of
+        wanted = min(self.settings.in_view - count, self.settings.starts)
+        length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
+        taken, new = np.concatenate([expected.e, segments[of[of >= 0]]]), list[int]()
+        for k in np.argsort(-length, kind="stable").tolist() if wanted > 0 else ():
+            if length[k] < self.settings.min_length_px or len(new) == wanted:
+                break
+            if not beside(segments[k], taken).any():
+                new.append(k)
+                taken = np.concatenate([taken, segments[k : k + 1]])
+        return new
+
+    def _room(self, new: int, gone: set[Id]) -> list[tuple[Id, str]]:
+        """Return the lines that make room for new ones: out of view, least fitted first."""
+        assert self.expected is not None
+        over, view = len(self.looks) - len(gone) + new - self.settings.most, {*self.expected.names, *gone}
+        out = sorted(
+            (of.fitted, of.seen, k, name) for k, (name, of) in enumerate(self.looks.items()) if name not in view
+        )
+        return [(name, "made room") for *_, name in out[: max(over, 0)]]
+
+    # ------------------------------------------------------------------ what a front end is asked besides
+    def watch_beginning(self) -> None:
+        """Lines begin when the map has begun: nothing is kept."""
+
+    def settle(self) -> None:
+        """Nothing is kept of the first frames."""
+
+    def survey(self, name: Id) -> None:
+        """Search for a line known beforehand: its profile is not known, so that it is not found."""
+
+    def begun(self, prior: float) -> None:
+        """Return that no frame is to be filtered again."""
+
+    def moved(self, poses: list[Array], names: Set[Id]) -> None:
+        """Take over that only `names` are left."""
+        self.looks = {name: look for name, look in self.looks.items() if name in names}
+
+    def state(self) -> dict[str, Any]:
+        """Return what is to be saved with the map, but for `arrays`."""
+        looks = [[name, *astuple(look)[:-1]] for name, look in self.looks.items()]
+        return {"frame": self.frame, "named": self.named, "looks": looks}
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the profiles of all lines."""
+        return {"profiles": np.array([look.profile for look in self.looks.values()]).reshape(-1, 2 * REACH_PX + 1)}
+
+    def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
+        """Take over what was saved; `read` gives an array by its name and shape."""
+        across = read("profiles", (len(state["looks"]), 2 * REACH_PX + 1))
+        for (name, *counts), profile in zip(state["looks"], across, strict=True):
+            searched, found, fitted, missed, seen = map(int, counts)
+            self.looks[name] = LineLook(searched, found, fitted, missed, seen, profile)
+        self.frame, self.named = int(state["frame"]), int(state["named"])
+
+
+def profiles(cv2: Any, image: Any, segments: Array) -> Array:
+    """Return the grey values across segments (M, 4), means along them, of mean 0 and length 1: (M, 2 REACH_PX + 1)."""
+    a, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
+    normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    s, offset = np.linspace(0.0, 1.0, ALONG + 2)[1:-1], np.arange(-REACH_PX, REACH_PX + 1)
+    at = a[:, None, None] + s[:, None, None] * along[:, None, None] + offset[:, None] * normal[:, None, None]
+    u, v = np.ascontiguousarray(at.reshape(-1, len(offset), 2).transpose(2, 0, 1), dtype=np.float32)
+    grey = np.zeros((0, len(offset)))
+    if len(segments):
+        grey = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    mean = grey.reshape(-1, ALONG, len(offset)).mean(axis=1)
+    mean -= mean.mean(axis=1, keepdims=True)
+    return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+
+
+def compatible(e: Array, Z: Array, segments: Array, sigma_px: float) -> tuple[Flags, Array]:
+    """Return which segments (M, 4) can be of lines expected at e (K, 4), and the length along these, px: (K, M) both.
+
+    Z (K, 2, 2) is the covariance of the distances of the expected ends from the line that is measured, with the noise
+    of a pixel in it.  The distances of other places are between these: d(s) = (1 - s) d_1 + s d_2, s along e.
+    """
+    a, along = e[:, None, None, :2], e[:, 2:] - e[:, :2]
+    length = np.maximum(np.hypot(*along.T), 1e-9)
+    t = (along / length[:, None])[:, None, None]
+    p = segments.reshape(1, -1, 2, 2) - a  # (K, M, 2, 2) from the first end
+    s, d = (p * t).sum(axis=3) / length[:, None, None], t[..., 0] * p[..., 1] - t[..., 1] * p[..., 0]
+    A = np.stack([1.0 - s, s], axis=3)
+    noise = sigma_px**2 * np.eye(2)
+    Z_s = A @ (Z - noise)[:, None] @ A.swapaxes(2, 3) + noise
+    det = Z_s[..., 0, 0] * Z_s[..., 1, 1] - Z_s[..., 0, 1] ** 2
+    squares = Z_s[..., 1, 1] * d[..., 0] ** 2 - 2.0 * Z_s[..., 0, 1] * d[..., 0] * d[..., 1]
+    squares += Z_s[..., 0, 0] * d[..., 1] ** 2
+    long = s[..., 1] - s[..., 0]  # the same way round: positive
+    turned = np.abs(d[..., 1] - d[..., 0]) <= TURNED * np.hypot(d[..., 1] - d[..., 0], long * length[:, None])
+    common = np.minimum(s[..., 1], 1.0) - np.maximum(s[..., 0], 0.0)
+    may = (long > 0) & turned & (common >= OVERLAP * np.minimum(long, 1.0)) & (squares <= GATE * det)
+    return may, np.maximum(common, 0.0) * length[:, None]
+
+
+def beside(segment: Array, others: Array) -> Flags:
+    """Return which of other segments (K, 4) a segment (4,) lies near: within APART_PX of their lines, along them."""
+    along = others[:, 2:] - others[:, :2]
+    length = np.maximum(np.hypot(*along.T), 1e-9)
+    p = segment.reshape(2, 2)[None] - others[:, None, :2]
+    s = (p * along[:, None]).sum(axis=2) / length[:, None] ** 2
+    d = np.abs(along[:, None, 0] * p[..., 1] - along[:, None, 1] * p[..., 0]) / length[:, None]
+    near: Flags = (d.max(axis=1) < APART_PX) & (s.max(axis=1) > 0.0) & (s.min(axis=1) < 1.0)
+    return near
+
+
+def paired(worth: Array) -> Index:
+    """Return of each row of what pairs are worth (K, M) its column, -1: none; the best first, each once, above 0."""
+    of, worth = np.full(len(worth), -1), worth.copy()
+    while worth.size and worth.max() > 0.0:
+        k, m = divmod(int(worth.argmax()), worth.shape[1])
+        of[k] = m
+        worth[k], worth[:, m] = 0.0, 0.0
+    return of
