@@ -468,6 +468,8 @@ def images() -> Iterator[Figure]:
     for name, label, wanted in sequences:
         yield Figure("Images", f"one camera, {label}: ATE of five seeds, aligned by similarity / scale drift / matched a frame / a frame",
                      wanted, f"python benchmarks/vision.py {name}", row(name, shown))  # fmt: skip
+        yield Figure("Images", f"the same with lines, {name}: ATE of five seeds / scale drift / points, lines matched a frame / a frame",
+                     wanted, f"python benchmarks/vision.py {name}+lines", row(f"{name}+lines", "{0} {1} {2} {3} {4} m / {6} % / {10}, {12} / {11} ms"))  # fmt: skip
     yield Figure("Images", "a camera with an inertial unit, EuRoC V1_01, 90 frames, largest of five seeds: position / attitude / velocity / scale / NEES of the pose, a dof",
                  "0.02 m / 0.5 deg / 0.05 m/s / 1 % / 1", "python benchmarks/vision.py euroc",
                  row("euroc", "{0} m / {1} deg / {2} m/s / {3} % / {4}"))  # fmt: skip

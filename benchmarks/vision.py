@@ -1,6 +1,7 @@
 """Cameras on recorded and rendered images: errors of their paths, NEES, matches and time a frame.
 
 python benchmarks/vision.py SEQUENCE [SEEDS]     of `SEQUENCES`; a row a seed, then the worst of them
+python benchmarks/vision.py SEQUENCE+lines       with the lines of the images in the map, too
 python benchmarks/vision.py euroc [SEEDS]        90 images of V1_01 with the inertial unit: errors against the truth
 python benchmarks/vision.py WORLD [SEEDS]        of `WORLDS`, rendered: errors against the truth, ANEES of the pose
 One camera on recorded images is aligned by similarity; what knows its scale and its start is not aligned at all.
@@ -38,6 +39,10 @@ SEQUENCES: dict[str, list[str]] = {
 }
 
 
+LINES = (
+    "robots.each.sensors.lines={type: segments, images: camera, detector: {type: line_search},"
+    " landmark: {type: anchored_homogeneous_line, prior_rho_per_m: 0.5, sigma_rho_per_m: 0.5}}"
+)
 SINGULAR = 1e12  # condition of a covariance, so much or more: no NEES
 WORLDS = ("textured_room", "textured_room_depth", "textured_room_stereo")
 
@@ -54,19 +59,26 @@ def similarity(p: Array, q: Array) -> tuple[float, float]:
 
 def run(name: str, seed: int) -> dict[str, float]:
     """Return the figures of one run."""
-    options = [*SEQUENCES[name], f"robots.each.sensors.camera.detector.seed={seed}"]
+    name, _, lines = name.partition("+")
+    options = [*SEQUENCES[name], f"robots.each.sensors.camera.detector.seed={seed}", *([LINES] if lines else [])]
     config, log = open_run("visual", None, options)
     slam = build_slam(config, log)
-    (front_end,) = slam.state.front_ends.values()
+    front_end = slam.state.front_ends[log.robots[0], "camera"]
     assert isinstance(front_end, FrontEnd)
-    way, took, matched, wanted = [], [], 0, 0
+    way, took, matched, wanted, lines_matched = [], [], 0, 0, 0
     seen: list[dict[Id, Array]] = []  # where landmarks were in each frame
     for frame in log.events:
         image = frame.grey()  # type: ignore[union-attr]
-        here = km.Frame(t_ns=frame.t_ns, robot=frame.robot, sensor="camera", image=image)
+        here = km.Frame(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, image=image)  # type: ignore[union-attr]
         start = time.process_time()
         report = slam.process(here)
-        took.append(time.process_time() - start)
+        spent = time.process_time() - start
+        if here.sensor == "lines":
+            took[-1] += spent
+            way[-1] = slam.mean(frame.robot)[:3]
+            lines_matched += sum(o.outcome == "associated" for o in report.observations)
+            continue
+        took.append(spent)
         fits = [o for o in report.observations if o.outcome in ("new", "associated") and o.landmark is not None]
         seen.append({o.landmark: report.y[o.index] for o in fits if o.landmark is not None})
         matched += sum(o.outcome == "associated" for o in report.observations)
@@ -78,12 +90,13 @@ def run(name: str, seed: int) -> dict[str, float]:
     found = {
         "matched": matched / len(took), "found": matched / max(wanted, 1), "ms": 1e3 * float(np.median(took)),
         "hz": 1.0 / float(np.mean(took)), "return": float(np.linalg.norm(p[-1] - p[0])) / length,
-        "back": len(shifts), "shift_px": float(np.median(shifts)) if shifts else np.nan,
+        "lines": lines_matched / len(took), "back": len(shifts),
+        "shift_px": float(np.median(shifts)) if shifts else np.nan,
         **{f"{part}_ms": 1e3 * spent / len(took) for part, spent in front_end.times.items()},
     }  # fmt: skip
     truth = log.truth.get(log.robots[0])
     if truth is not None:
-        q = truth.at([frame.t_ns for frame in log.events])[:, :3]
+        q = truth.at([e.t_ns for e in log.events if e.sensor == "camera"])[:, :3]  # type: ignore[union-attr]
         there = np.isfinite(q).all(axis=1)
         p, q = p[there], q[there]
         half = len(p) // 2
@@ -180,14 +193,15 @@ def main(name: str, seeds: int) -> None:
     for seed in range(seeds):
         rows.append(run(name, seed))
         print(f"seed {seed}: " + ", ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
-    print("| sequence | ATE, m, of each seed | largest | scale drift | end off start | matched a frame | ms, median |")
-    print("|---|---|---|---|---|---|---|")
+    head = "| sequence | ATE, m, of each seed | largest | scale drift | end off start | matched a frame"
+    print(f"{head} | ms, median | lines |")
+    print("|---|---|---|---|---|---|---|---|")
     ate = [row.get("ate_m", np.nan) for row in rows]
     drift = max(abs(row.get("drift", np.nan)) for row in rows)
     print(
         f"| {name} | {' '.join(f'{a:.3f}' for a in ate)} | {max(ate):.3f} | {100 * drift:.1f} % | "
         f"{100 * max(row['return'] for row in rows):.1f} % | {np.mean([row['matched'] for row in rows]):.0f} | "
-        f"{np.median([row['ms'] for row in rows]):.1f} |"
+        f"{np.median([row['ms'] for row in rows]):.1f} | {np.mean([row['lines'] for row in rows]):.0f} |"
     )
 
 

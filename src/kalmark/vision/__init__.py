@@ -3,5 +3,6 @@
 from kalmark.vision.front_end import ActiveSearch
 from kalmark.vision.overlay import overlay
 from kalmark.vision.segments import LineSearch
+from kalmark.vision.straight import Straightened
 
-__all__ = ["ActiveSearch", "LineSearch", "overlay"]
+__all__ = ["ActiveSearch", "LineSearch", "Straightened", "overlay"]
