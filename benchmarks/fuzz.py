@@ -18,13 +18,8 @@ as `fuzz/TARGET/crash-...`, seeds for later runs in `fuzz/TARGET/corpus`.
 from __future__ import annotations
 
 import argparse
-import gzip
 import itertools
-import json
 import math
-import os
-import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,69 +27,29 @@ import time
 import types
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from state_digest import digest, digest_of_saved
-from storm import ESTIMATORS, MAPS, events, robots
+from fuzz_caches import damaged, damaged_caches
+from fuzz_odd import odd_ones
+from fuzz_parts import CONFIG, CONTROLS, SCANS, TABLES, Broken, Target, plain, written
+from state_digest import digest
+from storm import ESTIMATORS, MAPS, robots
 
 import kalmark as km
-from kalmark.config import build_slam, config_dict, open_run
+from kalmark.config import build_slam, open_run
 from kalmark.errors import DivergedError, KalmarkError
 from kalmark.logs import open_log, write_native
 
-LONGEST_MESSAGE = 1500
-TIMEOUT_S, RSS_MB, LONGEST_INPUT, LONGEST_STREAM = 25, 2048, 20_000, 400
+TIMEOUT_S, RSS_MB, LONGEST_STREAM = 25, 2048, 400
 GUIDED = ("kalmark.logs", "kalmark.config", "kalmark.events", "kalmark.slam.slam", "kalmark.slam.state",
           "kalmark.slam.checks", "kalmark.declare")  # fmt: skip
 """Whose coverage guides.  Compiled functions are left alone: their byte code must stay as it is."""
 
 
-class Broken(Exception):
-    """What an input has broken."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """What is attacked: inputs that are right, and what takes an input; that raises KalmarkError or Broken at most."""
-
-    seeds: tuple[bytes, ...]
-    take: Callable[[bytes, Path], None]
-    longest: int = LONGEST_INPUT  # bytes
-
-
 # ------------------------------------------------------------------ files
-CONTROLS = b"t_s,robot,v_mps,w_radps\n0,rover,1,0\n1,rover,1,0.1\n2,rover,1,-0.1\n"
-SCANS = (
-    b"t_s,robot,sensor,id,range_m,bearing_rad\n0.5,rover,lidar,1,5,0.1\n1.5,rover,lidar,1,4,0.1\n1.5,rover,lidar,,3,1\n"
-)
-TABLES = {
-    "controls.csv": (CONTROLS, b"t_ms;robot;v_kmh;w_degps;sigma_v_mps;sigma_w_radps\n0;rover;1,5;0;0,1;0,1\n"),
-    "scans.csv": (
-        SCANS, b"t_s,robot,sensor,id,range_mm,bearing_deg,cov_00,cov_01,cov_11\n1,rover,lidar,x,5,1,1,0,1\n"),
-    "measurements.csv": (b"t_s,robot,sensor,heading_rad\n0.5,rover,compass,0.1\n",),
-    "fixes.csv": (b"t_s,robot,x_m,y_m,cov_xx,cov_xy,cov_yy\n1,rover,1,2,1,0,1\n",),
-    "truth.csv": (b"t_s,robot,x_m,y_m,theta_rad\n0,rover,0,0,0\n1,rover,1,0,0\n",
-                  b"t_s,robot,x_m,y_m,z_m,qx,qy,qz,qw\n0,rover,0,0,0,0,0,0,1\n"),
-    "landmarks.csv": (b"id,x_m,y_m\n1,5,0\n", b"id,x_m,y_m,z_m,x2_m,y2_m,z2_m\n1,5,0,1,2,3,4\n"),
-    "gps.csv": (b"t_s,robot,x_m,y_m,antenna_x_m,antenna_y_m\n1,rover,1,2,0,0\n",),
-    "rig.yaml": (b"robots: {rover: {motion: {type: unicycle}, sensors: {lidar: {type: range_bearing}}}}\n",),
-}  # fmt: skip
-CONFIG = b"""log: {path: log, to_s: 10, on_error: skip}
-robots:
-  each:
-    motion: {type: unicycle, sigma_v_mps: 0.05}
-    start: {x_m: 1.0, sigma_xy_m: 0.1}
-    sensors: {lidar: {type: range_bearing, sigma_range_m: 0.1, mount: {x_m: 0.3}, association: {type: auto}}}
-landmarks: {type: point}
-association: {type: identity}
-estimator: {type: invariant, iterations: 3}
-map: {type: dense}
-upkeep: {confirm: 3}
-"""
 MRCLAM = {
     "Barcodes.dat": b"1 5\n2 14\n6 72\n", "Landmark_Groundtruth.dat": b"6 1.0 2.0 0.1 0.1\n",
     "Robot1_Odometry.dat": b"10.0 0.1 0.2\n10.5 0.1 0.2\n",
@@ -120,15 +75,6 @@ TEXTS: dict[str, tuple[str, tuple[bytes, ...]]] = {
 }  # fmt: skip
 BESIDE = {"kitti": {"times.txt": b"0\n1\n"}, "freiburg": {"world.dat": b"1 2 3\n"}, "plaza": {
     "Plaza1_TD.txt": b"1.0 1 0 5.5\n1.2 1 1 6.5\n"}}  # fmt: skip
-
-
-def written(folder: Path, files: dict[str, bytes]) -> Path:
-    """Write files into an empty folder."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for name, content in files.items():
-        (folder / name).write_bytes(content)
-    return folder
 
 
 def read(path: Path, skip: bool, **options: Any) -> None:
@@ -308,13 +254,6 @@ def process(data: bytes, folder: Path | None = None) -> None:
 
 
 # ------------------------------------------------------------------ all of them
-def plain(error: KalmarkError) -> None:
-    """Raise Broken if an error's message is not one plain line."""
-    message = str(error)
-    if "\n" in message or not message or len(message) > LONGEST_MESSAGE:
-        raise Broken(f"message {message[:300]!r}") from None
-
-
 def a_map() -> bytes:
     """Return a saved map."""
     slam = km.Slam(robots(False))
@@ -465,213 +404,6 @@ def by_chance(target: Target, inputs: int, seed: int = 0) -> Iterator[tuple[byte
                 yield data, attacked(target, data, Path(folder))
             except Exception as error:
                 yield data, error
-
-
-# ------------------------------------------------------------------ odd files and configurations
-CONFIG_NAME = "my.yaml"
-VALUES = (b"", b"nan", b"-inf", b"1e999", b"1e999990", b"1e155", b"-1e300", b"9" * 5000, b"0x10", b"x\0y",
-          b"\xe2\x85\xa7", b'"', b"<b>&", b"[[1]]")  # fmt: skip
-LAUGHS = "\n".join(["a0: &a0 [x, x]", *(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 10))])
-DIGITS = "9" * 5000
-ODD_CONFIGS = (
-    "robots: 5", "robots: {robot: 5}", "robots: {rover: 5}", "robots: [1]", "robots: {5: 5}", "a: &a {b: *a}",
-    "robots: &r {rover: *r}", "a: &a [*a, *a]", "? [1, 2]\n: 3", "? [[1]]\n: 3", "? {a: 1}\n: 3", f"x: {DIGITS}",
-    f"seed: {DIGITS}", "seed: 1e300", f"upkeep: {{confirm: {DIGITS}}}", f"association: {{gate: {DIGITS[:400]}}}",
-    "plugins: [[1]]", "a: 2001-99-99", "a: !!int x", "robots: {rover: {motion: {type: [1]}}}", f"a: {'[' * 2000}",
-    "robots: {rover: {sensors: {lidar: {preset: [1], type: range_bearing}}}}", LAUGHS,
-    "robots: {rover: {motion: {type: unicycle}, sensors: {lidar: {type: [[1]], sigma_range_m: 1}}}}",
-)  # fmt: skip
-ODD_RIGS = (
-    "robots: 5", "robots: [1]", "robots: {rover: 5}", "robots: {rover: {motion: [1]}}", "[1, 2]", "5: 5",
-    "? {a: 1} : 2", "a: &a {b: *a}", "robots: &r {rover: *r}", f"x: {DIGITS}", "a: 2001-99-99", "landmarks: 5",
-    LAUGHS, "robots: {rover: {sensors: 5}}", "a: !!python/object:os.system x",
-)  # fmt: skip
-EQUAL: dict[str, Callable[[bytes], bytes]] = {
-    "a mark of the byte order": lambda text: b"\xef\xbb\xbf" + text,
-    "ends of lines of Windows": lambda text: text.replace(b"\n", b"\r\n"),
-    "no last end of line": lambda text: text.rstrip(b"\n"),
-    "semicolons": lambda text: text.replace(b",", b";"),
-    "spaces beside the cells": lambda text: text.replace(b",", b" , "),
-}
-"""Changes of a table that must not change the map, if they are taken."""
-WHOLE: dict[str, Callable[[bytes], bytes]] = EQUAL | {
-    "empty": lambda text: b"",
-    "a header alone": lambda text: text.split(b"\n")[0],
-    "two headers": lambda text: text.split(b"\n")[0] + b"\n" + text,
-    "a column twice": lambda text: text.replace(b"\n", b",1\n").replace(b",1\n", b",t_s\n", 1),
-    "cut in a row": lambda text: text[: -len(text) // 5],
-    "zeros": lambda text: bytes(len(text)),
-    "UTF-16": lambda text: text.decode().encode("utf-16"),
-    "compressed": gzip.compress,
-    "a picture": lambda text: b"\x89PNG\r\n\x1a\n" + text,
-    "one long line": lambda text: text.replace(b"\n", b",") * 2000,
-    "backwards": lambda text: b"\n".join([text.split(b"\n")[0], *text.split(b"\n")[:0:-1]]),
-}
-
-
-def odd_files() -> Iterator[tuple[str, dict[str, bytes], bool]]:
-    """Yield what is odd, the odd files, and whether the map must be that of the right ones."""
-    for name, texts in TABLES.items():
-        if not name.endswith(".csv"):
-            continue
-        for k, text in enumerate(texts):
-            *above, last = text.rstrip(b"\n").split(b"\n")
-            comma = b";" if b";" in last else b","
-            for column, value in itertools.product(range(last.count(comma) + 1), VALUES):
-                cells = last.split(comma)
-                cells[column] = value
-                rows = b"\n".join([*above, comma.join(cells), b""])
-                yield f"{name}, {k}: column {column} is {value[:20]!r}", {name: rows}, False
-        yield from ((f"{name}: {told}", {name: change(texts[0])}, told in EQUAL) for told, change in WHOLE.items())
-    for at in re.finditer(rb"(?<=: )[^,{}\[\]\n]+", CONFIG):
-        for value in VALUES:
-            changed = CONFIG[: at.start()] + value + CONFIG[at.end() :]
-            yield f"config: {at[0]!r} is {value[:20]!r}", {CONFIG_NAME: changed}, False
-    for odd in ODD_CONFIGS:
-        yield f"config: {odd[:40]}", {CONFIG_NAME: b"log: {path: log}\n" + odd.encode()}, False
-    for odd in ODD_RIGS:
-        yield f"rig: {odd[:40]}", {CONFIG_NAME: b"log: {path: log}\n", "rig.yaml": odd.encode()}, False
-
-
-def saved_run(folder: Path, odd: dict[str, bytes]) -> str:
-    """Run a log of which some files are odd, and save the run; return the digest of the map."""
-    files = {"controls.csv": CONTROLS, "scans.csv": SCANS, CONFIG_NAME: CONFIG.replace(b"skip", b"raise")} | odd
-    config_text = files.pop(CONFIG_NAME)
-    written(folder / "log", files)
-    (folder / CONFIG_NAME).write_bytes(config_text)
-    made, log = open_run(folder / CONFIG_NAME)
-    slam = build_slam(made, log)
-    run = km.record(slam, log, progress=False, on_error=made.log.on_error, config=config_dict(made))
-    run.evaluate()
-    out = run.save(folder / "out")
-    json.loads((out / "summary.json").read_text())
-    if not (out / "map.png").stat().st_size or b"<b>&" in (out / "report.html").read_bytes():
-        raise Broken("an empty picture, or an id that is not escaped")
-    names = [*slam.robots, *slam.tracks.confirmed]
-    P = slam.covariance(*names)
-    if not np.isfinite(P).all() or np.linalg.eigvalsh(P)[0] < -1e-9 * max(1.0, float(np.abs(P).max())):
-        raise Broken(f"covariance {np.linalg.eigvalsh(P)}")
-    return digest_of_saved(slam)
-
-
-def odd_ones() -> tuple[int, int, int]:
-    """Return how many odd files and configurations there were, were taken and broke something."""
-    counts = [0, 0, 0]
-    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        right = saved_run(Path(name), {})
-        for told, files, equal in odd_files():
-            counts[0] += 1
-            try:
-                map_ = saved_run(Path(name), files)
-                if equal and {*files} <= {"controls.csv", "scans.csv"} and map_ != right:
-                    raise Broken("another map")
-                counts[1] += 1
-            except KalmarkError as error:
-                try:
-                    plain(error)
-                except Broken as broken:
-                    counts[2] += report(told, broken)
-            except Exception as error:
-                counts[2] += report(told, error)
-    return counts[0], counts[1], counts[2]
-
-
-def report(told: str, error: Exception | str) -> int:
-    """Print what was broken; return 1."""
-    print(f"  {told}: {type(error).__name__}: {' '.join(str(error).split())[:300]}", flush=True)
-    return 1
-
-
-# ------------------------------------------------------------------ damaged caches
-DAMAGES: dict[str, Callable[[bytes, np.random.Generator, bytes], bytes]] = {
-    "empty": lambda code, random, other: b"",
-    "cut": lambda code, random, other: code[: random.integers(len(code))],
-    "cut by one": lambda code, random, other: code[:-1],
-    "a bit": lambda code, random, other: flipped(code, int(random.integers(len(code)))),
-    "a bit of the head": lambda code, random, other: flipped(code, int(random.integers(min(64, len(code))))),
-    "a hole": lambda code, random, other: code[: len(code) // 3] + bytes(len(code) // 3) + code[2 * len(code) // 3 :],
-    "zeros": lambda code, random, other: bytes(len(code)),
-    "noise": lambda code, random, other: random.bytes(len(code)),
-    "twice": lambda code, random, other: code + code,
-    "a text": lambda code, random, other: b"not code\n",
-    "another file": lambda code, random, other: other,
-    "half of another file": lambda code, random, other: code[: len(code) // 2] + other[len(other) // 2 :],
-}
-GONE = "gone", "a folder"
-
-
-def flipped(code: bytes, at: int) -> bytes:
-    """Return a file with one bit changed."""
-    return code[:at] + bytes([code[at] ^ 1 << at % 8]) + code[at + 1 :]
-
-
-def damage(files: list[Path], random: np.random.Generator) -> str:
-    """Damage one of these files, or one in ten times a third of them; return how."""
-    how = str(random.choice([*DAMAGES, *GONE]))
-    count = len(files) // 3 if random.random() < 0.1 else 1
-    for k in random.choice(len(files), count, replace=False):
-        file, other = files[k], files[int(random.integers(len(files)))]
-        code = file.read_bytes() or b"0"
-        if how in GONE:
-            file.unlink()
-            if how == "a folder":
-                file.mkdir()
-        else:
-            file.write_bytes(DAMAGES[how](code, random, other.read_bytes() if other.exists() else b""))
-    return f"{how}, {count} of {len(files)} files"
-
-
-def small_map() -> str:
-    """Return the digest of a small map in the plane."""
-    slam = km.Slam(robots(False))
-    for told in itertools.islice(events(False, np.random.default_rng(0)), 24):
-        slam.process(told.made())
-    return digest_of_saved(slam)
-
-
-def forked() -> str:
-    """Return the digest of the small map, from a process of its own, or how that ended."""
-    out, into = os.pipe()
-    child = os.fork()
-    if not child:
-        try:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-            os.write(into, small_map().encode())
-        except BaseException as error:
-            os.write(into, f"{type(error).__name__}: {error}"[:500].encode())
-        os._exit(0)
-    os.close(into)
-    with os.fdopen(out) as file:
-        told = file.read()
-    status = os.waitpid(child, 0)[1]
-    return f"ended by signal {status}" if status else told
-
-
-def damaged(count: int, seed: int) -> tuple[int, int]:
-    """Return how many damages there were to the cache that this process begins with, and how many broke something."""
-    random, root, broken = np.random.default_rng(seed), Path(os.environ["KALMARK_CACHE"]), 0
-    right = forked()
-    for _ in range(count):
-        told = damage([path for path in sorted(root.rglob("*")) if path.is_file()], random)
-        if (found := forked()) != right:
-            broken += report(told, found)
-        for folder in root.rglob("*.nb*"):
-            if folder.is_dir():
-                folder.rmdir()
-    return count, broken
-
-
-def damaged_caches(count: int, seed: int) -> tuple[int, int, int]:
-    """Return how many damages there were to a cache, how many of them kept the map, and how many broke something."""
-    with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"KALMARK_CACHE": cache, "OPENBLAS_NUM_THREADS": "1"}
-        command = [sys.executable, __file__, "--alone", "--caches", str(count), "--seed", str(seed)]
-        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    *lines, last = done.stdout.splitlines()
-    print("\n".join(lines))
-    damages, broken = map(int, last.split())
-    return damages, damages - broken, broken
 
 
 # ------------------------------------------------------------------ guided by coverage

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz import DIGITS, ODD_CONFIGS, ODD_RIGS
+from fuzz_odd import DIGITS, ODD_CONFIGS, ODD_RIGS
 
 import kalmark as km
 from kalmark.config import build_slam, open_run
