@@ -9,13 +9,22 @@ from typing import Any
 import numpy as np
 
 from kalmark.events import Control, Event, Scan
-from kalmark.logs import Log
+from kalmark.logs import Log, open_log
 from kalmark.logs.bag.write import Outgoing, Types, header
 from kalmark.logs.geodesy import earth_centred
 from laser_worlds import LaserWorld
 
 KINDS = ("ros1.bag", "sqlite3", "mcap")
 ORIGIN = (48.1, 11.6, 520.0)  # deg, deg, m
+TOPICS: dict[str, dict[str, Any]] = {
+    "/odom": {"type": "odometry_2d"},
+    "/scan": {"type": "scan", "sensor": "lidar"},
+    "/fix": {"type": "fix", "origin": [*ORIGIN]},
+    "/truth": {"type": "truth"},
+    "/imu": {"type": "imu", "at": "controls", "heading": "compass", "every_s": 1.0},
+}
+T0 = 1_700_000_000_000_000_000
+AT = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 EXTRA = {  # types that ROS does not define itself
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "ackermann_msgs/msg/AckermannDrive": "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
@@ -242,3 +251,15 @@ def same_logs(a: Log, b: Log) -> bool:
         and (a.control_columns, a.sensor_columns) == (b.control_columns, b.sensor_columns)
         and a.describes == b.describes
     )
+
+
+def bag_of(tmp_path: Path, messages: Iterable[Outgoing], kind: str = "mcap") -> Path:
+    return write_bag(tmp_path, kind, messages)
+
+
+def twist(v: float, w: float) -> dict[str, Any]:
+    return {"linear": {"x": v, "y": 0.1, "z": 0.2}, "angular": {"x": 0.3, "y": 0.4, "z": w}}
+
+
+def events_of(path: Path) -> list[Any]:
+    return list(open_log(path, topics=TOPICS).events)

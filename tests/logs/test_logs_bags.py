@@ -3,56 +3,44 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from ruamel.yaml import YAML
 
 from kalmark.config import build_slam, open_run
-from kalmark.errors import KalmarkError, LogError
+from kalmark.errors import LogError
 from kalmark.events import Control, Fix, Scan
 from kalmark.logs import open_log, write_native
-from kalmark.logs.bag.inertial import means
 from kalmark.logs.geodesy import A_M, E2, FLATTENING, earth_centred, local
 from kalmark.results.record import record
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")
 
 from ros_bags import (
+    AT,
     GYRO_BIAS,
-    IMU_TURN,
-    KINDS,
     MOUNT,
     ORIGIN,
     POSTS,
+    T0,
+    TOPICS,
     Outgoing,
+    bag_of,
     drive,
-    field,
+    events_of,
     fix,
     geodetic,
     header,
-    imu,
     odometry,
     pose,
-    robot_among_posts,
-    same,
     same_logs,
     tf,
     transform,
-    write_bag,
+    twist,
 )
 
-TOPICS: dict[str, dict[str, Any]] = {
-    "/odom": {"type": "odometry_2d"},
-    "/scan": {"type": "scan", "sensor": "lidar"},
-    "/fix": {"type": "fix", "origin": [*ORIGIN]},
-    "/truth": {"type": "truth"},
-    "/imu": {"type": "imu", "at": "controls", "heading": "compass", "every_s": 1.0},
-}
 CONFIG = """
 log: {{path: {path}{topics}}}
 robots:
@@ -68,18 +56,6 @@ IN_YAML = f""", topics: {{
   /odom: {{type: odometry_2d}}, /scan: {{type: scan, sensor: lidar}},
   /fix: {{type: fix, origin: {[*ORIGIN]}}}, /truth: {{type: truth}},
   /imu: {{type: imu, at: controls, heading: compass, every_s: 1.0}}}}"""
-T0 = 1_700_000_000_000_000_000
-
-
-@pytest.fixture(scope="module")
-def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return the bags of the robot among posts, by kind."""
-    folder, messages = tmp_path_factory.mktemp("bags"), robot_among_posts()
-    return {kind: write_bag(folder, kind, messages) for kind in KINDS}
-
-
-def bag_of(tmp_path: Path, messages: Iterable[Outgoing], kind: str = "mcap") -> Path:
-    return write_bag(tmp_path, kind, messages)
 
 
 # ------------------------------------------------------------------ the same from every file
@@ -215,10 +191,6 @@ def test_a_satellite_truth_only_scores(tmp_path: Path) -> None:
 
 
 # ------------------------------------------------------------------ each type of message
-def twist(v: float, w: float) -> dict[str, Any]:
-    return {"linear": {"x": v, "y": 0.1, "z": 0.2}, "angular": {"x": 0.3, "y": 0.4, "z": w}}
-
-
 @pytest.mark.parametrize(
     ("kind", "fields", "topic", "u"),
     [
@@ -266,133 +238,11 @@ def test_own_noise_that_is_not_finite_is_refused(kind: str, tmp_path: Path) -> N
 
 
 # ------------------------------------------------------------------ the robot itself
-def turned(angle: float, axis: int = 2) -> list[float]:
-    q = [0.0, 0.0, 0.0, np.cos(angle / 2)]
-    q[axis] = np.sin(angle / 2)
-    return q
-
-
-def unit_of(tmp_path: Path, *units: Outgoing, mount: Any = None, space: bool = False) -> Path:
-    """Return a bag of odometry at 1 Hz, of an inertial unit, and of where it is mounted."""
-    moved = [odometry(T0 + t * 10**9, pose(t, 0, 0, z=t if space else 0)) for t in range(4)]
-    frames = [] if mount is None else [tf("/tf_static", T0, transform("base_link", "imu", T0, mount))]
-    return bag_of(tmp_path, sorted([*frames, *moved, *units], key=lambda m: m.t_ns))
-
-
-def readings(log: Any, sensor: str) -> list[tuple[float, list[float]]]:
-    seen = (event for event in log.events if isinstance(event, Scan) and event.sensor == sensor)
-    return [((scan.t_ns - T0) * 1e-9, scan.y[0].tolist()) for scan in seen]
-
-
-def test_the_rates_of_a_robot_of_the_plane_are_about_its_vertical_axis(tmp_path: Path) -> None:
-    """Of a unit whose x axis points up: the robot turns about it."""
-    up = {"position": {"x": 0.5}, "orientation": dict(zip("xyzw", turned(-np.pi / 2, axis=1), strict=True))}
-    path = unit_of(tmp_path, *(imu(T0 + t, (0.3, 0.1, 0.2)) for t in (10, 20, 20, 30)), mount=up)
-    log = open_log(path, topics={"/odom": TOPICS["/odom"], "/imu": {"type": "imu"}})
-    np.testing.assert_allclose([y for _, y in readings(log, "gyro")], [[0.3]] * 3, atol=1e-12)
-    assert log.sensor_columns["robot", "gyro"] == ("w_radps",)
-    assert log.describes["robots"]["robot"]["sensors"]["gyro"]["mount"] == {"x_m": 0.5, "y_m": 0.0, "theta_rad": 0.0}
-    assert [line.split(": ", 1)[1] for line in log.skipped] == [
-        "/imu: 1 readings of gyro at the time of the one before"
-    ]
-
-
-def test_rates_are_averaged_from_one_control_to_the_next(tmp_path: Path) -> None:
-    """They grow by 1 rad/s each second, from 0.5 s on: the mean is the rate in the middle."""
-    times = np.arange(0.5, 3.01, 0.25)
-    path = unit_of(tmp_path, *(imu(T0 + round(t * 1e9), (0, 0, t)) for t in times))
-    log = open_log(path, topics={"/odom": TOPICS["/odom"], "/imu": {"type": "imu", "at": "controls"}})
-    (t1, y1), (t2, y2), (t3, y3) = readings(log, "gyro")
-    assert (t1, t2, t3) == (1.0, 2.0, 3.0)
-    np.testing.assert_allclose([y1[0], y2[0], y3[0]], [1.0, 1.5, 2.5], atol=1e-12)
-    with pytest.raises(LogError, match="gyro of 'robot' has `at: controls`, expected controls of this robot"):
-        open_log(path, topics={"/imu": {"type": "imu", "at": "controls"}})
-
-
-@pytest.mark.parametrize(
-    ("ends", "kept"), [([0, 10], [0, 10]), ([3, 4, 8], [3, 8]), ([1, 9, 30], [1, 9]), ([4], [4]), ([], []), ([20], [])]
-)
-def test_means_of_rates_are_their_integrals(ends: list[int], kept: list[int]) -> None:
-    """An end with no rate since the last one is left out."""
-    tenth = 10**8
-    t_ns, w = np.array([0, 2, 3, 7, 10]) * tenth, np.random.default_rng(5).normal(size=(5, 3))
-    found = means(t_ns, w, [end * tenth for end in ends])
-    assert [t for t, _ in found] == [end * tenth for end in kept]
-    for (a, _), (b, mean) in pairwise(found):
-        t = np.linspace(a, b, 10_001)
-        middle = (t[1:] + t[:-1]) / 2
-        line = np.column_stack([np.interp(middle, t_ns, column) for column in w.T])
-        np.testing.assert_allclose(mean, line.mean(axis=0), atol=1e-6)
-
-
-def test_headings_are_those_of_the_robot_however_its_unit_is_turned(tmp_path: Path) -> None:
-    units = [imu(T0 + t * 10**8, (0, 0, 0), turned(0.3 + IMU_TURN), 0.01) for t in range(10)]
-    path = unit_of(tmp_path, *units, mount=pose(0.1, 0, IMU_TURN))
-    topic = {"type": "imu", "gyro": None, "heading": "compass", "every_s": 0.45}
-    log = open_log(path, topics={"/odom": TOPICS["/odom"], "/imu": topic})
-    found = readings(log, "compass")
-    assert [t for t, _ in found] == [0.0, 0.5]
-    np.testing.assert_allclose([y for _, y in found], [[0.3]] * 2, atol=1e-12)
-
-
-def test_a_robot_of_space_has_rates_inclination_and_gravity_of_its_unit(tmp_path: Path) -> None:
-    q = turned(0.2, axis=0)
-    path = unit_of(tmp_path, imu(T0, (1, 2, 3), q, a=(1, 2, 9)), mount=pose(0.1, 0, IMU_TURN), space=True)
-    topic = {"type": "imu", "heading": "compass", "inclination": "level", "gravity": "down"}
-    log = open_log(path, topics={"/odom": {"type": "odometry_3d"}, "/imu": topic})
-    assert readings(log, "gyro")[0][1] == [1, 2, 3] and readings(log, "down")[0][1] == [1, 2, 9]
-    np.testing.assert_allclose(readings(log, "level")[0][1], [0.2, 0.0], atol=1e-12)
-    np.testing.assert_allclose(readings(log, "compass")[0][1], [0.0], atol=1e-12)
-    mounts = log.describes["robots"]["robot"]["sensors"]
-    assert {name: mount["mount"]["yaw_deg"] for name, mount in mounts.items()} == dict.fromkeys(mounts, 90.0)
-
-
-def test_a_magnetic_field_is_a_heading_from_magnetic_east(tmp_path: Path) -> None:
-    """Ahead to the north the field is along x, and the heading is a quarter of a turn; to the east it is along y."""
-    fields = [field(T0, (20, 0, -40)), field(T0 + 1, (0, 20, -40)), field(T0 + 2, (0, 0, -40))]
-    path = unit_of(tmp_path, *fields)
-    log = open_log(path, topics={"/odom": TOPICS["/odom"], "/mag": {"type": "compass"}})
-    np.testing.assert_allclose([y for _, y in readings(log, "mag")], [[np.pi / 2], [0.0]], atol=1e-12)
-    assert [line.split(": ", 1)[1] for line in log.skipped] == ["/mag: 1 fields that are steep"]
-
-
-@pytest.mark.parametrize(
-    ("odometry_", "topics", "said"),
-    [
-        ("odometry_3d", {"/mag": {"type": "compass"}}, "/mag gives headings by a magnetic field .*expected one of the"),
-        (
-            "odometry_2d",
-            {"/imu": {"type": "imu", "gravity": "g"}},
-            "gives inclinations or gravity to 'robot', expected",
-        ),
-        ("odometry_2d", {"/imu": {"type": "imu", "gyro": None}}, "gyro is None, expected a name, or one of heading"),
-        ("odometry_2d", {"/mag": {"type": "imu"}}, "MagneticField .magnetic field., expected one of sensor_msgs/Imu"),
-        ("odometry_2d", {"/imu": {"type": "imu", "every_s": -1.0}}, "every_s is -1.0, expected"),
-    ],
-)
-def test_readings_that_cannot_be_get_one_line(odometry_: str, topics: Any, said: str, tmp_path: Path) -> None:
-    path = unit_of(tmp_path, imu(T0, (0, 0, 0)), field(T0, (1, 0, 0)))
-    with pytest.raises(LogError, match=said) as error:
-        open_log(path, topics={"/odom": {"type": odometry_}} | topics)
-    assert "\n" not in str(error.value)
-
-
-def test_what_an_inertial_unit_does_not_measure_is_left_out(tmp_path: Path) -> None:
-    path = unit_of(tmp_path, imu(T0, (0, 0, 0), (0, 0, 0, 0), -1.0), imu(T0 + 1, (0, 0, np.nan)))
-    topics = {"/odom": TOPICS["/odom"], "/imu": {"type": "imu", "heading": "compass"}}
-    with pytest.raises(LogError, match=r"/imu at t=1700000000.000000001 s: rates .*nan.*, expected finite numbers"):
-        open_log(path, topics=topics)
-    log = open_log(path, topics=topics, on_error="skip")
-    assert [len(readings(log, name)) for name in ("gyro", "compass")] == [1, 0]
-    assert "/imu: 1 messages without an orientation" in log.skipped[-1]
-
-
 def corners(*points: tuple[float, float]) -> list[dict[str, float]]:
     return [{"x": x, "y": y} for x, y in points]
 
 
 SQUARE = ((10.0, 20.0), (30.0, 20.0), (30.0, 40.0), (10.0, 40.0))
-AT = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 AWAY = [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]
 
 
@@ -438,22 +288,6 @@ def test_observations_are_scans(
     (scan,) = open_log(path, topics={"/seen": {"type": "scan"} | topic}).events
     assert isinstance(scan, Scan) and scan.sensor == "seen" and scan.ids == ids
     np.testing.assert_array_equal(scan.y, np.array(y).reshape(len(y), -1) if y else np.empty((0, 0)))
-
-
-def test_an_inertial_unit_moves_a_robot_whose_frame_is_its_own(tmp_path: Path) -> None:
-    mount = tf("/tf_static", T0, transform("base_link", "imu", T0, pose(1, 0, 0)))
-    camera = tf("/tf_static", T0, transform("base_link", "camera", T0, pose(3, 0, 0)))
-    units = [imu(T0 + k * 10**7, (0.1, 0.2, 0.3 + k), a=(0.0, 0.1, 9.8)) for k in range(3)]
-    seen = {"markers": [{"id": 4, "header": header(T0, "camera"), "pose": AT}]}
-    messages = [mount, camera, *units, units[2], Outgoing("/seen", "visualization_msgs/msg/MarkerArray", T0, seen)]
-    topics = {"/imu": {"type": "inertial"}, "level": {"type": "imu", "topic": "/imu", "gyro": "gyro"}}
-    log = open_log(bag_of(tmp_path, messages), topics=topics | {"/seen": {"type": "scan"}})
-    controls = [event for event in log.events if isinstance(event, Control)]
-    assert [control.u.tolist() for control in controls] == [[0.1, 0.2, 0.3 + k, 0, 0.1, 9.8] for k in range(3)]
-    assert log.describes["robots"]["robot"]["motion"] == {"type": "inertial"}
-    assert log.describes["robots"]["robot"]["sensors"]["seen"]["mount"]["x_m"] == 2.0
-    assert sum(isinstance(event, Scan) and event.sensor == "gyro" for event in log.events) == 3
-    assert any("/imu: 1 readings at the time of the one before" in line for line in log.skipped)
 
 
 def test_observations_are_left_out_by_their_ids_and_times(tmp_path: Path) -> None:
@@ -556,162 +390,6 @@ def test_a_topic_without_messages_gets_one_line(tmp_path: Path) -> None:
     metadata.write_text(metadata.read_text().replace("message_count: 2", "message_count: 0"))
     with pytest.raises(LogError, match="topic /odom has no messages"):
         open_log(path, topics={"/odom": TOPICS["/odom"]})
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
-def test_a_cut_bag_gets_one_line(kind: str, share: float, bags: dict[str, Path], tmp_path: Path) -> None:
-    source = bags[kind] if bags[kind].is_file() else next(bags[kind].glob("*.[dm][bc]*"))
-    cut = tmp_path / source.name
-    content = source.read_bytes()
-    cut.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(LogError, match=r"not a bag that can be read|no message|no topic") as error:
-        open_log(cut, topics=TOPICS)
-    assert "\n" not in str(error.value) and str(cut) in str(error.value)
-
-
-def test_damaged_bags_get_one_line(bags: dict[str, Path], tmp_path: Path) -> None:
-    random = np.random.default_rng(0)
-    for kind in KINDS:
-        source = bags[kind] if bags[kind].is_file() else next(bags[kind].glob("*.[dm][bc]*"))
-        content = np.frombuffer(source.read_bytes(), np.uint8)
-        for n in range(12):
-            odd = content.copy()
-            odd[random.integers(0, len(odd), 1 + 40 * n)] = random.integers(0, 256, 1 + 40 * n)
-            (tmp_path / source.name).write_bytes(odd.tobytes())
-            try:
-                open_log(tmp_path / source.name, topics=TOPICS, on_error="skip")
-            except KalmarkError as error:
-                assert "\n" not in str(error)
-
-
-def test_two_clocks_get_one_line(tmp_path: Path) -> None:
-    messages = [odometry(10**9 * (1 + k), pose(0, 0, 0))._replace(t_ns=T0 + k) for k in range(2)]
-    messages.append(Outgoing("/cmd_vel", "geometry_msgs/msg/Twist", T0, twist(1.0, 0.0)))
-    path = bag_of(tmp_path, messages)
-    topics = {"/odom": {"type": "truth", "robot": "b"}, "/cmd_vel": {"type": "unicycle"}}
-    with pytest.raises(LogError, match="by its headers, /cmd_vel at 1700000000 s as recorded"):
-        open_log(path, topics=topics)
-    topics["/odom"]["time"] = "recorded"
-    assert open_log(path, topics=topics).events[0].t_ns == T0
-
-
-def test_bad_messages_are_refused_or_left_out(tmp_path: Path) -> None:
-    messages = [odometry(T0 + k, pose(0, 0, 0)) for k in (0, 10, 20)]
-    messages += [
-        odometry(T0 + 15, pose(0, 0, 0)),
-        odometry(T0 + 30, pose(np.nan, 0, 0)),
-        odometry(T0 + 40, pose(1, 0, 0)),
-    ]
-    messages += [odometry(T0 + 50, {"position": {}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 0}})]
-    messages = [message._replace(t_ns=T0 + 100 + n) for n, message in enumerate(messages)]
-    path, topics = bag_of(tmp_path, messages), {"/odom": TOPICS["/odom"]}
-    with pytest.raises(LogError, match=r"/odom at t=1700000000.000000015 s: time after 1700000000.000000020 s"):
-        open_log(path, topics=topics)
-    log = open_log(path, topics=topics, on_error="skip")
-    assert len(log.events) == 3 and len(log.skipped) == 3
-    assert "quaternion has length 0" in log.skipped[2] and "finite" in log.skipped[1]
-
-
-def test_a_type_that_the_bag_does_not_define_gets_one_line(tmp_path: Path) -> None:
-    """As older ROS 2 bags in sqlite3 are: without definitions, of which ROS's own are known."""
-    path = bag_of(tmp_path, [Outgoing("/tags", "aruco_msgs/msg/MarkerArray", T0, {"header": header(T0, "camera")}),
-                             odometry(T0, pose(0, 0, 0)), odometry(T0 + 9, pose(1, 0, 0))], "sqlite3")  # fmt: skip
-    with sqlite3.connect(next(path.glob("*.db3"))) as database:
-        database.execute("delete from message_definitions")
-    assert open_log(path, topics={"/odom": TOPICS["/odom"]}).events[0].u.tolist() == [1, 0, 0]
-    with pytest.raises(LogError, match="/tags has messages of the type aruco_msgs/msg/MarkerArray, which the"):
-        open_log(path, topics={"/tags": {"type": "scan"}})
-
-
-# ------------------------------------------------------------------ packed and split
-def events_of(path: Path) -> list[Any]:
-    return list(open_log(path, topics=TOPICS).events)
-
-
-@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
-def test_a_ros_1_bag_with_packed_chunks_is_the_same_log(
-    compression: str, bags: dict[str, Path], tmp_path: Path
-) -> None:
-    from rosbags.rosbag1 import Reader, Writer
-
-    path = tmp_path / "packed.bag"
-    writer = Writer(path)
-    writer.set_compression(Writer.CompressionFormat[compression])
-    with Reader(bags["ros1.bag"]) as reader, writer:
-        kept = {c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
-                for c in reader.connections}  # fmt: skip
-        for connection, t_ns, raw in reader.messages():
-            writer.write(kept[connection.id], t_ns, raw)
-    assert path.stat().st_size < 0.9 * bags["ros1.bag"].stat().st_size
-    assert all(map(same, events_of(path), events_of(bags["ros1.bag"])))
-
-
-def copied(source: Path, out: Path, mode: str, first: int = 0, last: int | None = None) -> Path:
-    """Copy the messages of a ROS 2 bag from one number to another, packed by file or by message, or not."""
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
-
-    plugin = StoragePlugin.MCAP if source.name == "mcap" else StoragePlugin.SQLITE3
-    writer = Writer(out, version=9, storage_plugin=plugin)
-    if mode != "NONE":
-        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-    with Reader(source) as reader, writer:
-        kept = {c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
-                for c in reader.connections}  # fmt: skip
-        for connection, t_ns, raw in list(reader.messages())[first:last]:
-            writer.write(kept[connection.id], t_ns, raw)
-    return out
-
-
-PACKED = [("sqlite3", "FILE"), ("sqlite3", "MESSAGE"), ("mcap", "FILE"), ("mcap", "MESSAGE"), ("mcap", "STORAGE")]
-
-
-@pytest.mark.parametrize(("kind", "mode"), PACKED)
-def test_a_packed_ros_2_bag_is_the_same_log(kind: str, mode: str, bags: dict[str, Path], tmp_path: Path) -> None:
-    path = copied(bags[kind], tmp_path / "packed", mode)
-    assert all(map(same, events_of(path), events_of(bags[kind]))) and len(events_of(path))
-
-
-@pytest.mark.parametrize("packed", ["NONE", "LZ4", "ZSTD"])
-@pytest.mark.parametrize("chunks", [True, False])
-def test_mcap_of_its_own_library_with_packed_chunks_or_none_is_the_same_log(
-    packed: str, chunks: bool, bags: dict[str, Path], tmp_path: Path
-) -> None:
-    reader, writer = pytest.importorskip("mcap.reader"), pytest.importorskip("mcap.writer")
-    path = tmp_path / "packed.mcap"
-    (source,) = bags["mcap"].glob("*.mcap")
-    with source.open("rb") as file, path.open("wb") as out:
-        kept: dict[int, int] = {}
-        to = writer.Writer(out, 4096, writer.CompressionType[packed], use_chunking=chunks)
-        to.start("ros2", "a library")
-        for schema, channel, message in reader.make_reader(file).iter_messages(log_time_order=False):
-            if channel.id not in kept:
-                number = to.register_schema(schema.name, schema.encoding, schema.data)
-                kept[channel.id] = to.register_channel(channel.topic, channel.message_encoding, number)
-            to.add_message(kept[channel.id], message.log_time, message.data, message.publish_time)
-        to.finish()
-    assert all(map(same, events_of(path), events_of(bags["mcap"]))) and len(events_of(path))
-
-
-@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
-def test_a_ros_2_bag_split_into_files_is_the_same_log(kind: str, bags: dict[str, Path], tmp_path: Path) -> None:
-    """As `ros2 bag record` splits: several files, one metadata.yaml that lists them."""
-    halves = [
-        copied(bags[kind], tmp_path / f"half{k}", "NONE", *part) for k, part in enumerate(((0, 900), (900, None)))
-    ]
-    whole = tmp_path / "split"
-    whole.mkdir()
-    yaml, names = YAML(), []
-    for half in halves:
-        (file,) = (path for path in half.iterdir() if path.suffix in (".db3", ".mcap"))
-        (whole / file.name).write_bytes(file.read_bytes())
-        names.append(file.name)
-    metadata = yaml.load(halves[0] / "metadata.yaml")
-    metadata["rosbag2_bagfile_information"]["relative_file_paths"] = names
-    yaml.dump(metadata, whole / "metadata.yaml")
-    assert all(map(same, events_of(whole), events_of(bags[kind]))) and len(events_of(whole)) == len(
-        events_of(bags[kind])
-    )
 
 
 def test_a_log_of_a_bag_uses_its_inertial_unit_and_its_satellite_fixes(bags: dict[str, Path]) -> None:
