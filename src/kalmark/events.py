@@ -72,6 +72,11 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 3] + "..."
 
 
+def is_number(value: Any) -> bool:
+    """Return whether a value is a number, and no truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def nanoseconds(t_s: Any, t_ns: Any, kind: str, robot: Any) -> int:
     """Return the time of an event in integer nanoseconds, from exactly one of seconds and nanoseconds."""
     if t_ns is None and isinstance(t_s, float) and -9e9 < t_s < 9e9:

@@ -18,6 +18,7 @@ from kalmark.arrays import Array
 from kalmark.campaign.campaign import FIGURES, Campaign, kinds, last_value, mean, rms
 from kalmark.campaign.cells import Cell, shown
 from kalmark.campaign.scoring import Scores
+from kalmark.events import is_number
 from kalmark.results.recording import replace_file, write
 from kalmark.results.report import show
 from kalmark.results.scene import COLOURS
@@ -132,8 +133,7 @@ class Sweep:
 
         rows = self.runs()
         for key in self.keys:
-            kinds_of = {float if isinstance(v, float | int) and not isinstance(v, bool) else type(v)
-                        for v in (row[key] for row in rows)}  # fmt: skip
+            kinds_of = {float if is_number(row[key]) else type(row[key]) for row in rows}
             as_type = float if kinds_of == {float} else shown if kinds_of != {bool} else bool
             rows = [row | {key: as_type(row[key])} for row in rows]
         names = list({name: None for row in rows for name in row})
@@ -149,7 +149,7 @@ class Sweep:
         from matplotlib.figure import Figure
 
         rows = self.runs()
-        numeric = [k for k in self.keys if all(_is_number(c.settings[k]) for c in self.cells)]
+        numeric = [k for k in self.keys if all(is_number(c.settings[k]) for c in self.cells)]
         along = (numeric or self.keys)[-1]
         values = [*dict.fromkeys(shown(cell.settings[along]) for cell in self.cells)]
         at = {text: float(text) if numeric else float(i) for i, text in enumerate(values)}
@@ -215,7 +215,3 @@ def _percent(key: str, value: Any) -> Any:
 def _setting(key: str, value: Any) -> str:
     """Return a setting as a curve's label has it: the name of an estimator, or the key's last word and the value."""
     return shown(value) if key.endswith("estimator.type") else f"{key.rpartition('.')[2]} {shown(value)}"
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -22,7 +22,7 @@ def diagnose(
     from kalmark.diagnosis.picture import draw_diagnosis
     from kalmark.diagnosis.verdict import diagnose as diagnosed
     from kalmark.results.plot import save_figure
-    from kalmark.results.recording import replace_file, write
+    from kalmark.results.recording import write
     from kalmark.results.run import Run
     from kalmark.results.verdict import verdict_lines
 
@@ -31,7 +31,7 @@ def diagnose(
         verdict = diagnosed(loaded, observations, progress=True)
         write(run / "summary.json", json.dumps(loaded.summary, indent=2, allow_nan=False) + "\n")
         picture = run / "diagnosis.png"
-        replace_file(picture, lambda path: save_figure(draw_diagnosis(loaded, verdict), path))
+        save_figure(draw_diagnosis(loaded, verdict), picture)
     if as_json:
         typer.echo(json.dumps(verdict.as_dict(), indent=2))
         return

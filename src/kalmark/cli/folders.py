@@ -89,7 +89,6 @@ def compare(
     from kalmark.results.compare import compare as compared
     from kalmark.results.compare import draw_comparison
     from kalmark.results.plot import save_figure
-    from kalmark.results.recording import replace_file
     from kalmark.results.run import Run
 
     writable(out.parent)
@@ -100,7 +99,7 @@ def compare(
         for title, rows in told.tables():
             print_table(title, ("", *told.names), rows, align="<" + ">" * len(told.names))
     out.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(out, lambda temporary: save_figure(draw_comparison(told), temporary))
+    save_figure(draw_comparison(told), out)
     typer.echo(str(out), err=as_json)
 
 
@@ -115,7 +114,7 @@ def explain(
     from kalmark.results.explain import explain as explanation_of
     from kalmark.results.plot import save_figure
     from kalmark.results.plot_scan import draw_scan
-    from kalmark.results.recording import file_name, replace_file
+    from kalmark.results.recording import file_name
     from kalmark.results.run import Run
 
     loaded = Run.load(run)
@@ -123,5 +122,5 @@ def explain(
     for line in told.lines():
         typer.echo(line)
     path = run / f"scan_{file_name(told.robot)}_{told.in_log}.png"
-    replace_file(path, lambda temporary: save_figure(draw_scan(loaded, told), temporary))
+    save_figure(draw_scan(loaded, told), path)
     typer.echo(str(path))

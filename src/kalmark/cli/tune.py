@@ -40,7 +40,7 @@ def tune(
     from kalmark.diagnosis.tune_picture import draw_tuning
     from kalmark.diagnosis.tuned_file import new_config
     from kalmark.results.plot import save_figure
-    from kalmark.results.recording import replace_file, write
+    from kalmark.results.recording import write
 
     out = out or Path("out") / f"{Path(config).stem}_tuned.yaml"
     if out.suffix not in (".yaml", ".yml"):
@@ -51,7 +51,7 @@ def tune(
     text, picture = new_config(config, tuning, overrides or (), log), out.with_suffix(".png")
     out.parent.mkdir(parents=True, exist_ok=True)
     write(out, text)
-    replace_file(picture, lambda path: save_figure(draw_tuning(tuning, Path(config).stem), path))
+    save_figure(draw_tuning(tuning, Path(config).stem), picture)
     show(tuning)
     typer.echo(f"{out}: the new configuration; {picture}: the NIS before and after")
 

@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.config.tree import OVERRIDE, Tree, show
 from kalmark.declare import class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
-from kalmark.events import most
+from kalmark.events import is_number, most
 from kalmark.logs.calibration import INTRINSICS, read_calibration
 from kalmark.logs.source import mapping
 
@@ -43,8 +43,7 @@ def _parameter(name: str) -> str:
 
 
 def _density(path: Path, name: str, value: Any) -> float:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not 0 <= value <= most(name)[0]:
+    if not is_number(value) or not 0 <= value <= most(name)[0]:
         raise ConfigError(f"{path}: {name}: got {show(value)}, expected a number >= 0")
     return float(value)
 

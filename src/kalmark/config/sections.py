@@ -37,7 +37,7 @@ from kalmark.declare import (
     world_of_class,
 )
 from kalmark.errors import ModelError
-from kalmark.events import MOST
+from kalmark.events import MOST, is_number
 from kalmark.models.protocols import of_pair
 from kalmark.tracks.front_ends import SearchingDetector
 
@@ -74,15 +74,11 @@ def expected(what: str, *below: str) -> PydanticCustomError:
     return PydanticCustomError("expected", "{what}", {"what": what, "below": below})
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _sigmas(value: Any) -> float | tuple[float, ...]:
     three = value if isinstance(value, list | tuple) else [value] * 3
-    if len(three) == 3 and all(_is_number(v) and 0 <= v <= FAR for v in three):
+    if len(three) == 3 and all(is_number(v) and 0 <= v <= FAR for v in three):
         return tuple(map(float, three)) if isinstance(value, list | tuple) else float(value)
-    far = f" and <= {FAR:.0e}" if any(_is_number(v) and FAR < v < math.inf for v in three) else ""
+    far = f" and <= {FAR:.0e}" if any(is_number(v) and FAR < v < math.inf for v in three) else ""
     raise expected(f"a number >= 0{far}, or a list of three: one for each axis")
 
 
@@ -92,7 +88,7 @@ Sigmas = Annotated[float | tuple[float, ...], PlainValidator(_sigmas)]
 def _linearity(value: Any) -> float | str:
     if value == "off":
         return "off"
-    if _is_number(value) and 0 < value < math.inf:
+    if is_number(value) and 0 < value < math.inf:
         return float(value)
     raise expected("a number > 0, or off")
 

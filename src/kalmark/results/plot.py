@@ -5,7 +5,9 @@ from __future__ import annotations
 import textwrap
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
+from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +22,7 @@ from matplotlib.transforms import Affine2D
 from kalmark.arrays import Array
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.landmarks import LINES, TAG
-from kalmark.results.recording import Recording
+from kalmark.results.recording import Recording, replace_file
 from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares
 from kalmark.results.verdict import alarm
 
@@ -60,7 +62,7 @@ class Stroke(NamedTuple):
 
 
 def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim: bool = True) -> None:
-    """Write a figure as a PNG, with a narrow rim around all that is drawn, or as it is.
+    """Write a figure as a PNG, completely or not at all, with a narrow rim around all that is drawn, or as it is.
 
     matplotlib draws twice to find that box, which only a figure with a layout of its own needs.
     """
@@ -70,7 +72,8 @@ def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # of a name in a script that the font does not have
         box = None if not rim else "tight" if laid_out else figure.get_tightbbox().padded(0.15)
-        figure.savefig(path, dpi=dpi, format="png", bbox_inches=box, pad_inches=0.15, pil_kwargs={"compress_level": 3})
+        style: dict[str, Any] = {"bbox_inches": box, "pad_inches": 0.15, "pil_kwargs": {"compress_level": 3}}
+        replace_file(FilePath(path), partial(figure.savefig, dpi=dpi, format="png", **style))
 
 
 def save_map(run: Recording, path: str | PathLike[str]) -> None:

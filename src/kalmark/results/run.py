@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from kalmark.results.evaluate import evaluate
 from kalmark.results.history import Camera, Measuring
-from kalmark.results.recording import Recording, file_name, only_writer, replace_file, write
+from kalmark.results.recording import Recording, file_name, only_writer, write
 from kalmark.results.scene import steps_of
 
 
@@ -56,12 +55,11 @@ class Run(Recording):
         from kalmark.results.report import report_html
 
         folder = Path(folder)
-        replace_file(folder / "map.png", lambda path: save_map(self, path))
+        save_map(self, folder / "map.png")
         written = [folder / "map.png", folder / "report.html"]
         drawable: list[Camera | Measuring] = [*self.history.cameras, *measuring(self.history)]
         for seen in (sensor for sensor in drawable if len(steps_of(self.history, sensor))):
             written.append(folder / f"sensor_{file_name(seen.robot)}_{file_name(seen.sensor)}.png")
-            picture = draw_sensor(self, seen.robot, seen.sensor)
-            replace_file(written[-1], partial(save_figure, picture, dpi=110, rim=False))
+            save_figure(draw_sensor(self, seen.robot, seen.sensor), written[-1], dpi=110, rim=False)
         write(folder / "report.html", report_html(self))
         return written

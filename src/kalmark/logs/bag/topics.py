@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from kalmark.declare import Number, Within, class_of, classes, declared, parameters, refuse, register
 from kalmark.errors import LogError, ModelError
-from kalmark.events import Id, shown
+from kalmark.events import Id, is_number, shown
 from kalmark.logs.columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 from kalmark.logs.source import landmark_id, nanoseconds, nearest
 
@@ -134,7 +134,7 @@ def _microseconds(time: Any) -> int:
 
 
 def _a_size(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e3
+    return is_number(value) and 0 < value < 1e3
 
 
 @register("topic", "scan")
@@ -265,7 +265,7 @@ class Placed(Posed):
         if self.origin is None:
             return
         given = self.origin if isinstance(self.origin, list | tuple) else ()
-        numbers = [float(v) for v in given if isinstance(v, int | float) and not isinstance(v, bool)]
+        numbers = [float(v) for v in given if is_number(v)]
         limits = (90.0, 360.0, 1e5)
         if len(numbers) != 3 or len(given) != 3 or not all(abs(v) <= m for v, m in zip(numbers, limits, strict=True)):
             raise refuse(self, "origin", "[latitude_deg, longitude_deg, height_m]")
