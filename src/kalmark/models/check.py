@@ -22,7 +22,7 @@ from kalmark.declare import classes
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import ANGLE, HOMOGENEOUS, RHO, ROTATION, SCALAR, SE2, SE3, TURNED, Rn, Space
 from kalmark.models import protocols
-from kalmark.models.sensing import Spatial
+from kalmark.models.seen import Spatial
 
 Rng = np.random.Generator
 Batch = Callable[[Array], Any]

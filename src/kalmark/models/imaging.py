@@ -11,7 +11,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.declare import NotNegative, Number, Positive, Within, declared, register
 from kalmark.errors import EventError
 from kalmark.models import cameras, lines, seen, tags
-from kalmark.models.sensing import Spatial, constant
+from kalmark.models.seen import Spatial, constant
 
 __all__ = ["Omnidirectional", "PinHole", "PixelDepth", "Segments", "Stereo", "TagCorners"]
 

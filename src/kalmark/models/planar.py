@@ -14,8 +14,7 @@ from kalmark.declare import Estimated, Limit, NotNegative, Number, Positive, dec
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import seen
-from kalmark.models.seen import refuse_negative_ranges
-from kalmark.models.sensing import Sensing
+from kalmark.models.seen import Sensing, refuse_negative_ranges
 
 __all__ = ["Bearing", "Position2D", "Range", "RangeBearing", "RangeBearingSignature"]
 

@@ -13,8 +13,7 @@ from kalmark.declare import Limit, NotNegative, Positive, declared, register
 from kalmark.errors import EventError
 from kalmark.geometry.directions import inv_spherical_many
 from kalmark.models import seen, walls
-from kalmark.models.seen import refuse_negative_ranges
-from kalmark.models.sensing import Spatial
+from kalmark.models.seen import Spatial, refuse_negative_ranges
 
 __all__ = ["Position3D", "RangeBearing3D", "TagPose", "Wall"]
 

@@ -21,8 +21,7 @@ from kalmark.errors import EventError
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
 from kalmark.models import seen
 from kalmark.models.protocols import CHANGE, POSE, TWIST
-from kalmark.models.seen import residual
-from kalmark.models.sensing import Sensing
+from kalmark.models.seen import Sensing, residual
 
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",

@@ -29,7 +29,7 @@ from kalmark.models.protocols import (
     image_size,
     range_limit,
 )
-from kalmark.models.sensing import Spatial
+from kalmark.models.seen import Spatial
 from kalmark.models.sensors import Wall
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.merging import make_equal
