@@ -306,10 +306,8 @@ class Replay:
         """
         found, points = [], np.ones(len(state.groups[LANDMARKS]), dtype=np.bool_)
         for factor in seen:
-            (of_pose, *_, of_wall), mount = (
-                factor.term.blocks,
-                self.given.robots[factor.sensor[0]].sensors[factor.sensor[1]],
-            )
+            of_pose, *_, of_wall = factor.term.blocks
+            mount = self.given.robots[factor.sensor[0]].sensors[factor.sensor[1]]
             if of_wall.group != LANDMARKS or self.given.seen_by(mount.sensor) is not self.given.landmark:
                 continue
             wall, first = np.unique(of_wall.rows, return_index=True)

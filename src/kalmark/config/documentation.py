@@ -63,10 +63,8 @@ no gate).
 
 def page() -> str:
     """Return the page as Markdown."""
-    of_sensor, parts = (
-        "`robots.NAME.sensors.SENSOR",
-        [HEAD.format(names=", ".join(f"`{n}`" for n in shipped_configs()))],
-    )
+    of_sensor = "`robots.NAME.sensors.SENSOR"
+    parts = [HEAD.format(names=", ".join(f"`{n}`" for n in shipped_configs()))]
     parts += [_section("The file", schema.Config)]
     parts += [_section("`log`", schema.LogConfig), _choice("`log.topics.TOPIC`, of a bag", "topic")]
     parts += [_section("`robots.NAME`", schema.RobotConfig)]

@@ -158,10 +158,8 @@ def cameras(slam: Slam) -> tuple[Camera, ...]:
         for name, mount in robot.sensors.items():
             sensor, columns = mount.sensor, tuple(mount.sensor.columns)
             if columns[0].endswith("_px") and isinstance(sensor, Imaging):
-                at, size = (
-                    mount_now(slam, robot.name, name, mount.at),
-                    (float(sensor.width_px), float(sensor.height_px)),
-                )
+                at = mount_now(slam, robot.name, name, mount.at)
+                size = (float(sensor.width_px), float(sensor.height_px))
                 found.append(Camera(robot.name, name, at, size, columns, _corners(sensor)))
     return tuple(found)
 
