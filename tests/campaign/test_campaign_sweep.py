@@ -192,7 +192,7 @@ def test_a_campaign_that_is_killed_goes_on_where_it_was(file: Path, tmp_path: Pa
     options = ["campaign", str(file), "--runs", "25", "--set", "steps=100", "--jobs", "1"]
     code = "import sys; from kalmark.cli import main; sys.exit(main())"
     process = subprocess.Popen([sys.executable, "-c", code, *options, "--out", str(out)], stderr=subprocess.DEVNULL)
-    while process.poll() is None and len([*out.glob("runs/*/*.npz")]) < 2:
+    while process.poll() is None and len([*out.glob("runs/*/0*.npz")]) < 2:
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
