@@ -16,7 +16,7 @@ from kalmark.management.pending import Initialization
 from kalmark.management.tags import Mirrored
 from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.landmarks import AsPoint
+from kalmark.models.landmarks import AnchoredHomogeneous, AsPoint
 from kalmark.models.protocols import (
     Ambiguous,
     Intersecting,
@@ -39,8 +39,8 @@ class Policy:
     first sight).  `starts` are the answers to an observation without an id that start one.  `averages`: the association
     may answer with mixtures; `holds_back`: its pairs are tested against chance; `reviews`: landmarks may change after a
     scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the
-    last `keep_poses` clones are kept for tentative landmarks.  `by_ids`: nothing is to be decided of a scan whose ids
-    are of landmarks of one type in the map.
+    last `keep_poses` clones are kept for tentative landmarks.  `restarts`: rays may have to be started again
+    (`baselines.py`).  `by_ids`: nothing is to be decided of a scan whose ids are of landmarks of one type in the map.
     """
 
     association: Association
@@ -55,6 +55,7 @@ class Policy:
     reviews: bool
     linear: float
     keep_poses: int
+    restarts: bool
     by_ids: bool
 
 
@@ -80,6 +81,7 @@ def policy_of(
         averages(association), upkeep.hold_back and not weighs(association), reviews,
         0.0 if channel.joins else linear or 0.0,
         upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
+        not channel.finds_depth and channel.mount >= 0 and any(isinstance(kind, AnchoredHomogeneous) for kind in seen),
         type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
         and not (reviews or varies or looks_back or approaches),
     )  # fmt: skip

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
 from kalmark.errors import MapError
 from kalmark.events import Id
-from kalmark.management import delayed, tags, walls
+from kalmark.management import baselines, delayed, tags, walls
 from kalmark.management.pending import Initialization, Step
 from kalmark.report import Observation
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
+from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Pending, Status, Track
 
 UNEXPLAINED = "no landmark explains this measurement"
+AGAIN = "started again: its mount leaves open from where it was seen before"
 SINGULAR = "what it may be cannot be computed: a matrix is singular"
 
 
@@ -64,6 +66,33 @@ def _initialized(state: State, scan: ScanContext, policy: Policy, k: int, name: 
         return Observation(k, None, "deferred", name, None, reason)
     why = f"first sighting: {reason}" if reason else "first sighting"
     return Observation(k, None, "tentative", name, None, why)
+
+
+def left_open(
+    state: State, scan: ScanContext, groups: list[tuple[ObservationModel, list[int]]], decisions: Sequence[Decision]
+) -> list[int]:  # fmt: skip
+    """Return the observations of rays whose depth a mount leaves open, and take them out of the groups to be fused."""
+    found: list[int] = []
+    for model, rows in groups:
+        slots = state.tracks.slots_of([decisions[k][0] for k in rows])
+        found += [
+            k
+            for k, is_open in zip(rows, baselines.left_open(scan, model, slots, rows).tolist(), strict=True)
+            if is_open
+        ]
+        rows[:] = [k for k in rows if k not in found]
+    return found
+
+
+def restart(state: State, scan: ScanContext, rows: Sequence[int], decisions: Sequence[Decision]) -> list[Observation]:
+    """Start the landmarks of these observations again: after a correction, for the camera is on their new anchors."""
+    found, names = [], [cast("Id", decisions[k][0]) for k in rows]
+    for k, name in zip(rows, names, strict=True):
+        start, track = scan.start_of(k), state.tracks.confirmed[name]
+        state.map.remove(track.slot)
+        state.tracks.replace(track, state.add(start), track.model)
+        found.append(Observation(k, scan.ids[k], "new", track.id, None, AGAIN))
+    return found
 
 
 def _refusal(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation | None:

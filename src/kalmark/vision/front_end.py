@@ -156,7 +156,7 @@ class FrontEnd:
             if name is None or o.outcome not in ("new", "associated"):
                 continue
             y = report.y[o.index, :PIXEL]
-            if o.outcome == "new":
+            if o.outcome == "new" and name not in self.looks:  # else it was only started again
                 view = self._taken(y, T)
                 if view is not None:
                     look = self.looks[name] = Look(views=[view], seen=self.frame)

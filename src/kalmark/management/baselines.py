@@ -1,0 +1,52 @@
+"""Rays of a camera whose mount is in the map: which are started again, in place of a depth that the mount leaves open.
+
+A ray is seen along h - rho t, t the way from its anchor to the camera.  Where the camera turns about its robot, the
+lever arm of the mount is a part of t.  While rho is open, too, images measure the product of two unknowns: what they
+say of the mount then is far from Gaussian, with its rotation it can have two maxima, and no later image repairs a
+correction towards the wrong one.  docs/bearing_only.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kalmark.arrays import Flags, Index
+from kalmark.geometry.rotations import skew
+from kalmark.models.landmarks import AnchoredHomogeneous
+from kalmark.models.observe import linearize
+from kalmark.tracks.channel import ObservationModel
+from kalmark.tracks.scan import ScanContext
+
+SHARE = 0.05  # of the way from its anchor that a mount may leave open
+
+
+def left_open(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:
+    """Return which observations `rows` (K,), of the blocks `slots`, are of rays whose way t the mount leaves open.
+
+    With C = P_tm P_mm^-1 P_mt, what the position m of the mount leaves open of t: that moves the ray by more than the
+    noise, Var(rho) tr(R^-1 E_h C E_h') > 1, and is more than a share of the way, tr C > SHARE^2 |t|^2.
+    """
+    if not isinstance(model.landmark, AnchoredHomogeneous):
+        return np.zeros(len(rows), dtype=np.bool_)
+    channel, map_, found = scan.channel, scan.map, np.zeros(len(rows), dtype=np.bool_)
+    T, T_r, T_s = channel.composed(map_, scan.robot)
+    l, R = map_.means(slots, model.d), scan.noise(model, slots, rows)
+    E_h = linearize(model.model, channel.head(map_, scan.robot), l, scan.y[rows])[3][:, :, 3:6]
+    W = E_h.transpose(0, 2, 1) @ np.linalg.solve(R, E_h)  # E_h' R^-1 E_h
+    P_m = map_.covariance([channel.mount])[:3, :3]
+    most = 4.0 * np.trace(P_m) * np.trace(W, axis1=1, axis2=2)  # two places of the camera, each moved by m
+    robot, mount = len(map_.rows(scan.robot)), len(map_.rows(channel.mount))
+    for i, slot in enumerate(slots.tolist()):
+        variance = map_.covariance([slot])[-1, -1]
+        if variance * most[i] < 1.0:
+            continue
+        t = T[:3] - l[i, :3]
+        P = map_.covariance([channel.mount, scan.robot, slot])
+        D = np.zeros((3, len(P)))  # t, but for the turn that all of the map has in common
+        D[:, :3], D[:, 3:6] = T_s[:3, :3], skew(t) @ T_s[3:, 3:]
+        D[:, mount : mount + 6] = T_r[:3] + np.hstack([np.zeros((3, 3)), skew(t)])
+        D[:, mount + robot : mount + robot + 3] = -np.eye(3)
+        P_tm = D @ P[:, :3]
+        C = P_tm @ np.linalg.pinv(P_m, hermitian=True) @ P_tm.T
+        found[i] = variance * np.sum(W[i] * C) > 1.0 and np.trace(C) > SHARE**2 * (t @ t)
+    return found
