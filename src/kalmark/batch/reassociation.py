@@ -22,8 +22,7 @@ from scipy.spatial import cKDTree
 from kalmark.arrays import Array, Flags
 from kalmark.association.gated import assigned
 from kalmark.batch.data import Replay
-from kalmark.batch.problem import Problem
-from kalmark.batch.solver import Batch, Reduced, optimum
+from kalmark.batch.solver import Batch, optimum
 from kalmark.batch.state import LANDMARKS, Ints, looked
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
@@ -36,7 +35,7 @@ SIGHTINGS = 5  # of a new landmark, in as many scans
 ODDS = 100.0  # against chance, at which two landmarks are one
 TOGETHER, WITHIN = 0.1, 0.5  # of a landmark's observations: in a scan with the other one, and within its gate
 ROUNDS = 12
-NEAR = 1e-4  # of the map's size, is a step at which a round ends; the last one ends at the optimum
+NEAR = 1e-2  # of the map's size, is a step at which a round ends; the last one ends at the optimum
 FAR = 1e9  # d2 of what is no candidate
 
 
@@ -76,7 +75,7 @@ def reassociated(replay: Replay, may_change: Flags, numbers: Iterable[int] = ran
             look.landmarks[new[-1]] = place
             for row in rows:
                 decided[row] = new[-1]
-        same = dict(coinciding(problem, batch, decided, look, new))
+        same = dict(coinciding(batch, decided, look, new))
         merged = {one: same.get(other, other) for one, other in merged.items()} | same
         decided = [same.get(name, name) if name is not None else None for name in decided]
         settled = decided == names
@@ -125,7 +124,10 @@ class _Look:
         self.factor = max(1.0, float(np.median(some)) / usual) if len(some) else 1.0
 
     def decided(self, names: Sequence[Id | None]) -> list[Id | None]:
-        """Return the landmark of each observation: of each scan the assignment of least sum of d2 within the gate."""
+        """Return the landmark of each observation: of each scan the assignment of least sum of d2 within the gate.
+
+        That is the nearest of each, but for scans in which two have the same or another observation holds it.
+        """
         decided, gate = list(names), self.factor * chi2_gate(GATE, self.dof)
         held: dict[int, set[Id]] = {}
         for row in np.flatnonzero(~self.open).tolist():
@@ -133,17 +135,22 @@ class _Look:
             if name is not None:
                 held.setdefault(int(self.scan[row]), set()).add(name)
         for seen in self.seen:
-            order = np.argsort(self.scan[seen.row], kind="stable")
-            ends = np.flatnonzero(np.diff(self.scan[seen.row[order]])) + 1
-            for part in np.split(order, ends):
+            scans, within, nearest = self.scan[seen.row], seen.d2[:, 0] <= gate, seen.near[:, 0]
+            for row, k, near in zip(seen.row.tolist(), nearest.tolist(), within.tolist(), strict=True):
+                decided[row] = self.ids[k] if near else None
+            pairs, number = np.unique((scans * len(self.ids) + nearest)[within], return_counts=True)
+            order = np.flatnonzero(np.isin(scans, [*held, *(pairs[number > 1] // len(self.ids)).tolist()]))
+            order = order[np.argsort(scans[order], kind="stable")]
+            ends = np.flatnonzero(np.diff(scans[order])) + 1
+            for part in np.split(order, ends) if len(order) else ():
                 near, taken = seen.near[part], held.get(int(self.scan[seen.row[part[0]]]), set())
                 some = [k for k in np.unique(near).tolist() if self.ids[k] not in taken]
                 d2 = np.full((len(part), len(some)), FAR)
                 for column, k in enumerate(some):
                     here = near == k
                     d2[here.any(axis=1), column] = seen.d2[part][here]
-                pairs = assigned(d2, gate) if some else np.full(len(part), -1)
-                for row, pair in zip(seen.row[part].tolist(), pairs.tolist(), strict=True):
+                taken_by = assigned(d2, gate) if some else np.full(len(part), -1)
+                for row, pair in zip(seen.row[part].tolist(), taken_by.tolist(), strict=True):
                     decided[row] = self.ids[some[pair]] if pair >= 0 else None
         return decided
 
@@ -212,9 +219,7 @@ def _seen(replay: Replay, batch: Batch, key: tuple[str, str, int], may_change: F
     return [_Seen(row, near, d2, places, L_y @ R @ L_y.swapaxes(1, 2))]
 
 
-def coinciding(
-    problem: Problem, batch: Batch, names: Sequence[Id | None], look: _Look, new: Sequence[Id]
-) -> list[tuple[Id, Id]]:
+def coinciding(batch: Batch, names: Sequence[Id | None], look: _Look, new: Sequence[Id]) -> list[tuple[Id, Id]]:
     """Return pairs of landmarks that are one; each landmark is in one pair at most.
 
     The first is the new one, or that of fewer observations.
@@ -232,12 +237,11 @@ def coinciding(
     seen = sp.csr_array((np.ones(len(rows)), (scans, which)), shape=(int(scans.max()) + 1, len(ids)))
     number = np.bincount(which, minlength=len(ids))
     together = (seen.T @ seen).toarray() > TOGETHER * np.minimum.outer(number, number)
-    P = Reduced(problem, problem.at(batch.state)).joint()
     means, dof = batch.means[:, :d], batch.means.shape[1]
     one, two = np.triu_indices(len(ids), 1)
     apart = ~together[one, two] & (number[one] > 0) & (number[two] > 0)
     one, two = one[apart], two[apart]
-    blocks = P.reshape(len(ids), dof, len(ids), dof)[:, :d, :, :d]
+    blocks = batch.joint.reshape(len(ids), dof, len(ids), dof)[:, :d, :, :d]
 
     def block(a: Ints, b: Ints) -> Array:
         return np.asarray(blocks[a, :, b, :])

@@ -44,14 +44,14 @@ FLAT = 1e-12  # least ratio of a squared pivot of S to the information of its bl
 class Batch:
     """The optimum of a log's data: its state, with a pose `nodes` (S,) for each scan and the landmarks `ids`.
 
-    `covariances` (m, dof, dof) are those of the landmarks, `chi2` is the sum of squared whitened residuals (motion
+    `joint` (m dof, m dof) is the covariance of the landmarks, `chi2` is the sum of squared whitened residuals (motion
     included), `dof` their number less what they determine, `relative_step` the last one over the map's size.
     """
 
     ids: list[Id]
     nodes: Ints
     state: State
-    covariances: Array
+    joint: Array
     chi2: float
     dof: int
     iterations: int
@@ -66,6 +66,11 @@ class Batch:
     def means(self) -> Array:
         """The landmarks (m, size)."""
         return self.state.groups[LANDMARKS]
+
+    @cached_property
+    def covariances(self) -> Array:
+        """The covariances (m, dof, dof) of the landmarks."""
+        return _blocks(self.joint, len(self.means))
 
     def sigma(self) -> Array:
         """Return the sigma (m,) of each landmark's position: the root of its covariance's trace, in metres."""
@@ -86,7 +91,7 @@ def optimum(
         for iteration in iterations:
             search.advance()
             if search.size < tolerance or search.flat:
-                at, P = search.at, Reduced(problem, search.at).covariances()
+                at, P = search.at, Reduced(problem, search.at).joint()
                 chi2, dof = 2 * search.cost(at, search.multipliers), len(at.z) + len(at.w) - int(problem.free.sum())
                 return Batch(problem.ids, problem.nodes, at.state, P, chi2, dof, iteration, search.size)
     raise unsolved(f"the last of {iteration} steps is {search.size:.3g} of the map, expected {tolerance:g}")
@@ -228,8 +233,7 @@ class Reduced:
 
     def covariances(self) -> Array:
         """Return the covariances (m, dof, dof) of the landmarks: blocks of the inverse of S, zero where held."""
-        m, dof = len(self.state.groups[LANDMARKS]), self.state.spaces[LANDMARKS].dof
-        return self.joint().reshape(m, dof, m, dof)[np.arange(m), :, np.arange(m)]
+        return _blocks(self.joint(), len(self.state.groups[LANDMARKS]))
 
     def joint(self) -> Array:
         """Return the joint covariance (m dof, m dof) of the landmarks: the inverse of S, zero where held."""
@@ -257,3 +261,9 @@ class Reduced:
             return b
         x: Array = la.cho_solve(self.factor, b)
         return x
+
+
+def _blocks(P: Array, m: int) -> Array:
+    """Return the diagonal blocks (m, dof, dof) of P (m dof, m dof)."""
+    dof = len(P) // max(m, 1)
+    return P.reshape(m, dof, m, dof)[np.arange(m), :, np.arange(m)]
