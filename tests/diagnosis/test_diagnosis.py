@@ -72,6 +72,7 @@ FAULTS: dict[str, tuple[Change | None, tuple[str, ...], float | None]] = {
     "range_scale": (measuring(lambda y: y * [1.06, 1.0]), (), 0.06),
     "time_offset": (lambda e: seen(e, t_ns=e.t_ns + 100_000_000) if isinstance(e, Scan) else e, (), -0.1),
     "odometry_turn": (controlling(lambda u: np.add(u, [0.0, 0.02])), (), -0.02),
+    "mount_position": (None, ("robots.rover.sensors.lidar.mount.y_m=0.5",), -0.5),
 }
 MISTAKES: dict[str, tuple[Change | None, tuple[str, ...]]] = {
     "bearing_sign": (measuring(lambda y: y * [1.0, -1.0]), ()),
@@ -91,12 +92,42 @@ def test_a_fault_is_named_first_with_its_size(name: str) -> None:
     assert verdict.causes[0].cure
 
 
-@pytest.mark.parametrize("name", ["range_sigma", "bearing_offset", "range_scale"])
+@pytest.mark.parametrize("name", ["range_sigma", "bearing_offset", "range_scale", "mount_position"])
 def test_the_cure_of_a_fault_takes_it_out(name: str) -> None:
     change, settings, _ = FAULTS[name]
     cure = km.diagnose(run_of(change, settings)).causes[0].cure
     after = km.diagnose(run_of(change, (*settings, cure.removeprefix("--set "))))
     assert name not in [cause.name for cause in after.causes]
+
+
+def test_landmarks_that_are_moved_once_are_named_and_are_no_outliers() -> None:
+    log, rng = simulate(world_of(), 3), np.random.default_rng(0)
+    ids, often = np.unique([i for e in log.events if isinstance(e, Scan) for i in e.ids or ()], return_counts=True)
+    moved = ids[np.argsort(-often)[:2]]
+    middle, truth = log.events[len(log.events) // 2].t_ns, log.truth["rover"]
+
+    def other(e: Event) -> Event:
+        if not isinstance(e, Scan) or e.ids is None or e.t_ns < middle:
+            return e
+        pose = truth.poses[np.searchsorted(truth.t_ns, e.t_ns)]
+        places = np.array([np.add(log.landmarks[i][:2], (1.5, 0.6)) for i in e.ids])
+        y = km.geometry.observe(compose(pose, np.array([0.3, 0.0, 0.0]))[0], places)[0]
+        y += rng.normal(size=y.shape) * (0.1, 0.02)
+        return seen(e, y=np.where(np.isin(e.ids, moved)[:, None], y, e.y))
+
+    names = [(c.name, c.evidence.split()[1]) for c in km.diagnose(run_of(other)).causes]
+    assert {("moving_landmark", str(i)) for i in moved} == {*names[:2]}
+    assert "outliers" not in dict(names)
+
+
+def test_a_log_that_does_not_fit_is_not_ok_where_there_is_no_batch_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unsolved(*given: Any) -> Any:
+        raise km.KalmarkError("not determined")
+
+    monkeypatch.setattr("kalmark.diagnosis.verdict._searched", unsolved)
+    assert km.diagnose(run_of()).map == "ok"
+    verdict = km.diagnose(run_of(measuring(lambda y: np.add(y, [0.0, 0.5 * np.sin(3 * y[0, 0])]))))
+    assert (verdict.map, verdict.causes[0].name) == ("doubtful", "misfit")
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -604,7 +635,8 @@ def test_a_verdict_in_words_is_short_or_whole() -> None:
 def test_a_hall_that_is_mapped_twice_after_a_gap_is_wrong_and_its_wheel_is_named() -> None:
     log = hall(1, gap_s=4.0)
     doubled, bridged = (km.diagnose(mapped(log, gaps=gaps)) for gaps in ("ignore", "widen"))
-    assert (doubled.map, [cause.name for cause in doubled.causes[:2]]) == ("wrong", ["map_repeats", "gap"])
+    assert (doubled.map, [cause.name for cause in doubled.causes[:2]]) == ("wrong", ["gap", "map_repeats"])
+    assert "places are mapped again after it" in doubled.causes[0].evidence
     assert (bridged.map, bridged.causes[0].name) == ("ok", "odometry_turn")
     assert "sigma_turn_rad_per_m" in bridged.causes[0].cure
     assert "estimator" not in [cause.name for cause in bridged.causes]

@@ -76,6 +76,7 @@ CASES: dict[str, tuple[Change, str, str]] = {
     "degrees": (measuring(lambda y: y * [1.0, 180 / np.pi]), "units", "rover.lidar.*degrees"),
     "millimetres": (measuring(lambda y: y * [1e3, 1.0]), "units", "rover.lidar.*millimetres"),
     "ways": (controlling((1e3, 1.0)), "units", "controls of rover.*millimetres"),
+    "speeds": (controlling((3.6, 1.0)), "units", "speeds of the controls of rover.*kilometres per hour"),
     "times": (controlling((1.0, 1.0), 1e3), "units", "times.*milliseconds"),
 }
 

@@ -11,6 +11,8 @@ from kalmark.arrays import Array
 from kalmark.batch.problem import Factor
 from kalmark.batch.state import POSES, Ints, State
 from kalmark.diagnosis.linear import Linear
+from kalmark.geometry.angles import rotation
+from kalmark.geometry.rotations import matrix
 from kalmark.results.measures import pose_error
 
 SLOW_S = 1e-3  # least time between two poses
@@ -98,6 +100,17 @@ def _of_sensor(
             moving += np.einsum("kij,kj->ki", E[:, :, first : first + dof], rates[block.rows, :dof])
         first += dof
     yield "time_offset", factor.sensor, "s", moving
+    observer, d = factor.term.blocks[0], state.d
+    if observer.group == POSES:
+        axes = _axes(state.groups[POSES][observer.rows])
+        for k, name in enumerate(("x_m", "y_m", "z_m")[:d]):
+            yield "mount_position", (*factor.sensor, name), "m", np.einsum("kij,kj->ki", E[:, :, :d], axes[:, :, k])
+
+
+def _axes(poses: Array) -> Array:
+    """Return the axes (K, d, d) of robots at poses (K, 3) or (K, 7), in the world."""
+    turns = map(rotation, poses[:, 2].tolist()) if poses.shape[1] == 3 else map(matrix, poses[:, 3:])
+    return np.array([*turns])
 
 
 def _longer(names: tuple[str, ...], e: Array) -> Array:

@@ -24,6 +24,7 @@ from kalmark.slam.robot import Robot
 TURNS_DEG = (180, 90, -90)
 DEGREE = math.pi / 180
 LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
+SPEEDS = {"kilometres per hour": 1 / 3.6, "miles per hour": 0.44704}
 TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6}
 TURNS = ("w_radps", "dtheta_rad", "steering_rad")  # of controls of the plane, to the left
 WHEELS = ("left_rad", "right_rad")
@@ -169,6 +170,9 @@ def _of_controls(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
     lengths = [name for name in names if name.endswith(("_m", "_mps"))]
     for unit, factor in LENGTHS.items() if lengths else ():
         yield made("units", f"ways of the controls of {of} fit only if they are {unit}", lengths, factor)
+    speeds = [name for name in names if name.endswith("_mps")]
+    for unit, factor in SPEEDS.items() if speeds else ():
+        yield made("units", f"speeds of the controls of {of} fit only if they are {unit}", speeds, factor)
 
 
 def shifted(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:

@@ -27,7 +27,7 @@ SHARE = (
 LEAST_GAIN = 8.0
 TAKEN_UP, ALIKE = 0.5, 0.85
 MOST_CONDITION = 1e6  # of the information on errors of one column, as correlations
-ORDER = ("steering_offset", "odometry_scale", "odometry_turn", "odometry_offset")
+ORDER = ("steering_offset", "mount_position", "odometry_scale", "odometry_turn", "odometry_offset")
 SCALINGS, SCALED = 5, 0.03
 NEAR = 9.0  # d2 of a landmark that an observation may well be of
 LOOKED_AT, DRAWS = 200, 40  # outliers whose landmarks are looked for, and draws of their errors
@@ -37,7 +37,8 @@ MANY = 0.3  # of the outliers, beyond chance, are of another landmark: it pulls 
 def best(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
-    Surveys that are off go before outliers and noise that would take them up, which are one for all of them, and noise
+    Surveys that are off go before outliers and noise that would take them up, which are one for all of them, landmarks
+    that move before outliers, and noise
     of several columns before outliers that explain clearly less: these would be one for all columns.
     A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
     as much, one in the sensors goes before one in the controls.
@@ -47,6 +48,9 @@ def best(sure: list[Finding]) -> list[Finding]:
     spread = first.name == "outliers" or first.unit == causes.TIMES
     if surveys and spread and sum(f.gain for f in surveys) > TAKEN_UP * first.gain:
         return [max(surveys, key=lambda f: f.gain)]
+    moving = [f for f in sure if f.name == "moving_landmark"]
+    if first.name == "outliers" and sum(f.gain for f in moving) > TAKEN_UP * first.gain:
+        return [max(moving, key=lambda f: f.gain)]
     noisy = [f for f in sure if f.unit == causes.TIMES and f.noise is not None]
     if first.name == "outliers" and ALIKE * sum(f.gain for f in noisy) >= first.gain:
         first = max(noisy, key=lambda f: f.gain)

@@ -17,6 +17,7 @@ from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
 from kalmark.diagnosis.columns import Where
 from kalmark.diagnosis.gross import LOST, fit, gross, started_at, until
+from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import LATE, Mistake
@@ -53,6 +54,7 @@ TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims t
 TINY_M = 1e-12
 SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to associations comes after it
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped anew because of it
+MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause that innovations look wrong, and nothing says why
 LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that says something
@@ -117,7 +119,7 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     else:
         verdict = _judged(run, log, most, progress)
         if mistake is not None:
-            rest = [c for c in verdict.causes if (mistake.name, c.name) != (LATE, "kidnapped")]
+            rest = [c for c in verdict.causes if mistake.name != LATE or c.name not in (LATE, "kidnapped")]
             verdict = replace(verdict, causes=(_of_mistake(mistake), *rest))
             if mistake.name == LATE and verdict.map == "ok":  # in turns nothing was of a landmark: they vanish, too
                 verdict = replace(verdict, map="doubtful")
@@ -139,7 +141,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     try:
         found = _searched(run, log, most, limit, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
-        signs = [Cause(MISFIT, begin_s(run), 0.0, line) for line in window_warnings(run)]
+        signs = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
         why = str(error).removeprefix("batch solution: ")
         checked = f"{INNOVATIONS}, no batch solution: {why}"
@@ -166,6 +168,13 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
     return Verdict(effect.status, tuple(causes), checked, *figures, found.search)
+
+
+def _all_misfit(run: Run) -> Iterator[str]:
+    """Tell that the observations do not fit, all over the run."""
+    mean = fit(run).mean
+    if MISFITS_ALL < mean < np.inf:
+        yield f"d2 per degree of freedom is {figure(mean, 2)} over all observations, where 1 is expected"
 
 
 def begin_s(run: Run) -> float:
@@ -308,10 +317,21 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
     return [replace(c, cure="") if f.overstated and f.of in lasting else c for f, c in causes]
 
 
+def _increments_s(run: Run, robot: str) -> float:
+    """Return the interval of the increments of a robot, s, 0 if its controls are velocities."""
+    controls = run.history.controls.get(robot)
+    if controls is None or controls.number < 2 or run.final_slam().robots[robot].motion.held:
+        return 0.0
+    return (controls.last_ns - controls.first_ns) * 1e-9 / (controls.number - 1)
+
+
 def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.overstated
     odd = _controls(run, log, finding.of[0]).odd(since_s) if finding.name in JUMPS and log is not None else None
     name, told = finding.name, words(finding, run.config)
+    if name == LATE and 0.0 < finding.value < _increments_s(run, finding.of[0]):
+        more = "a scan between two increments counts at the end of the first, which may be why"
+        told = f"{told[0]}; {more}", told[1]
     if odd is not None:
         name, told = "odometry_jump", of_odd_control(finding, odd)
     if name == TURNED and log is not None:
@@ -363,11 +383,11 @@ def _structural(run: Run, log: Log) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
     return [
         *carried_away(run, log),
+        *gaps(run),
         *repeats(run.summary),
         *split_landmarks(run),
         *misplaced_landmarks(run),
         *fits_nothing(run),
-        *gaps(run.summary),
         *given_up(run),
         *_started_elsewhere(run),
         *_copied(run, log),
@@ -453,18 +473,33 @@ def given_up(run: Run) -> list[Cause]:
     return found
 
 
-def gaps(summary: dict[str, Any]) -> list[Cause]:
-    """Return the gaps in the controls; one that was bridged, and after which the pose was known, is harmless."""
-    found = []
+def gaps(run: Run) -> list[Cause]:
+    """Return the gaps in the controls; one that was bridged, and after which the pose was known, is harmless.
+
+    Not if a place that was mapped before it is mapped again after it: then the robot was lost.
+    """
+    summary, found = run.summary, []
     stops = [gap for gap in summary.get("gaps", ()) if gap["kind"] != RULED_OUT]
     for gap in (gap for gap in stops if gap["action"] == "ignore" or matters(gap)):
         lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
+        anew = any(_mapped_again(run, part, gap["start_s"]) for part in summary.get("repeats", ()))
         cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
-        evidence = (
-            f"the control of {gap['robot']} stops for {figure(lasts)} s{', which was bridged' if bridged else ''}"
+        told = (
+            ", which was bridged" if bridged and not anew else ", and places are mapped again after it" if anew else ""
         )
-        found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged))
+        evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s{told}"
+        cure = cure or ("--set upkeep.repeats=merge" if anew else "")
+        found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged and not anew))
     return found + [Cause("odometry_jump", begin_s, 0.0, line, "", True) for begin_s, line in left_out(summary)]
+
+
+def _mapped_again(run: Run, part: dict[str, Any], t_s: float) -> bool:
+    """Return whether most of a repeat's older landmarks were seen first before a time, and the newer ones after it."""
+    h = run.history
+    names, first = np.unique(h.landmark, return_index=True)
+    at = dict(zip(names.tolist(), (h.t_ns[h.step[first]] * 1e-9).tolist(), strict=True))
+    before = [(at.get(a, np.inf) < t_s) & (at.get(b, -np.inf) >= t_s) for a, b in part["landmarks"]]
+    return float(np.mean(before)) > MOST_PAIRS
 
 
 def repeats(summary: dict[str, Any]) -> list[Cause]:

@@ -161,6 +161,13 @@ def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, corrected(config, "shift_s", where, finding.value)
 
 
+def _mount_position(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, sensor, column = finding.of
+    now = _current(config, robot, "sensors", sensor, "mount", column) or 0.0
+    evidence = f"{column} of the mount of {_sensor(finding)} is {figure(now + finding.value)}, not {figure(now)}"
+    return f"{evidence} ({_sure(finding)})", _set(robot, f"sensors.{sensor}.mount.{column}", now + finding.value)
+
+
 def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, column, kind = finding.of
     little = "little" if finding.value > 0 else "much"
@@ -283,6 +290,7 @@ _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "range_offset": _range_offset,
     "bearing_offset": _bearing_offset,
     "time_offset": _time_offset,
+    "mount_position": _mount_position,
     "odometry_scale": _odometry,
     "odometry_turn": _odometry,
     "odometry_offset": _odometry,
