@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,43 +51,35 @@ class OwnReadings:
         self.read_ns: dict[tuple[str, str], int] = {}
 
     def take(self, received: Received, topic: Sparse, offer: Message, t_ns: int) -> None:
-        """Take what an inertial unit or a compass measured of its robot; in the plane made level."""
+        """Take what an inertial unit or a compass measured of its robot, of what is sparse only now and then."""
+        for sensor, columns, y in self.said(received, topic, offer):
+            key, often = (topic.robot, sensor), columns in GYRO.values()
+            if often and isinstance(topic, Imu) and topic.at == "controls":
+                self.rates.setdefault(key, {})[t_ns] = y
+            elif often or key not in self.read_ns or t_ns - self.read_ns[key] >= topic.every_s * 1e9:
+                self.reading(received, *key, t_ns, columns, y)
+
+    def said(self, received: Received, topic: Sparse, offer: Any) -> Iterator[tuple[str, tuple[str, ...], Any]]:
+        """Yield what a message says, in the plane made level: the sensor, its columns and their numbers."""
         m, R = received.message, self.level.get(received.topic, (np.eye(3), False))[0]
-        if isinstance(topic, Compass):
-            b = self.measured(received, "field", offer.field(m))  # type: ignore[misc]
-            heading = None if b is None else heading_of_field(R @ b)
-            if heading is not None:
-                self.now_and_then(received, topic, topic.sensors(received.topic)[0], t_ns, HEADING, [heading])
-            elif b is not None:
+        if isinstance(topic, Compass) and (b := self.measured(received, "field", offer.field(m))) is not None:
+            heading = heading_of_field(R @ b)
+            if heading is None:
                 self.out.left_out[received.topic, "fields that are steep"] += 1
-        elif isinstance(topic, Imu):
-            if topic.gyro:
-                self.turned(received, topic, topic.gyro, t_ns, self.measured(received, "rates", offer.rates(m)), R)  # type: ignore[misc]
-            if topic.heading or topic.inclination:
-                q = self.measured(received, "an orientation", offer.attitude(m))  # type: ignore[misc]
-                self.oriented(received, topic, t_ns, q, R)
-            a = self.measured(received, "accelerations", offer.force(m)) if topic.gravity else None  # type: ignore[misc]
-            if topic.gravity and a is not None:
-                self.now_and_then(received, topic, topic.gravity, t_ns, GRAVITY, a)
-
-    def turned(self, received: Received, topic: Imu, sensor: str, t_ns: int, w: Array | None, R: Array) -> None:
-        """Take rates (3,) about the axes of an inertial unit, or keep them for their means."""
-        if w is None:
+            else:
+                yield topic.sensors(received.topic)[0], HEADING, [heading]
+        if not isinstance(topic, Imu):
             return
-        space = self.in_space(topic.robot)
-        w = w if space else (R @ w)[2:]
-        if topic.at == "controls":
-            self.rates.setdefault((topic.robot, sensor), {})[t_ns] = w
-        else:
-            self.reading(received, topic.robot, sensor, t_ns, GYRO[space], w)
-
-    def oriented(self, received: Received, topic: Imu, t_ns: int, q: Array | None, R: Array) -> None:
-        """Take heading and inclination of an orientation (4,)."""
-        if q is not None and topic.heading:
-            self.now_and_then(received, topic, topic.heading, t_ns, HEADING, [heading_of(q, R)])
-        if q is not None and topic.inclination:
-            level = rotations.to_euler(np.ascontiguousarray(q))[0][:2]
-            self.now_and_then(received, topic, topic.inclination, t_ns, INCLINATION, level)
+        if topic.gyro and (w := self.measured(received, "rates", offer.rates(m))) is not None:
+            space = self.in_space(topic.robot)
+            yield topic.gyro, GYRO[space], w if space else (R @ w)[2:]
+        q = self.measured(received, "an orientation", offer.attitude(m)) if topic.heading or topic.inclination else None
+        if topic.heading and q is not None:
+            yield topic.heading, HEADING, [heading_of(q, R)]
+        if topic.inclination and q is not None:
+            yield topic.inclination, INCLINATION, rotations.to_euler(np.ascontiguousarray(q))[0][:2]
+        if topic.gravity and (a := self.measured(received, "accelerations", offer.force(m))) is not None:
+            yield topic.gravity, GRAVITY, a
 
     def measured(self, received: Received, what: str, told: Measured | None) -> Array | None:
         """Return what a message measured; None, and counted, if it did not."""
@@ -97,14 +89,6 @@ class OwnReadings:
         if not np.isfinite(told.v).all():
             raise Refused(f"{what} {told.v.tolist()}, expected finite numbers")
         return told.v
-
-    def now_and_then(
-        self, received: Received, topic: Sparse, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any
-    ) -> None:
-        """Take a reading if the last one of its sensor was long enough before."""
-        last = self.read_ns.get((topic.robot, sensor))
-        if last is None or t_ns - last >= topic.every_s * 1e9:
-            self.reading(received, topic.robot, sensor, t_ns, columns, y)
 
     def reading(self, received: Received, robot: str, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any) -> None:
         """Take a reading of a sensor of the robot itself: one at a time."""
