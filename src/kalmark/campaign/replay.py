@@ -226,14 +226,12 @@ def replay_of(config: Config, log: Log, progress: bool = True) -> Replay:
 def refuse_other(config: Config, name: str, robot: Robot) -> None:
     """Refuse robots of space, states of more than a pose, and sensors whose scans a detector searches for landmarks."""
     path = ("robots", name if name in config.robots else "each")
+    got = f"got {config.robots[path[1]].motion.type}"
     if robot.motion.space.world != "plane":
-        what = f"got {config.robots[path[1]].motion.type}, a motion of space, expected one of the plane to replay a log"
+        what = f"{got}, a motion of space, expected one of the plane to replay a log"
         raise config.error((*path, "motion"), what)
     if robot.motion.space.size > SE2.size:
-        what = (
-            f"got {config.robots[path[1]].motion.type}, expected a motion of which the state is a pose to replay a log"
-        )
-        raise config.error((*path, "motion"), what)
+        raise config.error((*path, "motion"), f"{got}, expected a motion of which the state is a pose to replay a log")
     for key, mount in robot.sensors.items():
         if mount.detector is not None:
             what = "got a detector, expected scans of landmarks, not raw ones (victoria_park_known has such)"

@@ -111,7 +111,11 @@ class _Writer:
         odometries = {each.frame.lstrip("/") for each in self.usable if each.offers.twist and each.offers.pose}
         if topic.offers.seen is not None and frame and (frame in odometries or frame.split("/")[-1] in WORLD):
             return f"its frame {frame} is one of the world: a map, not what a sensor of the robot sees"
-        return _useless(topic)
+        if topic.offers.seen is None or topic.columns or {*IDS, *CLUSTERS} & {*topic.fields}:
+            return ""
+        if topic.fields:
+            return f"points with {', '.join(topic.fields)}, no ids and no clusters"
+        return topic.error or "nothing was seen"
 
     def lines(self) -> _Lines:
         """Return what is to be written."""
@@ -328,13 +332,3 @@ def _has_frames(topic: TopicSummary) -> bool:
 
 def _in_pixels(topic: TopicSummary) -> bool:
     return topic.columns[:1] in (("u_px",), ("u1_px",))
-
-
-def _useless(topic: TopicSummary) -> str:
-    """Return why a topic of observations cannot be used, "" if it can."""
-    if topic.offers.seen is None or topic.columns:
-        return ""
-    if topic.fields:
-        known = {*IDS, *CLUSTERS} & {*topic.fields}
-        return "" if known else f"points with {', '.join(topic.fields)}, no ids and no clusters"
-    return topic.error or "nothing was seen"

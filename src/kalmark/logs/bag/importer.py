@@ -111,7 +111,8 @@ class _Importer:
             robots=tuple(robot for robot in robots if any(event.robot == robot for event in self.out.events)),
             events=sorted(self.out.events, key=order), skipped=self.request.skipped,
             truth={robot: Trajectory.of(path) for robot, path in self.paths.items()},
-            gps={robot: _track(positions) for robot, positions in self.positions.items()},
+            gps={robot: PositionTrack(np.array([*at]), np.array([*at.values()]), np.zeros(2))
+                 for robot, at in self.positions.items()},
             control_columns=self.asked.columns, sensor_columns=self.out.sensor_columns, describes=self.describes(),
         )  # fmt: skip
 
@@ -218,15 +219,18 @@ class _Importer:
             return
         if before is None:
             return
-        cov, dt_s = None, (t_ns - before[0]) * 1e-9
-        if isinstance(topic, Noisy) and topic.own_noise:
-            twist = None if offer.twist is None else offer.twist(received.message).cov
-            if twist is None:
-                raise Refused("the message has no covariance, expected one for `own_noise`")
-            cov = twist * dt_s**2
-        if cov is not None and not self.in_space(topic.robot):
-            cov = flat(cov)
-        self.control(topic, t_ns, self.step(topic, before[1], pose.frame), cov)
+        rows = [0, 1, 2, 3, 4, 5] if topic.space else [0, 1, 5]
+        cov, dt_s = self.own_noise(topic, offer, received.message, rows), (t_ns - before[0]) * 1e-9
+        self.control(topic, t_ns, self.step(topic, before[1], pose.frame), None if cov is None else cov * dt_s**2)
+
+    def own_noise(self, topic: Topic, offer: Message, message: Any, rows: list[int]) -> Array | None:
+        """Return the covariance of some numbers of a message's twist, if controls take it.  Raises Refused."""
+        if not isinstance(topic, Noisy) or not topic.own_noise:
+            return None
+        cov = None if offer.twist is None else offer.twist(message).cov
+        if cov is None:
+            raise Refused("the message has no covariance, expected one for `own_noise`")
+        return cov[np.ix_(rows, rows)]
 
     def step(self, topic: Topic, a: Array, b: Array) -> Array:
         """Return the control that leads from the pose a (7,) to b: an increment of the plane or of space."""
@@ -252,12 +256,9 @@ class _Importer:
 
     def velocity(self, topic: Topic, t_ns: int, offer: Message, message: Any) -> None:
         """Take a velocity, held from now on."""
-        v, cov = offer.twist(message)  # type: ignore[misc]
         own = [0, 1, 2, 3, 4, 5] if topic.space else [0, 5]
-        if isinstance(topic, Noisy) and topic.own_noise and cov is None:
-            raise Refused("the message has no covariance, expected one for `own_noise`")
-        noise = cov[np.ix_(own, own)] if isinstance(topic, Noisy) and topic.own_noise and cov is not None else None
-        self.control(topic, t_ns, v[own], noise)
+        noise = self.own_noise(topic, offer, message, own)
+        self.control(topic, t_ns, offer.twist(message).v[own], noise)  # type: ignore[misc]
 
     def control(self, topic: Topic, t_ns: int, u: Array, cov: Array | None) -> None:
         """Take a control."""
@@ -407,16 +408,6 @@ def increment(a: Array, b: Array) -> Array:
     c, s = np.cos(a[2]), np.sin(a[2])
     x, y = b[:2] - a[:2]
     return np.array([c * x + s * y, c * y - s * x, wrap(b[2] - a[2])])
-
-
-def flat(cov: Array) -> Array:
-    """Return the covariance (3, 3) of x, y and yaw of one of (x, y, z, rotation)."""
-    own = [0, 1, 5]
-    return cov[np.ix_(own, own)]
-
-
-def _track(positions: Mapping[int, Array]) -> PositionTrack:
-    return PositionTrack(np.array([*positions]), np.array([*positions.values()]), np.zeros(2))
 
 
 BAG = Format("bag", "a ROS bag (.bag, .mcap, .db3, the folder of a ROS 2 bag), with log.topics", find_bag, read,

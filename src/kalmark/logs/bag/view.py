@@ -14,7 +14,7 @@ from kalmark.arrays import Array
 from kalmark.events import Control, Fix
 from kalmark.geometry.rotations import from_matrix
 from kalmark.logs.bag.write import Outgoing, header, stamp
-from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.log import Log
 
 MAP = "map"
 MOST_POSES = 5000  # of a path that is drawn
@@ -118,7 +118,8 @@ def messages(log: Log) -> Iterator[Outgoing]:
         return
     begin = log.events[0].t_ns
     for robot, path in log.truth.items():
-        yield truth_path(robot, path, begin)
+        fields = path_fields(path.t_ns.tolist(), path.poses)  # to be seen from the first moment
+        yield Outgoing(topic(robot, "truth"), "nav_msgs/msg/Path", begin, fields)
     if log.landmarks:
         rows = []
         for number, (id_, place) in enumerate(log.landmarks.items()):
@@ -138,11 +139,6 @@ def messages(log: Log) -> Iterator[Outgoing]:
             twist = {"linear": {"x": v, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": w}}
             fields = {"header": header(event.t_ns, event.robot), "twist": twist}
             yield Outgoing(topic(event.robot, "velocity"), "geometry_msgs/msg/TwistStamped", event.t_ns, fields)
-
-
-def truth_path(robot: str, path: Trajectory, t_ns: int) -> Outgoing:
-    """Return the true path of a robot, to be seen from the first moment."""
-    return Outgoing(topic(robot, "truth"), "nav_msgs/msg/Path", t_ns, path_fields(path.t_ns.tolist(), path.poses))
 
 
 def transform(t_ns: int, parent: str, child: str, pose: Array) -> dict[str, Any]:
