@@ -272,7 +272,9 @@ class Slam(Estimate):
         exact = correct_by_known(state, scan, policy, decisions) if state.tracks.known else []
         again = starting.left_open(state, scan, groups, decisions) if policy.restarts else []
         judged, found = correct(state, scan, policy, groups, decisions)
-        judged, found = exact + judged, found + starting.restart(state, scan, again, decisions)
+        judged = exact + judged
+        if again:
+            found = found + starting.restart(state, scan, again, decisions)
         if not found and not policy.reviews and sum(len(group.rows) for group in judged) == len(decisions):
             scan.report.judged = tuple(judged)
             return
