@@ -248,6 +248,10 @@ def inertial() -> Iterator[Figure]:
         name = f"V1_01, the truth: its turns in {seconds} s against those of the unit, RMS an axis / of the unit's noise / fitted"
         text = " / ".join(f"{{{at * 10 + k}}} mrad" for k in (6, 10, 12))
         yield Figure("Inertial", name, "", "python benchmarks/inertial.py truth", row("truth: turns off,", text))
+    name = ("V1_01, the truth's positions of 10 s by forces read: left with its turns and biases / a constant bias / the unit's turns and "
+            "a constant bias / windows in which that is less / change of its biases in 20 s / of their walk")  # fmt: skip
+    yield Figure("Inertial", name, "", "python benchmarks/inertial.py truth",
+                 row("truth: positions of", "{9} mm / {18} mm / {28} mm / {31} of {33} / {44} mm/s² / {49}"))  # fmt: skip
     for estimator in ("invariant", "ekf"):
         wanted = "0 of 100" if estimator == "invariant" else ""
         yield Figure("Inertial", f"information about position and yaw, `{estimator}`: most, start 1 / runs that gain any", wanted,

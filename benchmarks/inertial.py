@@ -17,7 +17,10 @@ and `--tilted` leave this out.
 
 `truth`: by how much its turns in 1, 5 and 20 s differ from the integral of the rates that were read, a spline in
 quarter steps; what the gyroscope's noise is in that time; and what is left in either half of the flight after a delay,
-scales, wrong axes and a bias of the gyroscope that are fitted to the other half.
+scales, wrong axes and a bias of the gyroscope that are fitted to the other half.  Then what its positions say, which
+are measured: of each 10 s, what the forces that were read leave of them, integrated twice with the orientations of the
+truth or with the rates that were read, where start, velocity, tilt and a constant bias of the force are fitted; and by
+how much the biases of the force in the truth change in 20 s.
 
 `gauge`: 10 s of it, from 20 s on, with an unknown start, 20 deg and 1 m.  `still`: one run at rest.  Both print how the
 information about the directions that nothing observes, shifts and turns about the gravity, compares with that of the
@@ -37,12 +40,13 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.random import Generator, SeedSequence
+from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from ways import pin
 
 import kalmark as km
-from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
+from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply, skew
 from kalmark.results.measures import anees_interval, path_m
 
 FOLDER = "visual/euroc_v101_micro"
@@ -270,6 +274,54 @@ def turns() -> None:
     print("truth: turns off, RMS an axis, " + "; ".join(words))
 
 
+def twice(at: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the integral of the integral of y (N, ...) over the times (N,)."""
+    for _ in range(2):
+        y = cumulative_trapezoid(y, at, axis=0, initial=0.0)
+    return y
+
+
+def left_of_places(at: np.ndarray, R: np.ndarray, f: np.ndarray, s: np.ndarray, p: np.ndarray) -> float:
+    """Return the mean square, m^2, that forces f (N, 3) at orientations R (N, 3, 3) leave of places p (n, 3) at s."""
+    F = np.einsum("nij,nj->ni", R, f)
+    fitted = np.concatenate([-np.array([skew(each) for each in F]), R], axis=2)  # a tilt, a bias
+    fitted, moved = CubicSpline(at, twice(at, fitted))(s), CubicSpline(at, twice(at, F + G))(s)
+    ways = np.tile(np.eye(3), (len(s), 1, 1))
+    A = np.concatenate([ways, s[:, None, None] * ways, fitted], axis=2).reshape(-1, 12)
+    y = (p - moved).ravel()
+    return float(np.mean((y - A @ np.linalg.lstsq(A, y)[0]) ** 2))
+
+
+def places(seconds: float = 10.0) -> None:
+    """Print what of the truth's positions is left with the truth's orientations and with those of the unit."""
+    t, rows = table("gt_V1_01_easy.csv")
+    at, u = table("mav0/imu0/data.csv.gz")
+    at, n = at[at <= t[-1]], round(seconds * RATE_HZ)
+    rates, forces = (np.column_stack([np.interp(at, t, bias) for bias in rows[:, k : k + 3].T]) for k in (10, 13))
+    w, raw = u[: len(at), :3] - rates, u[: len(at), 3:]
+    q = RotationSpline(t, Rotation.from_quat(rows[:, [4, 5, 6, 3]]))(at)
+    steps = Rotation.from_rotvec((w[1:] + w[:-1]) / 2 * np.diff(at)[:, None])
+    left = []
+    for a in range(6 * RATE_HZ, len(at) - n, n):  # under way
+        here, within = slice(a, a + n + 1), (t >= at[a]) & (t <= at[a + n])
+        unit = [q[a]]
+        for step in steps[a : a + n]:
+            unit.append(unit[-1] * step)
+        truth, turned = q[here].as_matrix(), Rotation.concatenate(unit).as_matrix()
+        pairs = (truth, raw - forces), (truth, raw), (turned, raw)
+        seen = t[within] - at[a], rows[within, :3]
+        left.append([left_of_places(at[here] - at[a], R, f[here], *seen) for R, f in pairs])
+    own, truths, units = 1e3 * np.sqrt(np.mean(left, axis=0))
+    better = sum(unit < truth for _, truth, unit in left)
+    d = rows[20 * 20 :, 13:] - rows[: -20 * 20, 13:]
+    change, walk = np.sqrt(np.mean(d**2)), UNIT.densities[9] * math.sqrt(20)
+    print(
+        f"truth: positions of {seconds:.0f} s, RMS left, with its turns and biases {own:.1f} mm, with its turns and a"
+        f" constant bias {truths:.1f}, with those of the unit and a constant bias {units:.1f}, less in {better} of"
+        f" {len(left)}; its biases of the force change in 20 s by {1e3 * change:.0f} mm/s^2, of a walk {1e3 * walk:.0f}"
+    )
+
+
 def added(steps: np.ndarray) -> np.ndarray:
     """Return the sums of the first 0 to N of N steps."""
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
@@ -354,6 +406,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.what == "truth":
         turns()
+        places()
         return
     {"path": paths, "recorded": paths, "gauge": gauges, "still": still}[given.what](given)
 
