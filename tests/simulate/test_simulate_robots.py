@@ -6,15 +6,18 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+import kalmark as km
 from kalmark.events import Control, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, scan_many, to_frame_many
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
 from kalmark.simulate.robots import simulation
+from kalmark.simulate.routes import Wander
 from kalmark.simulate.sights import gaussian
 
 
@@ -216,3 +219,19 @@ def test_a_constant_route_accelerates_evenly_after_a_stop_and_before_the_next() 
     )
     np.testing.assert_allclose(told[:, 1], told[:, 0] / 5)
     np.testing.assert_allclose(told[12:], told[:12])
+
+
+def test_a_robot_with_one_place_to_go_to_does_not_ask_for_others_again_and_again() -> None:
+    asked = []
+
+    class Counted(Wander):
+        def places(self, area: np.ndarray, rng: np.random.Generator) -> Any:
+            for place in super().places(area, rng):
+                asked.append(place)
+                yield place
+
+    area = np.array([[2.0, 3.0], [2.0, 3.0]])  # of one landmark
+    drive = Counted(turn_radius_m=8.0).driver(km.motion.Unicycle(), 0.1, area, np.random.default_rng(0))
+    for _ in range(10):
+        drive(np.array([1.0, 3.0, 0.2]))
+    assert len(asked) <= 11

@@ -86,7 +86,9 @@ class Drive(Section):
                 n = min(len(target), 3 if motion.space.world == "space" else 2)
                 if math.dist(target[:n], state[:n]) > 2 * self.turn_radius_m:
                     break
-                target = next(places)
+                reached, target = target, next(places)
+                if np.array_equal(target, reached):  # there is no other: in an area of one landmark
+                    break
             return steer(motion, state, target, self, dt_s)
 
         return drive
