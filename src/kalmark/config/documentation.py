@@ -72,6 +72,7 @@ def page() -> str:
     parts += [_section("`robots.NAME.start`, in space", schema.SpaceStartConfig)]
     parts += [_choice("`robots.NAME.motion`", "motion"), _section(f"{of_sensor}`", schema.Mounted)]
     parts += [_section(f"{of_sensor}`, in the plane, too", schema.PlaneMounted, schema.Mounted)]
+    parts += [_section(f"{of_sensor}`, in space, too", schema.SpaceMounted, schema.Mounted)]
     parts += [
         _choice(f"{of_sensor}`, in {there}", "sensor", w) for there, w in (("the plane", "plane"), ("space",) * 2)
     ]
