@@ -10,8 +10,10 @@ from kalmark.arrays import Array
 from kalmark.association.global_start import Located, is_lost, located
 from kalmark.association.query import Query
 from kalmark.association.relocalization import relocalized as found_again
+from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose, inverse
 from kalmark.slam.state import State
+from kalmark.tracks.channel import Channel
 from kalmark.tracks.scan import ScanContext
 
 HEADING_RAD = 0.3  # a sigma above which a correction is not linearised at the prediction
@@ -45,6 +47,16 @@ def relocalized(state: State, scan: ScanContext, query: Query) -> Query:
         return query
     _put(state, scan, T)
     return Query(scan)
+
+
+def placed_again(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:
+    """Put a robot of space where its sensor is at T (7,), with the covariance (6, 6), wherever it was."""
+    slot = state.moving[name].slot
+    r = state.map.mean(slot)
+    to_robot = frames3d.compose(frames3d.inverse(channel.pose(state.map, slot))[0], r[:7])[0]
+    state.map.predict(state.map.index(slot)[:6], np.zeros((6, 6)), cov)
+    state.map.set_predicted(slot, np.append(frames3d.compose(T, to_robot)[0], r[7:]))
+    state.clones.moved(name)
 
 
 def _put(state: State, scan: ScanContext, T: Array) -> None:

@@ -172,6 +172,9 @@ class Slam(Estimate):
             raise EventError(f"{when(event)}: the {what} {beside.shape}, expected {image.shape} as the image")
         state.t_ns = event.t_ns
         gaps = moves.advance(state, event.robot)
+        again = front_end.recognised(image, state.map, state.tracks, channel)
+        if again is not None:
+            locating.placed_again(state, channel, event.robot, *again)
         prospect = front_end.prospect_of(state.map, state.tracks, channel, event.robot)
         scan, removed = front_end.search(event, image, prospect, beside)
         for name, _ in removed:

@@ -31,6 +31,10 @@ class FrontEnd(Protocol):
     waits: bool
     beginning: Any
 
+    def recognised(self, image: Any, map_: Map, tracks: Tracks, channel: Channel) -> tuple[Array, Array] | None:
+        """Return where the sensor is (7,), and the covariance (6, 6), if it was lost and has recognised the place."""
+        ...
+
     def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Any:
         """Return what it wants to know before it searches: what the sensor should measure of the landmarks in view."""
         ...

@@ -203,6 +203,14 @@ def _places(model: ObservationModel, l: Array) -> Array:
     return model.landmark.to_point(l)[0]  # type: ignore[attr-defined]
 
 
+def places_of(map_: Map, tracks: Tracks, channel: Channel, names: list[Id]) -> Array:
+    """Return where landmarks of a channel are (K, 3), NaN of those that it does not observe."""
+    places = np.full((len(names), 3), np.nan)
+    for model, rows in tracks.by_model(channel, names):
+        places[rows] = _places(model, map_.means(tracks.slots_of([names[i] for i in rows]), model.d))
+    return places
+
+
 @compiled
 def joint(P: Array, rows: Index, E_h: Array, E_l: Array, at: Index, width: Index) -> tuple[Array, Array]:
     """Return C = P H' (N, K p) and S = H C (K p, K p) of expectations of the head and of one landmark each."""

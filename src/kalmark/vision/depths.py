@@ -33,7 +33,7 @@ def inverse_depths(depth: Array, y: Array, sigma: float) -> Array:
     at = np.rint(y).astype(np.int64)
     rows = np.clip(at[:, 1, None, None] + offsets[:, None], 0, depth.shape[0] - 1)
     columns = np.clip(at[:, 0, None, None] + offsets, 0, depth.shape[1] - 1)
-    near = depth[rows, columns].reshape(len(y), -1)
+    near = depth[rows, columns].reshape(len(y), len(offsets) ** 2)
     there = near > 0
     rho = 1.0 / np.where(there, near, 1.0)
     good = there.all(axis=1) & (np.ptp(rho, axis=1) <= EDGE * sigma)

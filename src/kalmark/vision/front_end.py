@@ -23,7 +23,7 @@ from kalmark.geometry.rotations import matrix
 from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
 from kalmark.tracks.channel import Channel
-from kalmark.tracks.prospect import PIXEL, Prospect
+from kalmark.tracks.prospect import PIXEL, Prospect, places_of
 from kalmark.tracks.track import Tracks
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
 from kalmark.vision.beginning import Beginning, Begun
@@ -33,10 +33,12 @@ from kalmark.vision.matching import Searcher
 from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import NUMBERS, Plane, measured, shown
-from kalmark.vision.searches import Searches
+from kalmark.vision.recognition import recognised
+from kalmark.vision.searches import TRIAL, Searches
 from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed import FirstLook
 
+FEW, ENOUGH = 4, 20  # matches, with fewer of which the sensor is lost; landmarks by which it may recognise the place
 PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
 
 
@@ -46,8 +48,8 @@ class ActiveSearch:
 
     Each frame, `in_view` landmarks are kept in view, at most `starts` new ones from corners with a gradient of at least
     `contrast` grey values a pixel; a match correlates by `accept` at least.  `keep` says which landmarks stay:
-    "global" all that are found in half of the searches for them, "local" of these the `most` best, "odometry" only
-    those in view.  The search begins with a random landmark, by `seed`: the same seed, the same result.
+    "global" those that are found in half of the searches for them, the `most` best, "odometry" only those in view.  The
+    search begins with a random landmark, by `seed`: the same seed, the same result.
     """
 
     columns: ClassVar[tuple[str, ...]] = PinHole.columns
@@ -101,12 +103,23 @@ class FrontEnd:
         self.prospect: Prospect | None = None
         self.image: Any = None
         self.beginning: Beginning | None = None
+        self.is_lost = False
         self.sighting: Sighting | None = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
     def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Prospect:
         """Return what the sensor should measure of the landmarks in view, jointly."""
         return Prospect(map_, tracks, channel, robot)
+
+    def recognised(self, image: Any, map_: Map, tracks: Tracks, channel: Channel) -> tuple[Array, Array] | None:
+        """Return where the sensor is (7,), and the covariance (6, 6), if it was lost and has recognised the place."""
+        known = [name for name, look in self.looks.items() if look.fitted >= TRIAL and look.views]
+        if not self.is_lost or len(known) < ENOUGH:
+            return None
+        places = places_of(map_, tracks, channel, known)
+        here = np.flatnonzero(np.isfinite(places).all(axis=1))
+        views = [self.looks[known[k]].views for k in here.tolist()]
+        return recognised(self.cv2, image, views, places[here], channel.calibrated(map_))
 
     def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any = None) -> Sighting:
         """Search an image (H, W) for the landmarks of a prospect, and for new ones.
@@ -124,6 +137,7 @@ class FrontEnd:
         t1 = perf_counter()
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
         found = self.found = Search(prospect, looks.told, searcher, settings.updates).run(self.random)
+        self.is_lost = found.matched.sum() < FEW
         removed = self._count(prospect, found)
         self._first_look(image, prospect, found)
         t2 = perf_counter()
@@ -224,7 +238,7 @@ class FrontEnd:
         beginning = None if self.beginning is None else self.beginning.state()
         return {
             "frame": self.frame, "named": self.named, "random": random, "looks": looks, "failed": failed,
-            "beginning": beginning,
+            "beginning": beginning, "is_lost": self.is_lost,
         }  # fmt: skip
 
     def arrays(self) -> dict[str, Array]:
@@ -253,7 +267,7 @@ class FrontEnd:
             plane = Plane.of(next(planes)) if own else None
             self.looks[name] = Look(searched, found, fitted, missed, seen, views[at : at + own], plane, bool(surveyed))
             at += own
-        self.frame, self.named = int(state["frame"]), int(state["named"])
+        self.frame, self.named, self.is_lost = int(state["frame"]), int(state["named"]), bool(state["is_lost"])
         self.random.bit_generator.state = state["random"]
         self.cells.failed = {(int(i), int(j)): int(frame) for i, j, frame in state["failed"]}
         begun = state["beginning"]
@@ -311,9 +325,12 @@ class FrontEnd:
         return with_depths(sensor, landmark, y, rho, e[:, 2], Z[:, 2, 2])
 
     def _count(self, prospect: Prospect, found: Selection) -> list[tuple[Id, str]]:
-        """Count searches; return the landmarks that are given up, each with the reason."""
+        """Count searches; return the landmarks that are given up, each with the reason.
+
+        A frame in which next to nothing is found says nothing of a landmark.
+        """
         removed: list[tuple[Id, str]] = []
-        for k in np.flatnonzero(found.searched).tolist():
+        for k in np.flatnonzero(found.searched).tolist() if not self.is_lost else ():
             look = self.looks[prospect.names[k]]
             reason = look.searched_for(bool(found.matched[k]))
             if reason and not look.surveyed:

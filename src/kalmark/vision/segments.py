@@ -96,6 +96,9 @@ class LineFrontEnd:
         self.image: Any = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
+    def recognised(self, image: Any, map_: Map, tracks: Tracks, channel: Channel) -> None:
+        """Return that lines recognise no place."""
+
     def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Expectations:
         """Return what the sensor should measure of the lines in view."""
         return expectations(map_, tracks, channel, robot, "", only_in_view=True)

@@ -1,0 +1,131 @@
+"""A place seen again: landmarks recognised by descriptors, whatever the filter expects, and the pose they agree on.
+
+The patches of all landmarks that have proven themselves, and corners of the image at three sizes, are described by ORB
+(Rublee and others 2011).  A pair is taken where each is the other's nearest, and clearly nearer than the next landmark.
+One pose must explain many of the pairs (PnP with RANSAC); by chance hardly two pairs agree with one found by four.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array, Index
+from kalmark.geometry.rotations import from_matrix
+from kalmark.vision.appearance import View
+
+SIZES = (1.0, 0.7, 0.5)  # of the image, in which corners are described
+CORNERS, APART_PX, QUALITY = 600, 5, 0.01
+REACH = 12  # half width of what is described, px
+MARGIN = 20  # about each patch where all are described together
+NEAREST, CLEARER = 70, 0.85  # bits of 256 that may differ, and those of the next landmark that it must stay below
+LEAST = 10  # pairs that agree with a pose
+OFF_PX, TRIES, SURE = 3.0, 300, 0.999
+POSITION, TURN_RAD = 0.05, 0.03  # sigmas of the pose: a share of the median depth, and an angle
+
+
+def recognised(
+    cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any
+) -> tuple[Array, Array] | None:
+    """Return the pose (7,) of the sensor that took an image of landmarks at `places` (K, 3), and its covariance (6, 6).
+
+    None if that is not sure.
+    """
+    orb = cv2.ORB_create(CORNERS, nlevels=1, edgeThreshold=REACH + 1, patchSize=2 * REACH + 1)
+    known, owner = of_patches(cv2, orb, views)
+    seen, y = of_corners(cv2, orb, image)
+    landmark, corner = pairs(known, owner, seen)
+    rays = sensor.rays(y[corner]) if len(corner) else np.zeros((0, 3))
+    ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.1)
+    if ahead.sum() < LEAST:
+        return None
+    places, rays = np.ascontiguousarray(places[landmark[ahead]]), rays[ahead]
+    flat, focal = np.ascontiguousarray(rays[:, :2] / rays[:, 2:]), float(sensor.fx_px)
+    found, turn, t, inliers = cv2.solvePnPRansac(
+        places, flat, np.eye(3), None, iterationsCount=TRIES, reprojectionError=OFF_PX / focal, confidence=SURE,
+        flags=cv2.SOLVEPNP_EPNP,
+    )  # fmt: skip
+    if not found or inliers is None or len(inliers) < LEAST:
+        return None
+    R = cv2.Rodrigues(turn)[0].T
+    at = -R @ t.ravel()
+    depth = float(np.median(((places[inliers.ravel()] - at) @ R)[:, 2]))
+    cov = np.diag([(POSITION * depth) ** 2] * 3 + [TURN_RAD**2] * 3)
+    return np.concatenate([at, from_matrix(np.ascontiguousarray(R))]), cov
+
+
+def of_patches(cv2: Any, orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any, Index]:
+    """Return the bits (N, 256) that describe all views, and the number (N,) of the landmark of each."""
+    owner = np.array([k for k, own in enumerate(views) for _ in own], dtype=np.int64)
+    patches = [view.patch for own in views for view in own]
+    if not patches:
+        return np.zeros((0, 256), np.float32), owner
+    across, side = int(np.ceil(np.sqrt(len(patches)))), patches[0].shape[0] + 2 * MARGIN
+    whole = np.zeros((-(-len(patches) // across) * side, across * side), np.uint8)
+    for k, patch in enumerate(patches):
+        row, column = side * (k // across), side * (k % across)
+        whole[row : row + side, column : column + side] = cv2.copyMakeBorder(
+            patch, MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_REPLICATE
+        )
+    number = np.arange(len(patches))
+    middle = side // 2 + side * np.column_stack([number % across, number // across])
+    bits, which = described(cv2, orb, whole, middle.astype(np.float64))
+    return bits, owner[which]
+
+
+def of_corners(cv2: Any, orb: Any, image: Any) -> tuple[Any, Array]:
+    """Return the bits (M, 256) that describe the corners of an image, and their pixels (M, 2)."""
+    bits, pixels = [np.zeros((0, 256), np.float32)], [np.zeros((0, 2))]
+    for size in SIZES:
+        small = image if size == 1.0 else cv2.resize(image, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
+        corners = cv2.goodFeaturesToTrack(small, CORNERS, QUALITY, APART_PX)
+        y = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
+        some, which = described(cv2, orb, small, y)
+        bits.append(some)
+        pixels.append((y[which] + 0.5) / size - 0.5)
+    return np.concatenate(bits), np.concatenate(pixels)
+
+
+def described(cv2: Any, orb: Any, image: Any, y: Array) -> tuple[Any, Index]:
+    """Return the bits (M, 256) that describe what is about the pixels y (N, 2), and which of them they are of (M,).
+
+    It is turned as the grey values lie: from the pixel towards their centre of mass.
+    """
+    offset = np.arange(-REACH, REACH + 1)
+    disc = offset[:, None] ** 2 + offset**2 <= REACH**2
+    at = np.rint(y).astype(np.int64)
+    inside = np.flatnonzero(((at > REACH) & (at < np.array(image.shape[::-1]) - REACH - 1)).all(axis=1))
+    at = at[inside]
+    grey = image[at[:, 1, None, None] + offset[:, None], at[:, 0, None, None] + offset] * disc
+    angle = np.degrees(np.arctan2((grey * offset[:, None]).sum(axis=(1, 2)), (grey * offset).sum(axis=(1, 2)))) % 360.0
+    points = [
+        cv2.KeyPoint(float(u), float(v), 2.0 * REACH + 1.0, float(turn), 0.0, 0, int(k))
+        for (u, v), turn, k in zip(y[inside], angle, inside, strict=True)
+    ]
+    points, bytes_ = orb.compute(image, points)
+    if bytes_ is None or not len(points):
+        return np.zeros((0, 256), np.float32), np.zeros(0, np.int64)
+    return np.unpackbits(bytes_, axis=1).astype(np.float32), np.array([p.class_id for p in points], dtype=np.int64)
+
+
+def pairs(known: Any, owner: Index, seen: Any) -> tuple[Index, Index]:
+    """Return numbers of landmarks and of corners that are each other's nearest, clearly nearer than the next landmark.
+
+    `known` (N, 256) are bits that describe the landmarks `owner` (N,), `seen` (M, 256) those of the corners.
+    """
+    none = np.zeros(0, np.int64)
+    if not len(known) or not len(seen):
+        return none, none
+    apart = seen.sum(axis=1)[:, None] + known.sum(axis=1) - 2.0 * (seen @ known.T)
+    nearest = apart.argmin(axis=1)
+    least, mine = apart[np.arange(len(seen)), nearest], owner[nearest]
+    others = np.where(owner == mine[:, None], np.inf, apart).min(axis=1)
+    clear = (least <= NEAREST) & (least <= CLEARER * others)
+    best: dict[int, int] = {}
+    for k in np.flatnonzero(clear).tolist():
+        before = best.get(int(mine[k]))
+        if before is None or least[k] < least[before]:
+            best[int(mine[k])] = k
+    return np.array([*best], dtype=np.int64), np.array([*best.values()], dtype=np.int64)
