@@ -355,8 +355,11 @@ APART = ("steps=400", "sight_robots=false", "world.size_m=60", "world.count=200"
          "robots.beta.route.points_m=[[55,35],[55,55],[35,55],[35,35]]")  # fmt: skip
 
 
-ALIKE = ("robots.beta.motion={type: unicycle, sigma_v_mps: 0.05, sigma_w_radps: 0.05}",
-         "robots.beta.sensors={lidar: {type: range_bearing, sigma_range_m: 0.1, sigma_bearing_rad: 0.02}}")  # fmt: skip
+ALIKE = (
+    "robots.beta.motion={type: unicycle, sigma_v_mps: 0.05, sigma_w_radps: 0.05}",
+    "robots.beta.sensors={lidar: "
+    "{type: range_bearing, sigma_range_m: 0.1, sigma_bearing_rad: 0.02, range_min_m: 0.3, range_max_m: 8}}",
+)
 
 
 def by_fixes(world: str, *settings: str) -> Callable[[str], Run]:
@@ -404,7 +407,7 @@ def test_the_robot_of_two_that_starts_elsewhere_is_named_where_fixes_tell(
 
 @pytest.mark.parametrize("each", [False, True])
 def test_several_robots_that_start_elsewhere_are_named_together(each: bool, tmp_path: Path) -> None:
-    log = with_fixes(simulate(load_world("two_robots", ["steps=200", *(ALIKE if each else ())]), 3))
+    log = with_fixes(simulate(load_world("two_robots", ["steps=200", *(ALIKE if each else ())]), 4))
     robots = config_dict(load_world("two_robots").config())["robots"]
     for name, x_m in (("alpha", 5.0), ("beta", 8.0)):
         robots[name]["start"]["x_m"] = x_m
