@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from kalmark.arrays import Array, Flags
+from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
@@ -352,23 +352,10 @@ def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:
 
 
 def kidnapped(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
-    """Return that the robot was moved, if the run does not fit from the observation `first` on, and a new one would.
-
-    Not if most landmarks that ids tell are where they were, beside each other, but some are not: then these were moved.
-    """
+    """Return that the robot was moved, if the run does not fit from the observation `first` on, and a new one would."""
     t_ns, robot, rest = _from(run, log, first)
-    anew = _filtered(run.config, log, rest)
-    after, before = REFUSED if anew is None else fit(anew), now.of(slice(first, None))
-    if anew is None or after.mean > FITS or MUCH * after.mean > before.mean:
-        return None
-    old = run.history.map_at(max(int(run.history.step[max(first - WINDOW, 0)]) - 1, 0))
-    new = {
-        name: at
-        for name, at in _places(anew.landmarks.ids, anew.landmarks.positions()[0]).items()
-        if str(name) in set(anew.history.id.tolist())
-    }
-    aligned = _aligned(_places(old.ids, old.means[:, : run.history.d]), new)
-    if aligned is not None and not aligned.still.all():
+    after, before = fit_of(run.config, log, rest), now.of(slice(first, None))
+    if after.mean > FITS or MUCH * after.mean > before.mean:
         return None
     evidence = (
         f"{robot} was elsewhere from t={t_ns * 1e-9:.1f} s on: the log before and after it fits, but not together"
@@ -414,42 +401,22 @@ def _misfit_in_a_row(run: Run, now: Fit) -> int | None:
     return int(min(starts)) if starts else None
 
 
-class Aligned(NamedTuple):
-    """The landmarks `names` that two maps have, by the alignment `onto` of most of them, and which are `still` there.
-
-    That is `near`, m, to where they were.
-    """
-
-    names: list[Any]
-    onto: Rigid
-    still: Flags
-    near: float
-
-
-def _aligned(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> Aligned | None:
-    """Return how a later map is aligned with one before it, None if most of its landmarks are elsewhere."""
+def elsewhere(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> dict[Any, Any]:
+    """Return the landmarks that are now where another one was, and which: after the alignment of most of all."""
     common = [name for name in after if name in before]
     if len(common) < COMMON:
-        return None
+        return {}
     old, new = (np.array([places[name] for name in common]) for places in (before, after))
     every = np.array([*before.values()])
     near = SAME * float(np.median(cKDTree(every).query(every, k=2)[0][:, 1]))
     onto = rigid_robust(new, old, near)
     still = np.linalg.norm(onto(new) - old, axis=1) < near
     if 2 * still.sum() <= len(common):
-        return None
-    return Aligned(common, rigid(new[still], old[still]), still, near)
-
-
-def elsewhere(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> dict[Any, Any]:
-    """Return the landmarks that are now where another one was, and which: after the alignment of most of all."""
-    aligned, every, names = _aligned(before, after), np.array([*before.values()]), list(before)
-    if aligned is None:
         return {}
-    away, which = cKDTree(every).query(aligned.onto(np.array([after[name] for name in aligned.names])))
-    moved = ~aligned.still & (away < aligned.near)
-    found = zip(aligned.names, which, moved, strict=True)
-    return {name: names[k] for name, k, other in found if other and names[k] != name}
+    onto, names = rigid(new[still], old[still]), list(before)
+    away, which = cKDTree(every).query(onto(new))
+    moved = ~still & (away < near)
+    return {name: names[k] for name, k, other in zip(common, which, moved, strict=True) if other and names[k] != name}
 
 
 def _places(ids: Sequence[Any], means: Array) -> dict[Any, Array]:

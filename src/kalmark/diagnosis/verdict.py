@@ -155,7 +155,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     causes = sorted([*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, -c.score))
     if not any(c.name == "gap" and not c.harmless for c in first):  # else it is that what doubles maps
         steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
-        first = [*(c for c in causes if c.name in steady and c.score > SURELY), *first]
+        alone = [c.score for c in first if c.name == "kidnapped" and not run.summary.get("repeats")]
+        first = [*(c for c in causes if c.name in steady and c.score > min([SURELY, *alone])), *first]
     causes = [*first, *(c for c in causes if c not in first)]
     causes.sort(key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(
