@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import base64
+import math
+from contextlib import suppress
+from copy import deepcopy
 from typing import Any
 
+from kalmark.config.images import with_images
 from kalmark.config.opening import open_config_log
-from kalmark.config.reading import validate
+from kalmark.config.reading import config_of, validate
 from kalmark.config.schema import Config
 from kalmark.config.tree import Tree
 from kalmark.errors import KalmarkError
@@ -15,7 +19,7 @@ from kalmark.logs.log import Log
 from kalmark.results.history import Camera
 from kalmark.results.recording import Recording
 
-WIDEST_PX, QUALITY = 480, 70  # of an image in a page
+WIDEST_PX, QUALITY = 400, 60  # of an image in a page; of several cameras as many pixels in all
 
 
 class Pictures:
@@ -39,13 +43,13 @@ class Pictures:
             return None
 
     def uri(self, camera: Camera, step: int, side: str = "") -> str:
-        """Return that image as a data URI of a JPEG, not wider than WIDEST_PX, "" if there is none."""
+        """Return that image as a data URI of a JPEG, of a width for a page with all cameras, "" if there is none."""
         image = self.at(camera, step, side)
         if image is None:
             return ""
         import cv2
 
-        scale = min(1.0, WIDEST_PX / image.shape[1])
+        scale = min(1.0, WIDEST_PX / math.sqrt(len(self.history.cameras)) / image.shape[1])
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
         packed = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
         return "data:image/jpeg;base64," + base64.b64encode(packed.tobytes()).decode()
@@ -57,7 +61,8 @@ def _read_again(run: Recording) -> Log | None:
     section = run.config.get("log")
     if not searched or not isinstance(section, dict) or run.log.path is None:
         return None
-    try:
-        return open_config_log(validate(Tree({"log": section}), Config), run.log.path)
-    except KalmarkError:
-        return None
+    log = None
+    with suppress(KalmarkError):
+        log = open_config_log(validate(Tree({"log": section}), Config), run.log.path)
+        log = with_images(config_of(Tree(deepcopy(dict(run.config))), None), log)
+    return log
