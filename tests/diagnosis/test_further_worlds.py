@@ -58,7 +58,7 @@ CASES: dict[str, tuple[str, Plant, tuple[str, ...], str, str, str]] = {
     # the robots that it sees are where they were, too
     "times of one": (
         "two_robots", scans(lambda y: y, "beta", 0.3), ("steps=300",),
-        "ok", "scans of beta.camera were made 0.1", "log.shift_s.beta.camera=-0.1",
+        "ok", "scans of beta.camera were made 0.2", "log.shift_s.beta.camera=-0.2",
     ),
     "a laser that looks aside": (
         "hall_of_walls", scans(lambda y: np.add(y, [0.0, math.pi / 2])), ("steps=150",),

@@ -378,6 +378,10 @@ class Slam(Estimate):
         for kind in kinds:
             twin = Slam(robots, **vars(replace(settings, map=kind)))
             surveyed = rehearse(twin, twin.process, twin.add_landmark)
+            if any(policy.restarts for policy in self.state.policies.values()):  # and once with rays that stay
+                twin = Slam(robots, **vars(replace(settings, map=kind)))
+                twin.state.policies = {k: replace(of, restarts=False) for k, of in twin.state.policies.items()}
+                rehearse(twin, twin.process, twin.add_landmark)
         if self.tracks.known:
             twin = Slam(robots, **vars(replace(settings, map=kinds[0])))
             for name, mean, model in surveyed:
