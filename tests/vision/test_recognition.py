@@ -38,13 +38,13 @@ def scene() -> Renderer:
     return Renderer([wall, board], CAMERA)
 
 
-def known(renderer: Renderer, T: np.ndarray, count: int) -> tuple[list[list[View]], np.ndarray]:
+def known(renderer: Renderer, T: np.ndarray, count: int, camera: Any = CAMERA) -> tuple[list[list[View]], np.ndarray]:
     """Return the views of some corners of what is seen from T, and where they are."""
     image, depth = renderer.taken(T, np.random.default_rng(0), noise=1.0, blur_px=0.6)
     y = cv2.goodFeaturesToTrack(image[20:-20, 20:-20], count, 0.05, 12).reshape(-1, 2).astype(float) + 20
-    rays = CAMERA.rays(y)
+    rays = camera.rays(y)
     z = depth[tuple(np.rint(y).astype(int).T[::-1])]
-    views = [taken(cv2, image, one, T, CAMERA, REACH) for one in y]
+    views = [taken(cv2, image, one, T, camera, REACH) for one in y]
     assert all(view is not None for view in views)
     return [[view] for view in views if view], from_frame_many(T, rays * (z / rays[:, 2])[:, None])[0]
 
@@ -61,6 +61,18 @@ def test_a_sensor_recognises_where_it_is_from_elsewhere(then: tuple[float, ...])
     assert np.linalg.norm(error[:3]) < 0.08
     assert np.degrees(np.linalg.norm(error[3:])) < 3.0
     assert error @ np.linalg.solve(cov, error) < 12.6  # 95 %
+
+
+def test_a_camera_with_a_wide_view_recognises_where_it_is_too() -> None:
+    camera, first = km.sensors.Omnidirectional(), pose(0, 0, 1.0, 0, 0, 0)
+    rng = np.random.default_rng(3)
+    wall = Plane(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, 0.004, rng, 60.0), 0.004)
+    renderer = Renderer([wall], camera)
+    views, places = known(renderer, first, 60, camera)
+    now = pose(0.05, -0.05, 1.0, 0, 2, 10)
+    found = recognised(cv2, renderer.taken(now, rng, noise=1.0)[0], views, places, camera)
+    assert found is not None
+    assert np.linalg.norm(minus(found[0], now)[:3]) < 0.08
 
 
 def test_another_place_is_not_recognised() -> None:

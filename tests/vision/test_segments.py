@@ -208,10 +208,10 @@ robots:
 """
 
 
-def written(folder: Path, camera: str) -> Path:
+def written(folder: Path, camera: str, more: str = "") -> Path:
     for k, frame in enumerate(frames()[:3]):
         cv2.imwrite(str(folder / f"{k}.png"), frame.grey())
-    (folder / "run.yaml").write_text(IMAGES.format(path=folder, camera=camera))
+    (folder / "run.yaml").write_text(IMAGES.format(path=folder, camera=camera) + more)
     return folder / "run.yaml"
 
 
@@ -224,6 +224,22 @@ def test_a_sensor_takes_the_images_of_a_camera_with_its_intrinsics_and_mount(tmp
     assert [frame.sensor for frame in log.events] == ["camera", "lines"] * 3
     assert log.events[1].grey().shape == log.events[0].grey().shape
     assert not np.array_equal(log.events[1].grey(), log.events[0].grey())  # it is straightened
+
+
+@pytest.mark.parametrize(
+    ("camera", "more", "wanted"),
+    [
+        ("[camera]", "", "run.yaml:8:.*images: got .*expected"),
+        ("camera", "      again: {type: segments, images: lines}", "run.yaml:9:.*images: got 'lines', .* camera$"),
+        ("camera", "      far: {type: position_3d, images: camera}", "run.yaml:9:.* expected one for pinhole or"),
+    ],
+)  # fmt: skip
+def test_images_that_cannot_be_taken_are_refused_in_one_line(
+    tmp_path: Path, camera: str, more: str, wanted: str
+) -> None:
+    with pytest.raises(ConfigError, match=wanted) as told:
+        open_run(written(tmp_path, camera, more))
+    assert "\n" not in str(told.value)
 
 
 def test_images_of_no_camera_are_refused_in_one_line(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from kalmark.logs.log import Log
 from kalmark.vision.straight import Straightened
 
 TAKEN = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px", "mount")
+TAKERS = "pinhole", "segments"  # types of sensors that can take them
 
 
 def complete(tree: Tree) -> None:
@@ -24,8 +25,9 @@ def complete(tree: Tree) -> None:
     for robot in robots.values() if isinstance(robots, dict) else ():
         sensors: Any = robot.get("sensors") if isinstance(robot, dict) else None
         for name, sensor in sensors.items() if isinstance(sensors, dict) else ():
-            camera = sensors.get(sensor.get("images")) if isinstance(sensor, dict) else None
-            if isinstance(camera, dict):
+            images = sensor.get("images") if isinstance(sensor, dict) else None
+            camera = sensors.get(images) if isinstance(images, str) else None
+            if isinstance(camera, dict) and sensor.get("type", TAKERS[0]) in TAKERS:
                 sensors[name] = {key: camera[key] for key in TAKEN if key in camera} | sensor
 
 
@@ -56,10 +58,13 @@ def _cameras(config: Config, robot: str) -> dict[str, list[tuple[str, Straighten
         camera = getattr(sensor, "images", None)
         if camera is None:
             continue
-        others = [other for other in sensors if other != name]
-        if camera not in others:
-            what = f"got {camera!r}, expected another sensor of the robot: one of {', '.join(others)}"
-            raise config.error(("robots", robot, "sensors", name, "images"), what + did_you_mean(camera, others))
+        where = "robots", robot, "sensors", name, "images"
+        own = [other for other, section in sensors.items() if not getattr(section, "images", None)]
+        if camera not in own:
+            what = f"got {camera!r}, expected a sensor of the robot with images of its own: one of {', '.join(own)}"
+            raise config.error(where, what + did_you_mean(camera, own))
+        if sensor.type not in TAKERS:
+            raise config.error(where, f"got {camera!r} for a {sensor.type}, expected one for {' or '.join(TAKERS)}")
         source, model = (model_of(sensors[of], "space") for of in (camera, name))
         numbers = [[getattr(of, key, None) for key in TAKEN[:-1]] for of in (source, model)]
         bent = numbers[0] != numbers[1] or bool(getattr(source, "distortion", None))

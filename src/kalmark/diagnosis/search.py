@@ -38,8 +38,8 @@ def best(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
     Surveys that are off go before outliers and noise that would take them up, which are one for all of them, landmarks
-    that move before outliers, and noise
-    of several columns before outliers that explain clearly less: these would be one for all columns.
+    that move before outliers, and noise of several columns before outliers that explain clearly less: these would be
+    one for all columns.
     A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
     as much, one in the sensors goes before one in the controls.
     """

@@ -267,7 +267,7 @@ class FrontEnd:
             plane = Plane.of(next(planes)) if own else None
             self.looks[name] = Look(searched, found, fitted, missed, seen, views[at : at + own], plane, bool(surveyed))
             at += own
-        self.frame, self.named, self.is_lost = int(state["frame"]), int(state["named"]), bool(state["is_lost"])
+        self.frame, self.named, self.is_lost = int(state["frame"]), int(state["named"]), bool(state.get("is_lost"))
         self.random.bit_generator.state = state["random"]
         self.cells.failed = {(int(i), int(j)): int(frame) for i, j, frame in state["failed"]}
         begun = state["beginning"]

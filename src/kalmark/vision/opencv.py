@@ -12,6 +12,7 @@ def opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise ModelError("ActiveSearch: OpenCV is not installed, expected it: pip install 'kalmark[opencv]'") from None
+        what = "OpenCV, which searches images, is not installed, expected it"
+        raise ModelError(f"{what}: pip install 'kalmark[opencv]'") from None
     cv2.setNumThreads(1)
     return cv2

@@ -42,9 +42,11 @@ def recognised(
     if ahead.sum() < LEAST:
         return None
     places, rays = np.ascontiguousarray(places[landmark[ahead]]), rays[ahead]
-    flat, focal = np.ascontiguousarray(rays[:, :2] / rays[:, 2:]), float(sensor.fx_px)
+    u, v = image.shape[1] / 2.0, image.shape[0] / 2.0
+    pixel_rad = float(np.linalg.norm(np.diff(sensor.rays(np.array([[u, v], [u + 1.0, v]])), axis=0)))
+    flat = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
     found, turn, t, inliers = cv2.solvePnPRansac(
-        places, flat, np.eye(3), None, iterationsCount=TRIES, reprojectionError=OFF_PX / focal, confidence=SURE,
+        places, flat, np.eye(3), None, iterationsCount=TRIES, reprojectionError=OFF_PX * pixel_rad, confidence=SURE,
         flags=cv2.SOLVEPNP_EPNP,
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < LEAST:

@@ -93,6 +93,7 @@ class LineFrontEnd:
         self.frame = self.named = 0
         self.expected: Expectations | None = None
         self.found: Matches | None = None
+        self._numbers: list[int] = []  # of the segments of the last scan
         self.image: Any = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
