@@ -35,6 +35,7 @@ class Gated:
 
     nearest: ClassVar[int] = 4  # candidates for an observation,
     farther: ClassVar[float] = 10.0  # within so many times the nearest distance
+    alone: ClassVar[bool] = False  # whether each is of the nearest, where all can only be of one
 
     def threshold(self, m: int, default: float) -> float:
         """Return the gate as a squared Mahalanobis distance."""
@@ -42,6 +43,9 @@ class Gated:
 
     def associate(self, query: Query) -> list[Decision]:
         """Answer with the ids where there are, with the pairs of `match` elsewhere."""
+        if self.alone and (sure := query.nearest(self.nearest, self.farther, chi2_gate(self.gate, query.dof()))):
+            query.learn(float(len(sure)), 0.0)
+            return [(name, "") for name in sure]
         answers: list[Decision] = [(i, "") if i is not None else (NEW, "no landmark near") for i in query.ids]
         open_ = np.array([k for k, i in enumerate(query.ids) if i is None], dtype=np.int64)
         gate, far = chi2_gate(self.gate, query.dof()), chi2_gate(self.new_gate, query.dof())
@@ -106,6 +110,8 @@ class NearestNeighbour(Gated):
     Each is taken at most once in a scan, the closest pair first.
     """
 
+    alone: ClassVar[bool] = True
+
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair greedily by d2 (K, L); an observation whose nearest landmark is taken gets none."""
         columns = d2.argmin(axis=1)
@@ -131,6 +137,8 @@ class GlobalAssignment(Gated):
     An observation without a pair counts as the gate.  Bipartite matching: an observation gives way to another if that
     makes the whole better.
     """
+
+    alone: ClassVar[bool] = True
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair by the linear assignment of the whole scan, of d2 (K, L)."""

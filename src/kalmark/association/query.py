@@ -83,6 +83,29 @@ class Query:
         scan.report.seen_at = places
         return self._names.copy()
 
+    def nearest(self, nearest: int, farther: float, gate: float) -> list[Id] | None:
+        """Return the landmark that each observation can only be of: the nearest inside the gate on d2, of no other one.
+
+        None of a scan in which that is not so of all, that has ids, or where it takes the other questions to tell.
+        """
+        scan, channel, tracks = self.scan, self.scan.channel, self.scan.tracks
+        model = tracks.only_model(channel)
+        plain = scan.event.ids is None and not (tracks.tentative or self._known or channel.joins or scan.noise_varies)
+        if model is None or not plain or not isinstance(model.model, tuple):
+            return None
+        p = channel.places(scan.map, scan.robot, scan.y)
+        if p is None:
+            return None
+        sorts = tracks.sorts_of(channel.kinds, len(scan.map.blocks))
+        seen = scan.robot, channel.second(scan.robot), model.d, self.y, scan.R
+        found = scan.map.nearest(model.model, seen, (sorts, p, nearest, farther, gate))
+        if found is None:
+            return None
+        landmarks = [tracks.names[slot] for slot in found.slots.tolist()]
+        scan.report.seen_at = p
+        scan.report.compared = Compared(found.rows, found.numbers, landmarks, found.compared, found.places)
+        return [tracks.names[slot] for slot in found.at.tolist()]
+
     def read(self, names: list[Id]) -> Marginal:
         """Return the joint marginal of robot, mount and landmarks, those known exactly among them."""
         scan = self.scan

@@ -15,6 +15,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import CAPACITY, P_AT, P_SIZE, Layout, Read, State, next_capacity, spaces_of
+from kalmark.filter.nearness import Asked, Nearest, Seen, nearest
 from kalmark.filter.neighbours import Sorts, distances, near_places, paired
 from kalmark.filter.prefault import Prefault
 from kalmark.geometry.spaces import Space, Table
@@ -87,6 +88,12 @@ class Map(Protocol):
         """Return the wanted blocks near p (K, 2 or 3): of each place the `nearest`, at most `farther` times the least.
 
         They are read jointly with the robot and, if it is in the map, the mount.
+        """
+
+    def nearest(self, model: Any, scan: Seen, asked: Asked) -> Nearest | None:
+        """Return the wanted block that each observation can only be of; None where that takes more to tell.
+
+        `model` is compiled.
         """
 
     def around(self, sorts: Sorts, p: Array, count: int) -> Index:
@@ -178,6 +185,11 @@ class StochasticMap(Layout):
         slots, _ = near_places(p, self.x, self.blocks, np.arange(len(self.blocks)), sorts, nearest, farther)
         places = self.stored(slots, p.shape[1])
         return Pairs.of(slots, places, self.marginal(robot, mount, slots), p, nearest, farther)
+
+    def nearest(self, model: Any, scan: Seen, asked: Asked) -> Nearest | None:
+        """Return the wanted block that each observation can only be of; None of a scan of which that is not clear."""
+        clear, found = nearest(model, self.whole, scan, np.arange(len(self.blocks)), asked)
+        return Nearest(*found) if clear else None
 
     def around(self, sorts: Sorts, p: Array, count: int) -> Index:
         """Return the slots (N,) of the wanted blocks nearest to p (2 or 3,), nearest first."""

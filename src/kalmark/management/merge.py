@@ -76,9 +76,9 @@ class Search:
         for name in self._observed:
             if name in tracks.confirmed and (self._merged or self._is_due(name)) and self._fits(name):
                 return name
-        if self._tried is None:
-            self._tried = set(tracks.recent)
         while self._around or self._merged:
+            if self._tried is None:
+                self._tried = set(tracks.recent)
             if not self._around:
                 at = self._merged.pop(0)
                 covisible = tracks.confirmed[at].covisible if at in tracks.confirmed else ()

@@ -25,7 +25,8 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
     decisions: Sequence[Decision],
 ) -> tuple[list[Judged], list[Observation]]:  # fmt: skip
     """Fuse observations of landmarks in the map, the groups of those of one type at once.  [S] (26)-(30)."""
-    report, found, most = scan.report, list[Observation](), policy.attention.updates
+    report, most = scan.report, policy.attention.updates
+    found: list[Observation] = []
     judged: list[Judged] = []
     if most is not None and sum(len(rows) for _, rows in groups) > most:
         groups, out = chosen(scan, policy.attention, groups, decisions)

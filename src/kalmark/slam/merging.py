@@ -23,13 +23,13 @@ from kalmark.tracks.scan import ScanContext, Start
 
 def merge_seen(state: State, scan: ScanContext, policy: Policy) -> None:
     """Merge landmarks that are one; report each that is gone, the one it is now, and why."""
-    seen: list[Any] = [o.landmark for o in scan.report.observations if o.outcome in ("associated", "new")]
-    names = [name for name in seen if name in state.tracks.confirmed]
+    confirmed, taken = state.tracks.confirmed, ("associated", "new")
+    seen = [o for o in scan.report.observations if o.outcome in taken and o.landmark in confirmed]
+    names: list[Any] = [o.landmark for o in seen]
     state.tracks.note_scan(names)
     if not policy.upkeep.merge:
         return
-    unnamed = {o.landmark for o in scan.report.observations if o.id is None}
-    search = merge.Search(state.tracks, [name for name in names if name in unnamed])
+    search = merge.Search(state.tracks, [name for name, o in zip(names, seen, strict=True) if o.id is None])
     while (name := search.next()) is not None:
         track = state.tracks.confirmed[name]
         if search.is_first_pass:

@@ -254,6 +254,10 @@ class Tracks:
             wanted = self._wanted[kinds] = np.array([*(sort in kinds for sort in self._numbers), False])
         return self._sort_at, wanted
 
+    def only_model(self, channel: Channel) -> ObservationModel | None:
+        """Return the model by which a sensor observes all landmarks of the map; None if they are of several kinds."""
+        return channel.models.get(next(iter(self._numbers))) if len(self._numbers) == 1 else None
+
     def _reach(self, slot: int) -> None:
         while slot + 1 >= len(self._sort_at):
             self._sort_at = np.concatenate([self._sort_at, np.full(len(self._sort_at), -1)])

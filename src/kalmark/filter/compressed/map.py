@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from kalmark.filter.compressed.search import Search
 from kalmark.filter.compressed.storage import PANEL, Triangle
 from kalmark.filter.layout import P_AT, P_SIZE, Layout, State, laid_out
 from kalmark.filter.map import AT_ONCE, NO_SLOTS, Marginal, Pairs, StochasticMap
+from kalmark.filter.nearness import Asked, Nearest, Seen, nearest
 from kalmark.filter.neighbours import Sorts, distances, near_places
 from kalmark.geometry.spaces import RHO, Rn, Space, Table
 
@@ -160,6 +161,29 @@ class CompressedMap(Layout):
         read = self.marginal(robot, mount, slots) if len(inactive) <= AT_ONCE else None
         places = self.means(slots, d) if read is None else read.map.means(read.slots, d)
         return Pairs.of(slots, places, read, p, nearest, farther)
+
+    def nearest(self, model: Any, scan: Seen, asked: Asked) -> Nearest | None:
+        """Return the wanted block that each observation can only be of; None where that takes more to tell.
+
+        Only active blocks are read: it is not clear where an inactive one may be nearer.
+        """
+        robot, mount, d, y, R = scan
+        if robot not in self.entered or (mount >= 0 and mount not in self.entered):
+            return None
+        m, own = self.active, (self.entered[robot], self.entered.get(mount, -1), d, y, R)
+        clear, found = nearest(model, m.whole, own, self._slot_of[: len(m.blocks)], asked)
+        if not clear:
+            return None
+        sorts, p, *_ = asked
+        mine, covariance = Nearest(*found), partial(self._at_first, p.shape[1])
+        return mine if self._search.none_nearer(self, self._at, sorts, p, mine, covariance) else None
+
+    def _at_first(self, d: int, slots: Index) -> Array:
+        """Return the covariance (N d, N d) of the first d numbers of blocks as it was when the interval began."""
+        if self._job is not None:
+            self._job.know(slots)
+        rows = (self.blocks[slots, P_AT][:, None] + np.arange(d)).ravel()
+        return self._read(rows, rows)
 
     def around(self, sorts: Sorts, p: Array, count: int) -> Index:
         """Return the slots (N,) of the wanted blocks nearest to p (2 or 3,), nearest first.

@@ -1,8 +1,12 @@
-"""Search for inactive blocks near places, by the means that they had when the compression interval began."""
+"""Search for inactive blocks near places, by the means that they had when the compression interval began.
+
+And how well such blocks are known relative to each other: what is between them and the robot need not be read then.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,12 +14,16 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter.layout import Layout
+from kalmark.filter.nearness import Nearest
 from kalmark.filter.neighbours import Sorts, distance, has_place, least
+
+Joint = Callable[[Index], Array]
 
 NONE = np.zeros(0, dtype=np.int64)
 FAR_M = 1e100
 REGION = 256  # blocks round a scan, to compare with this one and the next
 WIDER = 1.5  # times as far as this one needs
+NO, YES, OUTSIDE = 0, 1, 2
 
 
 @compiled
@@ -56,13 +64,53 @@ def near_in_region(
     return slots[here[:n][found]], inside
 
 
+@compiled
+def none_nearer(
+    p: Array, d2: Array, sigma: Array, limit: Array, own: Index, centre: Array, radius: float, slots: Index,
+    places: Array, spread: Array, at: Index, sorts: Sorts,
+) -> tuple[int, Index]:  # fmt: skip
+    """Return whether no wanted inactive block can be nearer to an observation than the one that is nearest now.
+
+    That takes `NO`, `YES`, another region (`OUTSIDE`) or the spread of some blocks, of which the numbers are returned.
+    The observations seem to be at p (K, d); their blocks `own` (K,) are at d2 (K,) with the distance's `sigma` (K,),
+    and no block farther away than a limit (K,) is in question.  The sigma of the distance to another block is no larger
+    than the sum of it and of the `spread` of both blocks, of what they are off by relative to a third one.
+    """
+    d, unknown, verdict = p.shape[1], np.zeros(len(slots), np.bool_), YES
+    for k in range(len(p)):
+        if not distance(p[k], centre) + limit[k] <= radius:
+            return OUTSIDE, slots[:0]
+        mine = -1
+        for i in range(len(slots)):
+            if slots[i] == own[k]:
+                mine = i
+        for i in range(len(slots)):
+            near = at[slots[i]] < 0 and sorts[1][sorts[0][slots[i]]]
+            for j in range(d):
+                near = near and abs(places[i, j] - p[k, j]) <= limit[k]
+            gap = distance(p[k], places[i]) if near else np.inf
+            if not gap <= limit[k]:
+                continue
+            if mine < 0:
+                return NO, slots[:0]
+            if spread[i] < 0.0 or spread[mine] < 0.0:
+                unknown[i], unknown[mine] = spread[i] < 0.0, spread[mine] < 0.0
+            elif not gap > math.sqrt(d2[k]) * (sigma[k] + spread[mine] + spread[i]):
+                verdict = NO
+    return verdict, np.flatnonzero(unknown) if verdict == YES else slots[:0]
+
+
 class Region(NamedTuple):
-    """All blocks within a radius of a centre, and where they were when the interval began."""
+    """All blocks within a radius of a centre, and where they were when the interval began.
+
+    `spread` are the sigmas of what the blocks are off by relative to the first one, or -1 until they are asked for.
+    """
 
     centre: Array
     radius: float
     slots: Index
     places: Array
+    spread: Array
 
 
 class Search:
@@ -78,19 +126,42 @@ class Search:
         """Return the slots of wanted inactive blocks, the `count` nearest to each p (K, d) within a limit (K,)."""
         if not self._planted:
             self._plant(layout, sorts, p.shape[1])
-        finite = (np.abs(p) < FAR_M).all(axis=1)
-        if self._tree is None or not finite.any():
+        if not np.abs(p).max(initial=0.0) < FAR_M:
+            finite = (np.abs(p) < FAR_M).all(axis=1)
+            p, limit = p[finite], limit[finite]
+        if self._tree is None or not len(p):
             return NONE
-        p, limit = p[finite], limit[finite]
         region, size, wider = self._region, REGION, 1.0
         while True:
             if region is not None:
-                centre, radius, slots, places = region
+                centre, radius, slots, places, _ = region
                 found, inside = near_in_region(p, limit, count, centre, radius / wider, slots, places, at, sorts)
                 if inside:
                     self._region = region
                     return found
             region, size, wider = self._around(p, size), 2 * size, WIDER
+
+    def none_nearer(self, layout: Layout, at: Index, sorts: Sorts, p: Array, found: Nearest, covariance: Joint) -> bool:
+        """Return whether no wanted inactive block can be nearer to an observation at p (K, d) than the nearest `found`.
+
+        `covariance` is that of the places of some blocks when the interval began.  It has not grown since: blocks that
+        do not move only gain information.
+        """
+        if not self._planted:
+            self._plant(layout, sorts, p.shape[1])
+        if self._tree is None:
+            return True
+        region = self._region or self._around(p, REGION)
+        while True:
+            asked = p, found.d2, found.sigma, found.limit, found.at, *region, at, sorts
+            verdict, unknown = none_nearer(*asked)
+            if len(unknown):
+                region.spread[unknown] = _spread(covariance(region.slots[np.append(0, unknown)]), p.shape[1])
+            elif verdict == OUTSIDE and region is self._region:
+                region = self._around(p, REGION)
+            else:
+                self._region = region
+                return verdict == YES
 
     def _plant(self, layout: Layout, sorts: Sorts, d: int) -> None:
         from scipy.spatial import cKDTree
@@ -105,4 +176,11 @@ class Search:
         centre, total = p.mean(axis=0), len(self._tree.data)
         gaps, found = self._tree.query(centre, np.arange(1, 1 + min(count, total)))
         radius = float(gaps[-1]) if count < total else math.inf
-        return Region(centre, radius, self._slots[found], self._tree.data[found])
+        return Region(centre, radius, self._slots[found], self._tree.data[found], np.full(len(found), -1.0))
+
+
+def _spread(C: Array, d: int) -> Array:
+    """Return the sigmas (N,) of places relative to a first one; C ((N + 1) d, (N + 1) d) is the covariance of all."""
+    P = C.reshape(len(C) // d, d, -1, d)
+    own, with_first = np.einsum("icic->i", P), np.einsum("cic->i", P[0])
+    return np.sqrt(np.maximum(own[1:] + own[0] - 2.0 * with_first[1:], 0.0))
