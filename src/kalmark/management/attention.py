@@ -129,5 +129,7 @@ def left_out(
     """
     held = [None, *(answer for answer in (DEFERRED, REMAP) if answer not in starts)]
     wanted = [k for k in new if decisions[k][0] not in held and decisions[k][0] not in scan.tracks.slots]
+    if not wanted or attention == EVERYTHING:
+        return {}
     empty = not scan.tracks.confirmed
     return attention.worth_a_start(wanted, known, scan.y, image_size(scan.channel.sensor), empty)
