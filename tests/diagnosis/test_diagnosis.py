@@ -100,7 +100,8 @@ def test_the_cure_of_a_fault_takes_it_out(name: str) -> None:
     assert name not in [cause.name for cause in after.causes]
 
 
-def test_a_landmark_that_is_moved_once_is_named_and_is_no_outlier() -> None:
+def run_with_moved(ids: list[int], by: tuple[float, float]) -> Run:
+    """Return the run of a log in which landmarks are moved in the middle."""
     log, rng = simulate(world_of(), 3), np.random.default_rng(0)
     middle, truth = log.events[len(log.events) // 2].t_ns, log.truth["rover"]
 
@@ -108,14 +109,26 @@ def test_a_landmark_that_is_moved_once_is_named_and_is_no_outlier() -> None:
         if not isinstance(e, Scan) or e.ids is None or e.t_ns < middle:
             return e
         pose = truth.poses[np.searchsorted(truth.t_ns, e.t_ns)]
-        places = np.array([np.add(log.landmarks[i][:2], (1.5, 0.6)) for i in e.ids])
+        places = np.array([np.add(log.landmarks[i][:2], by) for i in e.ids])
         y = km.geometry.observe(compose(pose, np.array([0.3, 0.0, 0.0]))[0], places)[0]
         y += rng.normal(size=y.shape) * (0.1, 0.02)
-        return seen(e, y=np.where(np.isin(e.ids, [12])[:, None], y, e.y))
+        return seen(e, y=np.where(np.isin(e.ids, ids)[:, None], y, e.y))
 
-    names = [(c.name, c.evidence.split()[1]) for c in km.diagnose(run_of(other)).causes]
+    return run_of(other)
+
+
+def test_a_landmark_that_is_moved_once_is_named_and_is_no_outlier() -> None:
+    names = [(c.name, c.evidence.split()[1]) for c in km.diagnose(run_with_moved([12], (1.5, 0.6))).causes]
     assert names[0] == ("moving_landmark", "12")
     assert "outliers" not in dict(names)
+
+
+def test_two_landmarks_that_are_moved_far_are_named_and_the_robot_is_not_kidnapped() -> None:
+    verdict = km.diagnose(run_with_moved([5, 20], (-3.0, 2.0)))
+    assert (verdict.map, verdict.causes[0].name) == ("doubtful", "moving_landmark")
+    assert verdict.causes[0].cure in ("leave out 5, 20", "leave out 20, 5")
+    assert "kidnapped" not in [cause.name for cause in verdict.causes]
+    assert "e-" not in next(verdict_lines(verdict.as_dict()))
 
 
 def test_a_log_that_does_not_fit_is_not_ok_where_there_is_no_batch_solution(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Flags
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
@@ -49,6 +49,7 @@ IN_A_ROW = 8  # sightings of a landmark that do not fit: its id may mean another
 SAME = 0.25  # of the distance to the next landmark, within which two places are one
 DOUBLED, SHORTER = 3, 0.25  # steps to the time by which scans are late, and the shortest, of the time of a control
 COMMON = 4  # landmarks, of which most are where they were
+MOVED = "moving_landmark"  # also one that was moved once
 
 
 class Fit(NamedTuple):
@@ -296,9 +297,7 @@ def _alone(events: list[Event], robot: str, robots: Sequence[str]) -> Iterator[E
         if not isinstance(e, Scan) or e.ids is None or not {*robots}.intersection(e.ids):
             yield e
             continue
-        rows = [k for k, name in enumerate(e.ids) if name not in robots]
-        cov = e.cov[rows] if e.cov is not None and e.cov.ndim == 3 else e.cov
-        yield Scan(t_ns=e.t_ns, robot=robot, sensor=e.sensor, y=e.y[rows], ids=[e.ids[k] for k in rows], cov=cov)
+        yield _rows_of(e, [k for k, name in enumerate(e.ids) if name not in robots])
 
 
 def started_at(
@@ -352,16 +351,55 @@ def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:
 
 
 def kidnapped(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
-    """Return that the robot was moved, if the run does not fit from the observation `first` on, and a new one would."""
+    """Return that the robot was moved, if the run does not fit from the observation `first` on, and a new one would.
+
+    Or that landmarks were, if the log before and after it fits together without these.
+    """
     t_ns, robot, rest = _from(run, log, first)
-    after, before = fit_of(run.config, log, rest), now.of(slice(first, None))
-    if after.mean > FITS or MUCH * after.mean > before.mean:
+    again, before = _filtered(run.config, log, rest), now.of(slice(first, None))
+    after = REFUSED if again is None else fit(again)
+    if again is None or after.mean > FITS or MUCH * after.mean > before.mean:
         return None
+    gain = explained(before.of(slice(len(after.values))), after)
+    found = moved(run, log, first, again)
+    if found:
+        return found._replace(gain=gain)
     evidence = (
         f"{robot} was elsewhere from t={t_ns * 1e-9:.1f} s on: the log before and after it fits, but not together"
     )
-    gain = explained(before.of(slice(len(after.values))), after)
     return Mistake("kidnapped", evidence, until(run, log, t_ns), run.config, None, gain, t_ns * 1e-9)
+
+
+def moved(run: Run, log: Log, first: int, again: Run) -> Mistake | None:
+    """Return that landmarks were moved, if most are where they were in a run `again` from an observation on.
+
+    Where a robot is moved all of them are, and the log before and after it does not fit together without a few.
+    """
+    t_ns, _, rest = _from(run, log, first)
+    old, new = run.history.map_at(int(run.history.step[first - WINDOW]) - 1), again.landmarks
+    both = aligned(_places(old.ids, old.means[:, : run.history.d]), _places(new.ids, new.positions()[0]))
+    names = [] if both is None else [str(both.names[k]) for k in np.flatnonzero(~both.still)]
+    around = [_without(e, {*names}) for e in log.events if abs(e.t_ns - t_ns) <= rest[-1].t_ns - t_ns]
+    if not names or fit_of(run.config, log, around).mean > FITS:
+        return None
+    told = ", ".join(names)
+    what = f"landmark {told} was" if len(names) == 1 else f"landmarks {told} were"
+    evidence = f"{what} moved by t={t_ns * 1e-9:.1f} s: without sightings of them the log before and after it fits"
+    return Mistake(MOVED, evidence, f"leave out {told}", run.config, None, 0.0, t_ns * 1e-9, 0.0)
+
+
+def _without(e: Event, names: set[str]) -> Event:
+    """Return an event without the sightings of landmarks."""
+    if not isinstance(e, Scan) or e.ids is None or names.isdisjoint(map(str, e.ids)):
+        return e
+    return _rows_of(e, [k for k, name in enumerate(e.ids) if str(name) not in names])
+
+
+def _rows_of(e: Scan, rows: list[int]) -> Scan:
+    """Return a scan with some of its observations."""
+    cov = e.cov[rows] if e.cov is not None and e.cov.ndim == 3 else e.cov
+    ids = None if e.ids is None else [e.ids[k] for k in rows]
+    return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y[rows], ids=ids, cov=cov)
 
 
 def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
@@ -401,22 +439,42 @@ def _misfit_in_a_row(run: Run, now: Fit) -> int | None:
     return int(min(starts)) if starts else None
 
 
-def elsewhere(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> dict[Any, Any]:
-    """Return the landmarks that are now where another one was, and which: after the alignment of most of all."""
+class Aligned(NamedTuple):
+    """Landmarks by `names` (N,) that two maps have, at the places `new` (N, d) of the later one, aligned by most.
+
+    Those that are where they were are `still` (N,): within `near`, m, a share of the distance to the next one.
+    """
+
+    names: list[Any]
+    new: Array
+    still: Flags
+    near: float
+
+
+def aligned(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> Aligned | None:
+    """Return the landmarks of two maps, None if they are few or if most are elsewhere."""
     common = [name for name in after if name in before]
     if len(common) < COMMON:
-        return {}
+        return None
     old, new = (np.array([places[name] for name in common]) for places in (before, after))
     every = np.array([*before.values()])
     near = SAME * float(np.median(cKDTree(every).query(every, k=2)[0][:, 1]))
     onto = rigid_robust(new, old, near)
     still = np.linalg.norm(onto(new) - old, axis=1) < near
     if 2 * still.sum() <= len(common):
+        return None
+    return Aligned(common, rigid(new[still], old[still])(new), still, near)
+
+
+def elsewhere(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> dict[Any, Any]:
+    """Return the landmarks that are now where another one was, and which: after the alignment of most of all."""
+    both = aligned(before, after)
+    if both is None:
         return {}
-    onto, names = rigid(new[still], old[still]), list(before)
-    away, which = cKDTree(every).query(onto(new))
-    moved = ~still & (away < near)
-    return {name: names[k] for name, k, other in zip(common, which, moved, strict=True) if other and names[k] != name}
+    names = list(before)
+    away, which = cKDTree(np.array([*before.values()])).query(both.new)
+    others = np.flatnonzero(~both.still & (away < both.near)).tolist()
+    return {both.names[k]: names[which[k]] for k in others if names[which[k]] != both.names[k]}
 
 
 def _places(ids: Sequence[Any], means: Array) -> dict[Any, Array]:

@@ -16,7 +16,7 @@ from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
 from kalmark.diagnosis.columns import Where
-from kalmark.diagnosis.gross import LOST, fit, gross, started_at, until
+from kalmark.diagnosis.gross import LOST, MOVED, fit, gross, started_at, until
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.linear import Linear
@@ -119,9 +119,10 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     else:
         verdict = _judged(run, log, most, progress)
         if mistake is not None:
-            rest = [c for c in verdict.causes if mistake.name != LATE or c.name not in (LATE, "kidnapped")]
+            of_it = (mistake.name, "kidnapped") if mistake.name in (LATE, MOVED) else ()
+            rest = [c for c in verdict.causes if c.name not in of_it]
             verdict = replace(verdict, causes=(_of_mistake(mistake), *rest))
-            if mistake.name == LATE and verdict.map == "ok":  # in turns nothing was of a landmark: they vanish, too
+            if of_it and verdict.map == "ok":  # of late scans nothing is of a landmark in turns: they vanish, too
                 verdict = replace(verdict, map="doubtful")
         if run.stopped or summary.get("diverged") or repeats(summary):
             verdict = replace(verdict, map="wrong")

@@ -10,7 +10,7 @@ from kalmark.results.words import count, figure
 SHOWN = 3  # causes in a short verdict
 ROUNDING_M = 1e-9
 INNOVATIONS = "innovations alone"  # how a map was checked that has no batch solution
-SEEN = 0.02  # by which a factor of the sigmas is worth a word
+SEEN = 0.02  # by which a factor of the sigmas is worth a word, and of the accuracy a shift
 
 
 def verdict_lines(verdict: Mapping[str, Any], shown: int | None = SHOWN) -> Iterator[str]:
@@ -42,7 +42,8 @@ def _trust(verdict: Mapping[str, Any]) -> str:
     """Return to what accuracy a map can be trusted."""
     factor, accuracy, shift = (verdict[key] for key in ("sigma_factor", "accuracy_m", "shift_m"))
     if verdict["map"] != "ok":
-        return f": its shape is off by {figure(shift)} m" if shift and shift > ROUNDING_M else ""
+        least = max(SEEN * (accuracy or 0.0), ROUNDING_M)
+        return f": its shape is off by {figure(shift)} m" if shift and shift > least else ""
     if factor is None:
         return f", by {checked}" if (checked := str(verdict["checked"])).startswith(INNOVATIONS) else ""
     said = f"{figure(factor, 2)} times what the filter states" if abs(factor - 1.0) > SEEN else "as the filter states"
