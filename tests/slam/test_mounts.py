@@ -80,3 +80,29 @@ def test_the_mount_of_a_laser_and_the_pose_are_as_sure_as_they_say() -> None:
     low, high = chi2.ppf([0.005, 0.995], 3 * len(poses)) / len(poses)
     assert low < np.mean(poses) < high
     assert low < np.mean(mounts) < high
+
+
+def test_a_compressed_map_with_a_mount_is_close_to_the_dense_one() -> None:
+    """Its inactive landmarks turn with the robot alone, not with the sensor: an approximation, here of two laps."""
+    rng, at, motion = np.random.default_rng(4), np.array([0.3, 0.1, 0.0]), km.motion.Unicycle(0.1, 0.02)
+    a, far = rng.uniform(0, 2 * np.pi, 150), rng.uniform(16, 24, 150)
+    world, true = np.column_stack([far * np.cos(a), far * np.sin(a)]), at + rng.normal(0, [0.05, 0.05, 0.026])
+    lidar = km.Mount(km.sensors.RangeBearing(0.1, 0.01), at=at, cov=np.diag([0.05, 0.05, 0.026]) ** 2)
+    truth, u = np.array([20.0, 0.0, np.pi / 2]), np.array([2.5, 0.125])
+    dense, compressed = (
+        km.Slam([km.Robot("r", motion, truth, {"lidar": lidar})], km.association.ByIdentity("off"), map=kind)
+        for kind in ("dense", "postponed")
+    )
+    for k in range(500):
+        control = km.Control(0.2 * k, "r", u + rng.normal(0, [0.1, 0.02]))
+        truth = motion.move(truth, u, 0.2)[0]
+        y = km.geometry.observe(km.geometry.compose(truth, true)[0], world)[0]
+        near = np.flatnonzero((y[:, 0] < 6.0) & (y[:, 0] > 0.6))[:10]
+        scan = km.Scan(0.2 * k + 0.2, "r", "lidar", y[near] + rng.normal(size=(len(near), 2)) * [0.1, 0.01], near)
+        for slam in (dense, compressed):
+            slam.process(control)
+            slam.process(scan)
+    for name in ["r", "r.lidar", *(name for name in dense.tracks.confirmed if isinstance(name, int))]:
+        sigmas, closely = (np.sqrt(np.diag(slam.covariance(name))) for slam in (dense, compressed))
+        assert (np.abs(dense.mean(name) - compressed.mean(name)) < 0.2 * sigmas).all(), name
+        np.testing.assert_allclose(closely, sigmas, rtol=0.015)
