@@ -72,6 +72,32 @@ def test_poses_and_constants_are_as_wrong_as_the_filter_says(estimator: Any) -> 
     assert 0.4 < np.mean(constants) < 1.9
 
 
+@pytest.mark.parametrize("name", ["wheels", "matcher"])
+def test_a_scale_is_not_pushed_by_the_noise_of_the_controls_that_its_readings_are_compared_with(name: str) -> None:
+    """Controls of 1 m/s are read with a noise of .3: by their own speed, the scale would be pushed at every reading."""
+    sensors = {
+        "wheels": km.Mount(km.sensors.Speed(0.02, sigma_scale=0.1)),
+        "matcher": km.Mount(km.sensors.Odometer2D(0.002, 0.005, sigma_scale=0.1)),
+        "receiver": km.Mount(km.sensors.Gps2D(0.1)),
+    }
+    motion, u, off = km.motion.Unicycle(sigma_v_mps=0.3, sigma_w_radps=0.1), np.array([1.0, 0.3]), []
+    way = motion.move(np.zeros(3), u, STEP_S)[0]
+    for seed in range(10):
+        rng, x = np.random.default_rng(seed), np.zeros(3)
+        slam = km.Slam(km.Robot("r", motion, sensors={key: sensors[key] for key in (name, "receiver")}))
+        for k in range(300):
+            slam.process(km.Control(k * STEP_S, "r", u + rng.normal(0, [0.3, 0.1])))
+            x, t_s = compose(x, way)[0], (k + 1) * STEP_S
+            scaled = way * [SCALE, SCALE, 1.0] + rng.normal(0, [0.002, 0.002, 0.005])
+            y = [SCALE + rng.normal(0, 0.02)] if name == "wheels" else scaled
+            slam.process(km.Scan(t_s, "r", name, [y]))
+            if k % 5 == 0:
+                slam.process(km.Scan(t_s, "r", "receiver", [x[:2] + rng.normal(0, 0.1, 2)]))
+        off.append((slam.mean(f"r.{name}")[3] - 1 / SCALE) / np.sqrt(slam.covariance(f"r.{name}")[3, 3]))
+    assert abs(np.mean(off)) < 3 / np.sqrt(10)
+    assert np.mean(np.square(off)) < 3.1, "99.9 % of means of ten chi-squares are below"
+
+
 def test_a_run_that_is_resumed_ends_bit_for_bit_where_it_would_have(tmp_path: Path) -> None:
     log, _ = events(0, 40)
     whole = ran(log)

@@ -160,6 +160,8 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
     """Return e (1, .), z (1, p), E_h (1, p, h), E_l (1, p, n) of one reading y of a sensor of the state.
 
     Like `observe.linearize`: the head is the robot's pose and, if in the map, the mount and the sensor's parameters.
+    y (1, m + 1) ends with the time since the last reading.  In y (1, 2 m + 1) the reading as earlier ones tell it comes
+    before that: the parameters' Jacobian is taken of it (docs/motions.md).
     """
     _, chain_at, expect_at, velocity, at, par, angular, vary_at = view
     pose, m = len(at), len(angular)
@@ -177,7 +179,8 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
     if len(head) > pose:
         E_h[0, :, n : 2 * n] = E_v[0] @ V_s
     if len(head) > 2 * pose:
-        E_h[0, :, 2 * n :] = seen.vary(vary_at, (0, par, angular, row, expected))[0]
+        usual = y[:, m : 2 * m].copy() if y.shape[1] > m + 1 else expected
+        E_h[0, :, 2 * n :] = seen.vary(vary_at, (0, par, angular, row, usual))[0]
     E_l = np.zeros((1, p, V_l.shape[1]))
     if V_l.shape[1] > 0:
         E_l[0] = E_v[0] @ V_l

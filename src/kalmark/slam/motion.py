@@ -61,7 +61,13 @@ class Part(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """The mean (k,) of the last controls, as rates: of a `number` of them that differ by their noise alone."""
+    """The mean (k,) of the last controls or readings, as rates: of a `number` that differ by their noise alone.
+
+    What a constant does is proportional to a control, or to a reading as it is expected after one.  Of the measured
+    control it would be correlated with the control's noise, and where another sensor shows that noise the constant
+    would be wrong: errors in variables.  Earlier ones are as large and have other noise: an instrumental variable
+    (Fuller 1987, section 1.4).
+    """
 
     rate: Array
     number: int
@@ -189,12 +195,7 @@ class HeldInput:
         return closing if part is None else [part, *closing]
 
     def _usual(self, u: Array, N: Array, dt_s: float) -> Array | None:
-        """Return a control u (k,) as the ones before tell it, and take it into their mean; itself where it has changed.
-
-        What a constant does is proportional to its control.  Of the measured control it would be correlated with the
-        control's noise, and where another sensor shows that noise the constant would be wrong: errors in variables.
-        Earlier controls are as large and have other noise: an instrumental variable (Fuller 1987, section 1.4).
-        """
+        """Return a control u (k,) as those before tell it, and take it into their mean; itself where it has changed."""
         if not self.calibrates or dt_s <= 0.0:
             return None
         rate, before = u / dt_s, self.mean

@@ -41,6 +41,8 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         done = done._replace(e=done.e[:, : event.width])
         report.e, report.z, report.Z = done.e, done.z, done.Z
         report.judged = (Judged([0], [None], [event.robot], done, reader.gate),)
+        if done.fused[0]:
+            reader.take(event.y, done.Z, since_s)
         if reader.is_position:
             position = replacing.LeftOut(event.y[0], R[0], done.e[0])
             report.replaced = _believed(state, event.robot, position, done.fused[0])

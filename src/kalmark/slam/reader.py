@@ -13,9 +13,10 @@ from kalmark.filter.estimators import Estimator, Iterating, Update
 from kalmark.filter.map import Map
 from kalmark.geometry.gaussian import gate
 from kalmark.models import protocols
-from kalmark.models.protocols import POSE, Motion, OfState
+from kalmark.models.protocols import CHANGE, POSE, Motion, OfState
 from kalmark.models.state_view import sees_state, state_view_of
 from kalmark.slam.checks import measurements
+from kalmark.slam.motion import Mean
 from kalmark.slam.standing import Standing
 
 POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures where an antenna is
@@ -38,6 +39,10 @@ class Reader:
         self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
         self.is_position = tuple(sensor.columns) in POSITIONS
+        scales = protocols.parameter_covariance(sensor) is not None and "gain" in protocols.parameter_names(sensor)
+        self.scales = self.counts and scales  # its scale is estimated of what the robot's controls say
+        self.mean: Mean | None = None  # of its readings, where it does,
+        self.sigma: Array = np.zeros(len(sensor.columns))  # and what the last was uncertain by, as a rate
         if self.of_state and not np.diagonal(sensor.noise(np.zeros((1, len(sensor.columns))))[0]).all():
             name, wanted = type(sensor).__name__, "a positive number for each component"
             raise ModelError(f"{name}: the noise of one reading is 0, expected {wanted}: the state has the velocity")
@@ -93,8 +98,22 @@ class Reader:
         if event.cov is None and isinstance(self.sensor, protocols.TimedNoise) and since_s > 0:
             R = self.sensor.noise_since(since_s)
         slot, d = (clone, len(self.at)) if self.counts else (robot, len(map_.mean(robot)) if self.of_state else 0)
-        given = np.column_stack([event.y, [since_s]])
+        given = np.column_stack([event.y, *self._usual(event.y, since_s), [since_s]])
         return Update(self.view, robot, self.mount, np.array([slot]), d, given, np.ascontiguousarray(R), self.gate)
+
+    def _usual(self, y: Array, since_s: float) -> list[Array]:
+        """Return a reading y (1, m) as the ones before tell it; none where it has changed, or none is needed."""
+        unit_s = since_s if self.sensor.views == CHANGE else 1.0
+        if self.mean is None or self.mean.after(y[0] / unit_s, self.sigma).number == 1:
+            return []
+        return [self.mean.rate[None] * unit_s]
+
+    def take(self, y: Array, Z: Array, since_s: float) -> None:
+        """Take a reading y (1, m) with the innovation covariance Z (1, m, m) into their mean."""
+        if self.scales:
+            unit_s = since_s if self.sensor.views == CHANGE else 1.0
+            rate, self.sigma = y[0] / unit_s, np.sqrt(np.diag(Z[0])) / unit_s
+            self.mean = Mean(rate, 1) if self.mean is None else self.mean.after(rate, self.sigma)
 
     def estimator(self, estimator: Estimator) -> Estimator:
         """Return how a reading is fused: absolute poses with iterations, how the robot moved without.
@@ -105,6 +124,16 @@ class Reader:
         if self.sensor.views == POSE:
             return estimator.for_fixes()
         return estimator.once() if isinstance(estimator, Iterating) else estimator
+
+    def readings(self) -> list[Any] | None:
+        """Return the mean of its readings as it is saved, None where there is none."""
+        return None if self.mean is None else [self.mean.rate.tolist(), self.mean.number, self.sigma.tolist()]
+
+    def restore(self, rate: list[float], number: int, sigma: list[float]) -> None:
+        """Take back the mean of its readings."""
+        size = (len(self.sensor.columns),)
+        self.mean = Mean(np.array(rate, dtype=np.float64).reshape(size), max(int(number), 1))
+        self.sigma = np.array(sigma, dtype=np.float64).reshape(size)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled view, whose addresses mean nothing to another process."""
