@@ -14,7 +14,7 @@ import kalmark as km
 from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import Verdict
-from kalmark.events import Event, Scan, order
+from kalmark.events import Control, Event, Scan, order
 from kalmark.logs.corrections import at_time
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
@@ -99,3 +99,16 @@ def test_the_cause_is_named_first(case: str) -> None:
     assert verdict.map == status, verdict.causes
     assert re.search(evidence, verdict.causes[0].evidence), verdict.causes
     assert re.search(cure, verdict.causes[0].cure), verdict.causes[0].cure
+
+
+def test_what_a_turn_that_is_too_large_makes_vanish_may_be_because_of_it() -> None:
+    def turned(log: Log) -> Log:
+        return replace(
+            log, events=[replace(e, u=e.u * [1, 1, 1.08]) if isinstance(e, Control) else e for e in log.events]
+        )
+
+    verdict = verdict_on("hall_of_walls", turned, "steps=600")
+    causes = {cause.name: cause for cause in verdict.causes}
+    assert verdict.causes[0].name == "odometry_turn"
+    assert causes["kidnapped"].evidence.endswith("and maps others, which odometry_turn may do, too")
+    assert not causes["kidnapped"].cure  # to leave out the log from there on would be wrong

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.config import load_config
+from kalmark.config import build_slam, load_config
 from kalmark.errors import DivergedError, EventError, LogError, RunError
 from kalmark.events import Control, Fix, Scan
 from kalmark.filter.estimators import Ekf
@@ -22,6 +22,7 @@ from kalmark.logs import open_log, write_native
 from kalmark.results.record import record
 from kalmark.results.recording import file_name, replace_file
 from kalmark.results.run import Run
+from kalmark.simulate import load_world, simulate
 from results_world import STEP_NS, circle, slam_for
 
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
@@ -357,3 +358,16 @@ def test_of_two_programs_that_save_into_one_folder_the_second_one_waits(
     for thread in threads:
         thread.join()
     assert inside == ["begins", "ends"] * 3
+
+
+def test_a_run_without_pictures_is_the_same_but_for_what_these_show() -> None:
+    world = load_world("random_field", ["steps=60"])
+    log = simulate(world, 0)
+    whole, bare = (
+        km.record(build_slam(world.config(), log), log, progress=False, pictures=pictures) for pictures in (True, False)
+    )
+    for name in ("mean", "covariance", "z", "d2", "outcome"):
+        np.testing.assert_array_equal(getattr(whole.history, name), getattr(bare.history, name))
+    np.testing.assert_array_equal(whole.landmarks.positions()[0], bare.landmarks.positions()[0])
+    assert len(whole.history.maps) > len(bare.history.maps) == 1
+    assert len(whole.history.unmeasured_step) > len(bare.history.unmeasured_step) == 0

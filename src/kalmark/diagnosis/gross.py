@@ -519,7 +519,7 @@ def _filtered(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run |
     try:
         made = config_of(Tree(deepcopy(dict(config))), None)
         part = replace(log, events=events)
-        run = record(build_slam(made, part), part, progress=False, on_error="skip")
+        run = record(build_slam(made, part), part, progress=False, on_error="skip", pictures=False)
     except (KalmarkError, np.linalg.LinAlgError):
         return None
     return None if run.stopped or len(run.skipped) > FEW_SKIPPED * len(events) else run

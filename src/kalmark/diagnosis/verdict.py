@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -157,7 +157,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     if not any(c.name == "gap" and not c.harmless for c in first):  # else it is that what doubles maps
         steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
         alone = [c.score for c in first if c.name == "kidnapped" and not run.summary.get("repeats")]
-        first = [*(c for c in causes if c.name in steady and c.score > min([SURELY, *alone])), *first]
+        before = [c for c in causes if c.name in steady and c.score > min([SURELY, *alone])]
+        first = [*before, *(_as_well(c, before) for c in first)]
     causes = [*first, *(c for c in causes if c not in first)]
     causes.sort(key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(
@@ -177,6 +178,13 @@ def _all_misfit(run: Run) -> Iterator[str]:
     mean = fit(run).mean
     if MISFITS_ALL < mean < np.inf:
         yield f"d2 per degree of freedom is {figure(mean, 2)} over all observations, where 1 is expected"
+
+
+def _as_well(cause: Cause, before: Sequence[Cause]) -> Cause:
+    """Return that a robot was carried away with what explains it, too, if that is known: it is to be cured first."""
+    if cause.name != "kidnapped" or not before:
+        return cause
+    return replace(cause, evidence=f"{cause.evidence}, which {before[0].name} may do, too", cure="")
 
 
 def begin_s(run: Run) -> float:

@@ -46,6 +46,7 @@ def record(
     progress: bool = True,
     on_error: Literal["raise", "skip"] = "raise",
     config: Mapping[str, Any] | None = None,
+    pictures: bool = True,
 ) -> Run:
     """Process every event of a log (or of any iterable) and return the run, ready to evaluate and save.
 
@@ -53,6 +54,7 @@ def record(
     filter refuses is left out and listed in `run.skipped`, as is always a frame whose image cannot be read.  A filter
     that diverges so far that it refuses to go on ends the run in either case: `run.stopped` says why and the summary
     has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's models.
+    Without `pictures` what only these show is left out, which is faster: the map on the way, and what was in view.
     Raises LogError if the log has other columns than the filter's motions and sensors.
     """
     if on_error not in ("raise", "skip"):
@@ -60,7 +62,7 @@ def record(
     log = log if isinstance(log, Log) else Log("", tuple(slam.robots), list(log), format="")
     refuse_other_columns(slam, log)
     slam.reserve(name for event in log.events if type(event) is Scan for name in event.ids or ())
-    recorder = _Recorder(slam, log)
+    recorder = _Recorder(slam, log, pictures)
     begin = time.perf_counter()
     with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.foresight:
         for event in track(log.events, log.name or "log", len(log.events), show=progress, note=recorder.rate):
@@ -112,15 +114,15 @@ class DeadReckoning:
 class _Recorder:
     """Gathers one run; `process` is the hot path, everything is put in order afterwards by `run`."""
 
-    def __init__(self, slam: Slam, log: Log) -> None:
-        self.slam, self.log = slam, log
+    def __init__(self, slam: Slam, log: Log, pictures: bool) -> None:
+        self.slam, self.log, self.pictures = slam, log, pictures
         kinds = {type(event) for event in log.events}
         self.has_images = Frame in kinds
         steps: tuple[tuple[str, set[type]], ...] = (("scan", {Scan, Frame}), ("fix", {Fix}), ("control", {Control}))
         self.stepped_by, self.stepped = next((step for step in steps if step[1] & kinds), steps[-1])
         scans = sum(type(e) in self.stepped for e in log.events)
-        self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS)
-        self.foresight = Foresight(slam, scans, np.floor(self.snapshot_at).astype(int).tolist())
+        self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS if pictures else 0)
+        self.foresight = Foresight(slam, scans if pictures else 0, np.floor(self.snapshot_at).astype(int).tolist())
         self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
         begins = {name: begins_at(log.events, name, robot.motion.held) for name, robot in slam.robots.items()}
         self.starts = tuple(
@@ -193,7 +195,7 @@ class _Recorder:
         if report.observations:
             self.left.append(left_px(self.slam, scan, report))
         due = self.due < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[self.due]
-        grown = self.kept < SMALL and any(o.outcome == "new" for o in report.observations)
+        grown = self.pictures and self.kept < SMALL and any(o.outcome == "new" for o in report.observations)
         if due or grown:
             self.maps.append(self._snapshot())
             self.due, self.kept = self.due + due, self.kept + len(self.maps[-1].ids)
