@@ -566,6 +566,9 @@ def commands() -> Iterator[Figure]:
     for verb in ("demo", "evaluate", "explain"):
         yield Figure("Speed", f"`kalmark {verb}`, warm, processor time added to the filter's own: here / 9ae1bee / ratio", "2 s",
                      "python benchmarks/warm.py 9ae1bee", row(f"{verb}, added:", "{0} s / {3} s / {7}"))  # fmt: skip
+    for verb in ("demo", "run"):
+        yield Figure("Speed", f"of what `kalmark {verb}` adds, imports, cache, pictures and page alone", "2 s",
+                     "python benchmarks/warm.py 9ae1bee", row(f"{verb}, imports, cache,", "{3} s"))  # fmt: skip
     yield Figure("Speed", "`kalmark run`, warm, on Lost in the Woods, 61,086 sightings: processor time added to the filter's own: here / 9ae1bee / ratio", "2 s",
                  "python benchmarks/warm.py 9ae1bee", row("run, added:", "{0} s / {3} s / {7}"))  # fmt: skip
     yield Figure("Speed", "page of a long run, of three logs of the plane and KITTI's 3,217 landmarks in space: largest / slowest to open",

@@ -38,6 +38,7 @@ WATCHED = {  # the functions of a module, or of a class in it, and the part of t
     ("kalmark.results.report", "", "report_html"): "page",
     ("kalmark.results.plot", "", "save_map"): "pictures",
 }
+NAMED = "start", "imports", "compiled code", "page", "pictures"  # what has to be done whatever the log
 PARTS = ("start", "imports", "compiled code", "filter", "log", "recording", "verdict", "files", "page", "pictures")
 
 
@@ -126,7 +127,9 @@ def main() -> None:
                     print(f"  {part:<16}" + "".join(f"{1e3 * m[part]:>8.0f}" for m in medians))
             added = [sum(m.values()) - m["filter"] - m["log"] for m in medians]
             there = f", {added[1]:.2f} s there, ratio {added[0] / added[1]:.2f}" if other else ""
-            print(f"{verb[0]}, added: {added[0]:.2f} s here{there}", flush=True)
+            named = sum(medians[0][part] for part in NAMED)
+            print(f"{verb[0]}, added: {added[0]:.2f} s here{there}")
+            print(f"{verb[0]}, imports, cache, pictures and page: {named:.2f} s", flush=True)
 
 
 if __name__ == "__main__":
