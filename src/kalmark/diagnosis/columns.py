@@ -160,6 +160,7 @@ def rates_of(linear: Linear, t_ns: Ints) -> Array:
     t[own] = t_ns * 1e-9  # a robot that did not move since then has the pose of its own scan
     for robot in dict.fromkeys(linear.problem.robots):
         node = np.flatnonzero((robots == robot) & np.isfinite(t))
+        node = node[np.argsort(t[node], kind="stable")]  # others may have observed it out of order
         node = node[np.diff(t[node], prepend=-np.inf) > SLOW_S]  # several scans may be at one pose
         after = t[node[2:]] - t[node[:-2]]
         out[node[1:-1]] = pose_error(poses[node[:-2]], poses[node[2:]]) / after[:, None]
