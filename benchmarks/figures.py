@@ -137,11 +137,12 @@ def space() -> Iterator[Figure]:
         text = f"{{estimators[{estimator}][pose_anees]:.2f}} / {{estimators[{estimator}][pose_inside]:.1%}}"
         yield Figure("Space", f"`{name}`{kind}, `{estimator}`: pose ANEES (6) / in band", wanted, command,
                      saved(f"{out}/summary.json", text))  # fmt: skip
-    out = "out/campaign-quick_turns"
-    yield Figure("Space", "`quick_turns`, `invariant`: pose ANEES (6) / in band", "90 % in the band",
-                 f"kalmark campaign quick_turns --runs 50 --estimator invariant --out {out}",
-                 saved(f"{out}/summary.json",
-                       "{estimators[invariant][pose_anees]:.2f} / {estimators[invariant][pose_inside]:.1%}"))  # fmt: skip
+    for name, skip in (("quick_turns", ""), ("thick_cloister_constant_velocity", " --skip 30")):
+        out = f"out/campaign-{name}"
+        yield Figure("Space", f"`{name}`, `invariant`: pose ANEES (6) / in band", "90 % in the band",
+                     f"kalmark campaign {name} --runs 50{skip} --estimator invariant --out {out}",
+                     saved(f"{out}/summary.json",
+                           "{estimators[invariant][pose_anees]:.2f} / {estimators[invariant][pose_inside]:.1%}"))  # fmt: skip
     house = "kalmark campaign house --runs 20 --skip 30 --estimator invariant --estimator ekf --out out/campaign-house"
     for estimator in ("invariant", "ekf"):
         text = f"{{estimators[{estimator}][pose_anees]:.2f}} / {{estimators[{estimator}][joint_anees]:.2f}}"
