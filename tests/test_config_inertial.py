@@ -10,7 +10,8 @@ import pytest
 
 from kalmark.config import build_slam, load_config
 from kalmark.config.data_sheets import data_sheet
-from kalmark.errors import ConfigError
+from kalmark.errors import ConfigError, LogError
+from kalmark.logs import open_log
 from kalmark.simulate import load_world
 
 SHEET = """# as Kalibr's tutorial has it
@@ -62,6 +63,14 @@ def test_what_is_given_beside_a_data_sheet_stays(tmp_path: Path) -> None:
 def test_the_result_of_a_calibration_has_them_below_the_unit(tmp_path: Path) -> None:
     below = "imu0:\n" + "".join(f"  {line}\n" for line in SHEET.splitlines()[1:])
     assert motion(written(tmp_path, sheet=below)).gyroscope_random_walk_radps_per_sqrt_s == 2e-5
+
+
+def test_controls_that_are_no_inertial_unit_s_are_refused_before_a_rest_is_sought_in_them(tmp_path: Path) -> None:
+    path = written(tmp_path, CONFIG.replace("start:", "start:\n      at_rest: true"))
+    rows = "".join(f"{0.01 * k:.2f},r,0,0,0,0,0,1\n" for k in range(100))
+    (tmp_path / "controls.csv").write_text(f"t_s,robot,wx_radps,wy_radps,wz_radps,ax_gee,ay_gee,az_gee\n{rows}")
+    with pytest.raises(LogError, match=r"the controls of r have the columns .*az_gee, expected wx_radps"):
+        build_slam(load_config(path), open_log(tmp_path))
 
 
 def test_a_world_takes_a_data_sheet(tmp_path: Path) -> None:

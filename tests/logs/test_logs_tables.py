@@ -87,6 +87,14 @@ def test_a_column_in_another_unit_that_its_name_states_is_converted(
     assert log.control_columns == plain.control_columns and log.sensor_columns == plain.sensor_columns
 
 
+def test_an_inertial_unit_may_be_in_the_units_of_its_data_sheet(tmp_path: Path) -> None:
+    head = "t_s,robot,wx_dps,wy_dps,wz_dps,ax_g,ay_mg,az_g\n"
+    log = open_log(native(tmp_path, controls=f"{head}0,rover,0,90,0,0.5,20,1\n"))
+    (control,) = (event for event in log if not isinstance(event, Scan))
+    np.testing.assert_allclose(control.u, [0, np.pi / 2, 0, 4.903325, 0.196133, 9.80665], rtol=1e-12)
+    assert log.control_columns["rover"][3:] == ("ax_mps2", "ay_mps2", "az_mps2")
+
+
 def test_noise_in_another_unit_is_converted_too_and_messages_name_the_column_as_it_is(tmp_path: Path) -> None:
     head = "t_ms,robot,sensor,id,range_mm,bearing_deg,sigma_range_mm,sigma_bearing_deg\n"
     log = open_log(native(tmp_path, scans=f"{head}200.25,rover,lidar,7,4200,90,10,1\n"))

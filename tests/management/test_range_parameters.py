@@ -101,6 +101,8 @@ def test_parameters_in_the_map_resume_bit_for_bit_and_are_told_of(tmp_path: Path
     assert figures["scale"] == pytest.approx(1 / slam.mean("r.s")[3], rel=1e-15)
     assert figures["bias_m"] == pytest.approx(slam.mean("r.s")[4] / slam.mean("r.s")[3], rel=1e-15)
     assert {row["unit"] for row in figures["directions"]} == {"", "m"}
+    sigmas = np.sqrt(np.diag(slam.covariance("r.s")))
+    assert [figures["sigma_x_m"], figures["sigma_y_m"]] == pytest.approx(sigmas[:2].tolist(), rel=1e-12)
 
 
 def test_a_scale_is_not_estimated_with_an_exact_prior_and_never_zero() -> None:

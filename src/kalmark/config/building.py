@@ -99,13 +99,13 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
         raise config.error(("robots",), f"got {', '.join(config.robots)}, expected {name!r} of the log, or each{near}")
     robot, path = config.robots[key], ("robots", key)
     moves = _made(config, (*path, "motion"), model_of, robot.motion)
+    if log is not None:
+        refuse_controls(config, key, name, moves.columns, log)
     start, cov = _start(robot.start, name, log, moves)
     rests: dict[str, Any] = {}
     if isinstance(robot.start, SpaceStartConfig) and robot.start.at_rest:
         start, cov, rests["rests_until_ns"] = _made(config, (*path, "start"), _at_rest, moves, name, log, start, cov)
     world = moves.space.world
-    if log is not None:
-        refuse_controls(config, key, name, moves.columns, log)
     mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
     if log is not None:
         refuse_scans(config, key, name, mounts, log)

@@ -47,7 +47,7 @@ OTHER_UNITS = {
 FACTORS = {
     "mm": ("m", 1e-3), "cm": ("m", 1e-2), "km": ("m", 1e3), "deg": ("rad", math.pi / 180), "mrad": ("rad", 1e-3),
     "mmps": ("mps", 1e-3), "cmps": ("mps", 1e-2), "kmh": ("mps", 1 / 3.6), "degps": ("radps", math.pi / 180),
-    "dps": ("radps", math.pi / 180),
+    "dps": ("radps", math.pi / 180), "g": ("mps2", 9.80665), "mg": ("mps2", 9.80665e-3),
 }  # fmt: skip
 """Units of columns that are taken, too: each the unit that it becomes, and by what it is multiplied."""
 GLOBE = {"lat_deg": "x_m", "lon_deg": "y_m", "height_m": "z_m"}

@@ -81,16 +81,22 @@ def mount_figures(mount: Mounted) -> dict[str, Any]:
     """Return where the filter believes a sensor to sit that calibrates itself, how far that is known, what was seen."""
     d, pose, dof = (3, 7, 6) if len(mount.mean) - len(mount.constants) == 7 else (2, 3, 3)
     sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
+    axes = describe_pose(mount.mean[:pose])
+    own = {f"sigma_{key}": each for key, each in zip(axes, sigma[:d].tolist(), strict=False)}
     found = [
         {"direction": str(each), "sigma": each.sigma, "prior_sigma": each.prior, "unit": each.unit, "ratio": each.ratio}
         for each in directions(mount.prior, mount.covariance, mount.constants)
     ]
-    return describe_pose(mount.mean[:pose]) | {
-        "sigma_position_m": float(sigma[:d].max()),
-        "sigma_rotation_deg": math.degrees(sigma[d:dof].max()),
-        **_constant_figures(mount.constants, mount.mean[pose:], mount.covariance[dof:, dof:]),
-        "directions": found,
-    }
+    return (
+        axes
+        | own
+        | {
+            "sigma_position_m": float(sigma[:d].max()),
+            "sigma_rotation_deg": math.degrees(sigma[d:dof].max()),
+            **_constant_figures(mount.constants, mount.mean[pose:], mount.covariance[dof:, dof:]),
+            "directions": found,
+        }
+    )
 
 
 def bias_figures(bias: Biased) -> dict[str, float]:
