@@ -32,6 +32,7 @@ from kalmark.geometry.spaces import SE3
 from kalmark.logs import write_native
 from kalmark.logs.log import Log
 from kalmark.results.batch import given_by
+from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.verdict import verdict_lines
 from kalmark.simulate import load_world, simulate
@@ -533,6 +534,31 @@ def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidn
     assert f"what is called {a} is where {b} was" in verdict.causes[0].evidence
     # its score is half of the chi-square of what was filtered again, which is at most that of the whole run
     assert 100 < verdict.causes[0].score < 0.5 * fit(run).chi2
+
+
+def test_wrong_ids_that_pull_the_solution_far_are_named_alone_and_the_map_is_not_ok() -> None:
+    exact = (f"{SIGMA}=0.03", "robots.rover.sensors.lidar.sigma_bearing_rad=0.004")
+    rng, made = np.random.default_rng(0), world_of(*exact)
+
+    def mixed(e: Event) -> Event:
+        if not isinstance(e, Scan) or e.ids is None:
+            return e
+        ids = list(e.ids)
+        for k in np.flatnonzero(rng.random(len(ids)) < 0.02):
+            j = int(rng.integers(len(ids)))
+            ids[k], ids[j] = ids[j], ids[k]
+        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=ids)
+
+    log = simulate(made, 3)
+    log = replace(log, events=[*map(mixed, log.events)])
+    run = km.record(build_slam(made.config(), log), log, progress=False, config=config_dict(made.config()))
+    places = np.array([log.landmarks[name][:2] for name in run.landmarks.ids])
+    mapped = run.landmarks.positions()[0]
+    off = rmse(rigid(mapped, places)(mapped) - places)
+    verdict = km.diagnose(run)
+    assert off > 0.2
+    assert (verdict.map, [cause.name for cause in verdict.causes]) == ("doubtful", ["wrong_ids"])
+    assert verdict.shift_m == pytest.approx(off, rel=0.3)
 
 
 def test_places_that_are_exchanged_are_found_under_a_shift_and_a_turn() -> None:

@@ -12,6 +12,7 @@ from hall import alarmed, hall, mapped, right
 
 import kalmark as km
 from kalmark.association.relocalization import aligned
+from kalmark.batch.course import Chain
 from kalmark.errors import EventError, ModelError
 from kalmark.report import Gap
 
@@ -195,3 +196,23 @@ def test_a_control_that_was_left_out_is_kept_in_a_file(tmp_path: Path) -> None:
     scan = km.Scan(4.5, "r", "laser", [], None)
     assert again.process(scan).gaps == slam.process(scan).gaps
     np.testing.assert_array_equal(again.covariance("r"), slam.covariance("r"))
+
+
+def test_what_is_usual_of_controls_is_known_after_a_part_that_is_left_out() -> None:
+    robot = km.Robot("r", km.motion.Unicycle(0.1, 0.05))
+    chain = Chain({"r": robot}, {}, {})
+    chain.node_at("r", 0)
+
+    def drive(begin_s: float, end_s: float) -> None:
+        for t_s in np.arange(begin_s, end_s, 0.1):
+            chain.take(km.Control(t_s=float(t_s), robot="r", u=(0.5, 0.0)))
+
+    drive(0.0, 5.0)
+    chain.lose("r")
+    drive(100.0, 100.5)
+    chain.node_at("r", 100_500_000_000)
+    drive(106.5, 107.0)  # after a gap of 6 s
+    chain.node_at("r", 107_000_000_000)
+    lost, gap = (np.sqrt(node.Q[-1, 0, 0]) for node in chain.nodes[-2:])
+    assert lost > 100.0  # it may have come from anywhere,
+    assert 1.0 < gap < 10.0  # and have driven by so much

@@ -82,7 +82,10 @@ class Course:
     def forget(self) -> None:
         """Have any motion since the node, and no control in force."""
         self.reset(self.node)
-        self.drive, self.moves, self.known = HeldInput(self.motion, self.robot.watch()), 1, False
+        gaps = self.drive.gaps
+        if gaps is not None:
+            gaps.forget()
+        self.drive, self.moves, self.known = HeldInput(self.motion, gaps), 1, False
         self.Q[-1] = ANYWHERE**2 * np.eye(len(self.T))
 
     def add(self, part: Part, roots: list[Array]) -> None:

@@ -86,6 +86,12 @@ class Search:
         self.found: list[Finding] = []
         self.simulated = linear.simulated(causes.SETS)
 
+    def take_outliers(self) -> None:
+        """Take out what is far off where the problem is linear: at a robust solution, which they do not pull."""
+        for finding in causes.outliers(self.linear, self.t_s, self.linear.at.z):
+            if finding.p < ALPHA:
+                self.take(finding)
+
     def run(self, progress: bool = False) -> list[Finding]:
         """Return all causes, the one that explains most first.
 

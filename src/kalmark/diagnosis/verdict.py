@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -11,8 +12,9 @@ from scipy.special import chdtrc
 
 from kalmark.arrays import Array
 from kalmark.batch.data import Associations, Given, replayed
+from kalmark.batch.problem import Problem
 from kalmark.batch.solver import Batch, optimum
-from kalmark.batch.state import LANDMARKS, Ints
+from kalmark.batch.state import LANDMARKS, Ints, State
 from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
 from kalmark.diagnosis.columns import Where
@@ -49,6 +51,8 @@ MORE = 4  # times as many are taken if the segments do not determine the map, up
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
+HUBER = 30.0, 10.0, 3.0, 1.5  # sigmas, beyond which observations count less for a robust solution, one after the other
+ROUGHLY = 1e-3  # of the map's size, is its last step
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
@@ -194,11 +198,12 @@ def begin_s(run: Run) -> float:
 
 # ------------------------------------------------------------------ the search
 class Searched(NamedTuple):
-    """A search for causes that is done, and the batch solution that it began at."""
+    """A search for causes that is done, and the batch solution that it began at; what is far off may have pulled it."""
 
     search: Search
     batch: Batch
     given: Given
+    pulled: bool = False
 
 
 def _searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
@@ -217,10 +222,24 @@ def _searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Sear
         if given is every or min(MORE * most, len(every.associations.landmark)) > limit:
             raise
         return _searched(run, log, MORE * most, limit, progress)
-    linear = Linear.of(problem, batch.state, within_gates(run))
-    search = Search(linear, sensors_of(run), given.t_ns)
+    search = Search(Linear.of(problem, batch.state, within_gates(run)), sensors_of(run), given.t_ns)
     search.run(progress)
-    return Searched(search, batch, given)
+    pulled = any(f.rows is not None for f in search.found) and fit(run).mean > MISFITS_ALL
+    if pulled:
+        state = robust(problem, batch.state)  # what is far off has pulled the solution out of where it is linear
+        search = Search(Linear.of(problem, state, within_gates(run)), sensors_of(run), given.t_ns)
+        search.take_outliers()
+        search.run(progress)
+    return Searched(search, batch, given, pulled)
+
+
+def robust(problem: Problem, state: State) -> State:
+    """Return the solution in which observations beyond fewer and fewer sigmas count less, from a state on."""
+    for huber in HUBER:
+        with suppress(KalmarkError):  # from a better start the next one may be found
+            less = tuple(replace(factor, huber=huber) for factor in problem.factors)
+            state = optimum(replace(problem, factors=less), state, tolerance=ROUGHLY).state
+    return state
 
 
 def once(run: Run, given: Given) -> Given:
@@ -596,11 +615,13 @@ def effect_of(run: Run, found: Searched) -> Effect:
     d, first, cured = found.batch.state.d, found.search.first, found.search.linear
     places, moved = (state.groups[LANDMARKS][its, :d] for state in (found.batch.state, cured.moved()))
     steady = replace(first, z=cured.z, w=cured.w).moved().groups[LANDMARKS][its, :d]  # the noise as it was stated
+    mapped = filtered_map(run)
+    if found.pulled:  # the filter's map is off otherwise
+        places = np.array([mapped[run.landmarks.ids[k]][0][:d] for k in mine])
     lines = np.array([run.landmarks.kinds[k] == "wall" for k in mine])
     angle = np.where(lines, found.batch.state.groups[LANDMARKS][its, -1], np.nan)
     off, extent = _off(places, moved, angle), rmse(moved - moved.mean(axis=0))
     by_steady = rmse(_off(places, steady, angle))  # of causes that are sure: no noise explains it
-    mapped = filtered_map(run)
     filtered = _sigma(np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine]))
     stated, honest = (_sigma(linear.reduced.covariances()[its, :d, :d]) for linear in (first, cured))
     shift_m = float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0)))

@@ -81,6 +81,10 @@ class Gaps:
                 self._learn()
         self._go_on(control.t_ns)
 
+    def forget(self) -> None:
+        """Forget the last control, and not what is usual: how the robot came to the next one is left open."""
+        self.last_ns, self.since_ns, self.left_out_ns, self.late_ns = None, None, None, NEVER_NS
+
     def _go_on(self, t_ns: int) -> None:
         self.last_ns, self.since_ns, self.left_out_ns = t_ns, None, None
         self._expect_next()
