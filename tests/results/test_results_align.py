@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kalmark.results.evaluate import of_a_free_scale, scale_figures, scale_is_free
+from kalmark.results.evaluate import of_a_free_scale, scale_figures, scale_is_free, scale_notes
 from kalmark.results.measures import identity, rigid, rigid_robust, rmse, similarity
 
 
@@ -139,3 +139,18 @@ def test_one_camera_alone_has_a_free_scale() -> None:
     assert not free(controls={"r": object()})
     assert not free(fixes=(object(),))
     assert not free(cameras=[SimpleNamespace(robot="r", sensor="camera", columns=("u_px", "v_px", "depth_m"))])
+
+
+def test_one_camera_on_a_velocity_that_drifts_is_said_to_be_too_sure() -> None:
+    camera = SimpleNamespace(robot="r", sensor="camera", columns=("u_px", "v_px"))
+    history = SimpleNamespace(cameras=[camera], robots=["r"], fixes=(), priors=(), controls={"r": object()})
+
+    def notes(motion: str, sensors: Any = ("camera",)) -> list[str]:
+        stub: Any = SimpleNamespace(
+            history=history, sections=lambda _: dict.fromkeys(sensors), motion=lambda _: {"type": motion}
+        )
+        return [*scale_notes(stub, {"r": {}})]
+
+    (note,) = notes("constant_velocity_3d")
+    assert note.startswith("r sees no scale, and its velocity drifts")
+    assert notes("odometry_3d") == notes("constant_velocity_3d", ("camera", "laser")) == []

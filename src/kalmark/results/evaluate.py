@@ -95,14 +95,19 @@ def evaluate(run: Recording) -> dict[str, Any]:
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
     summary["advice"] = advice(run, summary)
-    summary["notes"] = [*gap_notes(summary["gaps"]), *repeat_notes(history), *_scale_notes(run, robots)]
+    summary["notes"] = [*gap_notes(summary["gaps"]), *repeat_notes(history), *scale_notes(run, robots)]
     return summary
 
 
-def _scale_notes(run: Recording, robots: dict[str, Any]) -> Iterator[str]:
+def scale_notes(run: Recording, robots: dict[str, Any]) -> Iterator[str]:
+    """Yield a line for each robot of which nothing, or no sensor, tells the scale."""
     for name, figures in robots.items():
         if figures.get("scale") is not None and scale_is_free(run, name):
             yield f"nothing tells the scale of {name}'s path: compared after a similarity, and without pose NEES"
+    for name in robots:
+        coasts = run.motion(name).get("type") == "constant_velocity_3d"
+        if coasts and sees_no_scale(run, name) and not scale_is_free(run, name):
+            yield f"{name} sees no scale, and its velocity drifts: sigmas of places may be several times too small"
 
 
 def summary_of(run: Recording) -> dict[str, Any]:
@@ -189,12 +194,17 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
 
 
 def scale_is_free(run: Recording, name: str) -> bool:
-    """Return whether nothing tells the scale of what a robot sees: it has cameras of two numbers, nothing else."""
+    """Return whether nothing tells the scale of what a robot sees, controls included."""
+    return sees_no_scale(run, name) and run.history.controls.get(name) is None
+
+
+def sees_no_scale(run: Recording, name: str) -> bool:
+    """Return whether a robot has cameras of two numbers, nothing else, and no place is known."""
     h = run.history
     cameras = {camera.sensor for camera in h.cameras if camera.robot == name and len(camera.columns) == PIXEL}
     return (
         bool(cameras) and set(run.sections(name)) <= cameras and len(h.robots) == 1
-        and not h.fixes and not h.priors and h.controls.get(name) is None
+        and not h.fixes and not h.priors
     )  # fmt: skip
 
 

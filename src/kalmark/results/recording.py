@@ -215,6 +215,11 @@ class Recording:
         """Return the configuration of a robot's sensor, {} if it has none."""
         return self.sections(robot).get(sensor) or {}
 
+    def motion(self, robot: str) -> dict[str, Any]:
+        """Return the configuration of a robot's motion, {} if it has none."""
+        robots = self.config.get("robots") or {}
+        return (robots.get(robot) or robots.get("each") or {}).get("motion") or {}
+
     def sections(self, robot: str) -> dict[str, Any]:
         """Return the configuration of a robot's sensors by name."""
         robots = self.config.get("robots") or {}
