@@ -24,7 +24,8 @@ from kalmark.config import build_slam, open_run
 from kalmark.filter.kernels import one_thread
 from kalmark.models.sensors import PinHole
 
-CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]) * (0.105, 0.07425, 0.0)
+# of the drawing that was printed, with its line: 209.7 mm by 147.6 mm
+CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]) * (0.10486, 0.07381, 0.0)
 LEVELS = range(60, 121, 15)  # grey values below which the target may be
 LEAST_PX2, MOST_PX2, SIDES = 250, 12_000, (1.15, 1.8)
 OFF_PX = 3.5  # a side is looked for so far from the contour
