@@ -488,6 +488,9 @@ def images() -> Iterator[Figure]:
         yield Figure("Images", f"`{name}`, {label}, 450 rendered images, five seeds: largest RMS of the position, not aligned / ANEES of the pose, a dof / in its band / a frame",
                      "- / 1 / 80 % / -", f"python benchmarks/vision.py {name}",
                      row(name, "{0} m / {1} / {2} % / {4} ms"))  # fmt: skip
+        yield Figure("Images", f"`{name}`, matches against true points, three seeds: RMS / median as RMS / correlation with the next frame, 50 frames later / chi-square by their noise, a dof / median",
+                     "- / - / - / 1 / 1", f"python benchmarks/vision_matches.py {name}",
+                     row(name, "{1} px / {2} px / {4}, {5} / {6} / {7}"))  # fmt: skip
 
 
 def image_peers() -> Iterator[Figure]:

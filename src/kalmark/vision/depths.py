@@ -47,7 +47,7 @@ def with_depths(sensor: Any, landmark: Any, y: Array, rho: Array, e: Array, vari
     the rest are new `landmark`s.  One that has no prior of its depth is left out where no depth is.
     """
     k, out = len(e), np.column_stack([y, rho])
-    R = sensor.noise(out)
+    R = np.array(sensor.noise(out), dtype=np.float64)
     off = ~(np.square(out[:k, 2] - e) <= GATE * variance)
     out[:k, 2][off], R[:k, 2, 2][off] = np.maximum(e[off], 0.0), UNKNOWN**2
     bare = k + np.flatnonzero(np.isnan(out[k:, 2]))

@@ -29,7 +29,7 @@ from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS,
 from kalmark.vision.beginning import Beginning, Begun
 from kalmark.vision.depths import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
-from kalmark.vision.matching import Searcher
+from kalmark.vision.matching import Searcher, shift_covariances
 from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import NUMBERS, Plane, measured, shown
@@ -39,6 +39,7 @@ from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed import FirstLook
 
 FEW, ENOUGH = 4, 20  # matches, with fewer of which the sensor is lost; landmarks by which it may recognise the place
+SHIFT_PX = 0.04  # sigma of the shift of a match that counts half: as much as a pixel of the sensor
 PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
 
 
@@ -150,6 +151,7 @@ class FrontEnd:
         y, cov = np.concatenate([y, new]), None
         if isinstance(self.sensor, PixelDepth | Stereo):
             y, cov = self._measured(y, rows, beside, prospect, found)
+            self._add_shifts(cov, y, rows)
             there = np.flatnonzero(np.isfinite(y).all(axis=1))
             y, cov, ids = y[there], cov[there], [ids[k] for k in there.tolist()]
         t3 = perf_counter()
@@ -323,6 +325,20 @@ class FrontEnd:
             return with_pairs(self.cv2, sensor, landmark, images, y, e, Z, TEMPLATE, self.settings.accept)
         rho = np.full(len(y), np.nan) if beside is None else inverse_depths(beside, y, sensor.sigma_rho_per_m)
         return with_depths(sensor, landmark, y, rho, e[:, 2], Z[:, 2, 2])
+
+    def _add_shifts(self, R: Array, y: Array, rows: list[int]) -> None:
+        """Add to the noise R (n, m, m) of y (n, m), first landmarks `rows`, what the image leaves open of the pixels.
+
+        What slides at the edge of a thing counts less.  The right image of a pair is searched for what the left one
+        shows at the match: both err by the same shift.
+        """
+        n, which = len(rows), np.array(rows, dtype=np.int64)
+        found = np.ascontiguousarray(y[:n, :PIXEL])
+        C = shift_covariances(self.image, self.likely.templates, which, found)
+        C *= R[:n, :1, :1] / SHIFT_PX**2
+        if isinstance(self.sensor, Stereo):
+            C = np.tile(C, (1, 2, 2))
+        R[:n, : C.shape[1], : C.shape[1]] += C
 
     def _count(self, prospect: Prospect, found: Selection) -> list[tuple[Id, str]]:
         """Count searches; return the landmarks that are given up, each with the reason.

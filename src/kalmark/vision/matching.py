@@ -163,3 +163,40 @@ def top(image: Any, template: Any, u: int, v: int) -> tuple[float, float]:
         return 0.0, 0.0
     a, b = -(yy * x - xy * y) / det, -(xx * y - xy * x) / det
     return min(max(a, -1.0), 1.0), min(max(b, -1.0), 1.0)
+
+
+@compiled
+def shift_covariances(image: Any, templates: Any, which: Index, y: Array) -> Array:
+    """Return the covariances (k, 2, 2) of least-squares shifts of templates `which` (k,) that were found at y (k, 2).
+
+    The image about y is I(x) = g T(x) + o - g T_x t: gain, offset and shift t by least squares over the template, with
+    the variance of what they leave.  Zero where the template is partly outside, or is not of this image at all.
+    """
+    k, s = len(which), templates.shape[1]
+    C, h, row = np.zeros((k, 2, 2)), s // 2, np.empty(4)
+    for o in range(k):
+        left, above = int(np.floor(y[o, 0])), int(np.floor(y[o, 1]))
+        if left < h or above < h or left + h + 1 >= image.shape[1] or above + h + 1 >= image.shape[0]:
+            continue
+        template, du, dv = templates[which[o]], y[o, 0] - left, y[o, 1] - above
+        A, b, whole = np.zeros((4, 4)), np.zeros(4), 0.0
+        for j in range(1, s - 1):
+            for i in range(1, s - 1):
+                u, v = left + i - h, above + j - h
+                value = (1.0 - dv) * ((1.0 - du) * image[v, u] + du * image[v, u + 1])
+                value += dv * ((1.0 - du) * image[v + 1, u] + du * image[v + 1, u + 1])
+                row[0], row[1] = float(template[j, i]), 1.0
+                row[2] = 0.5 * (float(template[j, i - 1]) - float(template[j, i + 1]))
+                row[3] = 0.5 * (float(template[j - 1, i]) - float(template[j + 1, i]))
+                for p in range(4):
+                    b[p] += row[p] * value
+                    for q in range(4):
+                        A[p, q] += row[p] * row[q]
+                whole += value * value
+        for p in range(4):
+            A[p, p] += 1e-6 * (1.0 + A[p, p])
+        x = np.linalg.solve(A, b)
+        if x[0] > 0.1:
+            variance = max(whole - x @ b, 0.0) / ((s - 2) ** 2 - 4) / x[0] ** 2
+            C[o] = variance * np.linalg.inv(A)[2:, 2:]
+    return C

@@ -51,7 +51,7 @@ def with_pairs(
     if images[1] is not None and len(y):
         right, found = matched(cv2, (images[0], images[1]), y, middle, sigma, sensor.sigma_vr_px, k, half, accept)
     out = np.column_stack([y, np.where(found[:, None], right, y)])
-    R = np.array(sensor.noise(out))
+    R = np.array(sensor.noise(out), dtype=np.float64)
     off = np.flatnonzero(~found)
     known, new = off[off < k], off[off >= k]
     out[known, 2] -= np.maximum(middle[known], 0.0)
