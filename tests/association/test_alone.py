@@ -84,3 +84,22 @@ def test_a_block_that_is_not_read_and_may_be_nearer_is_read() -> None:
     slam.map.full_update()  # all are inactive,
     seen(1.0, marks[0], [0])  # then all but this one
     assert [o.landmark for o in seen(2.0, [4.28, 2.0]).observations] == [1]
+
+
+def test_a_landmark_that_is_new_in_its_interval_bounds_nothing() -> None:
+    """The robot's drift is in what it maps now, and not in an inactive landmark beside it, which may be nearer."""
+    robot = km.Robot(
+        "r", km.motion.Odometry2D(0.02, 0.005, 0.02), START, {"lidar": km.Mount(km.sensors.RangeBearing(0.1, 0.03))},
+        cov=np.diag([1.0, 1.0, 1e-4]),
+    )  # fmt: skip
+    slam = km.Slam([robot], association=km.association.NearestNeighbour(), map="postponed")
+    slam.add_landmark("old", [4.5, 2.0], 1e-4 * np.eye(2))
+    assert isinstance(slam.map, CompressedMap)
+    slam.map.full_update()  # it is inactive
+
+    def seen(t: float, place: Any, ids: Any = None) -> Any:
+        y = km.geometry.observe(slam.mean("r"), np.array([place]))[0]
+        return slam.process(km.Scan(t, "r", "lidar", y, ids))
+
+    seen(1.0, [4.0, 2.0], ["new"])
+    assert [o.landmark for o in seen(2.0, [4.2, 2.0]).observations] == ["old"]

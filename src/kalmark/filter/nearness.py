@@ -11,10 +11,8 @@ from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter.corrections import Map
 from kalmark.filter.kernels import cholesky_inverse
-from kalmark.filter.layout import X_AT
-from kalmark.filter.neighbours import Sorts, distance, paired
+from kalmark.filter.neighbours import Sorts, distance, paired, wanted
 from kalmark.filter.observed import head_sizes, innovation, observed_block
-from kalmark.geometry.spaces import Table
 from kalmark.models.observe import linearize
 
 Seen = tuple[int, int, int, Array, Array]  # slots of robot and mount, numbers of a landmark, y (K, m), R (K, p, p)
@@ -52,7 +50,7 @@ def nearest(
     x, P, _n, blocks, atoms, _axes, _ways = map_
     robot, mount, d, y, R = scan
     sorts, p, most, farther, gate = asked
-    here, places = _wanted(x, blocks, slots, sorts, p.shape[1])
+    here, places = wanted(x, blocks, slots, sorts, p.shape[1])
     rows, numbers, used = paired(p, places, most, farther)
     named, l = np.empty(len(used), np.int64), np.empty((len(used), p.shape[1]))
     for i in range(len(used)):
@@ -73,21 +71,6 @@ def nearest(
         if clear:
             sigma[k] = _sigma(E_l[best[k]], Z[best[k]])
     return clear, (at, d2, sigma, limit, rows, numbers, compared, named, l)
-
-
-@compiled
-def _wanted(x: Array, blocks: Table, slots: Index, sorts: Sorts, n: int) -> tuple[Index, Array]:
-    """Return the wanted blocks (N,), and where they are (N, n)."""
-    here, count = np.empty(len(slots), np.int64), 0
-    for i in range(len(slots)):
-        if sorts[1][sorts[0][slots[i]]]:
-            here[count] = i
-            count += 1
-    places = np.empty((count, n))
-    for i in range(count):
-        for j in range(n):
-            places[i, j] = x[blocks[here[i], X_AT] + j]
-    return here[:count], places
 
 
 @compiled

@@ -92,15 +92,10 @@ def paired(p: Array, places: Array, nearest: int, farther: float) -> tuple[Index
 
 
 @compiled
-def near_places(
-    p: Array, x: Array, blocks: Table, slots: Index, sorts: Sorts, nearest: int, farther: float
-) -> tuple[Index, Array]:
-    """Return the slots (N,) of wanted blocks within the `limits` (K,) of p (K, d), and these limits.
-
-    `slots` are those of the `blocks`, -1 for none.
-    """
+def wanted(x: Array, blocks: Table, slots: Index, sorts: Sorts, d: int) -> tuple[Index, Array]:
+    """Return which of the `blocks` are wanted (N,), and where they are (N, d); `slots` are theirs, -1 for none."""
     here = np.empty(len(slots), np.int64)
-    n, d = 0, p.shape[1]
+    n = 0
     for i in range(len(slots)):
         if sorts[1][sorts[0][slots[i]]]:
             here[n] = i
@@ -109,9 +104,21 @@ def near_places(
     for i in range(n):
         for j in range(d):
             places[i, j] = x[blocks[here[i], X_AT] + j]
+    return here[:n], places
+
+
+@compiled
+def near_places(
+    p: Array, x: Array, blocks: Table, slots: Index, sorts: Sorts, nearest: int, farther: float
+) -> tuple[Index, Array]:
+    """Return the slots (N,) of wanted blocks within the `limits` (K,) of p (K, d), and these limits.
+
+    `slots` are those of the `blocks`, -1 for none.
+    """
+    here, places = wanted(x, blocks, slots, sorts, p.shape[1])
     gaps = distances(p, places)
-    limit, found = limits(gaps, nearest, farther), np.zeros(n, np.bool_)
+    limit, found = limits(gaps, nearest, farther), np.zeros(len(here), np.bool_)
     for k in range(len(p)):
-        for i in range(n):
+        for i in range(len(here)):
             found[i] = found[i] or gaps[k, i] <= limit[k]
-    return slots[here[:n][found]], limit
+    return slots[here[found]], limit

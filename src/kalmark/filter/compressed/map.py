@@ -176,7 +176,10 @@ class CompressedMap(Layout):
             return None
         sorts, p, *_ = asked
         mine, covariance = Nearest(*found), partial(self._at_first, p.shape[1])
-        return mine if self._search.none_nearer(self, self._at, sorts, p, mine, covariance) else None
+        old = np.array(
+            [slot if slot in self.auxiliary else -1 for slot in mine.at.tolist()]
+        )  # nothing bounds a new one
+        return mine if self._search.none_nearer(self, self._at, sorts, p, mine, old, covariance) else None
 
     def _at_first(self, d: int, slots: Index) -> Array:
         """Return the covariance (N d, N d) of the first d numbers of blocks as it was when the interval began."""

@@ -72,9 +72,10 @@ def none_nearer(
     """Return whether no wanted inactive block can be nearer to an observation than the one that is nearest now.
 
     That takes `NO`, `YES`, another region (`OUTSIDE`) or the spread of some blocks, of which the numbers are returned.
-    The observations seem to be at p (K, d); their blocks `own` (K,) are at d2 (K,) with the distance's `sigma` (K,),
-    and no block farther away than a limit (K,) is in question.  The sigma of the distance to another block is no larger
-    than the sum of it and of the `spread` of both blocks, of what they are off by relative to a third one.
+    The observations seem to be at p (K, d); their blocks `own` (K,), -1 for new ones, are at d2 (K,) with the sigma
+    (K,) of the distance, and no block farther away than a limit (K,) is in question.  The sigma of the distance to
+    another block is no larger than the sum of it and of the `spread` of both, of what they are off by relative to a
+    third one.
     """
     d, unknown, verdict = p.shape[1], np.zeros(len(slots), np.bool_), YES
     for k in range(len(p)):
@@ -103,7 +104,7 @@ def none_nearer(
 class Region(NamedTuple):
     """All blocks within a radius of a centre, and where they were when the interval began.
 
-    `spread` are the sigmas of what the blocks are off by relative to the first one, or -1 until they are asked for.
+    `spread` are the sigmas of what they were off by then relative to one block, or -1 until they are asked for.
     """
 
     centre: Array
@@ -121,6 +122,7 @@ class Search:
         self._slots: Index = NONE  # of the places in the tree
         self._planted = False
         self._region: Region | None = None  # of the last scan
+        self._reference = -1  # the block relative to which spreads are
 
     def near(self, layout: Layout, at: Index, sorts: Sorts, p: Array, limit: Array, count: int) -> Index:
         """Return the slots of wanted inactive blocks, the `count` nearest to each p (K, d) within a limit (K,)."""
@@ -141,11 +143,13 @@ class Search:
                     return found
             region, size, wider = self._around(p, size), 2 * size, WIDER
 
-    def none_nearer(self, layout: Layout, at: Index, sorts: Sorts, p: Array, found: Nearest, covariance: Joint) -> bool:
+    def none_nearer(
+        self, layout: Layout, at: Index, sorts: Sorts, p: Array, found: Nearest, own: Index, covariance: Joint
+    ) -> bool:  # fmt: skip
         """Return whether no wanted inactive block can be nearer to an observation at p (K, d) than the nearest `found`.
 
-        `covariance` is that of the places of some blocks when the interval began.  It has not grown since: blocks that
-        do not move only gain information.
+        `own` (K,) are these, -1 for one that was not there when the interval began.  `covariance` is that of the places
+        of some blocks then.  It has not grown since: blocks that do not move only gain information.
         """
         if not self._planted:
             self._plant(layout, sorts, p.shape[1])
@@ -153,10 +157,12 @@ class Search:
             return True
         region = self._region or self._around(p, REGION)
         while True:
-            asked = p, found.d2, found.sigma, found.limit, found.at, *region, at, sorts
+            asked = p, found.d2, found.sigma, found.limit, own, *region, at, sorts
             verdict, unknown = none_nearer(*asked)
             if len(unknown):
-                region.spread[unknown] = _spread(covariance(region.slots[np.append(0, unknown)]), p.shape[1])
+                self._reference = self._reference if self._reference >= 0 else int(own.max())
+                slots = np.append(self._reference, region.slots[unknown])
+                region.spread[unknown] = _spread(covariance(slots), p.shape[1])
             elif verdict == OUTSIDE and region is self._region:
                 region = self._around(p, REGION)
             else:
