@@ -87,16 +87,14 @@ def mount_figures(mount: Mounted) -> dict[str, Any]:
         {"direction": str(each), "sigma": each.sigma, "prior_sigma": each.prior, "unit": each.unit, "ratio": each.ratio}
         for each in directions(mount.prior, mount.covariance, mount.constants)
     ]
-    return (
-        axes
-        | own
-        | {
-            "sigma_position_m": float(sigma[:d].max()),
-            "sigma_rotation_deg": math.degrees(sigma[d:dof].max()),
-            **_constant_figures(mount.constants, mount.mean[pose:], mount.covariance[dof:, dof:]),
-            "directions": found,
-        }
-    )
+    return {
+        **axes,
+        **own,
+        "sigma_position_m": float(sigma[:d].max()),
+        "sigma_rotation_deg": math.degrees(sigma[d:dof].max()),
+        **_constant_figures(mount.constants, mount.mean[pose:], mount.covariance[dof:, dof:]),
+        "directions": found,
+    }
 
 
 def bias_figures(bias: Biased) -> dict[str, float]:
