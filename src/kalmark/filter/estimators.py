@@ -15,6 +15,7 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import ahead
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
+from kalmark.filter.inertial import turn_own_errors
 from kalmark.filter.map import Map, StochasticMap
 
 
@@ -169,10 +170,13 @@ class _Estimator:
             return _joined([self.correct(map_, part) for part in _parts(update)])
         model, robot, mount, slots, d, y, R, gate, parallax = update
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
+        before = m.mean(robot_here) if self.transports else None
         scan = robot_here, mount_here, here, d, y, R, gate
         done = self._fused(model, m, scan, parallax)
         if not done.valid and not done.fused.any():
             done = self._one_by_one(model, m, scan, done, parallax)
+        if before is not None:
+            turn_own_errors(m, robot_here, before)
         map_.corrected(robot, self.transports)
         return done
 
