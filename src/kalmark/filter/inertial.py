@@ -3,7 +3,8 @@
 A correction of the heading by psi is a motion of the world, x = S(psi) x_hat.  Biases, and what they did to tilt and
 velocity, are the unit's own: R = S(psi) Exp(tau) R_hat, and tau = M R_hat d_b of a bias in the body, whatever psi is.
 So the error that is left after the correction is S(psi) (tau - tau_hat), and likewise that of a velocity: the errors
-turn by as much as the heading.  Without it the covariance of tilt and bias stays where the heading was: docs/inertial.md.
+turn by as much as the heading.  Without it the covariance of tilt and bias stays where the heading was.
+docs/inertial.md.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ UNIT = VECTOR3, ROTATION, VECTOR3, *(SCALAR,) * 6  # pose, velocity, biases; wha
 
 
 def turn_own_errors(map_: StochasticMap, robot: int, before: Array) -> None:
-    """Let what is the own of an inertial unit turn with it, after a correction of its mean `before`; else do nothing."""
+    """Let the errors of an inertial unit turn as it did in a correction of its mean `before`; other robots stay."""
     space = map_.spaces[robot]
     if space is not None and space.kinds[: len(UNIT)] == UNIT:
         map_.predict(map_.index(robot), carried(space, before, map_.mean(robot)), np.zeros((space.dof, space.dof)))
@@ -31,7 +32,7 @@ def carried(space: Space, before: Array, after: Array) -> Array:
     """Return T (dof, dof): the errors d (dof,) of an inertial unit, corrected from `before` to `after`, become T d.
 
     Attitude, velocity and gravity turn as the attitude did, about the vertical alone where that is known, so that the
-    heading stays as unobservable as it was.  It is xi = d - generator d_theta that turns: d = E xi + generator E d_theta.
+    heading stays as unobservable as it was.  What turns is xi = d - generator d_theta: to E xi + generator E d_theta.
     """
     E, T = matrix(after[3:7]) @ matrix(before[3:7]).T, np.eye(space.dof)
     if space.kinds == UNIT:
