@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +208,40 @@ def test_a_camera_finds_its_way_in_a_rendered_room_twice_the_same_and_from_a_sav
         assert np.array_equal(one.mean("camera"), same.mean("camera"))
         assert np.array_equal(one.covariance("camera"), same.covariance("camera"))
         assert one.landmarks().ids == same.landmarks().ids
+
+
+def test_patches_are_saved_as_the_bytes_they_are_and_read_from_files_that_have_them_as_numbers(tmp_path: Path) -> None:
+    slam = searching()
+    for frame in room(12)[0]:
+        slam.process(frame)
+    slam.save(tmp_path / "map.kmk")
+    with zipfile.ZipFile(tmp_path / "map.kmk") as archive:
+        assert np.lib.format.read_array(io.BytesIO(archive.read("patches0.npy"))).dtype == np.uint8
+    front_end = slam.state.front_ends["camera", "eye"]
+    state, arrays = front_end.state(), front_end.arrays()
+    state["looks"] = [look[:-1] for look in state["looks"]]  # an older file says nothing of misfits
+    again = km.vision.ActiveSearch().front_end(CAMERA)
+    again.restore(state, lambda name, shape: arrays[name].astype(np.float64).reshape(shape))
+    assert again.looks.keys() == front_end.looks.keys()
+    for one, same in zip(front_end.looks.values(), again.looks.values(), strict=True):
+        assert (one.fitted, same.misfit) == (same.fitted, 0.0)
+        assert all(np.array_equal(a.patch, b.patch) for a, b in zip(one.views, same.views, strict=True))
+
+
+def test_a_landmark_whose_matches_slide_over_the_image_is_given_up_and_one_known_beforehand_is_not() -> None:
+    for known in (False, True):
+        slam = searching()
+        frames, _ = room(40)
+        for frame in frames[:-1]:
+            slam.process(frame)
+        looks = slam.state.front_ends["camera", "eye"].looks
+        fits = [name for name, look in looks.items() if look.fitted >= 20 and not look.missed]
+        assert max(looks[name].misfit for name in fits) < 2  # d2 a number measured
+        looks[fits[0]].surveyed = known
+        for _ in range(40):
+            looks[fits[0]].fits(3.0, 0)
+        report = slam.process(frames[-1])
+        assert [name for name, reason in report.removed if "times their noise" in reason] == ([] if known else fits[:1])
 
 
 def surveyed(frame: km.Frame, T: np.ndarray, cov: Any = None) -> tuple[km.Slam, dict[str, np.ndarray]]:

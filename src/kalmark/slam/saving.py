@@ -187,8 +187,8 @@ def _arrays(state: State) -> Iterator[tuple[str, Array]]:
 
 
 def _npy(array: Array) -> bytes:
-    file = io.BytesIO()
-    np.lib.format.write_array(file, np.ascontiguousarray(array, dtype="<f8"), (1, 0), allow_pickle=False)
+    file, kind = io.BytesIO(), "|u1" if array.dtype == np.uint8 else "<f8"
+    np.lib.format.write_array(file, np.ascontiguousarray(array, dtype=kind), (1, 0), allow_pickle=False)
     return file.getvalue()
 
 
@@ -351,13 +351,13 @@ def _read(path: Path) -> tuple[Description, dict[str, bytes]]:
 
 
 def _array(members: dict[str, bytes], name: str, shape: tuple[int, ...]) -> Array:
-    """Return an array, its header compared with what is expected before anything is made of it."""
+    """Return an array as float64, its header compared with what is expected before anything is made of it."""
     file = io.BytesIO(members[f"{name}.npy"])
     version = np.lib.format.read_magic(file)
     got, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    if (version, got, fortran, dtype) != ((1, 0), shape, False, np.dtype("<f8")):
-        raise MapError(f"{name} is an array {got} of {dtype}, expected {shape} of float64")
-    return np.frombuffer(file.read(), "<f8").reshape(shape).astype(np.float64)
+    if (version, got, fortran) != ((1, 0), shape, False) or dtype not in (np.dtype("<f8"), np.dtype("|u1")):
+        raise MapError(f"{name} is an array {got} of {dtype}, expected {shape} of float64 or uint8")
+    return np.frombuffer(file.read(), dtype).reshape(shape).astype(np.float64)
 
 
 def _enter(tracks: Tracks, track: Track, slots: int) -> None:

@@ -39,6 +39,7 @@ from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed import FirstLook
 
 FEW, ENOUGH = 4, 20  # matches, with fewer of which the sensor is lost; landmarks by which it may recognise the place
+OLDER = 8  # words about a landmark in a file without its misfit
 SHIFT_PX = 0.04  # sigma of the shift of a match that counts half: as much as a pixel of the sensor
 PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
 
@@ -179,7 +180,7 @@ class FrontEnd:
                     look.plane = self._plane(y, view)
                 continue
             look, k = self.looks[name], at[name]
-            look.fitted, look.missed, look.seen = look.fitted + 1, 0, self.frame
+            look.fits((o.d2 or 0.0) / report.y.shape[1], self.frame)
             cosine, scale = self.likely.likeness[k]  # 0 where there is no view yet
             if look.plane is not None and cosine:
                 shown(self.image, self.likely.templates[k], y, look.plane.slopes, self.likely.rates[k], look.plane)
@@ -232,7 +233,7 @@ class FrontEnd:
     def state(self) -> dict[str, Any]:
         """Return what is to be saved with the map, but for `arrays`."""
         looks = [
-            [name, len(of.views), of.searched, of.found, of.fitted, of.missed, of.seen, of.surveyed]
+            [name, len(of.views), of.searched, of.found, of.fitted, of.missed, of.seen, of.surveyed, of.misfit]
             for name, of in self.looks.items()
         ]
         failed = [[*place, frame] for place, frame in self.cells.failed.items()]
@@ -248,7 +249,7 @@ class FrontEnd:
         views, side = [view for look in self.looks.values() for view in look.views], 2 * PATCH + 1
         planes = [look.plane.numbers for look in self.looks.values() if look.plane is not None]
         return {
-            "patches": np.array([view.patch for view in views], dtype=np.float64).reshape(-1, side, side),
+            "patches": np.array([view.patch for view in views], dtype=np.uint8).reshape(-1, side, side),
             "poses": np.array([view.T for view in views]).reshape(-1, 7),
             "rays": np.array([view.rays for view in views]).reshape(-1, 5, 3),
             "frames": np.array([view.frame for view in views], dtype=np.float64),
@@ -264,10 +265,13 @@ class FrontEnd:
         known = sum(int(look[1]) > 0 for look in state["looks"])
         planes = iter(read("planes", (known, NUMBERS)))
         self.looks, at = {}, 0
-        for name, own, *counts, surveyed in state["looks"]:
+        for look in state["looks"]:
+            name, own, *counts, surveyed, misfit = look if len(look) > OLDER else [*look, 0.0]
             searched, found, fitted, missed, seen = map(int, counts)
-            plane = Plane.of(next(planes)) if own else None
-            self.looks[name] = Look(searched, found, fitted, missed, seen, views[at : at + own], plane, bool(surveyed))
+            plane, own_views = Plane.of(next(planes)) if own else None, views[at : at + own]
+            self.looks[name] = Look(
+                searched, found, fitted, missed, seen, float(misfit), own_views, plane, bool(surveyed)
+            )
             at += own
         self.frame, self.named, self.is_lost = int(state["frame"]), int(state["named"]), bool(state.get("is_lost"))
         self.random.bit_generator.state = state["random"]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 TRIAL = 10  # searches after which a landmark may be given up
 LEAST_SHARE = 0.5  # of its searches in which one is found and fits; fewer: it is given up
 MOST_MISSED = 3  # times in a row that a new one may be missed
+RECENT, MOST_MISFIT = 20, 2.0  # matches, and their mean d2 above which a landmark is given up: it slides
 
 
 @dataclass
@@ -18,6 +19,7 @@ class Searches:
     fitted: int = 0
     missed: int = 0  # searches since it last fitted
     seen: int = -1  # frame of the last
+    misfit: float = 0.0  # mean d2 of recent matches, a number measured: 1 where they fit
 
     def searched_for(self, found: bool) -> str:
         """Count a search; return why the landmark is given up, "" if it is not."""
@@ -28,4 +30,11 @@ class Searches:
             return f"fitted in {self.fitted} of {self.searched} searches"
         elif self.searched < TRIAL and self.missed >= MOST_MISSED:
             return f"not found in {self.missed} searches, {self.fitted} before"
+        if self.fitted >= TRIAL and self.misfit > MOST_MISFIT:
+            return f"matches are off by {self.misfit:.1f} times their noise, as d2"
         return ""
+
+    def fits(self, d2: float, frame: int) -> None:
+        """Count a match in a frame, d2 being that of what it left, a number measured."""
+        self.fitted, self.missed, self.seen = self.fitted + 1, 0, frame
+        self.misfit += (d2 - self.misfit) / min(self.fitted, RECENT)

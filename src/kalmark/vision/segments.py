@@ -208,7 +208,7 @@ class LineFrontEnd:
 
     def state(self) -> dict[str, Any]:
         """Return what is to be saved with the map, but for `arrays`."""
-        looks = [[name, *astuple(look)[:-1]] for name, look in self.looks.items()]
+        looks = [[name, *astuple(look)[:-2]] for name, look in self.looks.items()]
         return {"frame": self.frame, "named": self.named, "looks": looks}
 
     def arrays(self) -> dict[str, Array]:
@@ -220,7 +220,7 @@ class LineFrontEnd:
         across = read("profiles", (len(state["looks"]), 2 * REACH_PX + 1))
         for (name, *counts), profile in zip(state["looks"], across, strict=True):
             searched, found, fitted, missed, seen = map(int, counts)
-            self.looks[name] = LineLook(searched, found, fitted, missed, seen, profile)
+            self.looks[name] = LineLook(searched, found, fitted, missed, seen, profile=profile)
         self.frame, self.named = int(state["frame"]), int(state["named"])
 
 
