@@ -14,12 +14,13 @@ from kalmark.geometry.spaces import SE2, SE3
 from kalmark.models.check import check_model
 from kalmark.models.known import known_view
 from kalmark.models.observe import linearize, sensor_address, sensor_at
+from kalmark.models.protocols import tells_velocity
 from kalmark.models.velocity_view import PythonMovingView, moving_view_of
 
 SENSORS: list[Any] = [km.sensors.RangeRate2D(), km.sensors.RangeRate3D(), km.sensors.Radar2D(), km.sensors.Radar3D()]
 COASTING: list[Any] = [km.motion.ConstantVelocity(), km.motion.ConstantTurnRate(), km.motion.ConstantVelocity3D()]
-MOTIONS: list[Any] = [*COASTING, km.motion.Unicycle(), km.motion.Odometry3D()]  # the last have no velocity
-SINCE = np.array([0.3])
+MOTIONS: list[Any] = [*COASTING, km.motion.Inertial(), km.motion.Unicycle(), km.motion.Odometry3D()]  # two have none
+SINCE = np.array([0.3, 0.5, -0.2, 0.4, 0.0, 0.0, 9.8])  # s since the last scan, and the control in force
 CASES = [(s, m) for s in SENSORS for m in MOTIONS if s.world == m.space.world]
 
 
@@ -42,7 +43,7 @@ def test_jacobians_in_pose_state_and_landmark_are_those_of_differences(sensor: A
     at, angular = drawn(pose, rng), np.array(sensor.angular)
     of = sensor, landmark, motion, at, SINCE
     view, in_python = moving_view_of(*of), PythonMovingView(*of, angular)
-    behind = motion.space if motion in COASTING else pose
+    behind = motion.space if tells_velocity(motion) else pose
     for _ in range(5):
         r, x = drawn(pose, rng), drawn(behind, rng)
         l, y = rng.normal(0, 5, (3, landmark.space.size)), np.zeros((3, len(sensor.columns)))

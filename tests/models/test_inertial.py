@@ -265,3 +265,16 @@ def test_the_rest_ends_before_the_motion_begins() -> None:
     u[600:, 3] += 0.5 * (t[600:] - 3.0)  # from 3 s on it accelerates
     found = km.motion.at_rest(motion, t, u, start, cov)
     assert 2.5 < found.until_s < 3.0
+
+
+@pytest.mark.parametrize("motion", MOTIONS, ids=named)
+def test_the_velocity_under_a_reading_is_that_at_which_the_unit_moves(motion: Any) -> None:
+    """The velocity is the state's, whatever the reading; the turn rate is the reading's, less the bias."""
+    rng, dt, pose = np.random.default_rng(12), 1e-6, km.geometry.SE3
+    for _ in range(20):
+        r, u = drawn(motion.space, rng), rng.normal(0, 1, 6)
+        way = pose.minus(motion.move(r, u, dt)[0][:7], r[:7]) / dt
+        Q_t = matrix(r[3:7]).T
+        np.testing.assert_allclose(np.kron(np.eye(2), Q_t) @ way, motion.body_velocity_under(r, u)[0], atol=1e-4)
+        at_rest = motion.body_velocity_under(r, np.full(6, np.nan))[0]
+        np.testing.assert_array_equal(at_rest[3:], 0.0)

@@ -18,11 +18,12 @@ from kalmark.models.state_view import PythonStateView, sees_state, state_view_of
 
 SENSORS = [cls for cls in built_in("sensor") if issubclass(cls, StateSensor)]
 PLANE, SPACE, COASTING = km.motion.Unicycle(), km.motion.Odometry3D(), km.motion.ConstantVelocity3D()
+UNIT = km.motion.Inertial()
 CASES = [
     (cls, motion)
     for cls in SENSORS
-    for motion in (PLANE, SPACE, COASTING)
-    if world_of(cls) in ("", motion.space.world) and (motion is not COASTING or cls.views == TWIST)
+    for motion in (PLANE, SPACE, COASTING, UNIT)
+    if world_of(cls) in ("", motion.space.world) and (motion not in (COASTING, UNIT) or cls.views == TWIST)
 ]
 
 
@@ -59,7 +60,8 @@ def test_jacobians_in_every_argument_are_those_of_differences(cls: Any, motion: 
     for _ in range(5):
         head = np.concatenate([drawn(pose, rng), at, sensor.parameters])
         l = drawn(block, rng) if sensor.views != POSE else np.zeros(0)
-        y = np.append(sensor.expect(at_origin(sensor, plane))[0][0], 0.7)[None]
+        told = np.append(0.7, rng.normal(0, 1, 6) if motion is UNIT and sees_state(sensor, motion) else [])
+        y = np.append(sensor.expect(at_origin(sensor, plane))[0][0], told)[None]
         e, z, E_h, E_l = linearize(view, head, l[None], y)
         assert e.shape == y.shape
         if not hasattr(sensor, "cov_size"):  # in Python an innovation is y - e

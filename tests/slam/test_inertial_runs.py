@@ -178,6 +178,8 @@ STATE_SENSORS = {
     "barometer": "{type: height, sigma_z_m: 0.05, sigma_bias_m: 0.1}",
     "compass": "{type: heading, sigma_heading_rad: 0.05}",
     "flow": "{type: body_velocity, sigma_mps: 0.02}",
+    "speed": "{type: speed, sigma_mps: 0.02, mount: {x_m: 0.1, y_m: 0.3}}",
+    "gyro": "{type: gyro, sigma_radps: 0.002}",
     "wheels": "{type: odometer, sigma_m: 0.01, sigma_rad: 0.01}",
 }
 

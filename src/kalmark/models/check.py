@@ -109,13 +109,13 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
                 return [np.array(each) for each in zip(*map(of.calibrated, u, a, dt_s), strict=True)]
 
             found.jacobian("U_a", true(a)[1], lambda x: true(x)[0], a, Rn(c), Rn(k), at | {"a": a})
-    if isinstance(model, protocols.HasVelocity):
+    if protocols.tells_velocity(model):
         size = 6 if space.world == "space" else 3
-        b, B_r = (np.array(each) for each in zip(*map(model.body_velocity, r), strict=True))
-        _shape("b of body_velocity", b, (DRAWS, size))
+        b, B_r = (np.array(each) for each in zip(*(protocols.velocity_in(model, one, u[0]) for one in r), strict=True))
+        _shape("b of the velocity", b, (DRAWS, size))
 
         def velocity(r: Array) -> Array:
-            return np.array([model.body_velocity(one)[0] for one in r])
+            return np.array([protocols.velocity_in(model, one, u[0])[0] for one in r])
 
         found.jacobian("B_r", B_r, velocity, r, space, Rn(size), {"r": r})
 

@@ -104,6 +104,20 @@ def inertial(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, A
 
 
 @compiled
+def inertial_velocity(r: Array, u: Array) -> tuple[Array, Array]:
+    """Return the velocity (v, w) of a state r (16 or 19,) in the robot's frame (6,), and its Jacobian (6, dof).
+
+    w is that of the reading in force u (6,) less the bias; its white noise is left out.  Of NaN it is zero.
+    """
+    Q_t, b, B_r = np.ascontiguousarray(matrix(r[3:7]).T), np.zeros(6), np.zeros((6, len(r) - 1))
+    b[:3] = Q_t @ r[7:10]
+    B_r[:3, 3:6], B_r[:3, 6:9] = Q_t @ skew(r[7:10]), Q_t
+    for i in range(0 if np.isnan(u[0]) else 3):
+        b[3 + i], B_r[3 + i, 9 + i] = u[i] - r[10 + i], -1.0
+    return b, B_r
+
+
+@compiled
 def inertial_noise(w: Array, f: Array, variances: Array, dt: float, dof: int) -> Array:
     """Return the covariance (dof, dof) gathered in dt s, in the frame where the robot ends, at a rate w and a force f.
 
@@ -158,6 +172,7 @@ class Inertial(MotionModel):
     columns: ClassVar[tuple[str, ...]] = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
     held: ClassVar[bool] = True
     moves: ClassVar[Any] = inertial
+    velocity: ClassVar[Any] = inertial_velocity
     state_columns: ClassVar[tuple[str, ...]] = (
         "vx_mps", "vy_mps", "vz_mps", "bias_wx_radps", "bias_wy_radps", "bias_wz_radps",
         "bias_ax_mps2", "bias_ay_mps2", "bias_az_mps2",
@@ -168,6 +183,10 @@ class Inertial(MotionModel):
     def parameters(self) -> Array:
         """The gravity (1,), m/s^2."""
         return np.array([self.gravity_mps2])
+
+    def body_velocity_under(self, r: Array, u: Array) -> tuple[Array, Array]:
+        """Return the velocity (v, w) of a state r in the robot's frame (6,) under a reading u, and its Jacobian."""
+        return inertial_velocity(np.asarray(r, dtype=np.float64), np.array(u, dtype=np.float64))
 
     def control_noise(self, u: Array) -> Array:
         """Return zeros (6, 6): the noise of a reading u (6,) is white, see `diffusion_at`."""

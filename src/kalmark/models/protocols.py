@@ -201,6 +201,39 @@ class HasVelocity(Protocol):
 
 
 @runtime_checkable
+class HoldsRate(Protocol):
+    """A motion of which the state has the velocity, and the control in force the turn rate: an inertial unit."""
+
+    columns: tuple[str, ...]
+
+    def body_velocity_under(self, r: Array, u: Array) -> tuple[Array, Array]:
+        """Return what `HasVelocity` does, under a control u (k,); NaN where there is none yet: it does not turn."""
+
+
+def tells_velocity(motion: object) -> bool:
+    """Return whether the velocity of a robot is in its state; by default it is not."""
+    return isinstance(motion, HasVelocity | HoldsRate)
+
+
+def velocity_in(motion: Any, r: Array, u: Array) -> tuple[Array, Array]:
+    """Return the velocity of a state r (size,) in the robot's frame under a control u (k,), and its Jacobian."""
+    if isinstance(motion, HoldsRate):
+        return motion.body_velocity_under(r, u)
+    velocity: tuple[Array, Array] = motion.body_velocity(r)
+    return velocity
+
+
+@runtime_checkable
+class _SeesRates(Protocol):
+    sees_rates: bool
+
+
+def sees_rates(sensor: object) -> bool:
+    """Return whether a sensor of a twist measures turn rates; by default it does not."""
+    return sensor.sees_rates if isinstance(sensor, _SeesRates) else False
+
+
+@runtime_checkable
 class _NamesParameters(Protocol):
     parameter_names: tuple[str, ...]
 

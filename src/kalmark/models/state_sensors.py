@@ -443,6 +443,7 @@ class _Gyro(StateSensor):
     sigma_bias_radps_per_sqrt_s: Walk = 0.0
 
     views: ClassVar[str] = TWIST
+    sees_rates: ClassVar[bool] = True
     expected: ClassVar[Any] = rates
     varied: ClassVar[Any] = plus
 
@@ -575,6 +576,7 @@ class _ZeroVelocity(StateSensor):
     sigma_radps: Annotated[Positive, "Turn rate of a robot that stands, about each axis."] = 0.005
 
     views: ClassVar[str] = TWIST
+    sees_rates: ClassVar[bool] = True
     expected: ClassVar[Any] = place
 
 

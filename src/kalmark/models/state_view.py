@@ -11,8 +11,9 @@ twist   its velocity and turn rate, in its own frame               the robot, or
 ======  =========================================================  ===================  =======================
 
 r is the robot, s the mount.  The twist is that of the robot's state where this has one (`HasVelocity`), else the mean
-since the sensor's last reading: of the constant twist that leads from there to here.  Behind the sensor's m numbers
-the filter's measurement has one more, the time since the last reading in seconds.
+since the sensor's last reading: of the constant twist that leads from there to here.  The velocity of an inertial
+unit's state is joined by the turn rate of the control in force (`HoldsRate`), for sensors of velocities alone.  Behind
+the sensor's m numbers the filter's measurement has the time since the last reading in seconds, and that control.
 
 `Chain` functions have one form and are called by their addresses; `linearize_state` applies the chain rule from there
 on.  The corrections call it as they call any `observe.linearize`.
@@ -33,11 +34,11 @@ from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.rotations import left_jacobian_inverse, left_jacobian_rate, log, matrix, skew
 from kalmark.models import seen
 from kalmark.models.observe import LINEARIZE, VELOCITY, View, call_velocity
-from kalmark.models.protocols import CHANGE, POSE, TWIST, HasVelocity, OfState
+from kalmark.models.protocols import CHANGE, POSE, TWIST, HasVelocity, HoldsRate, OfState, sees_rates, velocity_in
 from kalmark.models.seen import EXPECT, VARY, residual
 
-# of robot, mount, second block, seconds since the last reading, address of a VELOCITY: v, V_r, V_s, V_l
-CHAIN = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8, i8)")
+# of robot, mount, second block, seconds since the last reading and control, address of a VELOCITY: v, V_r, V_s, V_l
+CHAIN = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8[::1], i8)")
 call_chain = by_address(CHAIN)
 
 Chain = tuple[Array, Array, Array, Array]
@@ -45,21 +46,21 @@ Chain = tuple[Array, Array, Array, Array]
 
 # ------------------------------------------------------------------ what is seen of a state
 @compiled
-def pose_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def pose_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return the pose T = r o s (3,), T_r and T_s (3, 3); there is no second block."""
     T, T_r, T_s = frames.compose(r, s)
     return T, T_r, T_s, np.zeros((3, 0))
 
 
 @compiled
-def pose_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def pose_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return the pose T = r o s (7,), T_r and T_s (6, 6); there is no second block."""
     T, T_r, T_s = frames3d.compose(r, s)
     return T, T_r, T_s, np.zeros((6, 0))
 
 
 @compiled
-def change_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def change_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return C = (l o s)^-1 o (r o s) (3,), the way of a mount s while its robot went from l to r, and Jacobians."""
     A, A_l, A_s = frames.compose(l, s)
     B, B_r, B_s = frames.compose(r, s)
@@ -70,7 +71,7 @@ def change_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -
 
 
 @compiled
-def change_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def change_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return C = (l o s)^-1 o (r o s) (7,), the way of a mount s while its robot went from l to r, and Jacobians."""
     A, A_l, A_s = frames3d.compose(l, s)
     B, B_r, B_s = frames3d.compose(r, s)
@@ -81,7 +82,7 @@ def change_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -
 
 
 @compiled
-def mean_twist_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def mean_twist_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return the constant twist (vx, vy, w) of a mount s with which its robot goes from l to r, and Jacobians."""
     C, C_r, C_s, C_l = change_in_plane(r, s, l, since, velocity)
     p, q = exponential_v(C[2])
@@ -90,27 +91,27 @@ def mean_twist_in_plane(r: Array, s: Array, l: Array, since: float, velocity: in
     x, y = (p * C[0] + q * C[1]) / n, (p * C[1] - q * C[0]) / n  # V (x, y) = (C_x, C_y)
     dx, dy = p_a * x - q_a * y, q_a * x + p_a * y
     J = np.array([[p / n, q / n, -(p * dx + q * dy) / n], [-q / n, p / n, (q * dx - p * dy) / n], [0.0, 0.0, 1.0]])
-    J /= since
-    return np.array([x, y, C[2]]) / since, J @ C_r, J @ C_s, J @ C_l
+    J /= since[0]
+    return np.array([x, y, C[2]]) / since[0], J @ C_r, J @ C_s, J @ C_l
 
 
 @compiled
-def mean_twist_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def mean_twist_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return the constant twist (v, w) (6,) of a mount s with which its robot goes from l to r, and Jacobians."""
     C, C_r, C_s, C_l = change_in_space(r, s, l, since, velocity)
     turn = log(C[3:].copy())
     inverse = left_jacobian_inverse(turn)
     way, J, t = inverse @ C[:3].copy(), np.zeros((6, 6)), np.empty(6)
-    t[:3], t[3:] = way / since, turn / since
-    J[:3, :3] = J[3:, 3:] = inverse / since
-    J[:3, 3:] = -(inverse @ (left_jacobian_rate(turn, way) @ inverse)) / since
+    t[:3], t[3:] = way / since[0], turn / since[0]
+    J[:3, :3] = J[3:, 3:] = inverse / since[0]
+    J[:3, 3:] = -(inverse @ (left_jacobian_rate(turn, way) @ inverse)) / since[0]
     return t, J @ C_r, J @ C_s, J @ C_l
 
 
 @compiled
-def twist_in_plane(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def twist_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return the twist (vx, vy, w) of a mount s of a robot with the state l (n,), and Jacobians."""
-    t, T_l = call_velocity(velocity, (l, np.zeros(0)))
+    t, T_l = call_velocity(velocity, (l, since[1:].copy()))
     return carried_in_plane(t, T_l, s)
 
 
@@ -126,9 +127,9 @@ def carried_in_plane(t: Array, T_l: Array, s: Array) -> Chain:
 
 
 @compiled
-def twist_in_space(r: Array, s: Array, l: Array, since: float, velocity: int) -> Chain:
+def twist_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
     """Return the twist (v, w) (6,) of a mount s of a robot with the state l (n,), and Jacobians."""
-    t, T_l = call_velocity(velocity, (l, np.zeros(0)))
+    t, T_l = call_velocity(velocity, (l, since[1:].copy()))
     return carried_in_space(t, T_l, s)
 
 
@@ -160,15 +161,16 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
     """Return e (1, .), z (1, p), E_h (1, p, h), E_l (1, p, n) of one reading y of a sensor of the state.
 
     Like `observe.linearize`: the head is the robot's pose and, if in the map, the mount and the sensor's parameters.
-    y (1, m + 1) ends with the time since the last reading.  In y (1, 2 m + 1) the reading as earlier ones tell it comes
-    before that: the parameters' Jacobian is taken of it (docs/motions.md).
+    y (1, m + 1) ends with the time since the last reading, and may have the control in force behind it where the
+    velocity is of the state.  Else in y (1, 2 m + 1) the reading as earlier ones tell it comes before the time: the
+    parameters' Jacobian is taken of it (docs/motions.md).
     """
     _, chain_at, expect_at, velocity, at, par, angular, vary_at = view
     pose, m = len(at), len(angular)
     mount = head[pose : 2 * pose].copy() if len(head) > pose else at
     if len(head) > 2 * pose:
         par = head[2 * pose :].copy()
-    since = y[0, y.shape[1] - 1]
+    since = y[0, m if velocity != 0 else y.shape[1] - 1 :].copy()
     v, V_r, V_s, V_l = call_chain(chain_at, (head[:pose].copy(), mount, l[0].copy(), since, velocity))
     row, e = v.reshape((1, len(v))), y.copy()
     expected, z, E_v = seen.expect(expect_at, (0, par, angular, row, y[:, :m].copy()))
@@ -179,7 +181,7 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
     if len(head) > pose:
         E_h[0, :, n : 2 * n] = E_v[0] @ V_s
     if len(head) > 2 * pose:
-        usual = y[:, m : 2 * m].copy() if y.shape[1] > m + 1 else expected
+        usual = y[:, m : 2 * m].copy() if velocity == 0 and y.shape[1] > m + 1 else expected
         E_h[0, :, 2 * n :] = seen.vary(vary_at, (0, par, angular, row, usual))[0]
     E_l = np.zeros((1, p, V_l.shape[1]))
     if V_l.shape[1] > 0:
@@ -204,10 +206,10 @@ class PythonStateView:
             sensor = sensor.with_parameters(head[2 * pose :])
         if sees_state(sensor, self.motion):
             carried: Any = carried_in_plane if pose == 3 else carried_in_space
-            v, V_r, V_s, V_l = carried(*self.motion.body_velocity(l[0]), np.array(mount))
+            v, V_r, V_s, V_l = carried(*velocity_in(self.motion, l[0], y[0, m + 1 :]), np.array(mount))
         else:
             chain = CHAINS[sensor.views, False][pose != 3]
-            v, V_r, V_s, V_l = chain(head[:pose].copy(), np.array(mount), l[0].copy(), float(y[0, -1]), 0)
+            v, V_r, V_s, V_l = chain(head[:pose].copy(), np.array(mount), l[0].copy(), y[0, -1:].copy(), 0)
         expected, E_v = sensor.expect(v[None])
         e = y.copy()
         e[:, :m] = expected
@@ -240,15 +242,19 @@ def state_view_of(sensor: OfState, motion: Any, mount: Array) -> Any:
 
 
 def sees_state(sensor: OfState, motion: Any) -> bool:
-    """Return whether a sensor sees a twist that is in the robot's state."""
-    return sensor.views == TWIST and isinstance(motion, HasVelocity)
+    """Return whether a sensor sees a twist that is in the robot's state: of some motions the velocity alone is."""
+    held = isinstance(motion, HoldsRate) and not sees_rates(sensor)
+    return sensor.views == TWIST and (held or isinstance(motion, HasVelocity))
 
 
-def view_of_state(sensor: OfState, motion: Any, mount: Array, state: Array, before: Array, since_s: float) -> Array:
-    """Return what a sensor sees of a robot in a `state`, whose pose was `before` at the last reading."""
+def view_of_state(sensor: OfState, motion: Any, mount: Array, state: Array, before: Array, since: Array) -> Array:
+    """Return what a sensor sees of a robot in a `state`, whose pose was `before` at the last reading.
+
+    `since` (1 + k,): the seconds since then, and the control in force.
+    """
     pose = len(mount)
     if sees_state(sensor, motion):
         carried: Any = carried_in_plane if pose == 3 else carried_in_space
-        v: Array = carried(*motion.body_velocity(state), mount)[0]
+        v: Array = carried(*velocity_in(motion, state, since[1:]), mount)[0]
         return v
-    return CHAINS[sensor.views, False][pose != 3](state[:pose].copy(), mount, before, since_s, 0)[0]
+    return CHAINS[sensor.views, False][pose != 3](state[:pose].copy(), mount, before, since, 0)[0]

@@ -23,7 +23,7 @@ from kalmark.geometry.frames import compose
 from kalmark.models import seen
 from kalmark.models.landmarks3d import chained
 from kalmark.models.observe import LINEARIZE, VELOCITY, View, composed, is_built_in
-from kalmark.models.protocols import TWIST, HasVelocity, Landmark, Sensor
+from kalmark.models.protocols import TWIST, Landmark, Sensor, tells_velocity, velocity_in
 from kalmark.models.seen import EXPECT, LOOK, residual
 from kalmark.models.state_view import CHAIN, CHAINS, call_chain, carried_in_plane, carried_in_space
 
@@ -35,13 +35,13 @@ def linearize_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array
     """Return e, z (K, m), E_h (K, m, h) and E_l (K, m, n) of landmarks l (K, n) and the velocity of the sensor.
 
     The head is the robot's pose and its state or its clone; the view has the chain of the twist instead of a sensor's
-    code, the seconds since the last scan (1,) instead of parameters, and the address of the velocity instead of that of
+    code, `since` (1 + k,) instead of parameters, and the address of the velocity instead of that of
     `varied`.
     """
     _, look_at, expect_at, chain_at, marked, since, angular, velocity = view
     pose = len(marked) - 1
     at, r = marked[:pose].copy(), head[:pose].copy()
-    t, t_r, _t_s, t_x = call_chain(chain_at, (r, at, head[pose:].copy(), since[0], velocity))
+    t, t_r, _t_s, t_x = call_chain(chain_at, (r, at, head[pose:].copy(), since, velocity))
     T, T_r = placed(r, at)
     p, P_T, P_l = seen.look(look_at, (T, l))
     k, d, n, m = p.shape[0], p.shape[1], T_r.shape[0], y.shape[1]
@@ -88,7 +88,7 @@ class PythonMovingView:
     def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Return e, z (K, m), E_h (K, m, h) and E_l (K, m, n), as `linearize_moving` does."""
         pose = len(self.at)
-        t, t_r, t_x = velocity_of(self.motion, self.at, head[:pose], head[pose:], float(self.since[0]))
+        t, t_r, t_x = velocity_of(self.motion, self.at, head[:pose], head[pose:], self.since)
         T, T_r, _ = composed(head[:pose], self.at)
         p, P_T, P_l = self.landmark.seen_from(T, l)
         e, E_v = self.sensor.expect(np.concatenate([p, np.tile(t, (len(p), 1))], axis=1))
@@ -97,26 +97,28 @@ class PythonMovingView:
         return e, residual(y, e, self.angular), E_h, E_p @ P_l
 
 
-def velocity_of(motion: Any, at: Array, r: Array, x: Array, since_s: float) -> tuple[Array, Array, Array]:
+def velocity_of(motion: Any, at: Array, r: Array, x: Array, since: Array) -> tuple[Array, Array, Array]:
     """Return the velocity t (2 or 3,) of a sensor at `at`, in its frame, and its Jacobians t_r and t_x.
 
-    The robot's pose is r, and x its state if that has the velocity, else its pose `since_s` seconds ago.
+    The robot's pose is r, and x its state if that has the velocity, else its pose since[0] seconds ago; the rest of
+    `since` is the control in force.
     """
     d = 2 if len(at) == 3 else 3
-    if isinstance(motion, HasVelocity):
+    if tells_velocity(motion):
         carried: Any = carried_in_plane if d == 2 else carried_in_space
-        t, t_r, _, t_x = carried(*motion.body_velocity(x), at)
+        t, t_r, _, t_x = carried(*velocity_in(motion, x, since[1:]), at)
     else:
-        t, t_r, _, t_x = CHAINS[TWIST, False][d == 3](r.copy(), at, x.copy(), since_s, 0)
+        t, t_r, _, t_x = CHAINS[TWIST, False][d == 3](r.copy(), at, x.copy(), since, 0)
     return t[:d], t_r[:d], t_x[:d]
 
 
 def moving_view_of(sensor: Any, landmark: Any, motion: Any, at: Array, since: Array) -> Any:
     """Return the argument of `linearize` for a sensor on a mount (3,) or (7,) that sees landmarks and its velocity.
 
-    `since` (1,) is read at each scan: the seconds since the last one, where the motion has no velocity in its state.
+    `since` (1 + k,) is read at each scan: the seconds since the last one, which count where the motion has no velocity
+    in its state, and the control in force where that has the turn rate.
     """
-    angular, of_state = np.array(sensor.angular, dtype=np.bool_), isinstance(motion, HasVelocity)
+    angular, of_state = np.array(sensor.angular, dtype=np.bool_), tells_velocity(motion)
     if not is_built_in(sensor, landmark) or (of_state and type(motion) not in built_in("motion")):
         return PythonMovingView(sensor, landmark, motion, at, since, angular)
     of: Any = motion

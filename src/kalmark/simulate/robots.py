@@ -30,7 +30,6 @@ from kalmark.models.observe import composed
 from kalmark.models.protocols import (
     POSE,
     Drifting,
-    HasVelocity,
     OfState,
     Ranging,
     SeesVelocity,
@@ -40,6 +39,7 @@ from kalmark.models.protocols import (
     diffusion_of,
     parameter_covariance,
     range_limit,
+    tells_velocity,
     true_control,
 )
 from kalmark.models.sensors import PixelDepth, Stereo
@@ -90,6 +90,7 @@ class SimRobot:
     sensors: dict[str, SimSensor]
     states: list[Array] = field(default_factory=list)
     constants: Array = field(default_factory=lambda: np.zeros(0))
+    u: Array = field(default_factory=lambda: np.zeros(0))  # the control of the last step, as it was done
 
     @property
     def pose(self) -> Array:
@@ -243,6 +244,7 @@ def step(robot: SimRobot, world: World, rng: Generator) -> Array:
     error = gaussian(motion.control_noise(u), rng)
     noisy, done = (u + error, u) if world.noise_on == "control" else (u, u + error)
     robot.states.append(robot.state)
+    robot.u = done
     D = diffusion_of(motion, robot.state, done, dt_s)
     robot.state = disturbed(motion, motion.move(robot.state, done, dt_s)[0], D, rng)
     return told(motion, noisy, robot.constants, dt_s)
@@ -353,8 +355,8 @@ def begun(robot: SimRobot, name: str, chance: Chance) -> Event:
 def moving_at(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:
     """Return the velocity (2 or 3,) of a sensor at step k in its frame, or the mean since its last scan."""
     k_before, before = carried.last or (0, robot.states[0][: len(robot.pose)])
-    state = robot.state if isinstance(robot.motion, HasVelocity) else np.array(before)
-    return velocity_of(robot.motion, carried.at, robot.pose, state, (k - k_before) * dt_s)[0]
+    state = robot.state if tells_velocity(robot.motion) else np.array(before)
+    return velocity_of(robot.motion, carried.at, robot.pose, state, np.array([(k - k_before) * dt_s, *robot.u]))[0]
 
 
 def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Chance) -> Array | None:
@@ -368,7 +370,7 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
     if isinstance(of, Drifting) and (Q := of.drift(since_s)).any():
         of = carried.sensor = of.with_parameters(of.parameters + chance.sight.normal(0.0, np.sqrt(Q)))  # type: ignore[attr-defined]
     counts = of.views != POSE and not sees_state(of, robot.motion)
-    v = view_of_state(of, robot.motion, at, robot.state, np.array(before), since_s)
+    v = view_of_state(of, robot.motion, at, robot.state, np.array(before), np.array([since_s, *robot.u]))
     e, wild = of.expect(v[None])[0], chance.faults.uniform(size=2)
     R = of.noise_since(since_s)[0] if counts and isinstance(of, TimedNoise) else of.noise(e)[0]
     error = gaussian(R, chance.sight) * (WILD if wild[0] < carried.sensing.outliers else 1.0)

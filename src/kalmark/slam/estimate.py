@@ -135,7 +135,7 @@ class Estimate:
             if self.tracks.sort(name) is None:
                 raise MapError(f"{name!r} is a sensor's mount or a control's bias, expected a landmark or a robot")
         channel = self.state.channels[robot, sensor]
-        if channel.counts and (why := self.state.look_back((robot, sensor))):
+        if channel.sees_velocity and (why := self.state.look_back((robot, sensor))):
             raise MapError(f"sensor {sensor!r} of {robot!r} expects nothing: {why}")
         return expectations(self.map, self.tracks, channel, robot, sensor, chosen, in_view)
 

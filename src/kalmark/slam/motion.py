@@ -110,6 +110,11 @@ class HeldInput:
             if self.gaps is not None:
                 vars(self.gaps).update(watched)
 
+    @property
+    def in_force(self) -> Array:
+        """The control (k,) that it is moved by, NaN before the first."""
+        return np.full(len(self.motion.columns), np.nan) if self.u is None else self.u
+
     def stays(self, to_ns: int) -> bool:
         """Return whether the robot is at that time where it was, and nothing is to be told of a gap."""
         gaps = self.gaps

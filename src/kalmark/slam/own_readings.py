@@ -24,7 +24,7 @@ FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes s
 
 def read(state: State, event: Scan, reader: Reader) -> Report:
     """Correct by what a sensor measures of its own robot; leave a clone where its next reading counts from here."""
-    key, robot, since_s = (event.robot, event.sensor), state.moving[event.robot].slot, reader.since_s(event)
+    key, since_s = (event.robot, event.sensor), reader.since_s(event)
     R, report = reader.noise(event), Report(event, event.y)
     state.t_ns = event.t_ns
     report.gaps = moves.advance(state, event.robot)
@@ -36,7 +36,9 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         report.blank(R.shape[1])
         report.observations = (Observation(0, None, "ignored", None, None, "the first reading: none to count from"),)
     else:
-        update = reader.update(state.map, robot, state.clones[held[-1]] if held else -1, event, R, since_s)
+        update = reader.update(
+            state.map, state.moving[event.robot], state.clones[held[-1]] if held else -1, event, R, since_s
+        )
         done = state.corrected(update, event, reader.estimator(state.estimator))
         done = done._replace(e=done.e[:, : event.width])
         report.e, report.z, report.Z = done.e, done.z, done.Z

@@ -13,10 +13,10 @@ from kalmark.filter.estimators import Estimator, Iterating, Update
 from kalmark.filter.map import Map
 from kalmark.geometry.gaussian import gate
 from kalmark.models import protocols
-from kalmark.models.protocols import CHANGE, POSE, Motion, OfState
+from kalmark.models.protocols import CHANGE, POSE, HoldsRate, Motion, OfState
 from kalmark.models.state_view import sees_state, state_view_of
 from kalmark.slam.checks import measurements
-from kalmark.slam.motion import Mean
+from kalmark.slam.motion import Mean, Moving
 from kalmark.slam.standing import Standing
 
 POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures where an antenna is
@@ -93,13 +93,18 @@ class Reader:
             rows = map_.index(self.mount)[-len(Q) :]
             map_.predict(rows, np.eye(len(Q)), np.diag(Q))
 
-    def update(self, map_: Map, robot: int, clone: int, event: Scan, R: Array, since_s: float) -> Update:
+    def update(self, map_: Map, moving: Moving, clone: int, event: Scan, R: Array, since_s: float) -> Update:
         """Return the correction by a reading with the noise R (1, p, p); `clone` is where it counts from."""
+        robot = moving.slot
         if event.cov is None and isinstance(self.sensor, protocols.TimedNoise) and since_s > 0:
             R = self.sensor.noise_since(since_s)
         slot, d = (clone, len(self.at)) if self.counts else (robot, len(map_.mean(robot)) if self.of_state else 0)
-        given = np.column_stack([event.y, *self._usual(event.y, since_s), [since_s]])
+        given = np.column_stack([event.y, *self._usual(event.y, since_s), [since_s], *self._held(moving)])
         return Update(self.view, robot, self.mount, np.array([slot]), d, given, np.ascontiguousarray(R), self.gate)
+
+    def _held(self, moving: Moving) -> list[Array]:
+        """Return the control in force (1, k), where the turn rate is of it."""
+        return [moving.held.in_force[None]] if self.of_state and isinstance(self.motion, HoldsRate) else []
 
     def _usual(self, y: Array, since_s: float) -> list[Array]:
         """Return a reading y (1, m) as the ones before tell it; none where it has changed, or none is needed."""

@@ -236,7 +236,7 @@ class Slam(Estimate):
         scan = ScanContext(
             state.map, state.tracks, state.clones, state.estimator, channel, robot, event, ids, R, report
         )  # fmt: skip
-        why = state.look_back(key) if channel.counts else ""
+        why = state.look_back(key) if channel.sees_velocity else ""
         if self.before_scan is not None and not why:
             self.before_scan(event.robot, event.sensor)
         if why:

@@ -155,8 +155,11 @@ class State:
         return number
 
     def look_back(self, key: ChannelKey) -> str:
-        """Let a channel that counts from its last scan do so; return what keeps it from that, "" for nothing."""
+        """Let a channel have its velocity, from its last scan if it counts from there; return what it lacks, or ""."""
         channel, held = self.channels[key], self.clones.of(key)
+        if not channel.counts:
+            channel.since[1:] = self.moving[key[0]].held.in_force[: len(channel.since) - 1]
+            return ""
         channel.clone = self.clones[held[-1]] if held else -1
         if not held or self.t_ns is None:
             return "the first scan: none to count the velocity from"

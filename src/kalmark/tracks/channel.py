@@ -119,7 +119,8 @@ class Channel:
 
     `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
     `motion` is that of its robot: a sensor that sees its velocity has it from the state; else it `counts`, from a clone
-    of the robot's pose at its last scan, `since` (1,) seconds ago.
+    of the robot's pose at its last scan.  `since` (1 + k,): the seconds since then, and the control in force where that
+    has the turn rate.
     `robust`: how outliers count less, one of `ROBUST` (None: all count in full).
     """
 
@@ -129,8 +130,9 @@ class Channel:
     ) -> None:  # fmt: skip
         self.sensor: Any = sensor
         self.motion, self.sees_velocity = motion, isinstance(sensor, protocols.SeesVelocity)
-        self.counts = self.sees_velocity and not isinstance(motion, protocols.HasVelocity)
-        self.clone, self.since = -1, np.zeros(1)
+        self.counts = self.sees_velocity and not protocols.tells_velocity(motion)
+        held = len(motion.columns) if isinstance(motion, protocols.HoldsRate) else 0
+        self.clone, self.since = -1, np.zeros(1 + held)
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
         self.of_pair = of_pair(sensor)
@@ -223,7 +225,7 @@ class Channel:
         if not self.sees_velocity:
             return np.zeros(0)
         second, pose = map_.mean(self.second(robot)), map_.mean(robot)[: len(self.at)]
-        return velocity_of(self.motion, self.at, pose, second, float(self.since[0]))[0]
+        return velocity_of(self.motion, self.at, pose, second, self.since)[0]
 
     def observer(self, map_: Map, robot: int) -> Array:
         """Return the observer block (size,): the robot's pose, then mount and parameters if they are in the map."""
