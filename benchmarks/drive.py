@@ -71,11 +71,11 @@ def run(seed: SeedSequence, heading: float, estimator: str, states: np.ndarray, 
     arm, gain = np.array([0.5, 0.0, 1.0]) + rng.normal(0, ARM_M, 3), 1.0 + rng.normal(0, SCALE)
     t, found = DT_S * np.arange(len(u)), []
     for i in range(len(u)):
-        if round(100 * t[i]) in [round(100 * each) for each in TIMES_S]:
-            found.append(nees(slam, x[i]))
         slam.process(km.Control(t_s=t[i], robot="car", u=read[i]))
         readings(slam, rng, i, x[i], arm, gain)
-    return np.array([*found, nees(slam, x[len(u) - 1])][: len(TIMES_S)])
+        if i in [round(each / DT_S) for each in TIMES_S]:
+            found.append(nees(slam, x[i]))
+    return np.array(found)
 
 
 def started(read: np.ndarray, heading: float, estimator: str) -> km.Slam:
@@ -122,7 +122,7 @@ def main() -> None:
     parser.add_argument("--heading", type=float, default=30.0, help="sigma at the start, deg")
     parser.add_argument("--estimator", default="invariant")
     given = parser.parse_args()
-    states, u = drive(TIMES_S[-1])
+    states, u = drive(TIMES_S[-1] + DT_S)
     heading, seeds = math.radians(given.heading), SeedSequence(0).spawn(given.runs)
     scored = Parallel(n_jobs=1)(delayed(run)(s, heading, given.estimator, states, u) for s in seeds)
     mean, error = np.mean(scored, axis=0), np.std(scored, axis=0) / math.sqrt(given.runs)
