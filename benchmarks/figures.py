@@ -486,9 +486,17 @@ def images() -> Iterator[Figure]:
                      wanted, f"python benchmarks/vision.py {name}", row(name, shown))  # fmt: skip
         yield Figure("Images", f"the same with lines, {name}: ATE of five seeds / scale drift / points, lines matched a frame / a frame",
                      wanted, f"python benchmarks/vision.py {name}+lines", row(f"{name}+lines", "{0} {1} {2} {3} {4} m / {6} % / {10}, {12} / {11} ms"))  # fmt: skip
-    yield Figure("Images", "a camera with an inertial unit, EuRoC V1_01, 90 frames, largest of five seeds: position / attitude / velocity / scale / NEES of the pose, a dof",
-                 "0.02 m / 0.5 deg / 0.05 m/s / 1 % / 1", "python benchmarks/vision.py euroc",
-                 row("euroc", "{0} m / {1} deg / {2} m/s / {3} % / {4}"))  # fmt: skip
+    unit, wanted = "python benchmarks/vision_inertial.py", "0.02 m / 0.5 deg / 0.05 m/s / 1 % / 1"
+    errors = "position / attitude / velocity / scale / NEES of the pose, a dof"
+    for name, label in (
+        ("euroc", "EuRoC V1_01, 90 frames"),
+        ("smoothed", "the same against orientations optimised anew"),
+    ):
+        yield Figure("Images", f"a camera with an inertial unit, {label}, largest of five seeds: {errors}", wanted, unit,
+                     row(name, "{0} m / {1} deg / {2} m/s / {3} % / {4}"))  # fmt: skip
+    for name in ("data sheet", "in use"):
+        yield Figure("Images", f"exact points in the place of its images, densities of the unit {name}: {errors}", "- / - / - / - / 1", f"{unit} points",
+                     row(f"{name}:", "{1} m / {3} deg / {5} m/s / {7} % / {9}"))  # fmt: skip
     yield Figure("Images", "one camera, desk video, 640 x 480: end off the start, share of the path, largest of five seeds / a frame",
                  "1 % / -", "python benchmarks/vision.py desk", row("desk", "{8} % / {11} ms"))  # fmt: skip
     yield Figure("Images", "one camera that begins before a known target, MonoSLAM's sequence, 1,000 frames, worst of five seeds: medians against the target's PnP of position / angle / middle of the target / its corners; scatter of PnP; matched, least",

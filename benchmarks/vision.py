@@ -2,7 +2,6 @@
 
 python benchmarks/vision.py SEQUENCE [SEEDS]     of `SEQUENCES`; a row a seed, then the worst of them
 python benchmarks/vision.py SEQUENCE+lines       with the lines of the images in the map, too
-python benchmarks/vision.py euroc [SEEDS]        90 images of V1_01 with the inertial unit: errors against the truth
 python benchmarks/vision.py WORLD [SEEDS]        of `WORLDS`, rendered: errors against the truth, ANEES of the pose
 One camera on recorded images is aligned by similarity; what knows its scale and its start is not aligned at all.
 The drift of the scale is that of the second half of the path against the first.  One thread; times are of the
@@ -16,7 +15,6 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import kalmark as km
 from kalmark.arrays import Array
@@ -105,40 +103,6 @@ def run(name: str, seed: int) -> dict[str, float]:
     return found
 
 
-def inertial(seed: int) -> dict[str, float]:
-    """Return the errors of a run with the inertial unit, poses as they are, and NEES of the pose / 6."""
-    config, log = open_run("visual_inertial", None, [f"robots.each.sensors.cam0.detector.seed={seed}"])
-    slam = build_slam(config, log)
-    name, times, means, covariances = log.robots[0], [], [], []
-    for event in log.events:
-        slam.process(event)
-        if isinstance(event, km.Frame):
-            times.append(event.t_ns)
-            means.append(slam.mean(name))
-            covariances.append(slam.covariance(name)[:6, :6])
-    x, P, truth = np.array(means), np.array(covariances), log.truth[name].at(times)
-    v = np.gradient(truth[:, :3], np.array(times) * 1e-9, axis=0)
-    turn = Rotation.from_quat(x[:, 3:7]) * Rotation.from_quat(truth[:, 3:7]).inv()
-    error = np.concatenate([x[:, :3] - truth[:, :3], turn.as_rotvec()], axis=1)
-    nees = np.einsum("ka,kab,kb->k", error[1:], np.linalg.inv(P[1:]), error[1:])  # the first pose is known exactly
-    rms = [float(np.sqrt(np.mean(np.sum(e * e, axis=1)))) for e in (error[:, :3], error[:, 3:], x[:, 7:10] - v)]
-    scale = similarity(x[:, :3], truth[:, :3])[1]
-    return {"position_m": rms[0], "attitude_deg": float(np.degrees(rms[1])), "velocity_mps": rms[2],
-            "scale_percent": 100 * abs(scale - 1), "nees": float(nees.mean()) / 6}  # fmt: skip
-
-
-def print_inertial(seeds: int) -> None:
-    """Print the errors of each seed and the largest of them."""
-    rows = []
-    for seed in range(seeds):
-        rows.append(inertial(seed))
-        print(f"seed {seed}: " + ", ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
-    worst = [max(row[key] for row in rows) for key in rows[0]]
-    print("| sequence | position, m | attitude, deg | velocity, m/s | scale, % | NEES / 6 |")
-    print("|---|---|---|---|---|---|")
-    print("| euroc | {:.3f} | {:.2f} | {:.3f} | {:.1f} | {:.0f} |".format(*worst))
-
-
 def rendered(name: str, seed: int) -> tuple[Array, Array, float]:
     """Return after each image of a world the position's error [m] and the NEES of the pose (6); a frame's time [ms].
 
@@ -183,9 +147,6 @@ def print_rendered(name: str, seeds: int) -> None:
 
 def main(name: str, seeds: int) -> None:
     """Print the figures of each seed and the row of all."""
-    if name == "euroc":
-        print_inertial(seeds)
-        return
     if name in WORLDS:
         print_rendered(name, seeds)
         return

@@ -244,8 +244,8 @@ def test_euroc_has_the_unit_as_robot_and_starts_in_the_true_state(tmp_path: Path
     controls = [event for event in log if isinstance(event, Control)]
     assert (log.format, log.name, len(frames(log))) == ("euroc", "V1", 3)
     assert log.events[0].t_ns == T0 == controls[0].t_ns  # the reading before is held from the first image on
-    assert controls[0].u[2] == 2e-3
-    assert controls[1].t_ns == T0 + 3_000_000
+    assert controls[0].u[2] == 2e-3  # read 2 ms before, of the interval from 4.5 ms before to .5 ms after
+    assert controls[1].t_ns == T0 + 500_000  # read at 3 ms
     assert controls[-1].t_ns <= T0 + 100_000_000
     robot = log.describes["robots"]["robot"]
     assert (robot["motion"]["type"], robot["motion"]["accelerometer_random_walk_mps2_per_sqrt_s"]) == ("inertial", 3e-3)
@@ -261,7 +261,7 @@ def test_euroc_has_the_unit_as_robot_and_starts_in_the_true_state(tmp_path: Path
 
 def test_euroc_without_truth_starts_at_rest_with_all_readings_before(tmp_path: Path) -> None:
     log = km.open_log(euroc(tmp_path, truth=False))
-    assert log.events[0].t_ns == T0 - 12_000_000
+    assert log.events[0].t_ns == T0 - 14_500_000  # half an interval before the first one was read
     assert log.describes["robots"]["robot"]["start"]["at_rest"] is True
     data = tmp_path / "mav0" / "imu0" / "data.csv"
     data.write_text(data.read_text() + f"{T0},0,0,0,0,0,9\n")

@@ -278,3 +278,14 @@ def test_the_velocity_under_a_reading_is_that_at_which_the_unit_moves(motion: An
         np.testing.assert_allclose(np.kron(np.eye(2), Q_t) @ way, motion.body_velocity_under(r, u)[0], atol=1e-4)
         at_rest = motion.body_velocity_under(r, np.full(6, np.nan))[0]
         np.testing.assert_array_equal(at_rest[3:], 0.0)
+
+
+def test_a_unit_that_shakes_shows_its_noise_and_not_the_motion_of_its_vehicle_or_the_hum_of_a_motor() -> None:
+    rng, t = np.random.default_rng(4), np.arange(1200) / 200.0
+    density = np.repeat([0.002, 0.03], 3)
+    white = rng.normal(size=(1200, 6)) * density * np.sqrt(200.0)
+    moved = np.sin(2 * np.pi * 1.5 * t)[:, None] * [1.0, 0.5, 2.0, 3.0, 1.0, 2.0]
+    hum = 0.5 * np.sin(2 * np.pi * 73.0 * t)[:, None] * np.ones(6)
+    assert km.motion.shaken(t, white + moved + hum) == pytest.approx((0.002, 0.03), rel=0.15)
+    assert max(km.motion.shaken(t, moved)) < 1e-3
+    assert km.motion.shaken(t[:200], white[:200]) == (0.0, 0.0)  # too few

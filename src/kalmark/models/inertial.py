@@ -32,6 +32,7 @@ GRAVITY = 16  # where the gravity begins in a state that has it
 INERTIAL_DOF = 15  # of one that has none
 WINDOW_S, WINDOWS = 0.1, 5  # of readings that are compared, and how many of them at least are at rest
 SIGMAS = 5.0  # by which a window at rest may differ from the mean of those before it
+SPECTRUM, BAND_HZ = 128, 10.0  # readings, whose spectrum is taken; what is slower may be the motion of the vehicle
 SHAKEN = 100.0  # times the noise of the data sheet that readings at rest may scatter by: motors run
 
 
@@ -280,6 +281,24 @@ def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) ->
     P[rows, 12:15] = M @ B @ Q
     P[12:15, rows], P[12:15, 12:15] = P[rows, 12:15].T, Q.T @ B @ Q
     return Rest(until_s, state, P)
+
+
+def shaken(t_s: Array, u: Array) -> tuple[float, float]:
+    """Return the densities of white noise, of rate [rad/s/sqrt(Hz)] and force [m/s^2/sqrt(Hz)], of readings u (N, 6).
+
+    At `t_s` (N,).  A vehicle that shakes has more than the data sheet says.  Of the spectrum above what a vehicle
+    itself moves by, in bands, the least counts: a motor that hums has no part in it.  Zero of too few readings.
+    """
+    rate = 1.0 / float(np.median(np.diff(t_s))) if len(t_s) > 2 * SPECTRUM else 0.0
+    if rate < 4.0 * BAND_HZ:
+        return 0.0, 0.0
+    hann = np.hanning(SPECTRUM)[:, None]
+    parts = [u[k : k + SPECTRUM] for k in range(0, len(u) - SPECTRUM + 1, SPECTRUM // 2)]
+    power = np.mean([np.abs(np.fft.rfft((part - part.mean(axis=0)) * hann, axis=0)) ** 2 for part in parts], axis=0)
+    bands = (np.arange(len(power)) * rate / SPECTRUM // BAND_HZ).astype(np.int64)[:-1]
+    least = np.min([power[:-1][bands == k].mean(axis=0) for k in range(1, bands.max() + 1)], axis=0)
+    rate_, force = np.sqrt(least.reshape(2, 3).mean(axis=1) / (rate * np.sum(hann**2))).tolist()
+    return rate_, force
 
 
 def _shortest_turn(v: Array) -> Array:

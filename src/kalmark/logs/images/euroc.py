@@ -1,7 +1,8 @@
 """The layout of EuRoC (Burri and others, 2016), ASL's: `mav0` with cameras, an inertial unit and the true states.
 
 The robot is the inertial unit; `T_BS` of a camera's sensor.yaml is its mount.  The readings from the first image to the
-last drive the robot.  It starts in its true state at the first image where the log has that, else at rest.
+last drive the robot, with the noise of the data sheet or, where the unit shakes, of the readings.  It starts in its
+true state at the first image where the log has that, else at rest.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from kalmark.logs.images.pictures import frames_of
 from kalmark.logs.images.rigs import MOTION, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Times, Trajectory, interpolate
 from kalmark.logs.source import Format, Request, choice, nearest, number, placed, read_text
+from kalmark.models.inertial import shaken
 
 TRUE_STATES = "state_groundtruth_estimate0/data.csv"
 ADIS16448 = {  # the data sheet in EuRoC's imu0/sensor.yaml
@@ -32,6 +34,7 @@ ADIS16448 = {  # the data sheet in EuRoC's imu0/sensor.yaml
 }
 NAMES = dict(zip(("gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density",
                   "accelerometer_random_walk"), ADIS16448, strict=True))  # fmt: skip
+DENSITIES = tuple(ADIS16448)[::2]  # not the walks
 SURE = {
     "sigma_rotation_deg": [1.0, 1.0, 0.0],
     "sigma_v_mps": 0.05,
@@ -69,13 +72,18 @@ def read(path: Path, request: Request, cameras: Any = ("cam0",), imu: Any = "aut
     if readings is None:
         return camera_log("euroc", path, request, frames, sections, MOTION, name=name, truth=truth)
     start = None if states is None else started(states, begin)
-    first = int(np.searchsorted(readings.t_ns, begin, "right")) - 1 if start is not None else 0
+    half_ns = int(np.median(np.diff(readings.t_ns))) // 2 if len(readings.t_ns) > 1 else 0
+    since = readings.t_ns - half_ns  # a reading is of the interval around its time
+    first = int(np.searchsorted(since, begin, "right")) - 1 if start is not None else 0
     if first < 0:
         raise LogError(f"{path / 'imu0'}: the readings begin after the first image, expected some before it")
-    kept = slice(first, int(np.searchsorted(readings.t_ns, end, "right")))
-    times = np.maximum(readings.t_ns[kept], begin) if start is not None else readings.t_ns[kept]  # held from then on
-    controls = [Control(t_ns=t, robot=ROBOT, u=u) for t, u in zip(times.tolist(), readings.rows[kept], strict=True)]
-    motion = {"type": "inertial"} | data_sheet(path / "imu0" / "sensor.yaml")
+    kept = slice(first, int(np.searchsorted(since, end, "right")))
+    times, u = since[kept], readings.rows[kept]
+    held = np.maximum(times, begin) if start is not None else times  # the first one, from the start on
+    controls = [Control(t_ns=t, robot=ROBOT, u=one) for t, one in zip(held.tolist(), u, strict=True)]
+    motion: dict[str, Any] = {"type": "inertial"} | data_sheet(path / "imu0" / "sensor.yaml")
+    for key, density in zip(DENSITIES, shaken(np.asarray(times * 1e-9), u), strict=True):
+        motion[key] = max(motion[key], density)
     return camera_log("euroc", path, request, [*frames, *controls], sections, motion, INERTIAL, name=name, truth=truth,
                       start=AT_REST if start is None else start)  # fmt: skip
 
