@@ -397,6 +397,11 @@ def gaps() -> Iterator[Figure]:
     yield Figure(
         section, "wrong maps without an alarm / right maps with one", "0 / 0", command, row("total", "{2} / {3}")
     )
+    command = "python benchmarks/hall.py --rows --gaps 4 8 --runs 10 --verdict"
+    yield Figure(section, "pillars in rows, gaps of 4 and 8 s in the first round: maps that are right", "95 %", command,
+                 row("total", "{0} of {1}"))  # fmt: skip
+    yield Figure(section, "pillars in rows: wrong maps that the verdict calls ok / right ones that it does not", "0 / 0",
+                 command, row("total", "{2} / {3}"))  # fmt: skip
     section, command = "Walls", "python benchmarks/walls.py"
     for name, wanted in (("invariant", ("3 / 90 %", "0 / 0")), ("ekf", ("", ""))):
         yield Figure(section, f"hall of walls and corners, raw laser, no ids, 50 runs, `{name}`: pose ANEES / steps in its band",

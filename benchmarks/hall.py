@@ -2,12 +2,16 @@
 
     python benchmarks/hall.py                     # gaps of 0 to 16 s, 20 seeds, both wheels, both kinds of controls
     python benchmarks/hall.py --gaps 4 --runs 5 --action ignore
+    python benchmarks/hall.py --rows --gaps 4 8 --verdict
 
 A differential-drive robot drives round a hall of 24 x 16 m by its own odometry, increments or velocities at 10 Hz.  Its
 laser observes pillars within 8 m, without ids, at 5 Hz, and 3 % of its observations are of nothing.  The right wheel is
 1 % larger than its odometry assumes.  A recorder that stops loses scans and controls; the last velocity is then held
 too long.  A line a case: runs with a map that has every pillar once and nothing else, runs with a wrong map and a
 warning about it, runs with a wrong map and none, and runs with a right map and a warning.
+
+With --rows the pillars stand in rows, 3 m by 2.5 m apart and up to .3 m off, and the laser observes those within 5 m: a
+scan looks alike in many places.  The recorder stops in the first round, where it begins again nothing is mapped yet.  With --verdict a warning is a verdict that is not "ok".
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ from scipy.spatial.distance import cdist
 
 import kalmark as km
 from kalmark.arrays import Array
+from kalmark.diagnosis.verdict import diagnose
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log, Trajectory
 from kalmark.results.record import record
@@ -33,9 +38,11 @@ from kalmark.results.truth import Truth
 LONG_M, WIDE_M, PILLARS, APART_M = 24.0, 16.0, 24, 2.5
 ROUND_M = (-8, -4), (8, -4), (8, 4), (-8, 4)  # corners of its way, missed by up to 2 m
 REACH_M, SPURIOUS = 8.0, 0.03
+ROWS, IN_ROWS_M, OFF_M, NEAR_M = (6, 4), (3.0, 2.5), 0.3, 5.0  # how far apart pillars in rows are, off, and observed
 SPEED_MPS, TURN_RADPS, TRACK_M, DT_S = 0.8, 0.8, 0.5, 0.1
 LASTS_S, SCANNED = 180, 2  # controls to a scan
 SIGMA_RANGE_M, SIGMA_BEARING_RAD, SIGMA_WHEEL_MPS = 0.03, 0.01, 0.02
+LATE_S, EARLY_S = (60.0, 90.0), (15.0, 30.0)  # when the recorder stops
 GAPS_S = (0, 2, 4, 8, 16)
 RIGHT_M = 0.5  # a landmark of the map this near to a pillar is that pillar
 ALARM = "map"  # a warning with this word is about it
@@ -56,6 +63,12 @@ def pillars(rng: np.random.Generator) -> Array:
     return np.array(places)
 
 
+def in_rows(rng: np.random.Generator) -> Array:
+    """Return the places (24, 2) of pillars in rows."""
+    at = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in ROWS)), axis=-1).reshape(-1, 2)
+    return np.asarray(at * IN_ROWS_M + rng.uniform(-OFF_M, OFF_M, at.shape))
+
+
 def way(rng: np.random.Generator) -> tuple[Array, Array]:
     """Return the true poses (N + 1, 3) and the speeds and turn rates (N, 2) between them of a drive about the hall."""
     pose, poses, controls, turns = np.array([-8.0, -4.0, 0.0]), [], [], itertools.cycle(ROUND_M)
@@ -70,11 +83,12 @@ def way(rng: np.random.Generator) -> tuple[Array, Array]:
     return np.array([*poses, pose]), np.array(controls)
 
 
-def hall(seed: int, gap_s: float = 0.0, bad_wheel: bool = True, held: bool = False) -> Log:
+def hall(seed: int, gap_s: float = 0.0, bad_wheel: bool = True, held: bool = False, rows: bool = False) -> Log:
     """Return the log of a drive; `held` has velocities instead of increments."""
     rng = np.random.default_rng(seed)
-    places, (poses, controls) = pillars(rng), way(rng)
-    begin = int(rng.uniform(60.0, 90.0) / DT_S)
+    places, (poses, controls) = in_rows(rng) if rows else pillars(rng), way(rng)
+    reach_m = NEAR_M if rows else REACH_M
+    begin = int(rng.uniform(*(EARLY_S if rows else LATE_S)) / DT_S)
     lost = range(begin, begin + round(gap_s / DT_S))
     events: list[km.Control | km.Scan] = []
     for k, (v, w) in enumerate(controls):
@@ -88,7 +102,7 @@ def hall(seed: int, gap_s: float = 0.0, bad_wheel: bool = True, held: bool = Fal
             step = km.motion.Unicycle().move(np.zeros(3), told, DT_S)[0]
             if k not in lost:
                 events.append(km.Control(t_ns=then, robot="rover", u=step))
-        y = sight(poses[k + 1], places, rng)
+        y = sight(poses[k + 1], places, rng, reach_m)
         if k % SCANNED == SCANNED - 1 and k not in lost:
             events.append(km.Scan(t_ns=then, robot="rover", sensor="laser", y=y))
     times = np.round(np.arange(len(poses)) * DT_S * 1e9).astype(np.int64)
@@ -99,11 +113,11 @@ def hall(seed: int, gap_s: float = 0.0, bad_wheel: bool = True, held: bool = Fal
     )  # fmt: skip
 
 
-def sight(pose: Array, places: Array, rng: np.random.Generator) -> Array:
+def sight(pose: Array, places: Array, rng: np.random.Generator, reach_m: float) -> Array:
     """Return ranges and bearings (K, 2) of the pillars in reach, some of which are of nothing."""
     y = km.geometry.observe(pose, places)[0] + rng.normal(size=(len(places), 2)) * (SIGMA_RANGE_M, SIGMA_BEARING_RAD)
-    y = y[y[:, 0] < REACH_M]
-    spurious = np.column_stack([rng.uniform(0.5, REACH_M, len(y)), rng.uniform(-np.pi, np.pi, len(y))])
+    y = y[y[:, 0] < reach_m]
+    spurious = np.column_stack([rng.uniform(0.5, reach_m, len(y)), rng.uniform(-np.pi, np.pi, len(y))])
     return np.where(rng.random(len(y))[:, None] < SPURIOUS, spurious, y)
 
 
@@ -128,9 +142,11 @@ def right(run: Run, log: Log) -> bool:
     return apart.shape == (PILLARS, PILLARS) and bool((apart[rows, columns] < RIGHT_M).all())
 
 
-def alarmed(run: Run) -> bool:
-    """Return whether a run warns about its map, without the truth."""
+def alarmed(run: Run, verdict: bool = False) -> bool:
+    """Return whether a run warns about its map, without the truth, or whether the `verdict` on it does."""
     blind = replace(run, truth=Truth(np.full_like(run.truth.poses, np.nan)))
+    if verdict:
+        return diagnose(blind).map != "ok"
     return any(ALARM in line for line in blind.evaluate()["warnings"])
 
 
@@ -140,15 +156,17 @@ def main() -> None:
     parser.add_argument("--gaps", type=float, nargs="*", default=(0, 2, 4, 8, 16), help="seconds")
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--action", default="widen")
+    parser.add_argument("--rows", action="store_true")
+    parser.add_argument("--verdict", action="store_true")
     options = parser.parse_args()
     print("controls    wheel  gap s   right  wrong, said  wrong, not said  right, alarm")
     total = Counter[tuple[bool, bool]]()
     for held, bad, gap_s in itertools.product((False, True), (False, True), options.gaps):
         counts = Counter[tuple[bool, bool]]()
         for seed in range(options.runs):
-            log = hall(seed, gap_s, bad, held)
+            log = hall(seed, gap_s, bad, held, options.rows)
             run = mapped(log, held, options.action)
-            counts[right(run, log), alarmed(run)] += 1
+            counts[right(run, log), alarmed(run, options.verdict)] += 1
         total += counts
         good = counts[True, True] + counts[True, False]
         which = f"{'velocities' if held else 'increments'}  {'+1 %' if bad else 'true':>5}  {gap_s:>5g}"

@@ -167,6 +167,19 @@ def test_where_two_matchings_are_alike_the_automatic_choice_holds_them_back_and_
         np.testing.assert_array_equal(slam.mean("r"), before)
 
 
+@pytest.mark.parametrize(("built_alike", "outcome"), [(False, "associated"), (True, "deferred")])
+def test_a_lost_robot_takes_no_matching_of_which_all_but_a_pair_fits_elsewhere(built_alike: bool, outcome: str) -> None:
+    place = np.array([[4.0, 0.0], [7.0, 1.0], [5.5, 4.0], [2.0, -5.0], [9.0, -3.0]])
+    again = km.geometry.from_frame(np.array([12.0, 9.0, 2.0]), place[:4])[0]
+    mount = km.Mount(km.sensors.Position2D(0.05))
+    robot = km.Robot("r", km.motion.Odometry2D(), cov=np.diag([30.0, 30.0, 1.8]) ** 2, sensors={"s": mount})
+    slam = km.Slam([robot], km.association.Automatic())
+    for i, point in enumerate(np.vstack([place, again]) if built_alike else place):
+        slam.add_landmark(i, point, 1e-4 * np.eye(2))
+    report = slam.process(km.Scan(1, "r", "s", place))
+    assert {o.outcome for o in report.observations} == {outcome}
+
+
 def test_a_search_that_was_not_finished_says_nothing_about_what_is_not_there() -> None:
     rng = np.random.default_rng(5)
     points, truth = jittered_grid(rng), np.array([0.2, -0.2, 0.02])

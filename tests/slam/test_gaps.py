@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from hall import alarmed, hall, mapped, right
 import kalmark as km
 from kalmark.association.relocalization import aligned
 from kalmark.batch.course import Chain
+from kalmark.diagnosis.verdict import diagnose
 from kalmark.errors import EventError, ModelError
 from kalmark.report import Gap
 
@@ -134,6 +136,57 @@ def test_a_robot_lost_in_a_gap_finds_its_place_in_the_hall_again(held: bool) -> 
     assert gap["end_s"] - gap["start_s"] == pytest.approx(16.0, abs=0.2)
     assert gap["known_s"] - gap["end_s"] < 1.0
     assert any("of rover" in line for line in run.evaluate()["notes"])
+
+
+def test_a_robot_lost_among_pillars_in_rows_waits_until_its_scan_fits_in_one_place_only() -> None:
+    log = hall(2, gap_s=8.0, rows=True)
+    run = mapped(log)
+    assert right(run, log)
+    (gap,) = run.evaluate()["gaps"]
+    assert gap["known_s"] - gap["end_s"] > 20.0
+    assert diagnose(run).map == "ok"  # what was left open meanwhile contradicts nothing
+    early = replace(log, events=[e for e in log.events if e.t_ns < gap["known_s"] * 1e9 - 10e9])
+    verdict = diagnose(mapped(early))
+    assert (verdict.map, verdict.causes[0].name) == ("doubtful", "gap")
+    assert verdict.causes[0].evidence.endswith("and it was not localized again")
+
+
+def adrift() -> km.Slam:
+    """Return the filter of a robot that may be anywhere, heading any way, since a gap."""
+    robot = km.Robot("r", km.motion.Odometry2D(), sensors=LASER, max_speed_mps=1.0, max_turn_radps=10.0)
+    slam = km.Slam([robot], km.association.Automatic())
+    for k in range(1, 41):
+        slam.process(km.Control(0.1 * k, "r", STEP))
+    slam.process(km.Control(7.0, "r", STEP))
+    return slam
+
+
+def test_a_robot_adrift_takes_no_single_landmark_for_the_only_one_near_it() -> None:
+    slam = adrift()
+    ahead = km.geometry.from_frame(slam.mean("r"), np.array([[1.0, 0.0], [90.0, 5.0], [90.0, 9.0]]))[0]
+    for i, point in enumerate(ahead):
+        slam.add_landmark(i, point, 1e-4 * np.eye(2))
+    (seen,) = slam.process(km.Scan(7.0, "r", "laser", [[1.0, 0.0]])).observations
+    assert seen.outcome != "associated"
+
+
+@pytest.mark.parametrize("built_alike", [False, True])
+def test_a_robot_adrift_is_only_moved_to_where_its_scan_is_recognised(built_alike: bool) -> None:
+    slam, truth = adrift(), np.array([1.5, -1.0, -2.0])
+    place = np.array([[5.5, -1.0], [4.5, 2.0], [-0.5, 1.5], [0.5, -5.0], [3.5, -4.0]])
+    again = km.geometry.from_frame(np.array([8.0, 3.0, 2.0]), place[:4])[0]
+    for i, point in enumerate(np.vstack([place, again]) if built_alike else place):
+        slam.add_landmark(i, point, 1e-4 * np.eye(2))
+    before = slam.mean("r")
+    report = slam.process(km.Scan(7.0, "r", "laser", km.geometry.observe(truth, place)[0]))
+    assert {o.outcome for o in report.observations} == {"deferred" if built_alike else "associated"}
+    np.testing.assert_allclose(slam.mean("r"), before if built_alike else truth, atol=0.03)
+
+
+def test_a_robot_that_turns_for_the_first_time_after_a_gap_has_a_gap() -> None:
+    slam = odometer()
+    turning = km.Control(7.0, "r", (0.08, 0.0, 0.1))  # five times as much as in any tenth before
+    assert len(slam.process(turning).gaps) == 1
 
 
 def test_a_gap_that_is_ignored_doubles_the_map_and_is_warned_of() -> None:

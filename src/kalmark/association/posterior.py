@@ -30,12 +30,14 @@ class Posterior(NamedTuple):
     """Matchings (N, K), each the number of the landmark paired with each observation, -1 for none; their weights (N,).
 
     The likeliest comes first.  `chance` bounds how many matchings as good as that one are expected among things that
-    are not in the map; `finished` tells whether the search was.
+    stand anywhere; `elsewhere` is how many there are that have at most a pair less and are of another pose: in rows of
+    landmarks, these tell what chance does.  `finished` tells whether the search was.
     """
 
     pairs: Index
     weights: Array
     chance: float
+    elsewhere: int
     finished: bool
 
     def shares(self) -> Array:
@@ -98,10 +100,13 @@ def posterior(
     pairs = np.concatenate([pairs, without])
     likely = np.argsort(-scores, kind="stable")
     weights = np.exp(scores[likely] - scores[likely[0]])
-    count = int((pairs[likely[0]] >= 0).sum())
+    first = pairs[likely[0]]
+    count = int((first >= 0).sum())
     ratio = scores[likely[0]] - _log_share(count, len(d2), experience)  # of likelihoods: has the mean 1 by chance
     chance = math.comb(len(d2), count) * math.exp(-ratio) if count else math.inf
-    return Posterior(pairs[likely], weights / weights.sum(), chance, finished)
+    alike = ((found == first) & (found >= 0)).sum(axis=1)
+    elsewhere = int(((alike < p) & ((found >= 0).sum(axis=1) >= count - 1)).sum())
+    return Posterior(pairs[likely], weights / weights.sum(), chance, elsewhere, finished)
 
 
 def _score(

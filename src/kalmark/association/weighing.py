@@ -29,7 +29,8 @@ class Weighing(Gated):
     """Matchings as wholes, of landmarks however many are inside a gate.
 
     What is likely not to be in the map, by all matchings together, is new.  Where a gate holds more than one landmark
-    on average, not counting those just seen, the robot is lost: pairs are then not held against the pose one by one.
+    on average, not counting those just seen, or its heading is unknown, the robot is lost: pairs are then not held
+    against the pose one by one.
     """
 
     most_nodes: Annotated[Count, "Comparisons of pairs after which the search ends."] = 5_000_000
@@ -44,7 +45,7 @@ class Weighing(Gated):
 
     def near(self, query: Query, open_: Index, gate: float, nearest: int = 0) -> tuple[list[Id], Array]:
         """Return candidates, so many that each observation has one outside its gate, and d2 (K, L)."""
-        nearest = nearest or self.nearest
+        nearest = nearest or (WIDEST if query.scan.adrift else self.nearest)
         names, d2 = super().near(query, open_, gate, nearest)
         if nearest < WIDEST and ((d2 <= gate).sum(axis=1) >= nearest).any():
             return self.near(query, open_, gate, 4 * nearest)
@@ -59,9 +60,9 @@ class Weighing(Gated):
         just = np.zeros(d2.shape, dtype=np.bool_)
         just[rows, columns] = together.log_volume_ratio(open_[rows], columns) <= WELL_KNOWN
         crowded, fit = expected_in_gate(np.where(just, np.inf, d2), gate, query.dof()).max(), d2 <= gate
-        if crowded <= CLEAR and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
+        lost = query.scan.adrift or crowded > 1
+        if not lost and crowded <= CLEAR and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
             return GlobalAssignment.match(self, query, open_, names, d2, gate)  # type: ignore[arg-type]
-        lost = crowded > 1
         far = chi2_gate(self.new_gate, query.dof())
         near: Flags = np.isfinite(d2) if lost else fit  # far off, the distances themselves are not to be trusted
         found = posterior(together, open_, d2, near, query.dof(), self.gate, self.most_nodes, query.experience())
@@ -94,8 +95,8 @@ class Automatic(Weighing):
 
     Where gates are small against the gaps between landmarks, that is the global assignment.  Elsewhere the likeliest of
     the matchings whose pairs agree with each other is taken (`posterior`), and of it each pair that is at least as
-    probable as `confidence`; the others are deferred.  Where there is more than one landmark in a gate on average, the
-    robot is lost, and a matching is only taken if it holds most of the scan and none as good is expected by chance.
+    probable as `confidence`; the others are deferred.  A matching of a lost robot is only taken if it holds most of the
+    scan, none as good is expected by chance, and none with a pair less is of another pose.
     """
 
     confidence: Annotated[
@@ -105,8 +106,9 @@ class Automatic(Weighing):
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
         """Choose the most probable matching, defer its uncertain pairs; `near` (K,) as in `choose` above."""
         count = int((found.pairs[0] >= 0).sum())
-        if lost and (found.chance > BY_CHANCE or 2 * count <= len(near)):
+        if lost and (found.chance > BY_CHANCE or found.elsewhere or 2 * count <= len(near)):
             why = f"its scan is ambiguous: {count} pairs, {found.chance:.1g} matchings as good are expected by chance"
+            why += f", {found.elsewhere} with at most a pair less fit from elsewhere"
             why = why if count else "no matching of its scan is likely"
             return Matched(np.full(len(near), REMAP), dict.fromkeys(range(len(near)), why))
         pairs, shares = found.pairs[0].copy(), found.shares()

@@ -31,7 +31,7 @@ from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.models.sensors import Wall
 from kalmark.results.batch import filtered_map, given_by, log_of, of_the_filter_alone
-from kalmark.results.gaps import RULED_OUT, left_out, matters
+from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
 from kalmark.results.measures import cut_off, rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
@@ -165,9 +165,8 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         first = [*before, *(_as_well(c, before) for c in first)]
     causes = [*first, *(c for c in causes if c not in first)]
     causes.sort(key=lambda c: c.harmless)
-    wrong = any(misplaced(run, f) for f in found.search.found) or any(
-        c.name in ("misplaced_landmark", "split_landmarks", MISFIT) and not c.harmless for c in first
-    )
+    wrong = any(misplaced(run, f) for f in found.search.found) or any(map(stayed_lost, run.summary.get("gaps", ())))
+    wrong |= any(c.name in ("misplaced_landmark", "split_landmarks", MISFIT) and not c.harmless for c in first)
     if any(c.name == "kidnapped" for c in first):
         effect = replace(effect, status="wrong")
     elif effect.status == "ok" and wrong:
@@ -513,9 +512,8 @@ def gaps(run: Run) -> list[Cause]:
         lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
         anew = any(_mapped_again(run, part, gap["start_s"]) for part in summary.get("repeats", ()))
         cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
-        told = (
-            ", which was bridged" if bridged and not anew else ", and places are mapped again after it" if anew else ""
-        )
+        told = ", and it was not localized again" if stayed_lost(gap) else ", which was bridged" if bridged else ""
+        told = ", and places are mapped again after it" if anew else told
         evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s{told}"
         cure = cure or ("--set upkeep.repeats=merge" if anew else "")
         found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged and not anew))

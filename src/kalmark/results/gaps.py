@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Flags
 from kalmark.report import Gap
 from kalmark.results.history import History
 from kalmark.results.recording import Recording
@@ -49,6 +50,16 @@ def gap_figures(run: Recording) -> list[dict[str, Any]]:
     ]
 
 
+def while_lost(history: History) -> Flags:
+    """Return at which steps (S,) a robot is not known again after a gap."""
+    out = np.zeros(len(history.t_ns), dtype=np.bool_)
+    for gap in history.gaps:
+        known_s = _known_s(history, gap) if gap.sigma_m > 0.0 else gap.end_ns * 1e-9
+        until_ns = np.inf if known_s is None else known_s * 1e9 - 1.0
+        out |= (history.robot == gap.robot) & (history.t_ns >= gap.start_ns) & (history.t_ns < until_ns)
+    return out
+
+
 def _known_s(history: History, gap: Gap) -> float | None:
     later = np.flatnonzero((history.robot == gap.robot) & (history.t_ns >= gap.end_ns))
     sigma = np.sqrt(np.trace(history.covariance[later, : history.d, : history.d], axis1=1, axis2=2) / history.d)
@@ -67,6 +78,11 @@ def _before(history: History, gap: Gap) -> float:
 def matters(gap: dict[str, Any]) -> bool:
     """Return whether a gap left the pose so uncertain that it is worth a line."""
     return max(gap["sigma_m"], gap["sigma_rad"]) > NOTED and gap["end_s"] - gap["start_s"] > NOTED_S
+
+
+def stayed_lost(gap: dict[str, Any]) -> bool:
+    """Return whether a robot was not localized again after a gap that was bridged."""
+    return gap["action"] == "widen" and gap["known_s"] is None and matters(gap)
 
 
 def left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
@@ -104,5 +120,5 @@ def gap_warnings(gaps: list[dict[str, Any]]) -> Iterator[str]:
         since = f"from t={gap['start_s']:.1f} s in the log"
         if gap["action"] == "ignore":
             yield f"{lasts} {since}, which was ignored: the map may be wrong from there on; robots.each.gaps=widen"
-        elif gap["known_s"] is None and matters(gap):
+        elif stayed_lost(gap):
             yield f"{lasts} {since}: it was not localized again, the map may be wrong from there on"

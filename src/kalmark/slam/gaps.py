@@ -33,7 +33,7 @@ KEPT = (
     "last_ns", "since_ns", "until_ns", "left_out_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest",
     "adrift",
 )  # fmt: skip
-WHOLE = 1.5  # an increment so much larger than any before is of the whole gap: its odometry went on
+WHOLE = 1.5  # an increment at least so much larger than any before is of the whole gap: its odometry went on
 RULED_OUT = 1.5  # times the limits of the robot: no such motion, but a jump of its odometry
 
 
@@ -163,11 +163,15 @@ class Gaps:
         return D if D.any() else None
 
     def _is_of_all(self, t_ns: int, u: Array | None) -> bool:
-        """Return whether an increment is of the whole gap: larger than any usual one, yet possible in that time."""
+        """Return whether an increment is of the whole gap: far larger than any usual one, yet possible in that time.
+
+        All of N usual intervals are N times as large as one, and sqrt(N) lies between: a robot that has driven straight
+        ahead until then may be turning when its odometry comes back.
+        """
         if u is None or self.last_ns is None or self.since_ns is not None:
             return False
-        usual_s, gap_s = self.usual_ns * 1e-9, (t_ns - self.last_ns) * 1e-9
-        larger = (np.abs(u) > WHOLE * self.largest * usual_s).any()
+        usual_s, gap_s = max(self.usual_ns, 1) * 1e-9, (t_ns - self.last_ns) * 1e-9
+        larger = (np.abs(u) > max(WHOLE, math.sqrt(gap_s / usual_s)) * self.largest * usual_s).any()
         return bool(larger and (np.abs(u) <= MARGIN * self.largest * gap_s).all())
 
     def _reached(self, t_ns: int) -> Array:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.association.global_start import Located, is_lost, located
+from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
-from kalmark.association.relocalization import relocalized as found_again
+from kalmark.association.relocalization import relocalized
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose, inverse
 from kalmark.slam.state import State
@@ -32,21 +34,36 @@ def started(state: State, scan: ScanContext, query: Query) -> Located | None:
     return found
 
 
-def relocalized(state: State, scan: ScanContext, query: Query) -> Query:
-    """Move a robot whose heading a gap has left unknown to where its scan fits; return what to ask then."""
-    held = state.moving[scan.event.robot].held
-    if not held.is_adrift:
-        return query
-    if len(scan.pose()) != 3 or state.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2:
-        held.recovered()
-        return query
-    T = None
-    with suppress(np.linalg.LinAlgError):
-        T = found_again(query)
+def decided(
+    state: State, scan: ScanContext, query: Query, decide: Callable[[Query], Sequence[Decision]]
+) -> tuple[Query, Sequence[Decision]]:
+    """Return what was asked and the decisions on a scan; a robot adrift is moved first.
+
+    It is moved to where its scan fits, and stays there if the association recognises a landmark from there.
+    """
+    T, before = _fitting(state, scan, query), state.map.mean(scan.robot)
     if T is None:
-        return query
+        return query, decide(query)
     _put(state, scan, T)
-    return Query(scan)
+    moved = Query(scan)
+    decisions = decide(moved)
+    if not any(name in state.tracks.confirmed or name in state.tracks.known for name, _ in decisions):
+        state.map.set_predicted(scan.robot, before)
+        moved = Query(scan)
+        decisions = decide(moved)
+    return moved, decisions
+
+
+def _fitting(state: State, scan: ScanContext, query: Query) -> Array | None:
+    """Return where the sensor (3,) of a robot adrift is; None of others, or if its scan fits nowhere."""
+    held = state.moving[scan.event.robot].held
+    if held.is_adrift and (len(scan.pose()) != 3 or state.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2):
+        held.recovered()
+    scan.adrift = held.is_adrift
+    if scan.adrift:
+        with suppress(np.linalg.LinAlgError):
+            return relocalized(query)
+    return None
 
 
 def placed_again(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:

@@ -267,8 +267,11 @@ class Slam(Estimate):
             fate = [Observation(k, i, "deferred", None, None, located.why) for k, i in enumerate(scan.ids)]
             scan.report.observations = fate
             return
-        query = locating.relocalized(state, scan, query) if located is None else Query(scan)
-        decisions = self._decided(policy, query, located.decisions if located is not None else None)
+        if located is None:
+            query, decisions = locating.decided(state, scan, query, lambda asked: self._decided(policy, asked))
+        else:
+            query = Query(scan)
+            decisions = self._decided(policy, query, located.decisions)
         state.tracks.learn(*query.learned)
         names = [name for name, _ in decisions]
         groups = state.tracks.by_model(scan.channel, names, scan.event.robot)
@@ -291,7 +294,7 @@ class Slam(Estimate):
             found = list(seen.values())
         scan.report.observations = tuple(found)
 
-    def _decided(self, policy: Policy, query: Query, told: list[Decision] | None) -> Sequence[Decision]:
+    def _decided(self, policy: Policy, query: Query, told: list[Decision] | None = None) -> Sequence[Decision]:
         """Ask the association, unless it has `told`; where its numbers are singular, only ids say what was observed."""
         try:
             decisions = policy.association.associate(query) if told is None else told

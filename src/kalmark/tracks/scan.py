@@ -40,7 +40,8 @@ class Start(NamedTuple):
 class ScanContext:
     """A scan of K observations with their ids and noise R (K, p, p), and the state it is read against.
 
-    `robot` is the slot of the robot that observes, `report` the answer that is being made.
+    `robot` is the slot of the robot that observes, `report` the answer that is being made.  A robot is `adrift` while a
+    gap leaves its heading unknown.
     """
 
     map: Map
@@ -53,6 +54,7 @@ class ScanContext:
     ids: tuple[Id | None, ...]
     R: Array
     report: Report = field(repr=False)
+    adrift: bool = False
 
     @property
     def y(self) -> Array:
