@@ -11,7 +11,8 @@ too long.  A line a case: runs with a map that has every pillar once and nothing
 warning about it, runs with a wrong map and none, and runs with a right map and a warning.
 
 With --rows the pillars stand in rows, 3 m by 2.5 m apart and up to .3 m off, and the laser observes those within 5 m: a
-scan looks alike in many places.  The recorder stops in the first round, where it begins again nothing is mapped yet.  With --verdict a warning is a verdict that is not "ok".
+scan looks alike in many places.  The recorder stops in the first round, where it begins again nothing is mapped yet.
+With --verdict a warning is a verdict that is not "ok".
 """
 
 from __future__ import annotations
