@@ -507,6 +507,17 @@ def images() -> Iterator[Figure]:
     yield Figure("Images", "one camera that begins before a known target, MonoSLAM's sequence, 1,000 frames, worst of five seeds: medians against the target's PnP of position / angle / middle of the target / its corners; scatter of PnP; matched, least",
                  "0.01 m / 1 deg / - / - / - / never lost", "python benchmarks/vision_target.py",
                  row("target", "{0} m / {1} deg / {2} m / {3} px / {4} m / {8}"))  # fmt: skip
+    batch = "python benchmarks/vision_target.py batch"
+    off = "{5} m, {7} deg / {1} m, {3} deg / {9} m, {11} deg / {13}, {15} px / {17}, {19} px"
+    yield Figure("Images", "the same, every eighth frame, medians, three seeds: filter against a batch solution / filter against PnP / batch solution against PnP; corners under the batch solution, withheld from it / under PnP, under PnP of the frames before and after, moved as the filter",
+                 "0.01 m, 1 deg / 0.01 m, 1 deg / - / - / -", batch,
+                 row("batch, median:", off))  # fmt: skip
+    for label, start in (
+        ("the focal length of batch solution and PnP times 0.99", "focal length times 0.99:"),
+        ("the focal length of batch solution and PnP times 1.01", "focal length times 1.01:"),
+        ("corners of 0.05 px in the batch solution, 0.3 px elsewhere", "corners of 0.05 px:"),
+    ):
+        yield Figure("Images", f"the same, one seed, {label}", "-", batch, row(f"batch, seed 0, {start}", off))
     worlds = {"": "one camera", "_depth": "a camera with depth", "_stereo": "a rectified pair"}
     for name, label in ((f"textured_room{kind}", label) for kind, label in worlds.items()):
         yield Figure("Images", f"`{name}`, {label}, 450 rendered images, five seeds: largest RMS of the position, not aligned / ANEES of the pose, a dof / in its band / a frame",

@@ -1,21 +1,32 @@
 """One camera that begins before a known target: its poses against those that PnP of the target gives in each image.
 
-python benchmarks/vision_target.py [SEEDS]     MonoSLAM's sequence, `monoslam`: a row a seed, then the worst of them
+python benchmarks/vision_target.py [SEEDS]            MonoSLAM's sequence, `monoslam`: a row a seed, the worst of them
+python benchmarks/vision_target.py batch [SEEDS]      the same against a batch solution; its variations with seed 0
 
 The target is found as a dark quadrangle in a bright frame, its corners as the intersections of lines fitted to its
 sides, the pose by PnP of a plane (Collins and Bartoli 2014).  That has two solutions; seen from the front both fit
 nearly as well, so the one nearer to the filter's counts.  What such a pose is worth is its scatter: the camera moves
 smoothly, so the position must be near the mean of those of the frames before and after.  Where the middle of the target
 is in the camera's frame does not depend on the tilt, and is known far better.
+
+The batch solution (bundle adjustment, Triggs and others 2000; GTSAM) has the poses of every 8th frame and the points
+of the map.  It fits the filter's matches of points and the corners of the target, whose places alone are held.  The
+matches of the filter with the corners are not in it, nor its start, motion and prior of depths.  It says nothing of
+errors in what both have: matches, lens, intrinsics and the size of the target.  Residuals of the corners are printed
+under the batch solution; under one from which the corners of every other frame were withheld, in those frames; under
+PnP of the same image, and under the mean of PnP's poses in the images before and after, each moved by the motion of
+the filter between the two frames.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -30,6 +41,18 @@ LEVELS = range(60, 121, 15)  # grey values below which the target may be
 LEAST_PX2, MOST_PX2, SIDES = 250, 12_000, (1.15, 1.8)
 OFF_PX = 3.5  # a side is looked for so far from the contour
 FITS_PX = 0.5  # RMS of the corners of a pose that is used
+EVERY, SIGMA_PX, HUBER = 8, 0.3, 3.0  # of the batch solution: frames, noise of matches and corners, sigmas
+LEAST_SEEN, LEAST_PARALLAX, LEAST_M = 6, 1e-3, 0.05  # of a point: frames, least eigenvalue of its information, depth
+FOCAL, CORNERS_PX = (0.99, 1.01), 0.05  # variations: factors of the focal length, noise of the corners
+
+
+class View(NamedTuple):
+    """A frame: the filter's pose (7,), its matches (2,) [px], how many were of known landmarks, the corners (4, 2)."""
+
+    T: Array
+    matches: dict[Any, Array]
+    associated: int
+    corners: Array | None
 
 
 def quadrangle(image: Any) -> Array | None:
@@ -80,15 +103,28 @@ def side(image: Any, camera: PinHole, a: Array, b: Array) -> tuple[Array, float]
     return n, float(n @ x.mean(axis=0))
 
 
-def poses(image: Any, camera: PinHole) -> list[Array]:
-    """Return the poses (7,) from which an image may show the target, at most two, none where it is not found."""
+def corners(image: Any, camera: PinHole) -> Array | None:
+    """Return the pixels (4, 2) of the target's corners, none where it is not found."""
     q = quadrangle(image)
     if q is None:
-        return []
+        return None
     lines = [side(image, camera, a, b) for a, b in pairwise([*q, q[0]])]
     x = [np.linalg.solve([n, m], [c, d]) for (n, c), (m, d) in pairwise([lines[-1], *lines])]
+    return camera.expect(np.column_stack([x, np.ones(4)]))[0]
+
+
+def plane(camera: PinHole, y: Array) -> Array:
+    """Return the points (K, 2) on the plane z = 1 that are seen at the pixels y (K, 2)."""
+    rays = camera.rays(y)
+    return rays[:, :2] / rays[:, 2:]
+
+
+def poses(y: Array | None, camera: PinHole) -> list[Array]:
+    """Return the poses (7,), at most two, from which the target's corners are seen at y (4, 2)."""
+    if y is None:
+        return []
     _, turns, shifts, errors = cv2.solvePnPGeneric(
-        CORNERS, np.array(x)[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        CORNERS, plane(camera, y)[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
     )
     found = []
     for turn, shift, error in zip(turns, shifts, errors, strict=True):
@@ -96,6 +132,11 @@ def poses(image: Any, camera: PinHole) -> list[Array]:
         if error[0] * camera.fx_px < FITS_PX:
             found.append(np.append(-back.apply(shift.ravel()), back.as_quat()))
     return found
+
+
+def nearest(found: list[Array], T: Array) -> Array | None:
+    """Return the pose of these whose rotation is nearest to that of T (7,)."""
+    return min(found, key=lambda p: angle(p[3:], T[3:]), default=None)
 
 
 def seen(camera: PinHole, T: Array) -> Array:
@@ -108,34 +149,151 @@ def angle(q: Array, p: Array) -> float:
     return float(np.degrees((Rotation.from_quat(q).inv() * Rotation.from_quat(p)).magnitude()))
 
 
-def run(seed: int) -> dict[str, float]:
-    """Return the figures of one run."""
+def views(seed: int) -> tuple[PinHole, list[View]]:
+    """Run the filter; return its camera and what each frame gave."""
     config, log = open_run("monoslam", None, [f"robots.each.sensors.camera.detector.seed={seed}"])
     slam = build_slam(config, log)
     (channel,) = slam.state.channels.values()
-    rows, least, path = [], np.inf, []
+    made = []
     for frame in log.events:
         image = frame.grey()  # type: ignore[union-attr]
         report = slam.process(frame)
-        T = slam.mean(frame.robot)[:7]
-        if path:  # the first image has the target alone
-            least = min(least, sum(o.outcome == "associated" for o in report.observations))
-        found = poses(image, channel.sensor)
-        path.append(np.full(3, np.nan))
-        if found:
-            near = min(found, key=lambda p: angle(p[3:], T[3:]))
-            path[-1] = near[:3]
+        matched = [o for o in report.observations if o.outcome in ("new", "associated")]
+        made.append(
+            View(
+                T=slam.mean(frame.robot)[:7].copy(),
+                matches={o.landmark: report.y[o.index].copy() for o in matched},
+                associated=sum(o.outcome == "associated" for o in matched),
+                corners=corners(image, channel.sensor),
+            )
+        )
+    return channel.sensor, made
+
+
+def run(seed: int) -> dict[str, float]:
+    """Return the figures of one run."""
+    camera, frames = views(seed)
+    rows, path = [], []
+    for view in frames:
+        near, T = nearest(poses(view.corners, camera), view.T), view.T
+        path.append(np.full(3, np.nan) if near is None else near[:3])
+        if near is not None:
             middle = Rotation.from_quat(near[3:]).inv().apply(near[:3]) - Rotation.from_quat(T[3:]).inv().apply(T[:3])
-            moved = seen(channel.sensor, near) - seen(channel.sensor, T)
-            px = np.sqrt(np.mean(np.sum(moved**2, axis=1)))
+            px = apart(seen(camera, near), seen(camera, T))
             rows.append([np.linalg.norm(near[:3] - T[:3]), angle(near[3:], T[3:]), np.linalg.norm(middle), px])
     p = np.array(path)
     scatter = np.linalg.norm(p[1:-1] - (p[:-2] + p[2:]) / 2, axis=1) / np.sqrt(1.5)  # of the noise of one
     off, turned, middle, px = np.median(rows, axis=0)
+    least = min(view.associated for view in frames[1:])  # the first image has the target alone
     return {
         "position_m": off, "angle_deg": turned, "middle_m": middle, "corners_px": px,
         "scatter_m": float(np.nanmedian(scatter)), "frames": len(rows), "of": len(path), "matched_least": least,
     }  # fmt: skip
+
+
+def apart(y: Array, x: Array) -> float:
+    """Return the RMS over points of the distance between pixels (K, 2)."""
+    return float(np.sqrt(np.mean(np.sum((y - x) ** 2, axis=1))))
+
+
+def place(T: Array, rays: Array) -> Array | None:
+    """Return the point (3,) nearest to these rays (K, 3) of cameras at T (K, 7), none where they leave it open."""
+    turn, p = Rotation.from_quat(T[:, 3:]), T[:, :3]
+    r = turn.apply(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    across = np.eye(3) - r[:, :, None] * r[:, None, :]
+    if len(T) < LEAST_SEEN or np.linalg.eigvalsh(across.sum(axis=0))[0] < LEAST_PARALLAX:
+        return None
+    x = np.linalg.solve(across.sum(axis=0), np.einsum("kij,kj->i", across, p))
+    return x if turn.inv().apply(x - p)[:, 2].min() > LEAST_M else None
+
+
+def solve(some: list[View], camera: PinHole, corners_px: float = SIGMA_PX) -> Array:
+    """Return the poses (N, 7) of these views that fit matches and corners best, these with that noise."""
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    X, L, C = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L, gtsam.symbol_shorthand.C)
+    lens = gtsam.Cal3_S2(camera.fx_px, camera.fy_px, 0.0, 0.0, 0.0)  # of images made straight
+    robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
+    of_point, of_corner = (
+        gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Isotropic.Sigma(2, px)) for px in (SIGMA_PX, corners_px)
+    )
+
+    def add(pose: int, point: int, y: Array, noise: gtsam.noiseModel.Base) -> None:
+        straight = plane(camera, y[None])[0] * (camera.fx_px, camera.fy_px)
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(straight, noise, pose, point, lens))
+
+    for k, view in enumerate(some):
+        start.insert(X(k), gtsam.Pose3(gtsam.Rot3(Rotation.from_quat(view.T[3:]).as_matrix()), view.T[:3]))
+        if view.corners is not None and poses(view.corners, camera):  # else it is no view of the target
+            for c, y in enumerate(view.corners):
+                add(X(k), C(c), y, of_corner)
+    for c, corner in enumerate(CORNERS):
+        start.insert(C(c), corner)
+        graph.add(gtsam.PriorFactorPoint3(C(c), corner, gtsam.noiseModel.Isotropic.Sigma(3, 1e-7)))
+    points = sorted({n for view in some for n in view.matches if not str(n).startswith("target")}, key=str)
+    for n, name in enumerate(points):
+        by = [k for k, view in enumerate(some) if name in view.matches]
+        y = np.array([some[k].matches[name] for k in by])
+        x = place(np.array([some[k].T for k in by]), camera.rays(y))
+        if x is not None:
+            start.insert(L(n), x)
+            for k, match in zip(by, y, strict=True):
+                add(X(k), L(n), match, of_point)
+    solved = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    found = [solved.atPose3(X(k)) for k in range(len(some))]
+    return np.array([np.append(T.translation(), Rotation.from_matrix(T.rotation().matrix()).as_quat()) for T in found])
+
+
+def carry(T: Array, a: Array, b: Array) -> Array:
+    """Return the pose T (7,) moved as a camera that goes from a (7,) to b (7,)."""
+    at, back = Rotation.from_quat(T[3:]), Rotation.from_quat(a[3:]).inv()
+    return np.append(T[:3] + at.apply(back.apply(b[:3] - a[:3])), (at * back * Rotation.from_quat(b[3:])).as_quat())
+
+
+def against_batch(camera: PinHole, frames: list[View], corners_px: float = SIGMA_PX) -> dict[str, float]:
+    """Return medians of filter, batch solution and PnP against each other: m, deg; of the corners' residuals, px."""
+    pnp = [nearest(poses(view.corners, camera), view.T) for view in frames]
+    at = range(EVERY, len(frames) - 1, EVERY)
+    some = [frames[k] for k in at]
+    halves = [
+        solve(
+            [view._replace(corners=None) if k % 2 == half else view for k, view in enumerate(some)], camera, corners_px
+        )
+        for half in (0, 1)
+    ]
+    rows = []
+    for j, (k, T) in enumerate(zip(at, solve(some, camera, corners_px), strict=True)):
+        y, one, before, after = frames[k].corners, pnp[k], pnp[k - 1], pnp[k + 1]
+        if y is None or one is None or before is None or after is None:
+            continue
+        carried = [carry(p, frames[j].T, frames[k].T) for p, j in ((before, k - 1), (after, k + 1))]
+        turn = Rotation.from_quat([p[3:] for p in carried]).mean().as_quat()
+        between = np.append(np.mean([p[:3] for p in carried], axis=0), turn)
+        pairs = ((frames[k].T, one), (frames[k].T, T), (T, one))
+        off = [value for a, b in pairs for value in (np.linalg.norm(a[:3] - b[:3]), angle(a[3:], b[3:]))]
+        rows.append([*off, *(apart(seen(camera, p), y) for p in (T, halves[j % 2][j], one, between))])
+    names = (f"{pair}_{unit}" for pair in ("filter_pnp", "filter_batch", "batch_pnp") for unit in ("m", "deg"))
+    px = ("corners_batch_px", "corners_withheld_px", "corners_pnp_px", "corners_neighbours_px")
+    return dict(zip((*names, *px), map(float, np.median(rows, axis=0)), strict=True)) | {"frames": len(rows)}
+
+
+def show(name: str, row: dict[str, float]) -> None:
+    """Print a row."""
+    print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in row.items()), flush=True)
+
+
+def main_batch(seeds: int) -> None:
+    """Print filter, batch solution and PnP against each other: each seed, their medians, and variations."""
+    rows = []
+    for seed in range(seeds):
+        camera, frames = views(seed)
+        rows.append(against_batch(camera, frames))
+        show(f"batch, seed {seed}", rows[-1])
+        for scale in FOCAL if seed == 0 else ():
+            other = replace(camera, fx_px=scale * camera.fx_px, fy_px=scale * camera.fy_px)
+            show(f"batch, seed 0, focal length times {scale}", against_batch(other, frames))
+        if seed == 0:
+            show(f"batch, seed 0, corners of {CORNERS_PX} px", against_batch(camera, frames, CORNERS_PX))
+    show("batch, median", {key: float(np.median([row[key] for row in rows])) for key in rows[0]})
 
 
 def main(seeds: int) -> None:
@@ -143,7 +301,7 @@ def main(seeds: int) -> None:
     rows = []
     for seed in range(seeds):
         rows.append(run(seed))
-        print(f"seed {seed}: " + ", ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
+        show(f"seed {seed}", rows[-1])
     worst = {key: max(row[key] for row in rows) for key in rows[0]}
     print(
         "| sequence | position, m | angle, deg | middle, m | corners, px | PnP's scatter, m | frames | least matched |"
@@ -156,4 +314,8 @@ def main(seeds: int) -> None:
 
 if __name__ == "__main__":
     with one_thread():
-        main(int(sys.argv[1]) if len(sys.argv) > 1 else 5)
+        words = sys.argv[1:]
+        if words[:1] == ["batch"]:
+            main_batch(int(words[1]) if len(words) > 1 else 3)
+        else:
+            main(int(words[0]) if words else 5)
