@@ -672,6 +672,12 @@ def test_a_verdict_in_words_is_short_or_whole() -> None:
     assert len([*verdict_lines(verdict, None)]) == 1 + len(causes)
 
 
+def test_the_verdict_on_a_run_without_landmarks_is_on_its_path() -> None:
+    log = hall(0)
+    run = mapped(replace(log, events=[e for e in log.events if isinstance(e, km.Control)]))
+    assert next(verdict_lines(km.diagnose(run).as_dict())).startswith("the path is ok, by innovations alone")
+
+
 def test_a_hall_that_is_mapped_twice_after_a_gap_is_wrong_and_its_wheel_is_named() -> None:
     log = hall(1, gap_s=4.0)
     doubled, bridged = (km.diagnose(mapped(log, gaps=gaps)) for gaps in ("ignore", "widen"))

@@ -35,7 +35,7 @@ from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
 from kalmark.results.measures import cut_off, rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
-from kalmark.results.verdict import INNOVATIONS
+from kalmark.results.verdict import INNOVATIONS, NO_MAP
 from kalmark.results.warnings import NO_ID, window_warnings
 from kalmark.results.words import count, figure
 from kalmark.slam.robot import Mount
@@ -148,7 +148,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
-        why = str(error).removeprefix("batch solution: ")
+        why = str(error).removeprefix("batch solution: ") if len(run.landmarks) else NO_MAP
         checked = f"{INNOVATIONS}, no batch solution: {why}"
         carried = any(cause.name == "kidnapped" for cause in first)
         return Verdict("wrong" if carried else "doubtful" if signs else "ok", (*first, *signs), checked)

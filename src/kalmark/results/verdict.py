@@ -10,6 +10,7 @@ from kalmark.results.words import count, figure
 SHOWN = 3  # causes in a short verdict
 ROUNDING_M = 1e-9
 INNOVATIONS = "innovations alone"  # how a map was checked that has no batch solution
+NO_MAP = "no landmark is in the map"  # why there is none: only the path is to be judged
 SEEN = 0.02  # by which a factor of the sigmas is worth a word, and of the accuracy a shift
 
 
@@ -32,10 +33,11 @@ def alarm(verdict: Mapping[str, Any] | None) -> list[str]:
 
 
 def _first(verdict: Mapping[str, Any]) -> str:
-    """Return the line that says it all: what the map is, by which cause if it is not ok, and to what accuracy."""
+    """Return the line that says it all: what the map, or the path, is, by which cause, and to what accuracy."""
     harmful = [cause["name"] for cause in verdict["causes"] if not cause["harmless"]]
     why = f" because of {harmful[0]}" if harmful and verdict["map"] != "ok" else ""
-    return f"the map is {verdict['map']}{why}{_trust(verdict)}"
+    what = "path" if str(verdict["checked"]).endswith(NO_MAP) else "map"
+    return f"the {what} is {verdict['map']}{why}{_trust(verdict)}"
 
 
 def _trust(verdict: Mapping[str, Any]) -> str:
