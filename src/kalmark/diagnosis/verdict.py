@@ -512,7 +512,8 @@ def gaps(run: Run) -> list[Cause]:
         lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
         anew = any(_mapped_again(run, part, gap["start_s"]) for part in summary.get("repeats", ()))
         cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
-        told = ", and it was not localized again" if stayed_lost(gap) else ", which was bridged" if bridged else ""
+        again = f", which was bridged: it was localized again at t={gap['known_s']:.1f} s" if bridged else ""
+        told = ", and it was not localized again" if stayed_lost(gap) else again
         told = ", and places are mapped again after it" if anew else told
         evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s{told}"
         cure = cure or ("--set upkeep.repeats=merge" if anew else "")
