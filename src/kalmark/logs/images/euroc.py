@@ -23,7 +23,7 @@ from kalmark.logs.images.pictures import frames_of
 from kalmark.logs.images.rigs import MOTION, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Times, Trajectory, interpolate
 from kalmark.logs.source import Format, Request, choice, nearest, number, placed, read_text
-from kalmark.models.inertial import shaken
+from kalmark.models.motion import shaken
 
 TRUE_STATES = "state_groundtruth_estimate0/data.csv"
 ADIS16448 = {  # the data sheet in EuRoC's imu0/sensor.yaml
