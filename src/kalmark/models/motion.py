@@ -44,8 +44,7 @@ from kalmark.models.observe import CompiledVelocity
 __all__ = [
     "Ackermann", "ConstantTurnRate", "ConstantVelocity", "ConstantVelocity3D", "DifferentialDrive", "Inertial",
     "InertialGravity", "Mecanum", "Odometry2D", "Odometry3D", "Omnidirectional", "SlippingUnicycle", "Tricycle",
-    "Unicycle", "Velocity3D", "at_rest",
-    "shaken",
+    "Unicycle", "Velocity3D", "at_rest", "shaken",
 ]  # fmt: skip
 
 

@@ -41,9 +41,10 @@ def decided(
 
     It is moved to where its scan fits, and stays there if the association recognises a landmark from there.
     """
-    T, before = _fitting(state, scan, query), state.map.mean(scan.robot)
+    T = _fitting(state, scan, query)
     if T is None:
         return query, decide(query)
+    before = state.map.mean(scan.robot)
     _put(state, scan, T)
     moved = Query(scan)
     decisions = decide(moved)

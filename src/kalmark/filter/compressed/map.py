@@ -176,9 +176,7 @@ class CompressedMap(Layout):
             return None
         sorts, p, *_ = asked
         mine, covariance = Nearest(*found), partial(self._at_first, p.shape[1])
-        old = np.array(
-            [slot if slot in self.auxiliary else -1 for slot in mine.at.tolist()]
-        )  # nothing bounds a new one
+        old = np.array([slot if slot in self.auxiliary else -1 for slot in mine.at.tolist()])  # new: bounds nothing
         return mine if self._search.none_nearer(self, self._at, sorts, p, mine, old, covariance) else None
 
     def _at_first(self, d: int, slots: Index) -> Array:
