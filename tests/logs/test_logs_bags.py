@@ -366,6 +366,7 @@ def test_what_a_camera_sees_is_made_level_for_a_robot_of_the_plane(tmp_path: Pat
         ({"/odom": {"type": "odometry_2d"}, "/truth": {"type": "odometry_2d"}}, "both controls of 'robot'"),
         ({"/fix": {"type": "fix", "origin": [1, 2]}}, "origin is .1, 2., expected .latitude_deg"),
         ({"/fix": {"type": "fix", "sigma_m": -1.0}}, "sigma_m is -1.0, expected a positive number"),
+        ({"/fix": {"type": "fix", "sigma_z_m": 2.0}}, "sigma_m is None, expected a positive number beside sigma_z_m"),
         ({"/truth": {"type": "fix"}}, "the position has no covariance, expected .* sigma_m"),
         ({"/scan": {"type": "scan", "take": ["depth"]}}, "take has depth, expected some of range_m"),
     ],
@@ -397,3 +398,10 @@ def test_a_log_of_a_bag_uses_its_inertial_unit_and_its_satellite_fixes(bags: dic
     events = events_of(bags["mcap"])
     kinds = [event.sensor if isinstance(event, Scan) else type(event).__name__ for event in events]
     assert {kind: kinds.count(kind) for kind in ("gyro", "compass", "Fix")} == {"gyro": 398, "compass": 40, "Fix": 40}
+
+
+@pytest.mark.parametrize(("motion", "sigmas"), [("odometry_2d", (1.5, 1.5)), ("odometry_3d", (1.5, 1.5, 4.0))])
+def test_a_height_may_have_a_noise_of_its_own(motion: str, sigmas: tuple[float, ...], bags: dict[str, Path]) -> None:
+    topics = {"/odom": {"type": motion}, "/fix": {"type": "fix", "sigma_m": 1.5, "sigma_z_m": 4.0}}
+    fix = next(event for event in open_log(bags["mcap"], topics=topics) if isinstance(event, Fix))
+    np.testing.assert_array_equal(fix.cov, np.diag(np.square(sigmas)))

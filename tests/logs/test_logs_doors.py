@@ -109,9 +109,17 @@ def test_a_file_of_poses_is_truth_or_fixes_of_another_log(tmp_path: Path) -> Non
         ({"truth": {"other": tmp_path / "path.tum"}}, "expected a file, or one for each of the robots rover"),
         ({"truth": tmp_path / "none.tum"}, "not found"),
         ({"fixes": tmp_path / "path.tum", "sigma_fixes_m": -1.0}, "sigma_fixes_m is -1.0, expected"),
+        ({"sigma_fixes_z_m": 1.0}, "expected both: a file of positions and their noise"),
     ):
         with pytest.raises(LogError, match=said):
             open_log(tmp_path / "log", **options)
+
+
+def test_heights_of_fixes_may_have_a_noise_of_their_own(tmp_path: Path) -> None:
+    (tmp_path / "controls.csv").write_text("t_s,robot,dx_m,dy_m,dz_m,rx_rad,ry_rad,rz_rad\n1,r,0,0,0,0,0,0\n")
+    write_path(tmp_path / "path.tum", np.array([10**9]), np.array([[1.0, 2, 3, 0, 0, 0, 1]]))
+    log = open_log(tmp_path, "native", fixes=tmp_path / "path.tum", sigma_fixes_m=0.5, sigma_fixes_z_m=2.0)
+    assert log.events[-1].cov.tolist() == np.diag([0.25, 0.25, 4.0]).tolist()
 
 
 # ------------------------------------------------------------------ g2o

@@ -190,6 +190,21 @@ def test_a_rate_of_the_state_needs_a_noise_of_each_reading() -> None:
         km.Slam(km.Robot("r", motion=km.motion.ConstantTurnRate(), sensors={"gyro": km.Mount(density)}))
 
 
+def test_heights_of_a_receiver_have_a_noise_of_their_own() -> None:
+    """Horizontally and vertically as uncertain as single readings and the start, or a reading's own noise, say."""
+    for own, sigmas in ((None, (0.02, 0.02, 0.3)), (np.diag([0.01, 0.04, 0.09])[None], (0.1, 0.2, 0.3))):
+        receiver = km.Mount(km.sensors.Gps3D(0.02, sigma_z_m=0.3))
+        start = np.array([0.0, 0, 0, 0, 0, 0, 1])
+        slam = km.Slam(
+            km.Robot(
+                "r", km.motion.Odometry3D(), start, cov=np.diag([1.0] * 3 + [0.0] * 3), sensors={"receiver": receiver}
+            )
+        )
+        slam.process(km.Scan(0.0, "r", "receiver", [[0.1, 0.2, 0.3]], cov=own))
+        np.testing.assert_allclose(np.diag(slam.covariance("r"))[:3], 1 / (1 + 1 / np.square(sigmas)), rtol=1e-9)
+    assert np.diag(km.sensors.Gps3D(0.02).noise(np.zeros((1, 3)))[0]).tolist() == [0.02**2] * 3
+
+
 def test_what_measures_its_robot_expects_no_landmark() -> None:
     with pytest.raises(MapError, match="sensor 'gyro' of 'r' measures its robot, expected one of landmarks"):
         km.Slam(robot()).expect("r", "gyro")

@@ -308,7 +308,10 @@ def _three(sigma: float | tuple[float, ...]) -> Array:
 
 
 # keys of logs of any format
-COMMON = ("robots", "from_s", "to_s", "on_error", "ids", "truth", "fixes", "sigma_fixes_m", "factors", "shift_s")
+COMMON = (
+    "robots", "from_s", "to_s", "on_error", "ids", "truth", "fixes", "sigma_fixes_m", "sigma_fixes_z_m", "factors",
+    "shift_s",
+)  # fmt: skip
 BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]
 
 
@@ -335,6 +338,8 @@ class LogConfig(Section):
     """The same, of positions that the filter is given, as fixes."""
     sigma_fixes_m: Positive | None = None
     """Noise of each coordinate of `fixes`."""
+    sigma_fixes_z_m: Positive | None = None
+    """Noise of their heights; `sigma_fixes_m` if absent."""
     factors: BySensor | None = None
     """Factors of columns, also of one robot or sensor: `{w_radps: -1, laser: {range_m: .001}}`; `t_s`: of all times."""
     shift_s: BySensor | None = None

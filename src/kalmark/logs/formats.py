@@ -52,6 +52,7 @@ def open_log(
     truth: Path | str | Mapping[str, Path | str] | None = None,
     fixes: Path | str | Mapping[str, Path | str] | None = None,
     sigma_fixes_m: float | None = None,
+    sigma_fixes_z_m: float | None = None,
     factors: Mapping[str, Any] | None = None,
     shift_s: Mapping[str, Any] | None = None,
     progress: bool = False,
@@ -63,7 +64,8 @@ def open_log(
     from the log's first event.  With `on_error="skip"` bad rows are left out and listed in `log.skipped`.  With
     `ids="hidden"` no scan says which landmark is which; `log.true_ids` does.
     `truth` and `fixes` are files of poses in the formats of TUM or KITTI, by robot if there are several: true poses to
-    score against, and positions for the filter with the noise `sigma_fixes_m`.
+    score against, and positions for the filter with the noise `sigma_fixes_m`,
+    and `sigma_fixes_z_m` of their heights.
     `factors` of columns and `shift_s` of sensors correct units, signs and stamps (`kalmark.logs.corrections`).
     With `progress` tables that take longer than two seconds show a bar on standard error.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
@@ -76,7 +78,7 @@ def open_log(
             raise LogError(f"log option {name!r} is unknown to {entry.name}, expected {wanted}")
     request = requested(robot_names(robots, entry.robot_prefix), on_error, progress)
     log = corrected(entry.read(found, request, **options), factors, shift_s)
-    log = with_poses(log, request, truth, fixes, sigma_fixes_m)
+    log = with_poses(log, request, truth, fixes, sigma_fixes_m, sigma_fixes_z_m)
     return selected(log, request, from_s, to_s, ids)
 
 
@@ -111,15 +113,19 @@ def selected(log: Log, request: Request, from_s: float | None, to_s: float | Non
     return hide_ids(log) if choice(ids, "ids", ("given", "hidden")) == "hidden" else log
 
 
-def with_poses(log: Log, request: Request, truth: Any, fixes: Any, sigma_m: float | None) -> Log:
+def with_poses(
+    log: Log, request: Request, truth: Any, fixes: Any, sigma_m: float | None, sigma_z_m: float | None
+) -> Log:
     """Return the log with true poses and fixes of other files.  Raises LogError."""
     true = {robot: read_path(path, request) for robot, path in _by_robot(log, "truth", truth).items()}
     places = {robot: read_path(path, request) for robot, path in _by_robot(log, "fixes", fixes).items()}
-    if (sigma_m is None) != (fixes is None):
+    if (sigma_m is None) != (fixes is None) or (sigma_m is None and sigma_z_m is not None):
         both = f"fixes is {shown(fixes)} and sigma_fixes_m is {shown(sigma_m)}"
         raise LogError(f"log option {both}, expected both: a file of positions and their noise")
+    given = ((sigma_m, "sigma_fixes_m"), (sigma_z_m, "sigma_fixes_z_m"))
+    sigmas = [quantity(sigma, name, 1e-9) for sigma, name in given if sigma is not None]
     events = [
-        Fix(t_ns=t_ns, robot=robot, y=pose[:d], cov=quantity(sigma_m, "sigma_fixes_m", 1e-9) ** 2 * np.eye(d))
+        Fix(t_ns=t_ns, robot=robot, y=pose[:d], cov=np.diag(np.square([sigmas[0], sigmas[0], sigmas[-1]][:d])))
         for robot, path in places.items()
         for d in (_dimensions(log, robot),)
         for t_ns, pose in zip(path.t_ns.tolist(), path.poses, strict=True)

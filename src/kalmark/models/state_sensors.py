@@ -16,18 +16,12 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
-from kalmark.declare import NotNegative, Number, Positive, Probability, declared, refuse, register
+from kalmark.declare import NotNegative, Number, Positive, Probability, Within, declared, refuse, register
 from kalmark.errors import EventError
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
 from kalmark.models import seen
 from kalmark.models.protocols import CHANGE, POSE, TWIST
 from kalmark.models.seen import Sensing, residual
-
-__all__ = [
-    "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
-    "Gyro2D", "Gyro3D", "Heading", "Height", "Inclination", "Odometer2D", "Odometer3D", "Speed", "ZeroVelocity2D",
-    "ZeroVelocity3D",
-]  # fmt: skip
 
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
@@ -325,16 +319,21 @@ class Gps3D(_Gps):
     """The position of an antenna, at its mount, in the map's frame."""
 
     _: KW_ONLY
+    sigma_z_m: Annotated[float | None, Within(gt=0), "Noise of the height; sigma_m if absent."] = None
     bias_x_m: Bias = 0.0
     bias_y_m: Bias = 0.0
     bias_z_m: Bias = 0.0
 
     world: ClassVar[str] = "space"
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 3
+    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m", "sigma_m", "sigma_z_m")
     constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
         (f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xyz"
     )
+
+    @cached_property
+    def _variances(self) -> tuple[float, ...]:
+        return tuple((vars(self)[name] or self.sigma_m) ** 2 for name in self.sigmas)
 
 
 @register("sensor", "absolute_pose")

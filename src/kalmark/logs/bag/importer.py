@@ -289,7 +289,7 @@ class _Importer:
         own = _AXES3 if self.in_space(topic.robot) else _AXES2
         N = None if cov is None else cov[np.ix_(own, own)]
         if topic.sigma_m is not None:
-            N = np.eye(len(own)) * topic.sigma_m**2
+            N = np.diag(np.square([topic.sigma_m, topic.sigma_m, topic.sigma_z_m or topic.sigma_m]))[np.ix_(own, own)]
         if N is None or not np.isfinite(N).all() or np.linalg.eigvalsh(N)[0] <= 0:
             told = "no covariance" if N is None else f"the covariance {N.tolist()}"
             raise Refused(f"the position has {told}, expected a positive definite one, or sigma_m of the topic")

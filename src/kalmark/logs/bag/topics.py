@@ -278,6 +278,12 @@ class Fixes(Placed):
     sigma_m: Annotated[
         float | None, Within(gt=0), "Noise of each coordinate; the message's own covariance if absent."
     ] = None
+    sigma_z_m: Annotated[float | None, Within(gt=0), "Noise of the height, beside `sigma_m`; that if absent."] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sigma_z_m is not None and self.sigma_m is None:
+            raise refuse(self, "sigma_m", "a positive number beside sigma_z_m")
 
 
 @register("topic", "truth")
