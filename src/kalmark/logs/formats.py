@@ -14,6 +14,7 @@ from kalmark.errors import LogError, one_line
 from kalmark.events import Event, Fix, Scan, order, shown
 from kalmark.logs.bag.importer import BAG
 from kalmark.logs.carmen import CARMEN
+from kalmark.logs.columns import INCREMENT2, INCREMENT3
 from kalmark.logs.corrections import corrected
 from kalmark.logs.download import find_data
 from kalmark.logs.graph import G2O
@@ -248,6 +249,8 @@ def hide_ids(log: Log) -> Log:
     true_ids, events = {}, log.events.copy()
     for n, event in enumerate(events):
         if isinstance(event, Scan) and event.ids is not None:
+            if log.sensor_columns.get((event.robot, event.sensor)) in (INCREMENT2, INCREMENT3):
+                continue  # times of earlier scans
             ids = [i if i in log.robots else None for i in event.ids]
             hidden = Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor, y=event.y, ids=ids, cov=event.cov)
             events[n], true_ids[hidden] = hidden, event.ids

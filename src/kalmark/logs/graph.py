@@ -15,7 +15,7 @@ line                    numbers                                                i
 ======================  =====================================================  =====================================
 
 Poses have no times: in the order of their ids they are one second apart.  An edge between poses that do not follow each
-other, a loop that something else has closed, is nothing that a filter of events can take; it is left out and counted.
+other, a loop that something else has closed, is left out and counted: the map would need a clone of each such pose.
 
 Information matrices are upper triangles.  g2o's errors of an edge are in the frame where it ends, and those of a turn
 in space the vector part of a quaternion, half an angle (`EdgeSE3::computeError`).  So the covariance of an increment u

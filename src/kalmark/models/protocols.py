@@ -388,6 +388,16 @@ class OfState(Sensor, Protocol):
 
 
 @runtime_checkable
+class _Keeps(Protocol):
+    keep: int
+
+
+def poses_kept(sensor: OfState) -> int:
+    """Return of how many of its last scans a sensor of a change keeps the poses; by default of the last one."""
+    return sensor.keep if isinstance(sensor, _Keeps) and sensor.views == CHANGE else 1
+
+
+@runtime_checkable
 class TimedNoise(Protocol):
     """A sensor of the state whose noise depends on how long a reading means."""
 

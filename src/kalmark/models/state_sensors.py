@@ -16,7 +16,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
-from kalmark.declare import NotNegative, Number, Positive, Probability, Within, declared, refuse, register
+from kalmark.declare import Count, NotNegative, Number, Positive, Probability, Within, declared, refuse, register
 from kalmark.errors import EventError
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
 from kalmark.models import seen
@@ -608,6 +608,10 @@ class ZeroVelocity3D(_ZeroVelocity):
 class _Odometer(_Scaled):
     sigma_m: Annotated[Positive, "Noise of each coordinate of one increment."] = 0.01
     sigma_rad: Annotated[Positive, "Noise of each angle of one increment."] = 0.01
+    _: KW_ONLY
+    keep: Annotated[
+        Count, "Poses of its last scans that are kept: an `id`, the time of one, tells what it counts from."
+    ] = 1
 
     views: ClassVar[str] = CHANGE
     expected: ClassVar[Any] = increment

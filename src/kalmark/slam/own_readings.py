@@ -11,7 +11,7 @@ from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Update
 from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.observe import fix_view
-from kalmark.report import Judged, Observation, Report
+from kalmark.report import Judged, Observation, Report, outcomes_of
 from kalmark.slam import moves, replacing
 from kalmark.slam.checks import refuse_bad_fix
 from kalmark.slam.motion import Moving
@@ -23,35 +23,41 @@ FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes s
 
 
 def read(state: State, event: Scan, reader: Reader) -> Report:
-    """Correct by what a sensor measures of its own robot; leave a clone where its next reading counts from here."""
-    key, since_s = (event.robot, event.sensor), reader.since_s(event)
-    R, report = reader.noise(event), Report(event, event.y)
+    """Correct by what a sensor measures of its own robot; leave a clone where its next readings count from here."""
+    key, R, report = (event.robot, event.sensor), reader.noise(event), Report(event, event.y)
+    begins = reader.begins_ns(event)
     state.t_ns = event.t_ns
     report.gaps = moves.advance(state, event.robot)
-    if not len(event.y):
+    if not len(event.y) and reader.keep == 1:
         return report
-    reader.drift(state.map, since_s)
-    reader.t_ns, held = event.t_ns, state.clones.of(key)
-    if reader.counts and not held:
-        report.blank(R.shape[1])
-        report.observations = (Observation(0, None, "ignored", None, None, "the first reading: none to count from"),)
-    else:
-        update = reader.update(
-            state.map, state.moving[event.robot], state.clones[held[-1]] if held else -1, event, R, since_s
-        )
-        done = state.corrected(update, event, reader.estimator(state.estimator))
+    reader.drift(state.map, event.t_ns)
+    held, found = state.clones.of(key), list[Observation]()
+    clones = {state.clones.clones[number].t_ns: state.clones[number] for number in held}
+    report.blank(R.shape[1])
+    for k, from_ns in enumerate(begins):
+        is_loop, since_s = reader.is_loop(event, k), 0.0 if from_ns is None else (event.t_ns - from_ns) * 1e-9
+        if reader.counts and from_ns not in clones:
+            why = "no pose of the time of its id is kept" if is_loop else "the first reading: none to count from"
+            found.append(Observation(k, None, "ignored", None, None, why))
+            continue
+        clone = -1 if from_ns is None else clones.get(from_ns, -1)
+        update = reader.update(state.map, state.moving[event.robot], clone, event, k, R[k : k + 1], since_s)
+        done = state.corrected(update, event, reader.estimator(state.estimator, is_loop))
         done = done._replace(e=done.e[:, : event.width])
-        report.e, report.z, report.Z = done.e, done.z, done.Z
-        report.judged = (Judged([0], [None], [event.robot], done, reader.gate),)
-        if done.fused[0]:
-            reader.take(event.y, done.Z, since_s)
+        report.fill([k], done)
+        found += outcomes_of(Judged([k], [None] * len(event.y), [event.robot], done, reader.gate))
+        if done.fused[0] and not is_loop:
+            reader.take(event.y[k : k + 1], done.Z, since_s)
         if reader.is_position:
             position = replacing.LeftOut(event.y[0], R[0], done.e[0])
             report.replaced = _believed(state, event.robot, position, done.fused[0])
+    report.observations = found
     if reader.counts:
+        kept: list[int] = []
         with suppress(MapError):  # it is full: the next reading is the first again
-            state.clone(key, event.t_ns)
-        for slot in state.clones.refer(key, set(state.clones.of(key)) - set(held)):
+            here = state.clone(key, event.t_ns)
+            kept = [*(number for number in held if number != here), here][-reader.keep :]
+        for slot in state.clones.refer(key, kept):
             state.map.remove(slot)
     return report
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,21 @@ POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures wh
 LEAST_S = 1e-6  # between two readings that tell how the robot moved
 
 
+def _time(event: Scan, k: int) -> int:
+    """Return the time that the id of a row is, in ns.  Raises EventError."""
+    name = None if event.ids is None else event.ids[k]
+    try:
+        return int((Decimal(str(name)) * 10**9).to_integral_value())
+    except ArithmeticError:
+        raise EventError(f"{when(event)}: id {name!r}, expected the time in s of an earlier scan") from None
+
+
 class Reader:
     """A sensor of the state of a robot that moves by `motion`; `mount` is the slot of its mount, -1 for none.
 
-    `counts`: what it measures counts from its last reading, where a clone of the robot's pose was left.  `standing`
-    notices of a `zero_velocity` that its robot stands.  `is_position`: as a fix it says where a lost robot is.
+    `counts`: what it measures counts from its last scan, where a clone of the robot's pose was left, or, by an id that
+    is its time, from another of the last `keep`.  `standing` notices of a `zero_velocity` that its robot stands.
+    `is_position`: as a fix it says where a lost robot is.
     """
 
     def __init__(
@@ -38,6 +49,7 @@ class Reader:
         self.mount, self.motion, self.standing = mount, motion, standing
         self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
+        self.keep = protocols.poses_kept(sensor)
         self.is_position = tuple(sensor.columns) in POSITIONS
         scales = protocols.parameter_covariance(sensor) is not None and "gain" in protocols.parameter_names(sensor)
         self.scales = self.counts and scales  # its scale is estimated of what the robot's controls say
@@ -60,22 +72,28 @@ class Reader:
 
     def noise(self, event: Scan) -> Array:
         """Return the noise R (1, p, p) of a reading, refusing what its sensor cannot have made.  Raises EventError."""
-        if len(event.y) > 1:
+        if len(event.y) > 1 and self.keep == 1:
             name = type(self.sensor).__name__
             raise EventError(f"{when(event)}: y has {len(event.y)} rows, expected one: a {name} measures its robot")
         odd = [i for i in event.ids or () if i not in (None, event.robot)]
-        if odd:
+        if odd and self.keep == 1:
             raise EventError(f"{when(event)}: id {odd[0]!r}, expected none: {event.sensor!r} measures its robot")
         return measurements(event, self.sensor, self.check)
 
-    def since_s(self, event: Scan) -> float:
-        """Return how long ago the last reading was, 0 for the first.  Raises EventError where that is too short."""
-        if self.t_ns is None:
-            return 0.0
-        since_s = (event.t_ns - self.t_ns) * 1e-9
-        if self.counts and since_s < LEAST_S:
+    def begins_ns(self, event: Scan) -> list[int | None]:
+        """Return the time of the scan that each row counts from, the last one where it has no id; None for the first.
+
+        Raises EventError where that is too short ago.
+        """
+        begins = [_time(event, k) if self.is_loop(event, k) else self.t_ns for k in range(len(event.y))]
+        last = [self.t_ns] if self.counts and self.keep == 1 else []
+        if self.counts and any(t_ns is not None and (event.t_ns - t_ns) * 1e-9 < LEAST_S for t_ns in [*begins, *last]):
             raise EventError(f"{when(event)}: {event.sensor!r} was read at that time already, expected one reading")
-        return since_s
+        return begins
+
+    def is_loop(self, event: Scan, k: int) -> bool:
+        """Return whether a row of a scan says by its id from which earlier one it counts."""
+        return event.ids is not None and event.ids[k] not in (None, event.robot)
 
     def constants(self, map_: Map) -> tuple[Array, Array] | None:
         """Return the sensor's own constants (c,) in the map and their covariance (c, c), None where it has none."""
@@ -84,8 +102,9 @@ class Reader:
             return None
         return map_.mean(self.mount)[-own:], map_.covariance([self.mount])[-own:, -own:]
 
-    def drift(self, map_: Map, since_s: float) -> None:
-        """Let the sensor's constants walk since the last reading."""
+    def drift(self, map_: Map, t_ns: int) -> None:
+        """Let the sensor's constants walk from its last scan to the one at `t_ns`."""
+        since_s, self.t_ns = 0.0 if self.t_ns is None else (t_ns - self.t_ns) * 1e-9, t_ns
         if self.mount < 0 or not isinstance(self.sensor, protocols.Drifting):
             return
         Q = self.sensor.drift(since_s)
@@ -93,13 +112,15 @@ class Reader:
             rows = map_.index(self.mount)[-len(Q) :]
             map_.predict(rows, np.eye(len(Q)), np.diag(Q))
 
-    def update(self, map_: Map, moving: Moving, clone: int, event: Scan, R: Array, since_s: float) -> Update:
-        """Return the correction by a reading with the noise R (1, p, p); `clone` is where it counts from."""
+    def update(self, map_: Map, moving: Moving, clone: int, event: Scan, k: int, R: Array, since_s: float) -> Update:
+        """Return the correction by a row of a scan with the noise R (1, p, p); `clone` is where it counts from."""
         robot = moving.slot
         if event.cov is None and isinstance(self.sensor, protocols.TimedNoise) and since_s > 0:
             R = self.sensor.noise_since(since_s)
         slot, d = (clone, len(self.at)) if self.counts else (robot, len(map_.mean(robot)) if self.of_state else 0)
-        given = np.column_stack([event.y, *self._usual(event.y, since_s), [since_s], *self._held(moving)])
+        y = event.y[k : k + 1]
+        usual = [] if self.is_loop(event, k) else self._usual(y, since_s)
+        given = np.column_stack([y, *usual, [since_s], *self._held(moving)])
         return Update(self.view, robot, self.mount, np.array([slot]), d, given, np.ascontiguousarray(R), self.gate)
 
     def _held(self, moving: Moving) -> list[Array]:
@@ -120,15 +141,16 @@ class Reader:
             rate, self.sigma = y[0] / unit_s, np.sqrt(np.diag(Z[0])) / unit_s
             self.mean = Mean(rate, 1) if self.mean is None else self.mean.after(rate, self.sigma)
 
-    def estimator(self, estimator: Estimator) -> Estimator:
-        """Return how a reading is fused: absolute poses with iterations, how the robot moved without.
+    def estimator(self, estimator: Estimator, is_loop: bool) -> Estimator:
+        """Return how a reading is fused: absolute poses and loops with iterations, how the robot moved without.
 
         What one step was is a new unknown each time, constants of the sensor are not.  The iterated estimate is the
         mode of all of them together, which is no mode of the constants (docs/state_sensors.md).
         """
         if self.sensor.views == POSE:
             return estimator.for_fixes()
-        return estimator.once() if isinstance(estimator, Iterating) else estimator
+        many = is_loop and not self.scales
+        return estimator.once() if isinstance(estimator, Iterating) and not many else estimator
 
     def readings(self) -> list[Any] | None:
         """Return the mean of its readings as it is saved, None where there is none."""

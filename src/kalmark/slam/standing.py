@@ -145,7 +145,10 @@ class Standing:
         if isinstance(event, Control):
             source.take(event.t_ns, event.u, self.motion.control_noise(event.u) if event.cov is None else event.cov)
         elif isinstance(event, Scan):
-            source.take(event.t_ns, event.y[0], event.cov if event.cov is None or event.cov.ndim == 2 else event.cov[0])
+            plain = [k for k, name in enumerate(event.ids or (None,)) if name in (None, event.robot)]
+            for k in plain:  # not what counts from an earlier scan
+                cov = event.cov if event.cov is None or event.cov.ndim == 2 else event.cov[k]
+                source.take(event.t_ns, event.y[k], cov)
         if self.began_ns is None:
             self.began_ns = event.t_ns
         if (event.t_ns - self.began_ns) * 1e-9 < self.sensor.window_s * (1.0 - CLOCK):

@@ -171,7 +171,9 @@ class State:
         used = {m.clone for track in self.tracks.tentative.values() for m in track.measurements
                 if (m.robot, m.sensor) == key}  # fmt: skip
         used |= {m.clone for pending in self.tracks.waiting() if pending.channel == key for m in pending.measurements}
-        if key in self.readers or self.channels[key].counts or self.policies[key].delayed is not None:
+        if key in self.readers:
+            used.update(self.clones.of(key))
+        elif self.channels[key].counts or self.policies[key].delayed is not None:
             used.update(self.clones.of(key)[-1:])
         for slot in self.clones.refer(key, used):
             self.map.remove(slot)
