@@ -3,6 +3,8 @@
 python benchmarks/vision.py SEQUENCE [SEEDS]     of `SEQUENCES`; a row a seed, then the worst of them
 python benchmarks/vision.py SEQUENCE+lines       with the lines of the images in the map, too
 python benchmarks/vision.py WORLD [SEEDS]        of `WORLDS`, rendered: errors against the truth, ANEES of the pose
+python benchmarks/vision.py loop [SEEDS]         round `textured_room` with a view of the wall: errors after the first
+                                                 round with and without descriptors of what comes into view again
 One camera on recorded images is aligned by similarity; what knows its scale and its start is not aligned at all.
 The drift of the scale is that of the second half of the path against the first.  One thread; times are of the
 processor, so that other programs count little.
@@ -12,6 +14,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +22,11 @@ import numpy as np
 import kalmark as km
 from kalmark.arrays import Array
 from kalmark.config import build_slam, open_run
-from kalmark.events import Id
 from kalmark.filter.kernels import one_thread
 from kalmark.geometry.frames3d import minus
 from kalmark.results.measures import anees_interval
 from kalmark.simulate import load_world, simulate
+from kalmark.vision import front_end
 from kalmark.vision.front_end import FrontEnd
 
 SEQUENCES: dict[str, list[str]] = {
@@ -43,6 +46,13 @@ LINES = (
 )
 SINGULAR = 1e12  # condition of a covariance, so much or more: no NEES
 WORLDS = ("textured_room", "textured_room_depth", "textured_room_stereo")
+LOOP = (
+    "steps=520",
+    *(f"robots.robot.sensors.camera.{key}" for key in (
+        "mount.roll_deg=90", "landmark.prior_rho_per_m=0.8", "landmark.sigma_rho_per_m=0.4"
+    )),
+)  # fmt: skip
+ROUND, NEVER = 410, 10**6  # images of a round; more frames than there are
 
 
 def similarity(p: Array, q: Array) -> tuple[float, float]:
@@ -61,10 +71,9 @@ def run(name: str, seed: int) -> dict[str, float]:
     options = [*SEQUENCES[name], f"robots.each.sensors.camera.detector.seed={seed}", *([LINES] if lines else [])]
     config, log = open_run("visual", None, options)
     slam = build_slam(config, log)
-    front_end = slam.state.front_ends[log.robots[0], "camera"]
-    assert isinstance(front_end, FrontEnd)
+    eye = slam.state.front_ends[log.robots[0], "camera"]
+    assert isinstance(eye, FrontEnd)
     way, took, matched, wanted, lines_matched = [], [], 0, 0, 0
-    seen: list[dict[Id, Array]] = []  # where landmarks were in each frame
     for frame in log.events:
         image = frame.grey()  # type: ignore[union-attr]
         here = km.Frame(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, image=image)  # type: ignore[union-attr]
@@ -77,20 +86,16 @@ def run(name: str, seed: int) -> dict[str, float]:
             lines_matched += sum(o.outcome == "associated" for o in report.observations)
             continue
         took.append(spent)
-        fits = [o for o in report.observations if o.outcome in ("new", "associated") and o.landmark is not None]
-        seen.append({o.landmark: report.y[o.index] for o in fits if o.landmark is not None})
         matched += sum(o.outcome == "associated" for o in report.observations)
-        assert front_end.prospect is not None
-        wanted += len(front_end.prospect)
+        assert eye.prospect is not None
+        wanted += len(eye.prospect)
         way.append(slam.mean(frame.robot)[:3])
-    shifts = [float(np.hypot(*(seen[-1][name] - y))) for name, y in seen[0].items() if name in seen[-1]]
     p, length = np.array(way), float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
     found = {
         "matched": matched / len(took), "found": matched / max(wanted, 1), "ms": 1e3 * float(np.median(took)),
         "hz": 1.0 / float(np.mean(took)), "return": float(np.linalg.norm(p[-1] - p[0])) / length,
-        "lines": lines_matched / len(took), "back": len(shifts),
-        "shift_px": float(np.median(shifts)) if shifts else np.nan,
-        **{f"{part}_ms": 1e3 * spent / len(took) for part, spent in front_end.times.items()},
+        "lines": lines_matched / len(took),
+        **{f"{part}_ms": 1e3 * spent / len(took) for part, spent in eye.times.items()},
     }  # fmt: skip
     truth = log.truth.get(log.robots[0])
     if truth is not None:
@@ -103,12 +108,12 @@ def run(name: str, seed: int) -> dict[str, float]:
     return found
 
 
-def rendered(name: str, seed: int) -> tuple[Array, Array, float]:
+def rendered(name: str, seed: int, options: Sequence[str] = ()) -> tuple[Array, Array, float]:
     """Return after each image of a world the position's error [m] and the NEES of the pose (6); a frame's time [ms].
 
     The NEES is NaN while the pose is known exactly.
     """
-    world = load_world(name)
+    world = load_world(name, options)
     log = simulate(world, seed=seed)
     slam = build_slam(world.config(), log)
     (robot,), off, nees, took = log.robots, [], [], []
@@ -145,8 +150,26 @@ def print_rendered(name: str, seeds: int) -> None:
     print(f"| {name} | {max(off):.3f} | {mean.mean():.2f} | {inside:.0f} % | {np.median(ms):.1f} |")
 
 
+def print_loop(seeds: int) -> None:
+    """Print the errors of the position after a round, of each seed, with and without descriptors."""
+    rows, asked = [], front_end.AWAY
+    for seed in range(seeds):
+        row = []
+        for away in (asked, NEVER):
+            front_end.AWAY = away
+            off = rendered("textured_room", seed, LOOP)[0][ROUND:]
+            row.append(float(np.sqrt(np.mean(off**2))))
+        rows.append(row)
+        print(f"seed {seed}: {row[0]:.3f} m, without descriptors {row[1]:.3f} m", flush=True)
+    print("| world | position, m, of each seed | without descriptors |\n|---|---|---|")
+    print("| loop | " + " | ".join(" ".join(f"{row[k]:.2f}" for row in rows) for k in (0, 1)) + " |")
+
+
 def main(name: str, seeds: int) -> None:
     """Print the figures of each seed and the row of all."""
+    if name == "loop":
+        print_loop(seeds)
+        return
     if name in WORLDS:
         print_rendered(name, seeds)
         return

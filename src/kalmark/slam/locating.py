@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
@@ -12,6 +13,7 @@ from kalmark.association.global_start import Located, is_lost, located
 from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
 from kalmark.association.relocalization import relocalized
+from kalmark.events import Id
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose, inverse
 from kalmark.slam.state import State
@@ -75,6 +77,13 @@ def placed_again(state: State, channel: Channel, name: str, T: Array, cov: Array
     state.map.predict(state.map.index(slot)[:6], np.zeros((6, 6)), cov)
     state.map.set_predicted(slot, np.append(frames3d.compose(T, to_robot)[0], r[7:]))
     state.clones.moved(name)
+
+
+def widened(state: State, name: str, landmarks: Sequence[Id], factor: float) -> None:
+    """Multiply the joint covariance of a robot and of landmarks by a factor: they have drifted by more than it says."""
+    slots = [state.moving[name].slot, *state.tracks.slots_of(landmarks).tolist()]
+    rows = np.concatenate([state.map.index(slot) for slot in slots])
+    state.map.predict(rows, math.sqrt(factor) * np.eye(len(rows)), np.zeros((len(rows), len(rows))))
 
 
 def _put(state: State, scan: ScanContext, T: Array) -> None:

@@ -176,7 +176,9 @@ class Slam(Estimate):
         if again is not None:
             locating.placed_again(state, channel, event.robot, *again)
         prospect = front_end.prospect_of(state.map, state.tracks, channel, event.robot)
-        scan, removed = front_end.search(event, image, prospect, beside)
+        scan, removed, drifted = front_end.search(event, image, prospect, beside)
+        if drifted is not None:
+            locating.widened(state, event.robot, *drifted)
         for name, _ in removed:
             state.remove(name)
         report = self._found(scan)

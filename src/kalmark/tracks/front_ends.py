@@ -39,8 +39,13 @@ class FrontEnd(Protocol):
         """Return what it wants to know before it searches: what the sensor should measure of the landmarks in view."""
         ...
 
-    def search(self, frame: Frame, image: Any, prospect: Any, beside: Any) -> tuple[Scan, list[tuple[Id, str]]]:
+    def search(
+        self, frame: Frame, image: Any, prospect: Any, beside: Any
+    ) -> tuple[Scan, list[tuple[Id, str]], tuple[list[Id], float] | None]:
         """Return what was found in an image (H, W), and the landmarks that are given up, each with the reason.
+
+        And, if a place seen again shows that, landmarks that have drifted with the sensor, and the factor by which the
+        covariance of all these is too small.
 
         `beside` (H, W) is the depth of its pixels in m, 0 where there is none, or the right image of a pair, as the
         sensor has it; None: the sensor, or the frame, has none.

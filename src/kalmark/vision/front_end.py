@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Index
 from kalmark.declare import Count, Positive, Within, register
 from kalmark.events import Frame, Id, Scan
 from kalmark.filter.map import Map
@@ -33,12 +33,13 @@ from kalmark.vision.matching import Searcher, shift_covariances
 from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import NUMBERS, Plane, measured, shown
-from kalmark.vision.recognition import recognised
+from kalmark.vision.recognition import matched_again, recognised
 from kalmark.vision.searches import TRIAL, Searches
 from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed import FirstLook
 
 FEW, ENOUGH = 4, 20  # matches, with fewer of which the sensor is lost; landmarks by which it may recognise the place
+EVERY, AWAY = 5, 30  # frames: how often it asks if a place is seen again; how long landmarks of it were not found
 OLDER = 8  # words about a landmark in a file without its misfit
 SHIFT_PX = 0.04  # sigma of the shift of a match that counts half: as much as a pixel of the sensor
 PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
@@ -82,10 +83,14 @@ class Look(Searches):
 
 
 class Sighting(NamedTuple):
-    """What a frame showed: a scan, and the landmarks that are given up, each with the reason."""
+    """What a frame showed: a scan, and the landmarks that are given up, each with the reason.
+
+    `drifted` are landmarks that have drifted with the sensor, and the factor by which their covariance is too small.
+    """
 
     scan: Scan
     removed: list[tuple[Id, str]]
+    drifted: tuple[list[Id], float] | None = None
 
 
 class FrontEnd:
@@ -121,7 +126,8 @@ class FrontEnd:
         places = places_of(map_, tracks, channel, known)
         here = np.flatnonzero(np.isfinite(places).all(axis=1))
         views = [self.looks[known[k]].views for k in here.tolist()]
-        return recognised(self.cv2, image, views, places[here], channel.calibrated(map_))
+        found = recognised(self.cv2, image, views, places[here], channel.calibrated(map_))
+        return None if found is None else (found.T, found.cov)
 
     def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any = None) -> Sighting:
         """Search an image (H, W) for the landmarks of a prospect, and for new ones.
@@ -138,7 +144,11 @@ class FrontEnd:
         self.beside = beside if isinstance(self.sensor, PixelDepth) else None
         t1 = perf_counter()
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
-        found = self.found = Search(prospect, looks.told, searcher, settings.updates).run(self.random)
+        search, drifted = Search(prospect, looks.told, searcher, settings.updates), None
+        found = self.found = search.run(self.random)
+        again = self._matched_again(image, prospect, searcher)
+        if again is not None and search.run_again(*again).wider > 1.0:
+            drifted = [name for name in prospect.names if self._seen_lately(name)], found.wider
         self.is_lost = found.matched.sum() < FEW
         removed = self._count(prospect, found)
         self._first_look(image, prospect, found)
@@ -160,7 +170,7 @@ class FrontEnd:
             self.times[part] += spent
         scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None,
                     cov=cov if len(y) else None)  # fmt: skip
-        self.sighting = Sighting(scan, removed)
+        self.sighting = Sighting(scan, removed, drifted)
         return self.sighting
 
     def learn(self, report: Report, T: Array) -> None:
@@ -294,10 +304,29 @@ class FrontEnd:
         look = self.looks.get(name)
         return [] if look is None else look.views
 
+    def _seen_lately(self, name: Id) -> bool:
+        look = self.looks.get(name)
+        return look is not None and not look.surveyed and self.frame - look.seen <= AWAY
+
     def _name(self, frame: Frame) -> Id:
         """Return the id of a new landmark, which no other sensor gives."""
         self.named += 1
         return f"{frame.robot}.{frame.sensor} {self.named}"
+
+    def _matched_again(self, image: Any, prospect: Prospect, searcher: Searcher) -> tuple[Index, Array] | None:
+        """Return landmarks (n,) and where they are recognised (n, 2), if those that come into view again are not found.
+
+        Asked now and then, as it takes long: the sensor has drifted, or they are hidden.
+        """
+        found = self.found
+        if self.frame % EVERY or found is None:
+            return None
+        looks = [(k, self.looks[prospect.names[k]]) for k in self.likely.told.tolist()]
+        old = np.array([k for k, look in looks if look.fitted >= TRIAL and self.frame - look.seen > AWAY], np.int64)
+        if len(old) < ENOUGH or found.matched[old].sum() > len(old) / 2:
+            return None
+        views = [self._views(prospect.names[k]) for k in old.tolist()]
+        return matched_again(self.cv2, image, views, old, prospect, searcher)
 
     def _first_look(self, image: Any, prospect: Prospect, found: Selection) -> None:
         """Enter where landmarks known beforehand are that have no view yet; not in each frame, as it takes long."""

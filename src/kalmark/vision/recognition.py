@@ -3,18 +3,22 @@
 The patches of all landmarks that have proven themselves, and corners of the image at three sizes, are described by ORB
 (Rublee and others 2011).  A pair is taken where each is the other's nearest, and clearly nearer than the next landmark.
 One pose must explain many of the pairs (PnP with RANSAC); by chance hardly two pairs agree with one found by four.
+A camera that was lost is put there.  One that has drifted takes the pairs as matches, which correct the map.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array, Index
+from kalmark.geometry.frames3d import to_frame_many
 from kalmark.geometry.rotations import from_matrix
+from kalmark.tracks.prospect import PIXEL, Prospect
 from kalmark.vision.appearance import View
+from kalmark.vision.matching import Searcher
 
 SIZES = (1.0, 0.7, 0.5)  # of the image, in which corners are described
 CORNERS, APART_PX, QUALITY = 600, 5, 0.01
@@ -23,16 +27,37 @@ MARGIN = 20  # about each patch where all are described together
 NEAREST, CLEARER = 70, 0.85  # bits of 256 that may differ, and those of the next landmark that it must stay below
 LEAST = 10  # pairs that agree with a pose
 OFF_PX, TRIES, SURE = 3.0, 300, 0.999
+NEAR_PX = 5.0  # from where that pose shows a landmark, within which it is matched
 POSITION, TURN_RAD = 0.05, 0.03  # sigmas of the pose: a share of the median depth, and an angle
 
 
-def recognised(
-    cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any
-) -> tuple[Array, Array] | None:
-    """Return the pose (7,) of the sensor that took an image of landmarks at `places` (K, 3), and its covariance (6, 6).
+class Recognised(NamedTuple):
+    """The pose T (7,) of a sensor, its covariance (6, 6), and the landmarks `which` (n,) that agree with it."""
 
-    None if that is not sure.
+    T: Array
+    cov: Array
+    which: Index
+
+
+def matched_again(
+    cv2: Any, image: Any, views: Sequence[Sequence[View]], old: Index, prospect: Prospect, searcher: Searcher
+) -> tuple[Index, Array] | None:
+    """Return landmarks (n,) of a prospect and the pixels (n, 2) where an image shows them; None if that is not sure.
+
+    `old` (k,) are the landmarks of these views.
     """
+    found = recognised(cv2, image, views, prospect.places[old], prospect.sensor)
+    if found is None:
+        return None
+    rows = old[found.which]
+    e = prospect.sensor.expect(to_frame_many(found.T, prospect.places[rows])[0])[0][:, :PIXEL]
+    y, scores = searcher.in_discs(rows, e, np.full(len(rows), NEAR_PX))
+    good = scores >= searcher.accept
+    return (rows[good], y[good]) if good.sum() >= LEAST else None
+
+
+def recognised(cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any) -> Recognised | None:
+    """Return where an image (H, W) of landmarks at `places` (K, 3) was taken from; None if that is not sure."""
     orb = cv2.ORB_create(CORNERS, nlevels=1, edgeThreshold=REACH + 1, patchSize=2 * REACH + 1)
     known, owner = of_patches(cv2, orb, views)
     seen, y = of_corners(cv2, orb, image)
@@ -41,7 +66,8 @@ def recognised(
     ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.1)
     if ahead.sum() < LEAST:
         return None
-    places, rays = np.ascontiguousarray(places[landmark[ahead]]), rays[ahead]
+    landmark, rays = landmark[ahead], rays[ahead]
+    places = np.ascontiguousarray(places[landmark])
     u, v = image.shape[1] / 2.0, image.shape[0] / 2.0
     pixel_rad = float(np.linalg.norm(np.diff(sensor.rays(np.array([[u, v], [u + 1.0, v]])), axis=0)))
     flat = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
@@ -53,9 +79,10 @@ def recognised(
         return None
     R = cv2.Rodrigues(turn)[0].T
     at = -R @ t.ravel()
-    depth = float(np.median(((places[inliers.ravel()] - at) @ R)[:, 2]))
+    agree = inliers.ravel()
+    depth = float(np.median(((places[agree] - at) @ R)[:, 2]))
     cov = np.diag([(POSITION * depth) ** 2] * 3 + [TURN_RAD**2] * 3)
-    return np.concatenate([at, from_matrix(np.ascontiguousarray(R))]), cov
+    return Recognised(np.concatenate([at, from_matrix(np.ascontiguousarray(R))]), cov, landmark[agree])
 
 
 def of_patches(cv2: Any, orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any, Index]:

@@ -105,7 +105,7 @@ class LineFrontEnd:
         return expectations(map_, tracks, channel, robot, "", only_in_view=True)
 
     def search(self, frame: Frame, image: Any, expected: Expectations, beside: Any = None
-    ) -> tuple[Scan, list[tuple[Id, str]]]:  # fmt: skip
+    ) -> tuple[Scan, list[tuple[Id, str]], None]:  # fmt: skip
         """Search an image (H, W) for the lines expected, and for new ones."""
         t0 = perf_counter()
         self.frame, self.image, self.expected = self.frame + 1, image, expected
@@ -138,7 +138,7 @@ class LineFrontEnd:
             self.times[part] += spent
         scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None)
         self._numbers = [*of[rows].tolist(), *new]
-        return scan, removed
+        return scan, removed, None
 
     def learn(self, report: Report, T: Array) -> None:
         """Learn from what became of a frame: profiles of new lines, and which lines fitted."""

@@ -8,7 +8,7 @@ believed together, which leaves small ellipses for the rest: searched in the ord
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,7 @@ class Selection:
     """What was found of K landmarks: where, y (K, 2), their scores (K,), which were `searched`, which `matched` (K,).
 
     `belief` is what is believed after them, `centres` (K, 2) and `regions` (K, 2, 2) the ellipses searched, NaN where
-    none was, `base` the landmark on whose match the others agree.
+    none was, `base` the landmark on whose match the others agree.  The covariance of the map was too small by `wider`.
     """
 
     belief: Belief
@@ -41,6 +41,7 @@ class Selection:
     regions: Array
     base: int = -1
     tries: int = 0
+    wider: float = 1.0
 
 
 class Search:
@@ -61,6 +62,20 @@ class Search:
             self._consensus(random)
             self._active()
         return self.found
+
+    def run_again(self, rows: Index, y: Array) -> Selection:
+        """Return what is found with matches y (n, 2) of some landmarks that were recognised, beside those of the rest.
+
+        Where they are farther off than expected, in the median, the covariance is too small by as much.
+        """
+        found = self.found
+        d2 = float(np.median(self._d2(found.belief, rows, y)))
+        if d2 > GATE:
+            found.wider = d2 / PIXEL
+            found.belief = replace(found.belief, S=found.wider * found.belief.S, C=found.wider * found.belief.C)
+        self._take(rows, y)
+        self._active()
+        return found
 
     # ------------------------------------------------------------------ one-point RANSAC
     def _consensus(self, random: np.random.Generator) -> None:
