@@ -8,6 +8,7 @@ import threading
 import time
 
 import cv2
+import numpy as np
 
 import kalmark as km
 from kalmark.config.data_sheets import calibration
@@ -43,8 +44,11 @@ def main(file: str, source: str = "0") -> None:
     point = km.landmarks.Homogeneous(prior_rho_per_m=0.5, sigma_rho_per_m=0.5)
     camera = km.Mount(km.sensors.PinHole(**lens), landmark=point, detector=km.vision.ActiveSearch())
     hand = km.motion.ConstantVelocity3D(sigma_v_mps_per_sqrt_s=1.0, sigma_w_radps_per_sqrt_s=2.0)
-    slam, newest, begin, done = km.Slam([km.Robot("camera", hand, sensors={"eye": camera})]), Newest(source), None, 0
+    still = np.diag(np.repeat([0.0, 0.0, 0.3, 0.5], 3) ** 2)  # m/s and rad/s, nearly: its pose is the origin
+    robot = km.Robot("camera", hand, sensors={"eye": camera}, cov=still)
+    slam = km.Slam([robot], estimator=km.estimators.Ekf())  # one linearisation: docs/vision.md
     slam.warm_up()
+    newest, begin, done = Newest(source), None, 0  # from now on
     while (image := newest.take()) is not False:
         begin = begin or time.monotonic()
         report = slam.process(km.Frame(time.monotonic() - begin, "camera", "eye", image))

@@ -68,6 +68,7 @@ def test_the_names_of_images_are_their_times(tmp_path: Path, names: list[str], t
         put(tmp_path / name, picture(k))
     log = km.open_log(tmp_path)
     assert (log.format, [f.t_ns for f in frames(log)]) == ("images", t_ns)
+    assert (log.describes["estimator"], log.describes["map"]) == ({"type": "ekf"}, {"type": "dense"})  # as `visual`
     assert camera(log) == {"type": "pinhole", "width_px": 64, "height_px": 48}
     if not names[0].endswith(".jpg"):
         assert (frames(log)[1].pixels() == picture(1)).all()
@@ -256,6 +257,7 @@ def test_euroc_has_the_unit_as_robot_and_starts_in_the_true_state(tmp_path: Path
     mount = camera(log, "cam0")["mount"]
     assert (mount["x_m"], mount["yaw_deg"]) == pytest.approx((0.1, 90.0))
     assert "imu0" not in str(km.open_log(tmp_path / "V1" / "mav0", imu="none").events[0])
+    assert "estimator" not in log.describes  # the default
     assert "no camera 'cam1', expected cam0" in refused(tmp_path / "V1", cameras=["cam1"])
 
 

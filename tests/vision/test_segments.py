@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -215,7 +216,9 @@ def written(folder: Path, camera: str, more: str = "") -> Path:
     return folder / "run.yaml"
 
 
-def test_a_sensor_takes_the_images_of_a_camera_with_its_intrinsics_and_mount(tmp_path: Path) -> None:
+def test_a_sensor_takes_the_images_of_a_camera_with_its_intrinsics_and_mount(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config, log = open_run(written(tmp_path, "camera"))
     (robot,) = log.robots
     camera, lines = (config.robots[robot].sensors[name] for name in ("camera", "lines"))
@@ -224,6 +227,11 @@ def test_a_sensor_takes_the_images_of_a_camera_with_its_intrinsics_and_mount(tmp
     assert [frame.sensor for frame in log.events] == ["camera", "lines"] * 3
     assert log.events[1].grey().shape == log.events[0].grey().shape
     assert not np.array_equal(log.events[1].grey(), log.events[0].grey())  # it is straightened
+    decode = Mock(side_effect=cv2.imdecode)
+    monkeypatch.setattr(cv2, "imdecode", decode)
+    for frame in log.events:
+        frame.grey()
+    assert decode.call_count == 2  # each once for both; the first one above
 
 
 @pytest.mark.parametrize(

@@ -39,15 +39,32 @@ def with_images(config: Config, log: Log) -> Log:
     taken = {name: _cameras(config, name if name in config.robots else "each") for name in log.robots}
     if not any(taken.values()):
         return log
-    events = list[Event]()
+    events, newest = list[Event](), Newest()
     for event in log.events:
-        events.append(event)
-        if not isinstance(event, Frame):
+        takers = taken[event.robot].get(event.sensor, ()) if isinstance(event, Frame) else ()
+        if not isinstance(event, Frame) or not takers:
+            events.append(event)
             continue
-        for name, straight in taken[event.robot].get(event.sensor, ()):
-            image = event.image if straight is None else partial(straight.of, event)
+        frame = replace(event, image=partial(newest.of, event.image)) if callable(event.image) else event
+        events.append(frame)
+        for name, straight in takers:
+            image = frame.image if straight is None else partial(straight.of, frame)
             events.append(Frame(t_ns=event.t_ns, robot=event.robot, sensor=name, image=image))
     return replace(log, events=events)
+
+
+class Newest:
+    """The image that was read last: sensors that take it one after another have it read once."""
+
+    def __init__(self) -> None:
+        self.source: Any = None
+        self.image: Any = None
+
+    def of(self, source: Any) -> Any:
+        """Return the image of a source."""
+        if source is not self.source:
+            self.image, self.source = source(), source
+        return self.image
 
 
 def _cameras(config: Config, robot: str) -> dict[str, list[tuple[str, Straightened | None]]]:

@@ -59,7 +59,9 @@ def camera_log(
     """Return the log of a robot with cameras, `sensors` by name, whose frames are among the events."""
     start = rest.pop("start", START)
     robot = {"motion": dict(motion), "start": dict(start), "sensors": dict(sensors)}
-    rig = {"robots": {ROBOT: robot}, "map": {"type": "dense"}}  # most landmarks are in view
+    rig: dict[str, Any] = {"robots": {ROBOT: robot}, "map": {"type": "dense"}}  # most landmarks are in view
+    if motion is MOTION:
+        rig["estimator"] = {"type": "ekf"}  # one linearisation: docs/vision.md
     return one_robot(format, path, request, ROBOT, events, controls, {}, describes=rig, **rest)
 
 
