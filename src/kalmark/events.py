@@ -203,21 +203,36 @@ class Control(_Timed):
     """A robot's control: a velocity held from `t_s` on, or an increment that ended at `t_s`.
 
     `u` has the motion model's shape and units; `cov` (same size, squared) overrides the model's own noise.
-    `largest` is the largest magnitude in `u`.
+    `share` is less than 1 for a part of an increment, whose noise is that share of the whole one's, `cov` or the
+    model's, and the variances `uneven` (k,) besides.  `largest` is the largest magnitude in `u`.
     """
 
     t_ns: int
     robot: str
     u: Array
     cov: Array | None
+    share: float
+    uneven: Array | None
     largest: float = field(init=False, repr=False)
 
     def __init__(
-        self, t_s: float | None = None, robot: str = "", u: Any = (), cov: Any = None, *, t_ns: int | None = None
+        self,
+        t_s: float | None = None,
+        robot: str = "",
+        u: Any = (),
+        cov: Any = None,
+        *,
+        t_ns: int | None = None,
+        share: float = 1.0,
+        uneven: Any = None,
     ) -> None:
         set_ = object.__setattr__
         t_ns = nanoseconds(t_s, t_ns, "control", robot)
         try:
+            if not is_number(share) or not 0.0 < share <= 1.0:
+                raise EventError(f"share is {shown(share)}, expected a number above 0 and at most 1")
+            set_(self, "share", share)
+            set_(self, "uneven", None if uneven is None else finite(uneven, "uneven", MOST_OTHER**2))
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
             u, largest = measured(u, "u", MOST_OTHER)

@@ -12,7 +12,7 @@ The true control depends on where the robot truly is, its error does not: that i
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -38,7 +38,7 @@ from kalmark.results.recording import config_yaml
 from kalmark.results.warnings import NO_ID
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start, told
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
-from kalmark.slam.motion import HeldInput, Part
+from kalmark.slam.motion import HeldInput, Part, noise_of
 from kalmark.slam.robot import Robot
 from kalmark.slam.slam import Slam
 
@@ -304,11 +304,11 @@ class _Replaying:
         """Take the control that leads back to the path, and tell it with noise."""
         event, robot, rng = steer.event, self.robots[steer.event.robot], self.chance.control
         robot.advance(event.t_ns, rng, last=True)
-        N = robot.motion.control_noise(event.u) if event.cov is None else event.cov
+        N = noise_of(robot.motion, event)
         u = steered(robot.motion, robot.state, steer, N)
         robot.told = told(robot.motion, u, robot.constants, steer.dt_s) + gaussian(N, rng)
-        self.events.append(Control(t_ns=event.t_ns, robot=event.robot, u=robot.told, cov=event.cov))
-        for part in robot.drive.accept(Control(t_ns=event.t_ns, robot=event.robot, u=u)):
+        self.events.append(replace(event, u=robot.told))
+        for part in robot.drive.accept(replace(event, u=u, cov=None)):
             robot.move(part, rng)
 
     def _look(self, look: Look) -> None:

@@ -310,7 +310,7 @@ def _three(sigma: float | tuple[float, ...]) -> Array:
 # keys of logs of any format
 COMMON = (
     "robots", "from_s", "to_s", "on_error", "ids", "truth", "fixes", "sigma_fixes_m", "sigma_fixes_z_m", "factors",
-    "shift_s",
+    "shift_s", "increments",
 )  # fmt: skip
 BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]
 
@@ -344,6 +344,8 @@ class LogConfig(Section):
     """Factors of columns, also of one robot or sensor: `{w_radps: -1, laser: {range_m: .001}}`; `t_s`: of all times."""
     shift_s: BySensor | None = None
     """Added to the times of the scans of a sensor, by its name; of one robot: `{rover: {laser: .1}}`."""
+    increments: Literal["recorded", "cut"] = "cut"
+    """`cut`: a scan between the ends of two increments cuts the second, and finds its robot where it was then."""
     origin: list[Number] | None = None
     """native: [latitude_deg, longitude_deg, height_m] of the origin of positions on the globe (the first if absent)."""
     vertices: Literal["none", "truth"] | None = None

@@ -69,7 +69,7 @@ def copies(run: Run, log: Log) -> list[Copies]:
         since_s = float(h.t_ns[steps[0]]) * 1e-9
         found.append(Copies(*key, len(steps), len(np.unique(h.step[mine])), since_s))
     for name in run.final_slam().robots:
-        mine_ = [e for e in log.events if isinstance(e, Control) and e.robot == name]
+        mine_ = [e for e in log.events if isinstance(e, Control) and e.robot == name and e.share == 1.0]
         twice = np.flatnonzero(copied(np.array([e.u for e in mine_]), np.arange(len(mine_))))
         if len(twice):
             found.append(Copies(name, "", len(twice), len(mine_), mine_[twice[0]].t_s))

@@ -41,8 +41,9 @@ class Controls:
 
     def __init__(self, log: Log, columns: Sequence[str], robot: str) -> None:
         mine = [e for e in log.events if isinstance(e, Control) and e.robot == robot]
-        self.columns, self.t_s = columns, np.array([e.t_s for e in mine])
-        self.u = np.array([e.u for e in mine]).reshape(len(mine), -1)
+        self.columns, self.t_s, share = columns, np.array([e.t_s for e in mine]), np.array([e.share for e in mine])
+        self.u = np.array([e.u for e in mine]).reshape(len(mine), -1) / share[:, None]
+        self.interval_s = float(np.median(np.diff(self.t_s) / share[1:])) if len(mine) > 1 else 0.0
         self.usual = np.quantile(np.abs(self.u), USUAL, axis=0) if mine else np.zeros(0)
 
     def odd(self, t_s: float) -> OddControl | None:
@@ -55,7 +56,7 @@ class Controls:
         if times[row, column] < TIMES:
             return None
         k = int(near[row])
-        lasts_s = 1.0 if self.columns[column].endswith("ps") else float(np.median(np.diff(self.t_s)))
+        lasts_s = 1.0 if self.columns[column].endswith("ps") else self.interval_s
         value, most = float(self.u[k, column]), float(self.usual[column]) / max(lasts_s, 1e-9)
         return OddControl(float(self.t_s[k]), self.columns[column], value, float(times[row, column]), most)
 

@@ -22,6 +22,7 @@ from kalmark.logs.images.euroc import EUROC
 from kalmark.logs.images.folder import IMAGES, VIDEO
 from kalmark.logs.images.kitti import KITTI_ODOMETRY
 from kalmark.logs.images.tum import TUM_RGBD
+from kalmark.logs.increments import cut
 from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
@@ -56,6 +57,7 @@ def open_log(
     sigma_fixes_z_m: float | None = None,
     factors: Mapping[str, Any] | None = None,
     shift_s: Mapping[str, Any] | None = None,
+    increments: Literal["recorded", "cut"] = "recorded",
     progress: bool = False,
     **options: Any,
 ) -> Log:
@@ -68,6 +70,7 @@ def open_log(
     score against, and positions for the filter with the noise `sigma_fixes_m`,
     and `sigma_fixes_z_m` of their heights.
     `factors` of columns and `shift_s` of sensors correct units, signs and stamps (`kalmark.logs.corrections`).
+    With `increments="cut"`, as in a configuration, a scan between the ends of two increments cuts the second.
     With `progress` tables that take longer than two seconds show a bar on standard error.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
     Raises LogError, with ``file:line:`` for a bad row.
@@ -80,7 +83,8 @@ def open_log(
     request = requested(robot_names(robots, entry.robot_prefix), on_error, progress)
     log = corrected(entry.read(found, request, **options), factors, shift_s)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m, sigma_fixes_z_m)
-    return selected(log, request, from_s, to_s, ids)
+    log = selected(log, request, from_s, to_s, ids)
+    return cut(log) if choice(increments, "increments", ("recorded", "cut")) == "cut" else log
 
 
 def stream_log(

@@ -12,7 +12,7 @@ from kalmark.logs.source import nearest
 LONGEST_LINE = 10_000_000  # characters: more than any scan has
 _TIMES = ("t_s", "t_ns", "robot")
 KEYS: dict[str, tuple[type[Control | Scan | Fix], tuple[str, ...]]] = {
-    "control": (Control, (*_TIMES, "u", "cov")),
+    "control": (Control, (*_TIMES, "u", "cov", "share", "uneven")),
     "scan": (Scan, (*_TIMES, "sensor", "y", "ids", "cov")),
     "fix": (Fix, (*_TIMES, "y", "cov")),
 }
@@ -54,7 +54,9 @@ def line_of(event: Event) -> str:
     kind = next((name for name, (cls, _) in KEYS.items() if type(event) is cls), None)
     if kind is None:
         raise EventError(f"a {type(event).__name__.lower()} is not written as a line, expected a {', '.join(KEYS)}")
-    told = {key: getattr(event, key) for key in KEYS[kind][1] if key != "t_s"}
+    told = {
+        key: getattr(event, key) for key in KEYS[kind][1] if key != "t_s" and (key, getattr(event, key)) != ("share", 1)
+    }
     plain = {key: value.tolist() if hasattr(value, "tolist") else value for key, value in told.items()}
     return json.dumps({"type": kind, **{key: value for key, value in plain.items() if value is not None}})
 

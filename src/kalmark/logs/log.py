@@ -160,8 +160,8 @@ def begins_at(events: Iterable[Event], robot: str, held: bool) -> int | None:
     first = next(mine, None)
     if first is None or held or not isinstance(first, Control):
         return None if first is None else first.t_ns
-    second = next((event.t_ns for event in mine if isinstance(event, Control)), first.t_ns)
-    return 2 * first.t_ns - second
+    second = next((event for event in mine if isinstance(event, Control)), first)
+    return first.t_ns - round((second.t_ns - first.t_ns) * first.share / second.share)
 
 
 def true_start(log: Log, robot: str, held: bool) -> Array | None:

@@ -33,9 +33,9 @@ TYPES: dict[Any, Any] = {int: np.int64, bool: np.bool_, float: np.float64, str: 
 
 
 class Controlled(NamedTuple):
-    """A robot's controls: how many, and the times (ns) of the first and the last."""
+    """A robot's controls: how many, parts of an increment as one, and the times (ns) of the first and the last."""
 
-    number: int
+    number: float
     first_ns: int
     last_ns: int
 

@@ -151,7 +151,7 @@ def draw_plan(axes: Axes, scene: Scene) -> None:
 def strokes(scene: Scene) -> list[Stroke]:
     """Return all that is drawn of a scene, in the order of the legend."""
     several, crowded = len(scene.paths) > 1, len(scene.ids) > CROWD
-    gaps = " (dotted: no scans)" if any(s[-1:].any() for s in scene.stretches.values()) else ""
+    gaps = " (dotted: no scans, or lost)" if any(way.any() for way in scene.dotted.values()) else ""
     out = []
     for robot, path in scene.paths.items():
         style = {"color": scene.colour(robot), "linewidth": 0.8 if len(path) > LONG else 1.2, "alpha": 0.9, "zorder": 6}

@@ -168,7 +168,7 @@ class _Recorder:
         self.gaps += report.gaps
         if type(event) is Control:
             number, first_ns, _ = self.controls.get(event.robot, (0, event.t_ns, 0))
-            self.controls[event.robot] = Controlled(number + 1, first_ns, event.t_ns)
+            self.controls[event.robot] = Controlled(number + event.share, first_ns, event.t_ns)
             self.reckoned[event.robot].take(event)
         elif type(event) is Fix:
             used = all(o.outcome == "associated" for o in report.observations)
@@ -264,7 +264,7 @@ class _Recorder:
             ),
             noise=padded([stated_noise(self.slam, r) for r in reports], counts, p),
             maps=tuple(self.maps),
-            controls=self.controls,
+            controls={name: of._replace(number=round(of.number)) for name, of in self.controls.items()},
             fixes=tuple(self.fixes),
             starts=self.starts,
             priors=self.priors,

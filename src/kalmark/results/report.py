@@ -250,6 +250,7 @@ def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]
     out |= gaussians(mean[:, :d], P[:, :d, :d])
     stretches = scene.stretches[robot][thin(len(scene.stretches[robot]))]
     out["gaps"] = _gaps(stretches)
+    out["dotted"] = _gaps(np.cumsum(scene.dotted[robot], dtype=np.int64)[thin(len(scene.dotted[robot]))])
     out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
     dead = scene.dead[robot]
     if np.isfinite(dead).any():

@@ -22,6 +22,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
+from kalmark.results.gaps import while_lost
 from kalmark.results.history import Camera, History, Ints, Measuring
 from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
 from kalmark.results.measures import rigid
@@ -55,8 +56,8 @@ class Scene:
     """A run up to one of its steps, in the plane (d = 2) or in space (d = 3).
 
     By robot: poses (N, 3|7) and their covariances up to the step, `stretches` (S,), the gaps in time up to each of all
-    its steps, positions by `dead` reckoning (N, d), true ones (S, d; NaN: unknown), fixes (F, 2) to score with and
-    those `used` by the filter (F, d).
+    its steps, `dotted` (S,), whether the way to each is unknown, positions by `dead` reckoning (N, d), true ones (S, d;
+    NaN: unknown), fixes (F, 2) to score with and those `used` by the filter (F, d).
     `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
     `known` (N, d) are the landmarks known exactly and `known_ids` their names.
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
@@ -67,6 +68,7 @@ class Scene:
     paths: dict[str, Array]
     pose_covariances: dict[str, Array]
     stretches: dict[str, Ints]
+    dotted: dict[str, Flags]
     dead: dict[str, Array]
     truth: dict[str, Array]
     fixes: dict[str, Array]
@@ -112,6 +114,11 @@ class Scene:
         paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
         dead = {r: history.dead_reckoned[until][rows[until]][:, :d] for r, rows in mine.items()}
         stretches = {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()}
+        lost = while_lost(history)
+        dotted = {
+            r: lost[rows] | np.append(False, lost[rows])[:-1] | (np.diff(stretches[r], prepend=0) > 0)
+            for r, rows in mine.items()
+        }
         fixes = {}
         for robot in scored:  # the antenna's offset is taken off
             to_fixes, _, offset, xy = aligned_fixes(run, robot)
@@ -120,7 +127,7 @@ class Scene:
         at = {str(name): now.means[k] for k, name in enumerate(ids)}
         twice = [np.array([at[row.landmark], at[row.other]]) for row in history.repeats if {*row[1:3]} <= at.keys()]
         return cls(
-            d, paths, covariances, stretches, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
+            d, paths, covariances, stretches, dotted, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
             joined([line[:, :d] for line in twice], d), known_at, tuple(exact.ids),
         )  # fmt: skip
 
@@ -140,14 +147,15 @@ class Scene:
         return colours[list(self.paths).index(robot) % len(colours)]
 
     def line(self, robot: str) -> Array:
-        """Return a robot's path (N, d), NaN in gaps of time."""
-        return broken(self.paths[robot][:, : self.d], self.stretches[robot])
+        """Return a robot's path (N, d), NaN where its way is unknown."""
+        return broken(self.paths[robot][:, : self.d], np.cumsum(self.dotted[robot]))
 
     def bridges(self, robot: str) -> Array:
-        """Return a robot's path (N, d) across gaps of time alone: a straight line each, NaN between them."""
-        path, stretches = self.paths[robot][:, : self.d], self.stretches[robot]
-        after = np.flatnonzero(np.diff(stretches[: len(path)])) + 1
-        return joined([path[[k - 1, k]] for k in after.tolist()], self.d)
+        """Return the rest of a robot's path (N, d): across gaps of time and while it is lost, NaN between them."""
+        path = self.paths[robot][:, : self.d]
+        ends = np.diff(self.dotted[robot][: len(path)].astype(int), prepend=0, append=0)
+        spans = zip(np.flatnonzero(ends > 0).tolist(), np.flatnonzero(ends < 0).tolist(), strict=True)
+        return joined([path[max(first - 1, 0) : last] for first, last in spans], self.d)
 
     def inside(self, lines: Array) -> Array:
         """Return polylines (..., d) with NaN where they leave the box."""

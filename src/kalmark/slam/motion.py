@@ -80,6 +80,14 @@ class Mean(NamedTuple):
         return Mean(self.rate + (rate - self.rate) / number, number)
 
 
+def noise_of(motion: Motion, control: Control) -> Array:
+    """Return the covariance N (k, k) of a control's error: its own or the model's, of a part its share of that."""
+    if control.share == 1.0:
+        return motion.control_noise(control.u) if control.cov is None else control.cov
+    whole = motion.control_noise(control.u / control.share) if control.cov is None else control.cov
+    return control.share * whole + (0.0 if control.uneven is None else np.diag(control.uneven))
+
+
 class HeldInput:
     """The control in force of one robot and how far it has been acted upon.
 
@@ -185,7 +193,7 @@ class HeldInput:
             return []
         if self.gaps is not None and self.gaps.limited and self.gaps.rules_out(control):
             return self._left_out(control, self.gaps)
-        N = self.motion.control_noise(control.u) if control.cov is None else control.cov
+        N = noise_of(self.motion, control)
         if not self.motion.held:
             dt_s = 0.0 if self.t_ns is None else (control.t_ns - self.t_ns) * 1e-9
             part = self._lost(control.t_ns, control.u)

@@ -29,6 +29,7 @@ from kalmark.events import Control, Event, Frame, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState, TimedNoise, coasts
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
+from kalmark.slam.motion import noise_of
 from kalmark.slam.robot import Robot
 
 ZERO = ZeroVelocity2D | ZeroVelocity3D
@@ -143,7 +144,7 @@ class Standing:
         if source is None or isinstance(event, Frame) or (isinstance(event, Scan) and not len(event.y)):
             return None
         if isinstance(event, Control):
-            source.take(event.t_ns, event.u, self.motion.control_noise(event.u) if event.cov is None else event.cov)
+            source.take(event.t_ns, event.u, noise_of(self.motion, event))
         elif isinstance(event, Scan):
             plain = [k for k, name in enumerate(event.ids or (None,)) if name in (None, event.robot)]
             for k in plain:  # not what counts from an earlier scan

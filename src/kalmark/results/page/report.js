@@ -38,9 +38,14 @@ function broken(values, gaps) {
   return values.flatMap((v, i) => at.has(i) ? [null, v] : [v]);
 }
 
-/* The first n steps of a robot's path, broken at gaps. */
+/* The first n steps of a robot's path, broken where its way is unknown; and the rest of it. */
 function pathOf(r, n, axes) {
-  return Object.fromEntries(axes.map(k => [k, broken(r[k].slice(0, n), r.gaps)]));
+  return Object.fromEntries(axes.map(k => [k, broken(r[k].slice(0, n), r.dotted)]));
+}
+function bridgesOf(r, n, axes) {
+  const dotted = r.dotted.filter(g => g < n), goesOn = new Set(dotted.map(g => g + 1));
+  const way = k => dotted.flatMap(g => goesOn.has(g) ? [r[k][g]] : [null, r[k][g - 1], r[k][g]]);
+  return Object.fromEntries(axes.map(k => [k, way(k)]));
 }
 
 /* A curve over time, broken at gaps; what is alone between two of them is a dot. */

@@ -130,8 +130,7 @@ function moving(frame) {
     const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path", at = n ? [n - 1] : [];
     const own = {legendgroup: r.name, ...quiet};
     traces.push(stroke(pathOf(r, n, AXES), r.colour, 1.6, {name, legendgroup: r.name}));
-    const bridges = along(k => r.gaps.filter(g => g < n).flatMap(g => [r[k][g - 1], r[k][g], null]));
-    const dotted = stroke(bridges, r.colour, 1.6, own);
+    const dotted = stroke(bridgesOf(r, n, AXES), r.colour, 1.6, own);
     traces.push({...dotted, line: {...dotted.line, dash: "dot"}});
     if (SPACE) traces.push(stroke(n ? placed(DATA.bodies[r.name], r, n - 1) : along(() => []), r.colour, 1.2, own));
     else traces.push({...dart(r, at), mode: "lines", ...own, fill: "toself", fillcolor: r.colour,
