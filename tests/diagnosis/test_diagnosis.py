@@ -24,7 +24,8 @@ from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.copies import copied
 from kalmark.diagnosis.gross import elsewhere, fit
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.verdict import SEGMENT, Verdict, causes_of, thinned
+from kalmark.diagnosis.searched import SEGMENT, thinned
+from kalmark.diagnosis.verdict import Verdict, causes_of
 from kalmark.diagnosis.words import words
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.frames import compose, inverse
@@ -136,7 +137,7 @@ def test_a_log_that_does_not_fit_is_not_ok_where_there_is_no_batch_solution(monk
     def unsolved(*given: Any) -> Any:
         raise km.KalmarkError("not determined")
 
-    monkeypatch.setattr("kalmark.diagnosis.verdict._searched", unsolved)
+    monkeypatch.setattr("kalmark.diagnosis.verdict.searched", unsolved)
     assert km.diagnose(run_of()).map == "ok"
     verdict = km.diagnose(run_of(measuring(lambda y: np.add(y, [0.0, 0.5 * np.sin(3 * y[0, 0])]))))
     assert (verdict.map, verdict.causes[0].name) == ("doubtful", "misfit")

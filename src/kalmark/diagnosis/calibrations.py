@@ -19,7 +19,7 @@ from kalmark.diagnosis.columns import Column, columns_of, rates_of
 from kalmark.diagnosis.keys import Keys, Path_
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.search import LEAST_GAIN
-from kalmark.diagnosis.verdict import sensors_of
+from kalmark.diagnosis.searched import sensors_of
 from kalmark.models.observe import view_of
 from kalmark.results.run import Run
 

@@ -257,7 +257,7 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
             config, *words = started_at(config, start, *found)
             told.append(words)
             begin_s = min(begin_s, start.t_ns * 1e-9)
-    after = _filtered(config, log, events) if told else None
+    after = filtered(config, log, events) if told else None
     if after is None or fit(after).mean > FITS or any(_used(after, start.robot) <= REJECTED for start in lost):
         return None
     gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
@@ -270,7 +270,7 @@ def _onto_its_fixes(run: Run, log: Log, events: list[Event], start: Start) -> tu
 
     None if the path fits them nearly as well as it is: then it was another robot that started elsewhere.
     """
-    path = _filtered(run.config, log, list(_alone(events, start.robot, run.history.robots)))
+    path = filtered(run.config, log, list(_alone(events, start.robot, run.history.robots)))
     mine = np.zeros(0, np.bool_) if path is None else path.history.robot == start.robot
     if path is None or not mine.any():
         return None
@@ -359,7 +359,7 @@ def kidnapped(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
     Or that landmarks were, if the log before and after it fits together without these.
     """
     t_ns, robot, rest = _from(run, log, first)
-    again, before = _filtered(run.config, log, rest), now.of(slice(first, None))
+    again, before = filtered(run.config, log, rest), now.of(slice(first, None))
     after = REFUSED if again is None else fit(again)
     if again is None or after.mean > FITS or MUCH * after.mean > before.mean:
         return None
@@ -415,7 +415,7 @@ def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
     if first is None:
         return None
     t_ns, _, rest = _from(run, log, first)
-    after = _filtered(run.config, log, rest)
+    after = filtered(run.config, log, rest)
     if after is None or fit(after).mean > FITS:
         return None
     old = run.history.map_at(int(run.history.step[first]) - 1)
@@ -513,11 +513,11 @@ def fit_without(mistake: Mistake, log: Log, events: list[Event]) -> Fit:
 
 def fit_of(config: Mapping[str, Any], log: Log, events: list[Event]) -> Fit:
     """Return how events fit under a configuration."""
-    run = _filtered(config, log, events)
+    run = filtered(config, log, events)
     return REFUSED if run is None else fit(run)
 
 
-def _filtered(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
+def filtered(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
     """Return the run of events under a configuration, None if they are refused."""
     try:
         made = config_of(Tree(deepcopy(dict(config))), None)

@@ -87,10 +87,19 @@ class Search:
         self.simulated = linear.simulated(causes.SETS)
 
     def take_outliers(self) -> None:
-        """Take out what is far off where the problem is linear: at a robust solution, which they do not pull."""
+        """Take out what is far off where the problem is linear: at a robust solution, which they do not pull.
+
+        Of a landmark that is mostly far off it is left: that moves.
+        """
+        of, landmark = self.linear.observations, self.linear.rows.landmark
         for finding in causes.outliers(self.linear, self.t_s, self.linear.at.z):
-            if finding.p < ALPHA:
-                self.take(finding)
+            if finding.rows is None or finding.p > ALPHA:
+                continue
+            seen, off = (np.bincount(landmark[mine] + 1) for mine in (slice(None), finding.rows[of]))
+            moves = 2 * np.pad(off, (0, len(seen) - len(off))) > seen
+            far = finding.rows & ~np.isin(np.arange(len(finding.rows)), of[moves[landmark + 1] & (landmark >= 0)])
+            if far.any():
+                self.take(replace(finding, rows=far, noise=np.where(far[of], OUT, 1.0), value=float(far.mean())))
 
     def run(self, progress: bool = False) -> list[Finding]:
         """Return all causes, the one that explains most first.

@@ -31,7 +31,7 @@ from kalmark.diagnosis.components import Components, Estimate, Noise
 from kalmark.diagnosis.keys import Keys, Path_, Values
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.search import LEAST_GAIN
-from kalmark.diagnosis.verdict import NEAR, calibrated, sensors_of
+from kalmark.diagnosis.searched import NEAR, calibrated, sensors_of
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.logs.progress import track

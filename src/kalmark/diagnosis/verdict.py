@@ -3,56 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc
 
 from kalmark.arrays import Array
-from kalmark.batch.data import Associations, Given, replayed
-from kalmark.batch.problem import Problem
-from kalmark.batch.solver import Batch, optimum
-from kalmark.batch.state import LANDMARKS, Ints, State
+from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
-from kalmark.diagnosis.columns import Where
 from kalmark.diagnosis.gross import LOST, MOVED, fit, gross, started_at, until
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
-from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.mounts import TURNED
 from kalmark.diagnosis.search import LEAST_GAIN, Search
+from kalmark.diagnosis.searched import MORE, WORST, Searched, misfits, searched
 from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
-from kalmark.models.protocols import Calibrated
-from kalmark.models.sensors import Wall
-from kalmark.results.batch import filtered_map, given_by, log_of, of_the_filter_alone
+from kalmark.results.batch import filtered_map, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
-from kalmark.results.measures import cut_off, rigid, rmse
+from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict import INNOVATIONS, NO_MAP
 from kalmark.results.warnings import NO_ID, window_warnings
 from kalmark.results.words import count, figure
-from kalmark.slam.robot import Mount
-from kalmark.slam.slam import Slam
 from kalmark.slam.surveyed import ELSEWHERE
 from kalmark.tracks.surveys import MISFITS
 
-NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
-EVENTS = 4  # times as many as observations are taken
-SEGMENT = 30  # successive scans of each robot that are taken together where not all are
-MORE = 4  # times as many are taken if the segments do not determine the map, up to `MOST` at the end of a run
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
-HUBER = 30.0, 10.0, 3.0, 1.5  # sigmas, beyond which observations count less for a robust solution, one after the other
-ROUGHLY = 1e-3  # of the map's size, is its last step
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
@@ -62,8 +46,6 @@ MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a g
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause that innovations look wrong, and nothing says why
 LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that says something
-SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
-LOOKED_INTO = 3  # segments with the worst scans
 
 
 @dataclass(frozen=True)
@@ -144,7 +126,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
         most = max(most, MOST)  # its reason may show in all of the log only
     try:
-        found = _searched(run, log, most, limit, progress)
+        found = searched(run, log, most, limit, progress)
     except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
@@ -157,12 +139,19 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     if found.given.segments is not None and not any(c.name in JUMPS for c in causes):  # between these it is not looked
         causes += odd_controls(run, log)
     twice = any(cause.name == COPIES for cause in first)  # then the filter is too sure for that
-    causes = sorted([*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, -c.score))
+    odd = [*odd_controls(run, log)] if found.pulled else []  # a robust solution rather leaves out what is after them
+    causes = [*(c for c in causes if not odd or c.name not in JUMPS), *odd]
+    causes = sorted(
+        [*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, c not in odd, -c.score)
+    )
     if not any(c.name == "gap" and not c.harmless for c in first):  # else it is that what doubles maps
         steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
         alone = [c.score for c in first if c.name == "kidnapped" and not run.summary.get("repeats")]
         before = [c for c in causes if c.name in steady and c.score > min([SURELY, *alone])]
         first = [*before, *(_as_well(c, before) for c in first)]
+    noisy = [c for c in causes if c.name.endswith("_sigma") and c.score > SURELY]
+    split = [c for c in first if c.name == "split_landmarks" and noisy]  # which such noise does
+    first = [*(c for c in first if c not in split), *(c for c in noisy if split and c not in first), *split]
     causes = [*first, *(c for c in causes if c not in first)]
     causes.sort(key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(map(stayed_lost, run.summary.get("gaps", ())))
@@ -195,142 +184,6 @@ def begin_s(run: Run) -> float:
     return float(run.history.t_ns[0]) * 1e-9 if len(run.history.t_ns) else 0.0
 
 
-# ------------------------------------------------------------------ the search
-class Searched(NamedTuple):
-    """A search for causes that is done, and the batch solution that it began at; what is far off may have pulled it."""
-
-    search: Search
-    batch: Batch
-    given: Given
-    pulled: bool = False
-
-
-def _searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
-    """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none.
-
-    Where `most` observations do not solve it, more are tried, up to a `limit`: all of a long log take minutes.
-    """
-    every = calibrated(run, once(run, given_by(run)))
-    if not every.associations.landmark:
-        raise KalmarkError("no observation was of a landmark in the map")
-    given = thinned(run, every, most)
-    try:
-        problem = replayed(given, log)
-        batch = optimum(problem, tolerance=NEAR)
-    except KalmarkError:
-        if given is every or min(MORE * most, len(every.associations.landmark)) > limit:
-            raise
-        return _searched(run, log, MORE * most, limit, progress)
-    search = Search(Linear.of(problem, batch.state, within_gates(run)), sensors_of(run), given.t_ns)
-    search.run(progress)
-    pulled = any(f.rows is not None for f in search.found) and fit(run).mean > MISFITS_ALL
-    if pulled:
-        state = robust(problem, batch.state)  # what is far off has pulled the solution out of where it is linear
-        search = Search(Linear.of(problem, state, within_gates(run)), sensors_of(run), given.t_ns)
-        search.take_outliers()
-        search.run(progress)
-    return Searched(search, batch, given, pulled)
-
-
-def robust(problem: Problem, state: State) -> State:
-    """Return the solution in which observations beyond fewer and fewer sigmas count less, from a state on."""
-    for huber in HUBER:
-        with suppress(KalmarkError):  # from a better start the next one may be found
-            less = tuple(replace(factor, huber=huber) for factor in problem.factors)
-            state = optimum(replace(problem, factors=less), state, tolerance=ROUGHLY).state
-    return state
-
-
-def once(run: Run, given: Given) -> Given:
-    """Return it without the scans that are copies of the one before."""
-    twice = np.unique(run.history.step[copies.of_scans(run)])
-    used = given.associations
-    rows = np.flatnonzero(~np.isin(used.scan, twice))
-    return given if len(rows) == len(used.scan) else replace(given, associations=_rows(used, rows))
-
-
-def _rows(used: Associations, rows: Ints) -> Associations:
-    names = [used.landmark[k] for k in rows.tolist()]
-    return Associations(used.scan[rows], used.sensor[rows], used.index[rows], names, used.e[rows])
-
-
-def calibrated(run: Run, given: Given) -> Given:
-    """Return it with the mounts, ranges and controls that calibrate themselves as they were in the end."""
-    slam, robots = run.final_slam(), {}
-    for name, robot in given.robots.items():
-        sensors = {key: _calibrated(slam, f"{name}.{key}", mount) for key, mount in robot.sensors.items()}
-        robots[name] = replace(robot, sensors=sensors)
-    return replace(given, robots=robots, biases={bias.robot: bias.mean for bias in run.history.biases})
-
-
-def _calibrated(slam: Slam, name: str, mount: Mount) -> Mount:
-    """Return a mount as it is in the map, if it is there."""
-    if mount.block(name) is None:
-        return mount
-    mean, pose, sensor = slam.mean(name), len(mount.at), mount.sensor
-    if isinstance(sensor, Calibrated) and len(mean) > pose:
-        sensor = sensor.with_parameters(mean[pose:])
-    return replace(mount, at=mean[:pose], sensor=sensor, cov=None)
-
-
-def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
-    """Return the columns that each sensor of a run measures, by robot and sensor; of a wall those that have a noise."""
-    robots, found = run.final_slam().robots.values(), {}
-    for key, sensor in (((r.name, name), m.sensor) for r in robots for name, m in r.sensors.items()):
-        columns = tuple(sensor.columns)
-        found[key] = tuple(c for c in columns if f"sigma_{c}" in sensor.sigmas) if isinstance(sensor, Wall) else columns
-    return found
-
-
-def within_gates(run: Run) -> dict[Where, Array]:
-    """Return by what factor (p,) the noise that a sensor's gate leaves is smaller than that of all its observations.
-
-    A gate leaves innovations of covariance k Z (`cut_off`).  Their noise has then R - (1 - k) R Z^-1 R, of which the
-    shares that R has of Z on the diagonals are taken here.
-    """
-    h, found = run.history, {}
-    robots = h.robot[h.step]
-    for key, channel in run.final_slam().state.channels.items():
-        mine = (h.outcome == "associated") & (robots == key[0]) & (h.sensor == key[1])
-        k = cut_off(channel.gate, channel.dof)
-        if k < 1.0 and mine.any():
-            share = h.noise[mine] ** 2 / np.diagonal(h.Z[mine], axis1=1, axis2=2)
-            share = share[:, np.isfinite(share).any(axis=0)]
-            found[key] = np.sqrt(1.0 - (1.0 - k) * np.nanmean(np.minimum(share, 1.0), axis=0))
-    return found
-
-
-def thinned(run: Run, given: Given, most: int) -> Given:
-    """Return about `most` of the observations: segments of successive scans, evenly over the run.
-
-    Those with the scans that fit least are among them, if these do not fit by chance: a jump is a single step.
-    """
-    used, t_ns = given.associations, given.t_ns
-    events = len(t_ns) + sum(controls.number for controls in run.history.controls.values())
-    share = most / max(len(used.landmark), events / EVENTS, 1)
-    if share >= 1.0:
-        return given
-    segment = SEGMENT * len(given.robots)
-    number = max(len(t_ns) // segment, 2)
-    even = np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)
-    worst = misfits(run)[1]
-    with_worst = [*dict.fromkeys(np.minimum(worst // segment, number - 1).tolist())][:LOOKED_INTO]
-    first = np.unique([*even, *with_worst]) * segment
-    last = np.minimum(first + segment, len(t_ns)) - 1
-    begins = np.maximum(first - np.isin(first, worst), 0)  # with the scan before, or there is no step
-    last[:-1] = np.minimum(last[:-1], begins[1:] - 1)
-    segments = np.stack([t_ns[begins], t_ns[last]], axis=1)
-    segments[0, 0] = np.iinfo(np.int64).min  # the motion before the first scan leads from the start to it
-    within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
-    kept = (within >= 0) & (t_ns <= segments[within, 1])
-    renumbered, rows = np.cumsum(kept) - 1, np.flatnonzero(kept[used.scan])
-    some = _rows(used, rows)
-    some = replace(some, scan=renumbered[some.scan])
-    return replace(
-        given, t_ns=t_ns[kept], robot=given.robot[kept], poses=given.poses[kept], associations=some, segments=segments
-    )
-
-
 # ------------------------------------------------------------------ the causes
 def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None = None) -> list[Cause]:
     """Return the causes that a search found; a landmark that moves by less than the map's accuracy does not matter.
@@ -357,7 +210,8 @@ def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.overstated
     odd = _controls(run, log, finding.of[0]).odd(since_s) if finding.name in JUMPS and log is not None else None
     name, told = finding.name, words(finding, run.config)
-    if name == LATE and 0.0 < finding.value < _increments_s(run, finding.of[0]):
+    cut = (run.config.get("log") or {}).get("increments") == "cut"
+    if name == LATE and not cut and 0.0 < finding.value < _increments_s(run, finding.of[0]):
         more = "a scan between two increments counts at the end of the first, which may be why"
         told = f"{told[0]}; {more}", told[1]
     if odd is not None:
@@ -387,14 +241,6 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
             finding = Finding("odometry_jump", (robot, "", *at), 0.0, 0.0, 0.0)
             score = 0.5 * float(sum(chi2[k] for _, k in odd.values()))
             yield Cause("odometry_jump", min(odd), score, *of_odd_control(finding, most))
-
-
-def misfits(run: Run) -> tuple[Array, Ints]:
-    """Return the chi-square (S,) of each scan, and those that do not fit by chance, the worst first."""
-    h, now = run.history, fit(run)
-    chi2, dof = (np.bincount(h.step, of, len(h.t_ns)).astype(np.float64) for of in (now.values * now.dof, now.dof))
-    bad = np.flatnonzero(chdtrc(np.maximum(dof, 1), chi2) * len(dof) < SELDOM)
-    return chi2, bad[np.argsort(-chi2[bad])]
 
 
 def misplaced(run: Run, finding: Finding) -> bool:
