@@ -1,8 +1,9 @@
 """A car with an inertial unit, a receiver and wheels, from a rest with an unknown heading: is it as sure as it may be?
 
-    python benchmarks/drive.py [--runs 40] [--heading 30] [--estimator invariant]
+    python benchmarks/drive.py [--runs 40] [--heading 30] [--estimator invariant] [--receiver 1.0]
+        [--seen]
 
-The unit is read at 100 Hz with the noise of a data sheet, the receiver at 5 Hz (1 m), the wheels at 20 Hz (.03 m/s).
+The unit is read at 100 Hz with the noise of a data sheet, the receiver at 5 Hz, the wheels at 20 Hz (.03 m/s).
 Biases, the antenna's lever arm (.5 m an axis), the scale of the wheels (5 %), position (3 m) and heading of the start
 are drawn by the sigmas that the filter is told.  The start is found at rest.  Printed: the mean NEES of attitude,
 velocity, position and biases (15) at several times, and of attitude and biases of the force for themselves.
@@ -60,25 +61,27 @@ def turned(states: np.ndarray, yaw_rad: float, at: np.ndarray) -> np.ndarray:
     return out
 
 
-def run(seed: SeedSequence, heading: float, estimator: str, states: np.ndarray, u: np.ndarray) -> np.ndarray:
+def run(
+    seed: SeedSequence, heading: float, estimator: str, receiver_m: float, seen: bool, states: np.ndarray, u: np.ndarray
+) -> np.ndarray:  # fmt: skip
     """Return the NEES (times, 3) of the whole state, of the attitude and of the biases of the force."""
     rng = np.random.default_rng(seed)
     x = turned(states, rng.normal(0, heading), rng.normal(0, START_M, 3))
     walk = UNIT.densities[6:] * math.sqrt(DT_S)
     x[:, 10:] = rng.normal(0, np.repeat([SIGMA_W, SIGMA_F], 3)) + np.cumsum(rng.normal(0, walk, (len(x), 6)), axis=0)
     read = u + x[:-1, 10:] + rng.normal(0, UNIT.densities[:6] / math.sqrt(DT_S), u.shape)
-    slam = started(read, heading, estimator)
+    slam = started(read, heading, estimator, receiver_m, seen)
     arm, gain = np.array([0.5, 0.0, 1.0]) + rng.normal(0, ARM_M, 3), 1.0 + rng.normal(0, SCALE)
     t, found = DT_S * np.arange(len(u)), []
     for i in range(len(u)):
         slam.process(km.Control(t_s=t[i], robot="car", u=read[i]))
-        readings(slam, rng, i, x[i], arm, gain)
+        readings(slam, rng, i, x[i], arm, gain, receiver_m)
         if i in [round(each / DT_S) for each in TIMES_S]:
             found.append(nees(slam, x[i]))
     return np.array(found)
 
 
-def started(read: np.ndarray, heading: float, estimator: str) -> km.Slam:
+def started(read: np.ndarray, heading: float, estimator: str, receiver_m: float, seen: bool = False) -> km.Slam:
     """Return the filter of a car whose readings (N, 6) begin at rest."""
     cov = np.zeros((15, 15))
     cov[:3, :3], cov[5, 5] = START_M**2 * np.eye(3), heading**2
@@ -86,20 +89,30 @@ def started(read: np.ndarray, heading: float, estimator: str) -> km.Slam:
     rest = km.motion.at_rest(UNIT, DT_S * np.arange(len(read)), read, np.eye(16)[6], cov)
     of_arm = np.diag([ARM_M**2] * 3 + [0.0] * 3)
     sensors = {
-        "gps": km.Mount(km.sensors.Gps3D(sigma_m=1.0), at=(0.5, 0, 1, 0, 0, 0, 1), cov=of_arm),
+        "gps": km.Mount(km.sensors.Gps3D(sigma_m=receiver_m), at=(0.5, 0, 1, 0, 0, 0, 1), cov=of_arm),
         "wheels": km.Mount(km.sensors.Speed(sigma_mps=0.03, sigma_scale=SCALE), at=(0, 0, 0, 0, 0, 0, 1)),
     }
     until_ns = round(rest.until_s * 1e9)
-    car = km.Robot("car", UNIT, rest.start, sensors, rest.cov, rests_until_ns=until_ns)
-    return km.Slam(car, estimator=getattr(estimators, estimator.capitalize())())
+    if seen:
+        del sensors["gps"]
+    robots = [km.Robot("car", UNIT, rest.start, sensors, rest.cov, rests_until_ns=until_ns)]
+    if seen:
+        eye = km.Mount(km.sensors.Position3D(receiver_m, receiver_m, receiver_m), at=np.eye(7)[6])
+        robots.append(km.Robot("tower", km.motion.Odometry3D(), np.eye(7)[6], {"eye": eye}))
+    return km.Slam(robots, estimator=getattr(estimators, estimator.capitalize())())
 
 
-def readings(slam: km.Slam, rng: Generator, i: int, x: np.ndarray, arm: np.ndarray, gain: float) -> None:
+def readings(
+    slam: km.Slam, rng: Generator, i: int, x: np.ndarray, arm: np.ndarray, gain: float, receiver_m: float
+) -> None:  # fmt: skip
     """Let the filter read receiver and wheels, where they are due."""
     Q, t_s = matrix(x[3:7]), DT_S * i
     if i and i % 20 == 0:
-        y = x[:3] + Q @ arm + rng.normal(0, 1.0, 3)
-        slam.process(km.Scan(t_s=t_s, robot="car", sensor="gps", y=y[None]))
+        y, noise = x[:3] + Q @ arm, rng.normal(0, receiver_m, 3)
+        if "tower" in slam.robots:
+            slam.process(km.Scan(t_s=t_s, robot="tower", sensor="eye", y=(x[:3] + noise)[None], ids=["car"]))
+        else:
+            slam.process(km.Scan(t_s=t_s, robot="car", sensor="gps", y=(y + noise)[None]))
     if i and i % 5 == 0:
         y = [[(x[7:10] @ Q[:, 0]) / gain + rng.normal(0, 0.03)]]
         slam.process(km.Scan(t_s=t_s, robot="car", sensor="wheels", y=y))
@@ -121,10 +134,13 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--heading", type=float, default=30.0, help="sigma at the start, deg")
     parser.add_argument("--estimator", default="invariant")
+    parser.add_argument("--seen", action="store_true", help="of a tower whose pose is known, instead of a receiver")
+    parser.add_argument("--receiver", type=float, default=1.0, help="its sigma, m")
     given = parser.parse_args()
     states, u = drive(TIMES_S[-1] + DT_S)
     heading, seeds = math.radians(given.heading), SeedSequence(0).spawn(given.runs)
-    scored = Parallel(n_jobs=1)(delayed(run)(s, heading, given.estimator, states, u) for s in seeds)
+    told = heading, given.estimator, given.receiver, given.seen
+    scored = Parallel(n_jobs=1)(delayed(run)(s, *told, states, u) for s in seeds)
     mean, error = np.mean(scored, axis=0), np.std(scored, axis=0) / math.sqrt(given.runs)
     for t_s, row, sigma in zip(TIMES_S, mean, error, strict=True):
         parts = f"attitude {row[1]:.2f}, force {row[2]:.2f}"

@@ -270,11 +270,17 @@ def inertial() -> Iterator[Figure]:
         yield Figure("Inertial", f"5 min at rest, `{estimator}`: least and most information about position and yaw", wanted,
                      f"python benchmarks/inertial.py still --estimator {estimator}",
                      row(f"still {estimator}:", "{2} / {4}"))  # fmt: skip
-    for heading, estimator in ((30, "invariant"), (0.01, "invariant"), (30, "ekf")):
-        label = f"a drive with a receiver and wheels, heading at the start {heading} deg, `{estimator}`"
+    for heading, estimator, sigma_m in (
+        (30, "invariant", 0),
+        (0.01, "invariant", 0),
+        (30, "ekf", 0),
+        (30, "invariant", 0.05),
+    ):
+        of, more = (f" of {sigma_m} m", f" --receiver {sigma_m}") if sigma_m else ("", "")
+        label = f"a drive with a receiver{of} and wheels, heading at the start {heading} deg, `{estimator}`"
         yield Figure("Inertial", f"{label}: state NEES (15) after 30 s / 60 s / 180 s, mean of 40 runs",
                      "below 16.8, its 97.5 %" if estimator == "invariant" else "",
-                     f"python benchmarks/drive.py --heading {heading} --estimator {estimator}",
+                     f"python benchmarks/drive.py --heading {heading} --estimator {estimator}{more}",
                      several([f"{estimator} {t_s} s: state" for t_s in (30, 60, 180)]))  # fmt: skip
 
 

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import kalmark as km
 from kalmark.arrays import Array
 from kalmark.errors import EventError, MapError, ModelError
 from kalmark.geometry.frames import compose, inverse
+from kalmark.geometry.frames3d import compose as compose3
 
 STEP_S = 0.1
 ARM = np.array([0.5, -0.1, 0.0])
@@ -188,6 +190,40 @@ def test_a_rate_of_the_state_needs_a_noise_of_each_reading() -> None:
     km.Slam(km.Robot("r", motion=km.motion.Unicycle(), sensors={"gyro": km.Mount(density)}))
     with pytest.raises(ModelError, match="Gyro2D: the noise of one reading is 0, expected a positive number"):
         km.Slam(km.Robot("r", motion=km.motion.ConstantTurnRate(), sensors={"gyro": km.Mount(density)}))
+
+
+@pytest.mark.parametrize("plane", [True, False])
+def test_a_heading_is_found_with_an_exact_receiver_on_a_lever_arm_that_is_not_known(plane: bool) -> None:
+    """While it stands only the antenna's place is known; as it drives, the heading is found, off by 20 deg at first."""
+    d, found = (2, []) if plane else (3, [])
+    sigmas = np.array([3.0, 3.0, 0.35, 0.5, 0.5] if plane else [3.0, 3, 3, 0.003, 0.003, 0.35, 0.5, 0.5, 0.5])
+    motion: Any = km.motion.Odometry2D(0.01, 0.01, 0.005) if plane else km.motion.Odometry3D(0.01, 0.01, 0.01, 0.005)
+    gps: Any = (km.sensors.Gps2D if plane else km.sensors.Gps3D)(0.02)
+    start, pose = (np.zeros(3), 3) if plane else (np.array([0.0, 0, 0, 0, 0, 0, 1]), 6)
+    noise = np.array([0.01] * d + [0.005] * (pose - d))
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        off = rng.normal(0, sigmas)
+        x, at = motion.space.plus(start, off[:pose]), start.copy()
+        at[:d] += off[pose:]
+        arm_cov = np.zeros((pose, pose))
+        arm_cov[:d, :d] = 0.25 * np.eye(d)
+        mount = km.Mount(gps, at=start, cov=arm_cov)
+        cov = np.diag(sigmas[:pose] ** 2)
+        slam = km.Slam(km.Robot("r", motion=motion, start=start, cov=cov, sensors={"gps": mount}))
+        for k in range(80):
+            if k >= 20:  # it stood so far
+                u = np.zeros(pose)
+                u[0], u[-1] = min(0.1, 0.004 * (k - 19)), 0.02
+                slam.process(km.Control(0.1 * k, "r", u))
+                x = motion.move(x, u + rng.normal(0, noise), 0.1)[0]
+            antenna = (compose if plane else compose3)(x, at)[0][:d]
+            slam.process(km.Scan(0.1 * k, "r", "gps", [antenna + rng.normal(0, 0.02, d)]))
+        e = np.append(motion.space.minus(slam.mean("r"), x), slam.mean("r.gps")[:d] - at[:d])
+        rows = [*range(pose), *range(pose, pose + d)]
+        found.append(e @ np.linalg.solve(slam.covariance("r", "r.gps")[np.ix_(rows, rows)], e))
+    low, high = chi2.ppf([0.0005, 0.9995], len(sigmas) * len(found))
+    assert low < sum(found) < (high if plane else 2 * high)  # what is left in space: docs/invariant.md
 
 
 def test_heights_of_a_receiver_have_a_noise_of_their_own() -> None:

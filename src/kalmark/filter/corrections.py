@@ -53,7 +53,8 @@ from kalmark.filter.observed import (
     within,
 )
 from kalmark.filter.parallax import anchored
-from kalmark.geometry.rotations import matrix
+from kalmark.geometry.angles import exponential_v
+from kalmark.geometry.rotations import exp, left_jacobian, matrix
 from kalmark.geometry.spaces import ANGLE, SCALAR, TURNED, Table, generator, generator_plane, retract, retract_plane
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
@@ -108,9 +109,11 @@ def turning_rows(table: Table, pose: int, head: int, axes: int, H: Array) -> Ind
 
     The map turns with the sensor that observes it, so with its mount (docs/invariant.md).  A second block that is no
     mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation in H are zero.
+    Of such a mount the rows of its position (2 or 3) follow, which turns with the robot: its lever arm.
     """
     dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
     mounted = head > pose and table[2, 0] == SCALAR and table[last, 0] == (ANGLE if pose == 3 else TURNED)
+    begin, more = 2 * dof - turns, turns
     if mounted:
         most = turning = 0.0
         for i in range(len(H)):
@@ -118,21 +121,33 @@ def turning_rows(table: Table, pose: int, head: int, axes: int, H: Array) -> Ind
                 most = max(most, abs(H[i, j]))
                 if 2 * dof - turns <= j < 2 * dof:
                     turning = max(turning, abs(H[i, j]))
-        mounted = turning > BLIND * most
-    rows = np.empty(axes + turns if mounted else axes, np.int64)
+        if turning <= BLIND * most:
+            begin, more = dof, dof - turns
+    rows = np.empty(axes + more if mounted else axes, np.int64)
     for a in range(len(rows)):
-        rows[a] = dof - axes + a if a < axes else 2 * dof - turns + a - axes
+        rows[a] = dof - axes + a if a < axes else begin + a - axes
     return rows
 
 
 @compiled
-def frame_of(x: Array, at: int, size: int) -> Array:
-    """Return R_r (1, 1) or (3, 3) of the pose at this place of a mean x: a mount turns in the frame of its robot.
+def arm_of(rows: Index, axes: int, pose: int) -> int:
+    """Return how many of the `turning_rows` are of a lever arm: 2, 3 or 0."""
+    return len(rows) - axes if len(rows) > axes and rows[axes] == (3 if pose == 3 else 6) else 0
 
-    `size`: 3 for a mount of space.
+
+@compiled
+def frame_of(x: Array, at: int, size: int) -> Array:
+    """Return R_r (size, size) of the pose at this place of a mean x, in whose frame its mounts are.
+
+    `size`: 3 in space, in the plane 2 of positions, and 1 of rotations.
     """
-    if size < 3:
+    if size < 2:
         return np.eye(1)
+    if size == 2:
+        R = np.empty((2, 2))
+        R[0, 0] = R[1, 1] = np.cos(x[at + 2])
+        R[1, 0], R[0, 1] = np.sin(x[at + 2]), -np.sin(x[at + 2])
+        return R
     q = np.empty(4)
     for i in range(4):
         q[i] = x[at + 3 + i]
@@ -140,11 +155,12 @@ def frame_of(x: Array, at: int, size: int) -> Array:
 
 
 @compiled
-def turns_of(g: Array, R: Array, x: Array, at: int, last: int, columns: int) -> Array:
+def turns_of(g: Array, R: Array, x: Array, at: int, last: int, columns: int, arm: int) -> Array:
     """Return a generator g (n, axes) with, up to so many columns, how a turn of the mount moves everything: g R.
 
     R is R_r before the correction, the pose of the robot is at this place of the mean x now.  Its own rotation, whose
     rows end with `last`, moves by -R_r: a correction leaves d_theta_r + R_r d_theta_s as it is, that of the sensor.
+    Its position moves by -R_r B with a lever arm (`arm` rows), where R is the B of `leaning`.
     """
     n, axes = g.shape
     turns = columns - axes
@@ -154,23 +170,101 @@ def turns_of(g: Array, R: Array, x: Array, at: int, last: int, columns: int) -> 
     for i in range(n):
         for a in range(axes):
             out[i, a] = g[i, a]
-        for c in range(turns):
+        for c in range(turns - arm):
             for a in range(turns):
                 out[i, axes + c] += g[i, axes - turns + a] * R[a, c]
-    now = frame_of(x, at, turns)
+    now, first = frame_of(x, at, turns), last + 1 - (turns if arm == 0 else 3 if arm == 2 else 6)
+    now = product(now, R) if arm > 0 else now
     for a in range(turns):
         for c in range(turns):
-            out[last + 1 - turns + a, axes + c] = -now[a, c]
+            out[first + a, axes + c] = -now[a, c]
     return out
 
 
 @compiled
-def gauge(mean: Array, correction: Array, rows: Index, axes: int) -> Array:
+def product(A: Array, B: Array) -> Array:
+    """Return A B of two small square matrices."""
+    out = np.zeros(A.shape)
+    for i in range(len(A)):
+        for j in range(len(A)):
+            for c in range(len(A)):
+                out[i, j] += A[i, c] * B[c, j]
+    return out
+
+
+@compiled
+def leaning(P: Array, R: Array, arm: int) -> Array:
+    """Return B (arm, arm): in the robot's frame, R = R_r, its position leans on the lever arm by -B.
+
+    That is d_p = -R_r B d_a + C d_theta + what both do not explain, of the covariance P of the head: B is I where an
+    antenna's place is known and the heading is not, 0 where the robot's place is known.
+    """
+    turns = 1 if arm == 2 else 3
+    pose, n = arm + turns, arm + turns
+    A, B, most = np.empty((n, n)), np.zeros((arm, arm)), 0.0
+    rows = np.empty(n, np.int64)
+    for i in range(n):
+        rows[i] = pose + i if i < arm else i  # of the arm, then of the rotation
+    for i in range(n):
+        for j in range(n):
+            A[i, j] = P[rows[i], rows[j]]
+        A[i, i] += RAISED * max(A[i, i], 1.0)
+        most = max(most, A[i, i] if i < arm else 0.0)
+    M, positive = cholesky_inverse(A)
+    if most <= RAISED or not positive:
+        return B
+    for i in range(arm):
+        for j in range(arm):
+            for a in range(arm):
+                for b in range(n):
+                    for c in range(n):  # R' P_p. M' M
+                        B[i, j] -= R[a, i] * P[a, rows[b]] * M[c, b] * M[c, j]
+    return B
+
+
+@compiled
+def frames_of(P: Array, x: Array, at: int, columns: int, arm: int) -> tuple[Array, Array]:
+    """Return R_r, before a correction, and what `turns_of` takes for it, of the covariance P of the head."""
+    R = frame_of(x, at, columns)
+    return R, leaning(P, R, arm) if arm > 0 else R
+
+
+@compiled
+def carry_arm(x: Array, at: int, R: Array, turn: Array, d: Array) -> None:
+    """Move the position of a robot, at this place of the mean x, for what a correction d (k,) of its lever arm does.
+
+    With a turn E it moves by (V - E) R d, R = R_r B: what the arm explains of it turns with E.
+    """
+    k, M = len(d), np.zeros((3, 3))  # V - E
+    if k == 2:
+        p, q = exponential_v(turn[0])
+        M[0, 0] = M[1, 1] = p - np.cos(turn[0])
+        M[1, 0], M[0, 1] = q - np.sin(turn[0]), np.sin(turn[0]) - q
+    else:
+        whole = turn[len(turn) - 3 :].copy()
+        M = left_jacobian(whole) - matrix(exp(whole))
+    for i in range(k):
+        for j in range(k):
+            for c in range(k):
+                x[at + i] += M[i, j] * R[j, c] * d[c]
+
+
+@compiled
+def arm_in(correction: Array, rows: Index, axes: int) -> Array:
+    """Return what a correction of the head is of the lever arm (2,) or (3,), whose rows are the last ones."""
+    d = np.empty(len(rows) - axes)
+    for i in range(len(d)):
+        d[i] = correction[rows[axes + i]]
+    return d
+
+
+@compiled
+def gauge(mean: Array, correction: Array, rows: Index, axes: int, arm: int) -> Array:
     """Return the motion of the gauge (axes,), d_theta or (xi_p, d_theta), in a correction of the head.
 
     The observing robot's pose comes first in `mean` and in `correction`; `rows` are its `turning_rows`.
     """
-    turn, turns = np.empty(axes), len(rows) - axes
+    turn, turns = np.empty(axes), len(rows) - axes - arm
     for a in range(axes):
         turn[a] = correction[rows[a]]
     if turns > 0:  # of the sensor: d_theta + R_r d_theta_s
@@ -212,9 +306,10 @@ def iterate(
     theta = turning_rows(table, pose, head, axes, linear[1])
     correction = np.zeros(len(P_ss))
     origin = mean[:3].copy()
-    last, R_r = theta[axes - 1], frame_of(mean, 0, len(theta) - axes)
+    last, arm = theta[axes - 1], arm_of(theta, axes, pose)
+    R_r, B = frames_of(P_ss, mean, 0, len(theta) - axes, arm)
     turned = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
-    turned = turns_of(turned, R_r, mean, 0, last, len(theta))
+    turned = turns_of(turned, B, mean, 0, last, len(theta), arm)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
     depths = anchored(table if parallaxes else table[:0])
     v, H, HP, Z = linear
@@ -233,7 +328,7 @@ def iterate(
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            transport_rows(H, v, turns_of(now, R_r, x_j, 0, last, len(theta)), turned, theta, correction)
+            transport_rows(H, v, turns_of(now, B, x_j, 0, last, len(theta), arm), turned, theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, E_r.shape[2])
         M, positive = cholesky_inverse(Z)
         if not positive:
@@ -242,7 +337,10 @@ def iterate(
         if settled(table, correction, before, P_ss, tolerance):
             break
         x_j = mean.copy()
-        call_retract(ways[_RETRACT], (table, x_j, correction, gauge(mean, correction, theta, axes)))
+        turn = gauge(mean, correction, theta, axes, arm)
+        call_retract(ways[_RETRACT], (table, x_j, correction, turn))
+        if arm > 0:
+            carry_arm(x_j, 0, product(R_r, B), turn, arm_in(correction, theta, axes))
         if len(depths):
             s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
             d_head = correction[: S.shape[1]]
@@ -343,8 +441,9 @@ def invariant(
         return e, z, Z, d2, within(d2, -1.0)[0], False
     origin = mean[:3].copy()
     theta, at = turning_rows(table, pose, head, axes, linear[1]), blocks[robot, 0]
-    last, R_r = index[theta[axes - 1]], frame_of(x, at, len(theta) - axes)
-    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
+    last, arm = index[theta[axes - 1]], arm_of(theta, axes, pose)
+    R_r, B = frames_of(P_ss, x, at, len(theta) - axes, arm)
+    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
     V, correction = gain(sparse_product(H, rows_of(P, index, n), h, count), M, v)
     depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
@@ -356,8 +455,11 @@ def invariant(
     d_head = np.empty(h)
     for i in range(h):
         d_head[i] = correction[rows[i]]
-    call_retract(ways[_RETRACT], (atoms, x, correction, gauge(mean, d_head, theta, axes)))
-    now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
+    turn = gauge(mean, d_head, theta, axes, arm)
+    call_retract(ways[_RETRACT], (atoms, x, correction, turn))
+    if arm > 0:
+        carry_arm(x, at, product(R_r, B), turn, arm_in(d_head, theta, axes))
+    now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
     for i in range(n):
         for a in range(len(theta)):
             now[i, a] -= before[i, a]
@@ -474,14 +576,17 @@ def averaged(
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
     origin = mean[:3].copy()
-    last, R_r = index[theta[axes - 1]], frame_of(x, at, len(theta) - axes)
-    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
-    turn = gauge(mean, correction[index], theta, axes) if transports else np.zeros(0)
+    last, arm = index[theta[axes - 1]], arm_of(theta, axes, pose)
+    R_r, B = frames_of(submatrix(P, index), x, at, len(theta) - axes, arm)
+    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
+    turn = gauge(mean, correction[index], theta, axes, arm) if transports else np.zeros(0)
     call_retract(ways[_RETRACT], (atoms, x, correction, turn))
+    if transports and arm > 0:
+        carry_arm(x, at, product(R_r, B), turn, correction[index[theta[axes:]]])
     downdate(P, V)
     add_square(P, spread)
     if transports:
-        now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), R_r, x, at, last, len(theta))
+        now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
         transport(P, now - before, picked(index, theta))
     return d2, True
 

@@ -206,8 +206,11 @@ class _Estimator:
         """
         model, *scan = update[:-1]
         run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
-        m = map_.opened(update.robot, update.mount, update.slots, self.transports).map
+        m, robot_here, _, _ = map_.opened(update.robot, update.mount, update.slots, self.transports)
+        before = m.mean(robot_here)
         d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)
+        if self.transports:
+            turn_own_errors(m, robot_here, before)
         return d2, bool(valid)
 
     def _option(self, map_: StochasticMap) -> Any:

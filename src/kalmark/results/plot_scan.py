@@ -249,8 +249,9 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, measu
         _draw_expected(axes, s, size, colour, rejected)
     if named and s.outcome != "ignored" and s.name:
         at = s.expected.mean(axis=0) if expected and (single or not len(s.measured)) else s.measured.mean(axis=0)
-        text: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 7, "color": NAME, "clip_on": True}
-        axes.text(at[0], at[1] - 15.0, s.name, zorder=7, **text)
+        text: dict[str, Any] = {"va": "bottom", "fontsize": 7, "color": NAME, "clip_on": True}
+        within = "left" if at[0] < 0.02 * size[0] else "right" if at[0] > 0.98 * size[0] else "center"
+        axes.text(at[0], at[1] - 15.0, s.name, zorder=7, ha=within, **text)
 
 
 def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: str, rejected: bool) -> None:
