@@ -500,6 +500,8 @@ def images() -> Iterator[Figure]:
                      wanted, f"python benchmarks/vision.py {name}", row(name, shown))  # fmt: skip
         yield Figure("Images", f"the same with lines, {name}: ATE of five seeds / scale drift / points, lines matched a frame / a frame",
                      wanted, f"python benchmarks/vision.py {name}+lines", row(f"{name}+lines", "{0} {1} {2} {3} {4} m / {6} % / {10}, {12} / {11} ms"))  # fmt: skip
+    yield Figure("Images", "one camera, tsukuba, 640 x 480, 54 matched of 84 in view, a frame on one core, median: all / templates / search / new landmarks / patches / filter",
+                 "16.7 ms / - / - / - / - / -", "python benchmarks/vision.py tsukuba", row("tsukuba", "{11} ms / {13} / {14} / {15} / {16} / {17} ms"))  # fmt: skip
     unit, wanted = "python benchmarks/vision_inertial.py", "0.02 m / 0.5 deg / 0.05 m/s / 1 % / 1"
     errors = "position / attitude / velocity / scale / NEES of the pose, a dof"
     for name, label in (
@@ -527,8 +529,15 @@ def images() -> Iterator[Figure]:
         ("the focal length of batch solution and PnP times 0.99", "focal length times 0.99:"),
         ("the focal length of batch solution and PnP times 1.01", "focal length times 1.01:"),
         ("corners of 0.05 px in the batch solution, 0.3 px elsewhere", "corners of 0.05 px:"),
+        (
+            "the lens that a batch solution with free intrinsics found, in filter, batch solution and PnP",
+            "fitted lens:",
+        ),
     ):
         yield Figure("Images", f"the same, one seed, {label}", "-", batch, row(f"batch, seed 0, {start}", off))
+    yield Figure("Images", "the same, medians, three seeds: filter against a batch solution with free intrinsics, lens and size of the target / its chi-square as a share of that with them held / its focal lengths / centre / target",
+                 "0.01 m, 1 deg / - / - / - / -", batch,
+                 row("free, median:", "{1} m, {3} deg / {5} / {7}, {9} px / {11}, {13} px / {19}, {21} mm"))  # fmt: skip
     yield Figure("Images", "one camera round a room, its walls in view, 520 rendered images: RMS of the position after the first round, each of five seeds / the same without descriptors",
                  "-", "python benchmarks/vision.py loop", row("loop", "{0} {1} {2} {3} {4} m / {5} {6} {7} {8} {9} m"))  # fmt: skip
     worlds = {"": "one camera", "_depth": "a camera with depth", "_stereo": "a rectified pair"}

@@ -44,6 +44,7 @@ LINES = (
     "robots.each.sensors.lines={type: segments, images: camera, detector: {type: line_search},"
     " landmark: {type: anchored_homogeneous_line, prior_rho_per_m: 0.5, sigma_rho_per_m: 0.5}}"
 )
+PARTS = ("search", "match", "start", "learn", "filter")  # templates; ...; new landmarks; patches; all of the filter
 SINGULAR = 1e12  # condition of a covariance, so much or more: no NEES
 WORLDS = ("textured_room", "textured_room_depth", "textured_room_stereo")
 LOOP = (
@@ -74,6 +75,7 @@ def run(name: str, seed: int) -> dict[str, float]:
     eye = slam.state.front_ends[log.robots[0], "camera"]
     assert isinstance(eye, FrontEnd)
     way, took, matched, wanted, lines_matched = [], [], 0, 0, 0
+    parts = [list(eye.times.values())]  # so far, s
     for frame in log.events:
         image = frame.grey()  # type: ignore[union-attr]
         here = km.Frame(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, image=image)  # type: ignore[union-attr]
@@ -86,16 +88,19 @@ def run(name: str, seed: int) -> dict[str, float]:
             lines_matched += sum(o.outcome == "associated" for o in report.observations)
             continue
         took.append(spent)
+        parts.append(list(eye.times.values()))
         matched += sum(o.outcome == "associated" for o in report.observations)
         assert eye.prospect is not None
         wanted += len(eye.prospect)
         way.append(slam.mean(frame.robot)[:3])
+    own = np.diff(parts, axis=0)
+    spent_on = 1e3 * np.median(np.column_stack([own, np.array(took) - own.sum(axis=1)]), axis=0)
     p, length = np.array(way), float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
     found = {
         "matched": matched / len(took), "found": matched / max(wanted, 1), "ms": 1e3 * float(np.median(took)),
         "hz": 1.0 / float(np.mean(took)), "return": float(np.linalg.norm(p[-1] - p[0])) / length,
         "lines": lines_matched / len(took),
-        **{f"{part}_ms": 1e3 * spent / len(took) for part, spent in eye.times.items()},
+        **{f"{part}_ms": spent for part, spent in zip((*eye.times, "filter"), spent_on, strict=True)},
     }  # fmt: skip
     truth = log.truth.get(log.robots[0])
     if truth is not None:
@@ -178,14 +183,16 @@ def main(name: str, seeds: int) -> None:
         rows.append(run(name, seed))
         print(f"seed {seed}: " + ", ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
     head = "| sequence | ATE, m, of each seed | largest | scale drift | end off start | matched a frame"
-    print(f"{head} | ms, median | lines |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(f"{head} | ms, median | lines | its parts: {', '.join(PARTS)} |")
+    print("|---|---|---|---|---|---|---|---|---|")
     ate = [row.get("ate_m", np.nan) for row in rows]
     drift = max(abs(row.get("drift", np.nan)) for row in rows)
     print(
         f"| {name} | {' '.join(f'{a:.3f}' for a in ate)} | {max(ate):.3f} | {100 * drift:.1f} % | "
         f"{100 * max(row['return'] for row in rows):.1f} % | {np.mean([row['matched'] for row in rows]):.0f} | "
-        f"{np.median([row['ms'] for row in rows]):.1f} | {np.mean([row['lines'] for row in rows]):.0f} |"
+        f"{np.median([row['ms'] for row in rows]):.1f} | {np.mean([row['lines'] for row in rows]):.0f} | "
+        + " ".join(f"{np.median([row[f'{part}_ms'] for row in rows]):.1f}" for part in PARTS)
+        + " |"
     )
 
 

@@ -15,7 +15,7 @@ matches of the filter with the corners are not in it, nor its start, motion and 
 errors in what both have: matches, lens, intrinsics and the size of the target.  Residuals of the corners are printed
 under the batch solution; under one from which the corners of every other frame were withheld, in those frames; under
 PnP of the same image, and under the mean of PnP's poses in the images before and after, each moved by the motion of
-the filter between the two frames.
+the filter between the two frames.  Another solution has free intrinsics, with the lens and the size of the target.
 """
 
 from __future__ import annotations
@@ -44,6 +44,14 @@ FITS_PX = 0.5  # RMS of the corners of a pose that is used
 EVERY, SIGMA_PX, HUBER = 8, 0.3, 3.0  # of the batch solution: frames, noise of matches and corners, sigmas
 LEAST_SEEN, LEAST_PARALLAX, LEAST_M = 6, 1e-3, 0.05  # of a point: frames, least eigenvalue of its information, depth
 FOCAL, CORNERS_PX = (0.99, 1.01), 0.05  # variations: factors of the focal length, noise of the corners
+FREE = np.array(
+    [30.0, 30.0, 1e-6, 30.0, 30.0, 0.1, 0.1, 1e-6, 1e-6]
+)  # sigmas of free focal lengths, skew, centre, lens
+FREE_M = 2e-3  # and of free corners in the plane of the target
+FITTED = (  # what a solution with free intrinsics found, as a lens that the filter has: to .1 px
+    "lens=equidistant", "distortion=[-0.01431, -0.03021, 0.02168, -0.00087]",
+    "fx_px=194.1", "fy_px=194.16", "cx_px=161.58", "cy_px=124.78",
+)  # fmt: skip
 
 
 class View(NamedTuple):
@@ -149,9 +157,10 @@ def angle(q: Array, p: Array) -> float:
     return float(np.degrees((Rotation.from_quat(q).inv() * Rotation.from_quat(p)).magnitude()))
 
 
-def views(seed: int) -> tuple[PinHole, list[View]]:
-    """Run the filter; return its camera and what each frame gave."""
-    config, log = open_run("monoslam", None, [f"robots.each.sensors.camera.detector.seed={seed}"])
+def views(seed: int, *camera: str) -> tuple[PinHole, list[View]]:
+    """Run the filter, with other options of its camera; return this and what each frame gave."""
+    options = [f"robots.each.sensors.camera.{option}" for option in (f"detector.seed={seed}", *camera)]
+    config, log = open_run("monoslam", None, options)
     slam = build_slam(config, log)
     (channel,) = slam.state.channels.values()
     made = []
@@ -207,19 +216,33 @@ def place(T: Array, rays: Array) -> Array | None:
     return x if turn.inv().apply(x - p)[:, 2].min() > LEAST_M else None
 
 
-def solve(some: list[View], camera: PinHole, corners_px: float = SIGMA_PX) -> Array:
-    """Return the poses (N, 7) of these views that fit matches and corners best, these with that noise."""
+def solve(
+    some: list[View], camera: PinHole, corners_px: float = SIGMA_PX, free: bool = False
+) -> tuple[Array, dict[str, float]]:
+    """Return the poses (N, 7) of these views that fit matches and corners best, these with that noise, and numbers.
+
+    With `free` intrinsics, these and the size of the target are fitted with them: the centre, both focal lengths, and
+    what is wrong with the lens, as a polynomial in the square and the fourth power of the radius.
+    """
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     X, L, C = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L, gtsam.symbol_shorthand.C)
-    lens = gtsam.Cal3_S2(camera.fx_px, camera.fy_px, 0.0, 0.0, 0.0)  # of images made straight
+    f = np.array([camera.fx_px, camera.fy_px])
+    lens, own = gtsam.Cal3_S2(*f, 0.0, 0.0, 0.0), gtsam.Cal3DS2(*f, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # made straight
+    K = gtsam.symbol("K", 0)
+    if free:
+        start.insert(K, own)
+        graph.add(gtsam.PriorFactorCal3DS2(K, own, gtsam.noiseModel.Diagonal.Sigmas(FREE)))
     robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
     of_point, of_corner = (
         gtsam.noiseModel.Robust.Create(robust, gtsam.noiseModel.Isotropic.Sigma(2, px)) for px in (SIGMA_PX, corners_px)
     )
 
     def add(pose: int, point: int, y: Array, noise: gtsam.noiseModel.Base) -> None:
-        straight = plane(camera, y[None])[0] * (camera.fx_px, camera.fy_px)
-        graph.add(gtsam.GenericProjectionFactorCal3_S2(straight, noise, pose, point, lens))
+        straight = plane(camera, y[None])[0] * f
+        if free:
+            graph.add(gtsam.GeneralSFMFactor2Cal3DS2(straight, noise, pose, point, K))
+        else:
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(straight, noise, pose, point, lens))
 
     for k, view in enumerate(some):
         start.insert(X(k), gtsam.Pose3(gtsam.Rot3(Rotation.from_quat(view.T[3:]).as_matrix()), view.T[:3]))
@@ -228,7 +251,8 @@ def solve(some: list[View], camera: PinHole, corners_px: float = SIGMA_PX) -> Ar
                 add(X(k), C(c), y, of_corner)
     for c, corner in enumerate(CORNERS):
         start.insert(C(c), corner)
-        graph.add(gtsam.PriorFactorPoint3(C(c), corner, gtsam.noiseModel.Isotropic.Sigma(3, 1e-7)))
+        sigmas = np.array([FREE_M, FREE_M, 1e-7]) if free else np.full(3, 1e-7)
+        graph.add(gtsam.PriorFactorPoint3(C(c), corner, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
     points = sorted({n for view in some for n in view.matches if not str(n).startswith("target")}, key=str)
     for n, name in enumerate(points):
         by = [k for k, view in enumerate(some) if name in view.matches]
@@ -240,7 +264,14 @@ def solve(some: list[View], camera: PinHole, corners_px: float = SIGMA_PX) -> Ar
                 add(X(k), L(n), match, of_point)
     solved = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     found = [solved.atPose3(X(k)) for k in range(len(some))]
-    return np.array([np.append(T.translation(), Rotation.from_matrix(T.rotation().matrix()).as_quat()) for T in found])
+    T = np.array([np.append(T.translation(), Rotation.from_matrix(T.rotation().matrix()).as_quat()) for T in found])
+    left = {"chi2": 2.0 * graph.error(solved)}
+    if free:
+        numbers, at = solved.atCal3DS2(K).vector(), np.array([solved.atPoint3(C(c)) for c in range(len(CORNERS))])
+        left |= dict(zip(("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2"), numbers[[0, 1, 3, 4, 5, 6]], strict=True))
+        left["cx_px"], left["cy_px"] = left["cx_px"] + camera.cx_px, left["cy_px"] + camera.cy_px
+        left |= dict(zip(("width_mm", "height_mm"), 1e3 * np.ptp(at[:, :2], axis=0), strict=True))
+    return T, left
 
 
 def carry(T: Array, a: Array, b: Array) -> Array:
@@ -257,11 +288,11 @@ def against_batch(camera: PinHole, frames: list[View], corners_px: float = SIGMA
     halves = [
         solve(
             [view._replace(corners=None) if k % 2 == half else view for k, view in enumerate(some)], camera, corners_px
-        )
+        )[0]
         for half in (0, 1)
     ]
     rows = []
-    for j, (k, T) in enumerate(zip(at, solve(some, camera, corners_px), strict=True)):
+    for j, (k, T) in enumerate(zip(at, solve(some, camera, corners_px)[0], strict=True)):
         y, one, before, after = frames[k].corners, pnp[k], pnp[k - 1], pnp[k + 1]
         if y is None or one is None or before is None or after is None:
             continue
@@ -276,6 +307,19 @@ def against_batch(camera: PinHole, frames: list[View], corners_px: float = SIGMA
     return dict(zip((*names, *px), map(float, np.median(rows, axis=0)), strict=True)) | {"frames": len(rows)}
 
 
+def against_free(camera: PinHole, frames: list[View]) -> dict[str, float]:
+    """Return medians of the filter against a batch solution with free intrinsics, m, deg, and what this found.
+
+    `chi2_of_fixed` is its chi-square as a share of that with the intrinsics as they are.
+    """
+    some = [frames[k] for k in range(EVERY, len(frames) - 1, EVERY)]
+    T, left = solve(some, camera, free=True)
+    off = [(np.linalg.norm(view.T[:3] - t[:3]), angle(view.T[3:], t[3:])) for view, t in zip(some, T, strict=True)]
+    m, deg = map(float, np.median(off, axis=0))
+    share = left.pop("chi2") / solve(some, camera)[1]["chi2"]
+    return {"filter_batch_m": m, "filter_batch_deg": deg, "chi2_of_fixed": share, **left}
+
+
 def show(name: str, row: dict[str, float]) -> None:
     """Print a row."""
     print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in row.items()), flush=True)
@@ -283,17 +327,21 @@ def show(name: str, row: dict[str, float]) -> None:
 
 def main_batch(seeds: int) -> None:
     """Print filter, batch solution and PnP against each other: each seed, their medians, and variations."""
-    rows = []
+    rows, free = [], []
     for seed in range(seeds):
         camera, frames = views(seed)
         rows.append(against_batch(camera, frames))
         show(f"batch, seed {seed}", rows[-1])
+        free.append(against_free(camera, frames))
+        show(f"free, seed {seed}", free[-1])
         for scale in FOCAL if seed == 0 else ():
             other = replace(camera, fx_px=scale * camera.fx_px, fy_px=scale * camera.fy_px)
             show(f"batch, seed 0, focal length times {scale}", against_batch(other, frames))
         if seed == 0:
             show(f"batch, seed 0, corners of {CORNERS_PX} px", against_batch(camera, frames, CORNERS_PX))
-    show("batch, median", {key: float(np.median([row[key] for row in rows])) for key in rows[0]})
+            show("batch, seed 0, fitted lens", against_batch(*views(seed, *FITTED)))
+    for name, some in (("batch", rows), ("free", free)):
+        show(f"{name}, median", {key: float(np.median([row[key] for row in some])) for key in some[0]})
 
 
 def main(seeds: int) -> None:

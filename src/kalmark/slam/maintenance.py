@@ -11,7 +11,7 @@ from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.management import existence, reparametrize, walls
 from kalmark.management import repeats as of_map
-from kalmark.models.protocols import Segmented
+from kalmark.models.protocols import Reparametrizable, Segmented
 from kalmark.report import Observation
 from kalmark.slam import merging, surveyed, tentative
 from kalmark.slam.policy import Policy
@@ -23,7 +23,11 @@ def review(state: State, scan: ScanContext, policy: Policy, seen: Sequence[Obser
     """Simplify and extend the landmarks of a scan, and give up those that are expected and not found.  [TB] 4.4."""
     fused = [(o, state.tracks.confirmed[o.landmark]) for o in seen
              if o.outcome == "associated" and o.landmark in state.tracks.confirmed]  # fmt: skip
-    for _, track in fused if policy.linear else ():
+    models = {id(track.model): track.model for _, track in fused}  # few: to ask each track takes long
+    simpler = {key for key, model in models.items() if policy.linear and isinstance(model, Reparametrizable)}
+    for _, track in fused if simpler else ():
+        if id(track.model) not in simpler:
+            continue
         point = None
         with suppress(np.linalg.LinAlgError):
             point = reparametrize.simplified(scan, track, policy.linear)
