@@ -14,9 +14,9 @@ from kalmark.batch.problem import Problem
 from kalmark.batch.solver import optimum
 from kalmark.config import build_slam
 from kalmark.config.building import config_dict
-from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Event, Scan
 from kalmark.geometry import frames
+from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 
 WORLD = ("world.count=30", "world.size_m=24", "steps=400", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")
@@ -36,14 +36,12 @@ def solved(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr("kalmark.diagnosis.searched.optimum", only_robust)
 
 
-def verdict_on(change: Callable[[Scan], Scan], seed: int = 3) -> Verdict:
+def run_of(change: Callable[[Scan], Scan], seed: int = 3) -> Run:
     made = load_world("random_field", [*WORLD, *PRECISE])
     log = simulate(made, seed)
     events: list[Event] = [change(e) if isinstance(e, Scan) and e.ids else e for e in log.events]
     log = replace(log, events=events)
-    return km.diagnose(
-        km.record(build_slam(made.config(), log), log, progress=False, config=config_dict(made.config()))
-    )
+    return km.record(build_slam(made.config(), log), log, progress=False, config=config_dict(made.config()))
 
 
 def test_ids_of_landmarks_anywhere_are_named() -> None:
@@ -57,7 +55,10 @@ def test_ids_of_landmarks_anywhere_are_named() -> None:
             ids[k] = ids[k] if other in ids else other
         return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=ids)
 
-    assert verdict_on(mixed).causes[0].name == "wrong_ids"
+    run = run_of(mixed)
+    assert km.diagnose(run).causes[0].name == "wrong_ids"
+    nis = next(line for line in run.summary["warnings"] if line.startswith("NIS per degree"))
+    assert nis.endswith("where 1 is consistent: see wrong_ids in the verdict")
 
 
 def test_a_landmark_that_goes_far_is_named_before_outliers() -> None:
@@ -75,5 +76,5 @@ def test_a_landmark_that_goes_far_is_named_before_outliers() -> None:
         mine = np.equal(np.array(e.ids), goes)[:, None]
         return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=np.where(mine, y, e.y), ids=e.ids)
 
-    verdict = verdict_on(moving)
+    verdict = km.diagnose(run_of(moving))
     assert verdict.causes[0].name == "moving_landmark" and verdict.causes[0].cure == f"leave out {goes}"

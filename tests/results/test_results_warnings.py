@@ -12,6 +12,7 @@ import pytest
 
 import results_space
 from kalmark.config import build_slam, config_dict
+from kalmark.diagnosis.verdict import diagnose
 from kalmark.errors import DivergedError
 from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.logs.log import Log
@@ -202,10 +203,13 @@ def test_advice_is_kept_with_a_run_and_shown_in_its_report(tmp_path: Path) -> No
     log = circle(steps=60)
     events: list[Event] = [scan(e, cov=np.diag([0.2, 0.1]) ** 2) if isinstance(e, Scan) else e for e in log]
     run = record(slam_for(log), replace(log, events=events), progress=False)
+    verdict = diagnose(run)
     run.save(tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert f'<ul class="warnings verdict {verdict.map}"><li>the map is {verdict.map}' in page
     assert "its sigma is stated" in only(run.summary["advice"])
     assert Run.load(tmp_path).evaluate()["advice"] == run.summary["advice"]
-    assert '<ul class="warnings advice"><li>sensor lidar: ' in (tmp_path / "report.html").read_text()
+    assert '<ul class="warnings advice"><li>sensor lidar: ' in page
 
 
 def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(

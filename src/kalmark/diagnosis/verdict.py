@@ -28,7 +28,7 @@ from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict import INNOVATIONS, NO_MAP
-from kalmark.results.warnings import NO_ID, window_warnings
+from kalmark.results.warnings import NO_ID, TOO_SMALL, window_warnings
 from kalmark.results.words import count, figure
 from kalmark.slam.surveyed import ELSEWHERE
 from kalmark.tracks.surveys import MISFITS
@@ -113,6 +113,9 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
         if run.stopped or summary.get("diverged") or repeats(summary):
             verdict = replace(verdict, map="wrong")
     summary["verdict"] = verdict.as_dict()
+    first = next((cause.name for cause in verdict.causes if not cause.harmless), "noise")
+    if first not in ("noise", MISFIT) and not first.endswith(("_sigma", "_noise")):
+        summary["warnings"] = [w.replace(TOO_SMALL, f"see {first} in the verdict") for w in summary["warnings"]]
     return verdict
 
 

@@ -10,7 +10,7 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 from itertools import combinations_with_replacement
 from typing import Any
@@ -75,6 +75,10 @@ _HINTS = {
 }
 
 
+def _items(lines: Iterable[str]) -> str:
+    return "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+
+
 def report_html(run: Recording) -> str:
     """Return the page: the map over time, errors, NEES and NIS, associations, figures and configuration."""
     from plotly.offline import get_plotlyjs  # slow to import
@@ -82,15 +86,17 @@ def report_html(run: Recording) -> str:
     title, figures = headline(run)
     summary = summary_of(run)
     verdict = summary.get("verdict")
-    notes = [*summary.get("notes", ()), *summary.get("advice", ()), *(verdict_lines(verdict) if verdict else ())]
+    notes = [*summary.get("notes", ()), *summary.get("advice", ())]
     return _resource("report.html").format(
         title=html.escape(title),
         style=_resource("report.css"),
         figures="".join(f"<span>{html.escape(figure)}</span>" for figure in figures),
         robots=robot_table(summary),
         summary=summary_table(summary),
-        warnings="".join(f"<li>{html.escape(line)}</li>" for line in summary.get("warnings", ())),
-        advice="".join(f"<li>{html.escape(line)}</li>" for line in notes),
+        map="" if verdict is None else verdict["map"],
+        verdict=_items([] if verdict is None else verdict_lines(verdict)),
+        warnings=_items(summary.get("warnings", ())),
+        advice=_items(notes),
         mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS)
         + _section(DIFFERENCE_TITLE, difference_rows(summary), DIFFERENCE_COLUMNS),
         reasons=_table(reasons(run), ("outcome", "reason", "observations")),

@@ -51,6 +51,7 @@ MOST_GAP_STEPS = 5
 NO_ID = "no id in the log"  # the reason that association by identity gives
 POSE_NEES = {3: 9.0, 6: 14.0}  # by what is consistent; 3 % of constant errors are above, of others fewer
 NIS_HIGH = 3.0  # per degree of freedom
+TOO_SMALL = "the noise is set too small"  # what a high one means, unless a verdict knows better
 FIX_NIS_HIGH = 5.0
 FIRST_FIX = 0.9999  # of right starts pass the test of the first fix
 BEARINGS = ("range_bearing", "range_bearing_3d")
@@ -389,7 +390,7 @@ def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
             )
     value = summary["nis_per_dof"]
     if value is not None and value > NIS_HIGH and summary["associated"] >= 50:
-        yield f"NIS per degree of freedom {figure(value, 2)} where 1 is consistent: the noise is set too small"
+        yield f"NIS per degree of freedom {figure(value, 2)} where 1 is consistent: {TOO_SMALL}"
 
 
 def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
