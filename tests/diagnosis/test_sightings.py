@@ -13,7 +13,7 @@ from hall import hall, mapped
 import kalmark as km
 from kalmark.diagnosis import sightings
 from kalmark.diagnosis.verdict import SHORT
-from kalmark.events import Scan
+from kalmark.events import Control, Scan
 
 NEAR, FAR, POST = (5.0, 0.0), (5.2, 0.0), (0.0, 5.0)
 
@@ -83,6 +83,19 @@ def test_a_robot_that_is_carried_away_is_named_before_the_map_that_is_doubled(ca
     else:
         assert verdict.map == "ok"
         assert "kidnapped" not in names
+
+
+def test_a_control_far_too_large_is_named_where_the_place_is_mapped_anew() -> None:
+    log = hall(2, bad_wheel=False)
+    k = next(k for k, e in enumerate(log.events) if isinstance(e, Control) and 2 * k > len(log.events))
+    far = log.events[k]
+    assert isinstance(far, Control)
+    events = [*log.events[:k], replace(far, u=np.add(far.u, (5.0, 0.0, 0.0))), *log.events[k + 1 :]]
+    verdict = km.diagnose(mapped(replace(log, events=events)))
+    first = verdict.causes[0]
+    assert (verdict.map, first.name) == ("wrong", "odometry_jump")
+    assert first.since_s == pytest.approx(far.t_s) and "dx_m" in first.evidence and "max_speed_mps" in first.cure
+    assert "kidnapped" not in [cause.name for cause in verdict.causes]
 
 
 def test_a_noise_that_is_stated_too_small_splits_landmarks() -> None:

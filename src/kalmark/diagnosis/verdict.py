@@ -43,6 +43,7 @@ TINY_M = 1e-12
 SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to associations comes after it
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped anew because of it
 MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
+JUMP = "odometry_jump"  # the cause that controls say a motion that was none
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause that innovations look wrong, and nothing says why
 LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that says something
@@ -135,7 +136,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
         why = str(error).removeprefix("batch solution: ") if len(run.landmarks) else NO_MAP
         checked = f"{INNOVATIONS}, no batch solution: {why}"
-        carried = any(cause.name == "kidnapped" for cause in first)
+        carried = any(cause.name in JUMPS and not cause.harmless for cause in first)
         return Verdict("wrong" if carried else "doubtful" if signs else "ok", (*first, *signs), checked)
     effect = effect_of(run, found)
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
@@ -159,7 +160,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     causes.sort(key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(map(stayed_lost, run.summary.get("gaps", ())))
     wrong |= any(c.name in ("misplaced_landmark", "split_landmarks", MISFIT) and not c.harmless for c in first)
-    if any(c.name == "kidnapped" for c in first):
+    if any(c.name in JUMPS and not c.harmless for c in first):
         effect = replace(effect, status="wrong")
     elif effect.status == "ok" and wrong:
         effect = replace(effect, status="doubtful")
@@ -218,7 +219,7 @@ def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
         more = "a scan between two increments counts at the end of the first, which may be why"
         told = f"{told[0]}; {more}", told[1]
     if odd is not None:
-        name, told = "odometry_jump", of_odd_control(finding, odd)
+        name, told = JUMP, of_odd_control(finding, odd)
     if name == TURNED and log is not None:
         told = f"from t={since_s:.1f} s on {told[0]}", until(run, log, round(since_s * 1e9))
     return Cause(name, since_s, finding.gain, *told, harmless)
@@ -241,9 +242,9 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
         if odd:
             most, _ = max(odd.values(), key=lambda of: of[0].times)
             at = [f"{t_s:.1f}" for t_s in sorted(odd) if t_s != most.t_s]
-            finding = Finding("odometry_jump", (robot, "", *at), 0.0, 0.0, 0.0)
+            finding = Finding(JUMP, (robot, "", *at), 0.0, 0.0, 0.0)
             score = 0.5 * float(sum(chi2[k] for _, k in odd.values()))
-            yield Cause("odometry_jump", min(odd), score, *of_odd_control(finding, most))
+            yield Cause(JUMP, min(odd), score, *of_odd_control(finding, most))
 
 
 def misplaced(run: Run, finding: Finding) -> bool:
@@ -367,7 +368,7 @@ def gaps(run: Run) -> list[Cause]:
         evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s{told}"
         cure = cure or ("--set upkeep.repeats=merge" if anew else "")
         found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged and not anew))
-    return found + [Cause("odometry_jump", begin_s, 0.0, line, "", True) for begin_s, line in left_out(summary)]
+    return found + [Cause(JUMP, begin_s, 0.0, line, "", True) for begin_s, line in left_out(summary)]
 
 
 def _mapped_again(run: Run, part: dict[str, Any], t_s: float) -> bool:
@@ -395,7 +396,7 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
     """Yield that a robot was carried away: what it saw until then vanished at once, and what it sees is mapped anew.
 
     Chance does not do that, or the place is in the map already.  Not if its controls had stopped: then it may have
-    driven.
+    driven.  With a control that is far larger than all others it is its odometry that jumps.
     """
     h, repeat = run.history, next(iter(run.summary.get("repeats", ())), None)
     stops = [(gap["robot"], gap["start_s"], gap["end_s"] + STOPPED_S) for gap in run.summary.get("gaps", ())]
@@ -411,6 +412,10 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
     told = f"it sees none of the {first.number} landmarks that it saw just before, and maps {others}"
     evidence = f"{first.robot} was elsewhere{far} from t={first.t_s:.1f} s on: {told}"
     score = max(first.score, repeat["score"] if repeat and again else 0.0)
+    odd = _controls(run, log, first.robot).odd(first.t_s)
+    if odd is not None:
+        yield Cause(JUMP, odd.t_s, score, *of_odd_control(Finding(JUMP, (first.robot, ""), 0.0, 0.0, 0.0), odd))
+        return
     yield Cause("kidnapped", first.t_s, score, evidence, until(run, log, round(first.t_s * 1e9)))
 
 
