@@ -55,7 +55,18 @@ from kalmark.filter.observed import (
 from kalmark.filter.parallax import anchored
 from kalmark.geometry.angles import exponential_v
 from kalmark.geometry.rotations import exp, left_jacobian, matrix
-from kalmark.geometry.spaces import ANGLE, SCALAR, TURNED, Table, generator, generator_plane, retract, retract_plane
+from kalmark.geometry.spaces import (
+    ANGLE,
+    SCALAR,
+    TURNED,
+    VECTOR,
+    VECTOR3,
+    Table,
+    generator,
+    generator_plane,
+    retract,
+    retract_plane,
+)
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
 Routines = tuple[int, int, int, int, int, int, int, int]  # addresses, see `routines`
@@ -65,7 +76,7 @@ Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
 TO_ITERATE = (
-    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 3), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
+    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 4), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
     "Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
 )
 ITERATE = signature_of(f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({TO_ITERATE})")
@@ -104,12 +115,13 @@ def compile_correction(name: str, option: str, axes: int, inverse_depths: bool) 
 
 
 @compiled
-def turning_rows(table: Table, pose: int, head: int, axes: int, H: Array) -> Index:
+def turning_rows(table: Table, pose: int, head: int, axes: int, alone: int, H: Array) -> Index:
     """Return the rows of the head that turn the map: of the pose (axes,), then of a mount that is in the map (1 or 3).
 
     The map turns with the sensor that observes it, so with its mount (docs/invariant.md).  A second block that is no
     mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation in H are zero.
-    Of such a mount the rows of its position (2 or 3) follow, which turns with the robot: its lever arm.
+    Of such a mount the rows of its position (2 or 3) follow, which turns with the robot: its lever arm.  So it is of a
+    robot that is `alone`: landmarks lean on the arm as the robot does, and would have to turn with it.
     """
     dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
     mounted = head > pose and table[2, 0] == SCALAR and table[last, 0] == (ANGLE if pose == 3 else TURNED)
@@ -122,11 +134,22 @@ def turning_rows(table: Table, pose: int, head: int, axes: int, H: Array) -> Ind
                 if 2 * dof - turns <= j < 2 * dof:
                     turning = max(turning, abs(H[i, j]))
         if turning <= BLIND * most:
-            begin, more = dof, dof - turns
+            begin, more = dof, (dof - turns) * alone
     rows = np.empty(axes + more if mounted else axes, np.int64)
     for a in range(len(rows)):
         rows[a] = dof - axes + a if a < axes else begin + a - axes
     return rows
+
+
+@compiled
+def is_alone(blocks: Table, atoms: Table, robot: int, mount: int) -> int:
+    """Return 1 if nothing but a robot with a mount in the map has a place in it, else 0."""
+    first, last = blocks[robot, 0], blocks[robot, 0] + blocks[robot, 1]
+    for a in range(len(atoms)):
+        kind, at = atoms[a, 0], atoms[a, 1]
+        if (kind == VECTOR or kind >= VECTOR3) and not first <= at < last and kind != TURNED:
+            return 0
+    return 1 if mount >= 0 else 0
 
 
 @compiled
@@ -289,8 +312,8 @@ def picked(index: Index, rows: Index) -> Index:
 
 
 def iterate(
-    model: Any, ways: Routines, sizes: tuple[int, int, int], table: Table, mean: Array, P_ss: Array, y: Array, R: Array,
-    linear: Linear, limits: tuple[int, float],
+    model: Any, ways: Routines, sizes: tuple[int, int, int, int], table: Table, mean: Array, P_ss: Array, y: Array,
+    R: Array, linear: Linear, limits: tuple[int, float],
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
 
@@ -301,9 +324,9 @@ def iterate(
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
     back where inverse distances are corrected by their parallax.
     """
-    (pose, head, axes), (most, tolerance) = sizes, limits
+    (pose, head, axes, alone), (most, tolerance) = sizes, limits
     k = len(y)
-    theta = turning_rows(table, pose, head, axes, linear[1])
+    theta = turning_rows(table, pose, head, axes, alone, linear[1])
     correction = np.zeros(len(P_ss))
     origin = mean[:3].copy()
     last, arm = theta[axes - 1], arm_of(theta, axes, pose)
@@ -352,8 +375,8 @@ compiled_iterate = compiled(iterate)
 
 
 def iterated(
-    model: Any, ways: Routines, sizes: tuple[int, int, int], table: Table, mean: Array, P_ss: Array, y: Array, R: Array,
-    linear: Linear, limits: tuple[int, float],
+    model: Any, ways: Routines, sizes: tuple[int, int, int, int], table: Table, mean: Array, P_ss: Array, y: Array,
+    R: Array, linear: Linear, limits: tuple[int, float],
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Return what `iterate` returns, compiled for a compiled model."""
     if isinstance(model, tuple):
@@ -421,6 +444,7 @@ def invariant(
     robot, mount, slots, d, y, R, gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
+    alone = is_alone(blocks, atoms, robot, mount)
     e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     h = E_r.shape[2]
     P_ss = submatrix(P, index)
@@ -436,11 +460,11 @@ def invariant(
         P_ss = submatrix(P, index)
         _e, z_near, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(count, d), y)
         linear = linearized(z_near, E_r, E_l, P_ss, R)
-    H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
+    H, M, v, positive = iterated(model, ways, (pose, head, axes, alone), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return e, z, Z, d2, within(d2, -1.0)[0], False
     origin = mean[:3].copy()
-    theta, at = turning_rows(table, pose, head, axes, linear[1]), blocks[robot, 0]
+    theta, at = turning_rows(table, pose, head, axes, alone, linear[1]), blocks[robot, 0]
     last, arm = index[theta[axes - 1]], arm_of(theta, axes, pose)
     R_r, B = frames_of(P_ss, x, at, len(theta) - axes, arm)
     before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
@@ -528,10 +552,11 @@ def fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[f
     robot, mount, slots, d, y, R, _gate = scan
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     pose, head = head_sizes(blocks, atoms, robot, mount)
+    alone = is_alone(blocks, atoms, robot, mount)
     _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     P_ss = submatrix(P, index)
     linear = linearized(z, E_r, E_l, P_ss, R)
-    _H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, P_ss, y, R, linear, limits)
+    _H, M, v, positive = iterated(model, ways, (pose, head, axes, alone), table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return np.inf, np.inf
     w, log_det = M @ v, 0.0
@@ -552,6 +577,7 @@ def averaged(
     x, P, n, blocks, atoms, axes, ways = map_
     robot, mount, slots, d, y, R, _gate = scan
     pose, head = head_sizes(blocks, atoms, robot, mount)
+    alone = is_alone(blocks, atoms, robot, mount)
     q = R.shape[1]
     V, D, H = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, head))
     d2, used = np.full(len(y), np.nan), 0
@@ -565,14 +591,16 @@ def averaged(
             d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
         S = submatrix(P, index)
         linear = linearized(z, E_r, E_l, S, R[rows])
-        H, M, v, positive = iterated(model, ways, (pose, head, axes), table, mean, S, y[rows], R[rows], linear, limits)
+        H, M, v, positive = iterated(
+            model, ways, (pose, head, axes, alone), table, mean, S, y[rows], R[rows], linear, limits
+        )
         if not positive:
             return d2, False
         V_i, D[:, i] = gain(sparse_product(H, rows_of(P, index, n), E_r.shape[2], len(rows)), M, v)
         V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
         used += len(V_i)
     index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
-    theta, at = turning_rows(table, pose, head, axes, H), blocks[robot, 0]
+    theta, at = turning_rows(table, pose, head, axes, alone, H), blocks[robot, 0]
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
     origin = mean[:3].copy()
