@@ -91,6 +91,12 @@ def test_the_first_increment_began_one_interval_before_its_end() -> None:
     assert begins_at(log.events[1:], "rover", held=False) == 0
 
 
+def test_two_increments_at_one_time_are_left_as_they_are() -> None:
+    events: list[Event] = [Control(t_s, "rover", WHOLE[PLANE]) for t_s in (1, 2, 2, 3)]
+    found = [e for e in cut(log_of([*events, *drive(2.5, number=0)])) if isinstance(e, Control)]
+    assert [(e.t_s, e.share) for e in found] == [(1, 1), (2, 1), (2, 1), (2.5, 0.5), (3, 0.5)]
+
+
 def test_a_gap_is_not_cut() -> None:
     """Of a gap nobody knows when its increment began: it stays whole, and the gap is noticed."""
     after: list[Event] = [Control(14 + k, "rover", WHOLE[PLANE]) for k in range(8)]

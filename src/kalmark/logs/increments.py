@@ -58,7 +58,7 @@ def _parts(controls: list[Control], columns: tuple[str, ...], asked: list[int]) 
     firsts, lasts = np.searchsorted(times, begins, "right"), np.searchsorted(times, ends, "left")
     lasts_ns = ends - begins
     u = np.array([control.u for control in controls])
-    rates = u / lasts_ns[:, None]
+    rates = u / np.maximum(lasts_ns, 1)[:, None]
     steps = np.diff(rates, axis=0)
     before, after = np.vstack([steps[:1], steps]), np.vstack([steps, steps[-1:]])
     changes = 2 * np.minimum(np.abs(before), np.abs(after)) * (before * after > 0)
