@@ -99,14 +99,14 @@ def test_colour_becomes_grey_and_a_calibration_and_true_poses_beside_the_images_
         encoding="utf-8",
     )
     (tmp_path / "cam_traj_truth.txt").write_text(
-        "0 0 0 1 0 0 0 1 0 0 0 1\n100 0 20 1 0 0 0 0 -1 0 1 0\n", encoding="utf-8"
+        "0 0 0 1 0 0 0 1 0 0 0 1\n100 0 20 0 0 1 0 1 0 -1 0 0\n", encoding="utf-8"
     )
     log = km.open_log(tmp_path)
     assert np.abs(frames(log)[0].pixels().astype(int) - cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)).max() <= 1
     found = camera(log)
     assert (found["fx_px"], found["cx_px"], found["fy_px"], found["cy_px"]) == (50.0, 31.5, 51.0, 23.5)  # half the size
     assert (found["width_px"], found["lens"], found["distortion"][:2]) == (64, "radtan", [-0.2, 0.1])
-    assert log.truth["robot"].poses[1] == pytest.approx([1.0, 0.0, 0.2, np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+    assert log.truth["robot"].poses[1] == pytest.approx([1.0, 0.0, 0.2, 0, -np.sqrt(0.5), 0, np.sqrt(0.5)])
 
 
 # ------------------------------------------------------------------ videos

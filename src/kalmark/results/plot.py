@@ -36,7 +36,7 @@ GROUPS = {  # of landmarks that are drawn alike, by the dimensions of the scene
     ),
     3: (
         (EUCLIDEAN_COLOUR, "Euclidean landmarks, 3σ"),
-        (OTHER_COLOUR, "other landmarks, 3σ"),
+        (OTHER_COLOUR, "landmarks that are not Euclidean, 3σ"),
         (LINE_COLOUR, "lines, 3σ of their ends"),
     ),
 }

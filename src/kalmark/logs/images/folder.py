@@ -2,7 +2,8 @@
 
 The time of an image is its name, or a row of `times.txt`, or its number over the rate `fps`.  A calibration beside the
 images (`rigs.CALIBRATIONS`) is taken; true poses are `groundtruth.txt` of TUM, `poses.txt` of KITTI, or
-`cam_traj_truth.txt` of the New Tsukuba set: x y z in cm and the rotation row by row, a row an image.
+`cam_traj_truth.txt` of the New Tsukuba set, a row an image: x y z in cm in the axes of a camera, and the rotation row
+by row in those of OpenGL (y up, z to the back): the images turn so.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from kalmark.logs.source import Format, Request, frame, nanoseconds, number, qua
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ogv")
 TIMES = "times.txt"
+OPTICAL = np.diag([1.0, -1.0, -1.0])  # of the axes of OpenGL, in which New Tsukuba turns: y up, z to the back
 TRUE_POSES = "groundtruth.txt", "poses.txt", "cam_traj_truth.txt"
 NEW_TSUKUBA = {"fx_px": 615.0, "fy_px": 615.0, "cx_px": 320.0, "cy_px": 240.0, "width_px": 640, "height_px": 480}
 _NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?")
@@ -143,7 +145,7 @@ def true_path(file: Path, t_ns: list[int], request: Request) -> Trajectory:
             numbers = np.array([number(cell) for cell in cells]).reshape(4, 3)
         except ValueError:
             raise LogError(f"{file}:{line}: {len(cells)} cells, expected 12 finite numbers") from None
-        poses.append(frame(0.01 * numbers[0], numbers[1:]))
+        poses.append(frame(0.01 * numbers[0], OPTICAL @ numbers[1:] @ OPTICAL))
     if len(poses) != len(t_ns):
         raise LogError(f"{file}: {len(poses)} poses for {len(t_ns)} images, expected one each")
     return Trajectory(np.array(t_ns), np.array(poses))
