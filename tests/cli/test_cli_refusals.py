@@ -272,6 +272,12 @@ def test_what_is_set_and_nothing_takes_is_refused(
             assert said.endswith("; did you mean rover?" if "rovre" in setting else "; did you mean the sensor lidar?")
 
 
+def test_a_robot_that_is_set_alone_leaves_no_warning_of_each(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
+    (tmp_path / "each.yaml").write_text(NAMED.replace("rover:", "each:"))
+    lines = kalmark("run", tmp_path / "each.yaml", "--log", log, "--set", "robots.rover.gaps=ignore").out.splitlines()
+    assert [line for line in lines if "robots.each" in line] == []
+
+
 def test_what_is_configured_and_serves_nothing_is_said_in_one_line(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
     (tmp_path / "named.yaml").write_text("robots: {each: {}, " + NAMED.removeprefix("robots: {"))
     run = ("run", tmp_path / "named.yaml", "--log", log)

@@ -184,19 +184,25 @@ def laid_over(tree: Tree, log: Log) -> Tree:
 
 
 def for_each(tree: Tree, log: Log) -> None:
-    """Lay what the command line sets for a robot that the file does not name over the file's `each`, in place."""
+    """Lay what the command line sets for a robot that the file does not name over the file's `each`, in place.
+
+    If `each` then stands for no robot, it is left out: the file is not to blame for that.
+    """
     robots: Any = tree.values.get("robots")
     each: Any = robots.get(EACH) if isinstance(robots, dict) else None
+    laid = False
     for name in log.robots if isinstance(each, dict) else ():
         places = [at for path, at in tree.places.items() if path[:2] == ("robots", name)]
         if isinstance(robots.get(name), dict) and all(at.startswith(OVERRIDE) for at in places):
-            robots[name] = merged(deepcopy(each), robots[name])
+            robots[name], laid = merged(deepcopy(each), robots[name]), True
             for table in (tree.keys, tree.places):
                 table |= {
                     ("robots", name, *path[2:]): at
                     for path, at in table.items()
                     if path[:2] == ("robots", EACH) and ("robots", name, *path[2:]) not in table
                 }
+    if laid and all(name in robots for name in log.robots):
+        del robots[EACH]
 
 
 def _place(tree: Tree, values: dict[str, Any], path: tuple[str, ...], log: str) -> None:
