@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from kalmark.config.building import build_slam
 from kalmark.config.opening import open_run
 from kalmark.diagnosis.copies import copies
 from kalmark.diagnosis.jumps import Controls
+from kalmark.errors import EventError
 from kalmark.events import Event
 from kalmark.geometry import frames, frames3d
 from kalmark.logs.increments import CUT, cut, part_of, unevenness
@@ -83,6 +85,20 @@ def test_a_turn_that_begins_within_an_increment_makes_its_parts_uncertain() -> N
     assert_allclose(
         [more[t_s] for t_s in (2.5, 3.0, 3.5, 4.0, 6.5, 7.0)], np.array([0, 0, 1, 1, 0, 0]) / 48, atol=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    "part",
+    [{"share": 0.5, "uneven": u} for u in ([1.0], [-1.0, 0.0, 0.0], 3.0)] + [{"uneven": [1.0] * 3}, {"share": 2}],
+)
+def test_a_part_that_is_none_is_refused_and_changes_nothing(part: dict[str, Any]) -> None:
+    slam = km.Slam([km.Robot("rover", km.motion.Odometry2D())])
+    slam.process(Control(0.0, "rover", WHOLE[PLANE]))
+    before = slam.mean("rover"), slam.covariance("rover")
+    with pytest.raises(EventError, match=r"t=1 s: (uneven|share) is .*, expected"):
+        slam.process(Control(1.0, "rover", WHOLE[PLANE], **part))
+    assert_allclose(slam.mean("rover"), before[0], rtol=0)
+    assert_allclose(slam.covariance("rover"), before[1], rtol=0)
 
 
 def test_the_first_increment_began_one_interval_before_its_end() -> None:

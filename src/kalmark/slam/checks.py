@@ -122,6 +122,10 @@ def refuse_bad_control(event: Control, columns: tuple[str, ...]) -> None:
     if event.cov is not None:
         covariance(event.cov, len(columns), f"{when(event)}: cov", definite=False)
         refuse_vague(event.cov, columns, when(event))
+    more = event.uneven
+    if more is not None and (event.share == 1.0 or more.shape != (len(columns),) or (more < 0.0).any()):
+        wanted = f"{len(columns)} variances, of a part of an increment: share below 1"
+        raise EventError(f"{when(event)}: uneven is {shown(more.tolist())}, expected {wanted}")
 
 
 def refuse_bad_fix(event: Fix, size: int) -> None:
