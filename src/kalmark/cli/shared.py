@@ -28,7 +28,7 @@ Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
 ]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that `kalmark run` wrote.")]
-_SHOWN_IF_ANY = {"ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
+_SHOWN_IF_ANY = {"new", "ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
 from kalmark.diagnosis.gross import LOST, MOVED, fit, gross, started_at, until
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
+from kalmark.diagnosis.gross import MOST as MOST_D2
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.mounts import TURNED
@@ -21,14 +22,15 @@ from kalmark.diagnosis.search import LEAST_GAIN, Search
 from kalmark.diagnosis.searched import MORE, WORST, Searched, misfits, searched
 from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError
+from kalmark.geometry.gaussian import quantile
 from kalmark.logs.log import Log
 from kalmark.results.batch import filtered_map, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
-from kalmark.results.verdict import INNOVATIONS, NO_MAP
-from kalmark.results.warnings import NO_ID, TOO_SMALL, window_warnings
+from kalmark.results.verdict import INNOVATIONS, NO_LANDMARKS, NO_MAP
+from kalmark.results.warnings import CHANCE, NO_ID, TOO_SMALL, window_warnings
 from kalmark.results.words import count, figure
 from kalmark.slam.surveyed import ELSEWHERE
 from kalmark.tracks.surveys import MISFITS
@@ -134,10 +136,11 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     except (KalmarkError, np.linalg.LinAlgError) as error:
         signs = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
         signs = [*(odd_controls(run, log) if signs else ()), *signs]
-        why = str(error).removeprefix("batch solution: ") if len(run.landmarks) else NO_MAP
-        checked = f"{INNOVATIONS}, no batch solution: {why}"
-        carried = any(cause.name in JUMPS and not cause.harmless for cause in first)
-        return Verdict("wrong" if carried else "doubtful" if signs else "ok", (*first, *signs), checked)
+        none = NO_LANDMARKS if run.history.localizes else NO_MAP
+        why = str(error).removeprefix("batch solution: ") if len(run.landmarks) else none
+        harm = {cause.name for cause in first if not cause.harmless}
+        status = "wrong" if harm & {*JUMPS} else "doubtful" if signs or harm else "ok"
+        return Verdict(status, (*first, *signs), f"{INNOVATIONS}, no batch solution: {why}")
     effect = effect_of(run, found)
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     if found.given.segments is not None and not any(c.name in JUMPS for c in causes):  # between these it is not looked
@@ -266,6 +269,7 @@ def _structural(run: Run, log: Log) -> list[Cause]:
         *split_landmarks(run),
         *misplaced_landmarks(run),
         *fits_nothing(run),
+        *readings_off(run),
         *given_up(run),
         *_started_elsewhere(run),
         *_copied(run, log),
@@ -314,12 +318,27 @@ def misplaced_landmarks(run: Run) -> list[Cause]:
 def fits_nothing(run: Run) -> Iterator[Cause]:
     """Yield that most observations without an id are of no landmark in the map: it says nothing of the place."""
     h, now = run.history, fit(run)
-    mine = (h.id == "") & (h.reason != NO_ID)
+    mine = (h.id == "") & (h.reason != NO_ID) & ~h.of_own
     share = float(np.mean(now.values[mine] < LOST)) if mine.any() else 1.0
     if share < LEAST_SHARE:
         evidence = f"{share:.0%} of the {int(mine.sum())} observations without an id are of a landmark in the map"
         cure = "the scans contradict the controls: look at mounts, signs and units of both, and their times"
         yield Cause(MISFIT, begin_s(run), 0.5 * LOST * float(mine.sum()), f"only {evidence}", cure)
+
+
+def readings_off(run: Run) -> Iterator[Cause]:
+    """Yield the sensors of the state whose readings are further off than their noise and that of the pose allow."""
+    h, now = run.history, fit(run)
+    robots, d2 = h.robot[h.step], np.nan_to_num(h.d2)
+    for robot, sensor in sorted({*zip(robots[h.of_own].tolist(), h.sensor[h.of_own].tolist(), strict=True)}):
+        mine = h.of_own & (robots == robot) & (h.sensor == sensor)
+        dof, number = int(now.dof[mine].sum()), int(mine.sum())
+        mean = float(np.minimum(d2[mine], MOST_D2 * now.dof[mine]).sum()) / dof
+        if mean > max(MISFITS_ALL, float(quantile(1.0 - CHANCE, dof)) / dof):
+            score, of = 0.5 * dof * (mean - 1.0 - float(np.log(mean))), f"{number} readings of {sensor} of {robot}"
+            evidence = f"d2 per degree of freedom is {figure(mean, 2)} over {of}, where 1 is expected"
+            cure = "state more noise for it, or look for what lasts: a bias, a delay, its mount, a wrong start"
+            yield Cause(MISFIT, begin_s(run), score, evidence, cure)
 
 
 def _copied(run: Run, log: Log) -> list[Cause]:

@@ -120,7 +120,8 @@ def headline(run: Recording) -> tuple[str, list[str]]:
     summary = summary_of(run)
     name = run.log.name or "run"
     title = f"{name} · {run.estimator}" if run.estimator else name
-    parts = [count(summary["landmarks"], "landmark"), count(summary["scans"], "scan")]
+    parts = [] if run.history.localizes and not summary["landmarks"] else [count(summary["landmarks"], "landmark")]
+    parts += [count(summary["scans"], "scan")]
     if not summary["scans"]:
         parts = [count(summary["fixes"], "fix", "fixes"), count(summary["controls"], "control")]
     errors = [figures for figures in summary["robots"].values() if figures.get("ate_m") is not None]

@@ -63,7 +63,7 @@ def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]
 def no_ids(run: Recording) -> bool:
     """Return whether a run's landmarks can be matched to the true ones by their positions alone."""
     history, true = run.history, {str(i) for i in run.truth.landmarks}
-    told = (history.id != "") & ~np.isin(history.id, history.robots)
+    told = (history.id != "") & ~np.isin(history.id, history.robots) & ~history.of_own
     return (
         not (told | (history.true_id != "")).any()
         and bool(true)

@@ -11,6 +11,7 @@ SHOWN = 3  # causes in a short verdict
 ROUNDING_M = 1e-9
 INNOVATIONS = "innovations alone"  # how a map was checked that has no batch solution
 NO_MAP = "no landmark is in the map"  # why there is none: only the path is to be judged
+NO_LANDMARKS = "no sensor observes landmarks"  # why there is no map, either
 SEEN = 0.02  # by which a factor of the sigmas is worth a word, and of the accuracy a shift
 
 
@@ -36,7 +37,7 @@ def _first(verdict: Mapping[str, Any]) -> str:
     """Return the line that says it all: what the map, or the path, is, by which cause, and to what accuracy."""
     harmful = [cause["name"] for cause in verdict["causes"] if not cause["harmless"]]
     why = f" because of {harmful[0]}" if harmful and verdict["map"] != "ok" else ""
-    what = "path" if str(verdict["checked"]).endswith(NO_MAP) else "map"
+    what = "path" if str(verdict["checked"]).endswith((NO_MAP, NO_LANDMARKS)) else "map"
     return f"the {what} is {verdict['map']}{why}{_trust(verdict)}"
 
 

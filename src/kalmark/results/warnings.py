@@ -233,7 +233,7 @@ def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     yield from _unused(run)
     if not total and history.scans:
         yield "no observation was made: there is nothing to map"
-    elif not summary["landmarks"] and history.scans:
+    elif not summary["landmarks"] and history.scans and not history.localizes:
         yield "no landmark was mapped"
     seen = list(zip(history.robot[history.step].tolist(), history.sensor.tolist(), strict=True))
     bearing = {pair for pair in set(seen) if run.section(*pair).get("type") in BEARINGS}
@@ -324,7 +324,8 @@ def _truth(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
             "the landmarks are not scored: no ids tie them to the true ones, and less than half of them (or less than "
             f"{LEAST}) are nearer to a true one than half the way to the next: is the truth in the map's frame?"
         )
-    told, there = set(run.history.id.tolist()) - {"", *run.history.robots}, {str(i) for i in run.truth.landmarks}
+    ids, there = run.history.id[~run.history.of_own], {str(i) for i in run.truth.landmarks}
+    told = set(ids.tolist()) - {"", *run.history.robots}
     if told and there and told.isdisjoint(there):
         yield f"the landmarks are not scored: the log calls them {_some(told)}, the true ones are {_some(there)}"
     true, mine = set(run.truth.robots), run.history.robots

@@ -38,7 +38,7 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         is_loop, since_s = reader.is_loop(event, k), 0.0 if from_ns is None else (event.t_ns - from_ns) * 1e-9
         if reader.counts and from_ns not in clones:
             why = "no pose of the time of its id is kept" if is_loop else "the first reading: none to count from"
-            found.append(Observation(k, None, "ignored", None, None, why))
+            found.append(Observation(k, None, "ignored", event.robot, None, why))
             continue
         clone = -1 if from_ns is None else clones.get(from_ns, -1)
         update = reader.update(state.map, state.moving[event.robot], clone, event, k, R[k : k + 1], since_s)

@@ -85,10 +85,10 @@ window.addEventListener("beforeprint", () => [...waiting.keys()].forEach(drawNow
 
 function drawMap() {
   if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
-  const slider = el("time"), draw = mapPicture();
+  const slider = el("time"), draw = mapPicture(), mapped = DATA.maps.some(map => map.count);
   const show = () => {
     const map = DATA.maps[+slider.value];
-    el("now").textContent = `${map.t.toFixed(1)} s · ${map.count} landmarks`;
+    el("now").textContent = `${map.t.toFixed(1)} s` + (mapped ? ` · ${map.count} landmarks` : "");
     draw(+slider.value);
   };
   slider.max = DATA.maps.length - 1;

@@ -1,0 +1,61 @@
+"""Runs of robots whose sensors see no landmark: a path is judged, drawn and printed, and no map is missed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.diagnosis.verdict import diagnose
+from kalmark.results.evaluate import headline
+from kalmark.results.run import Run
+from kalmark.results.verdict import verdict_lines
+
+STEPS, DT = 600, 0.1
+
+
+def run_of(sigma_m: float = 0.5, bias_radps: float = 0.0, outliers: int = 0) -> Run:
+    """Return the run of a robot with wheels, a gyroscope of a bias and a receiver of 0.5 m, stated as `sigma_m`."""
+    rng, x, events = np.random.default_rng(1), np.zeros(3), list[Any]()
+    for k in range(STEPS):
+        v, w = 1.0, 0.05 + 0.15 * np.sin(k * DT / 9)
+        events.append(km.Control(k * DT, "rover", [v + rng.normal(0, 0.1), w + rng.normal(0, 0.1)]))
+        x += DT * np.array([v * np.cos(x[2] + w * DT / 2), v * np.sin(x[2] + w * DT / 2), w])
+        t_s = round((k + 1) * DT, 6)
+        events.append(km.Scan(t_s, "rover", "gyro", [[w + bias_radps + rng.normal(0, 0.005)]]))
+        if k % 5 == 4:
+            off = 500.0 if k // 5 in range(3, 3 * outliers + 3, 3) else 0.0
+            events.append(km.Scan(t_s, "rover", "receiver", [x[:2] + rng.normal(0, 0.5, 2) + off]))
+    sensors = {"gyro": km.Mount(km.sensors.Gyro2D(0.005)), "receiver": km.Mount(km.sensors.Gps2D(sigma_m))}
+    slam = km.Slam(km.Robot("rover", motion=km.motion.Unicycle(0.1, 0.1), sensors=sensors))
+    return km.record(slam, events, progress=False)
+
+
+def test_a_path_without_landmarks_is_judged_as_a_path(tmp_path: Path) -> None:
+    run = run_of()
+    summary = run.evaluate()
+    assert summary["warnings"] == [] and summary["landmarks"] == 0
+    assert diagnose(run).map == "ok"
+    assert [*verdict_lines(run.summary["verdict"])] == [
+        "the path is ok, by innovations alone, no batch solution: no sensor observes landmarks"
+    ]
+    assert headline(run)[1][0] == f"{STEPS + STEPS // 5} scans"
+    run.save(tmp_path / "out")
+    loaded = Run.load(tmp_path / "out")
+    assert loaded.evaluate()["warnings"] == [] and loaded.history.localizes
+
+
+@pytest.mark.parametrize("keys", [{"sigma_m": 0.2}, {"bias_radps": 0.03}], ids=["noise", "bias"])
+def test_readings_that_are_off_make_a_path_doubtful(keys: dict[str, float]) -> None:
+    verdict = diagnose(run_of(**keys))
+    assert (verdict.map, verdict.causes[0].name) == ("doubtful", "misfit")
+    assert f"over {STEPS // 5} readings of receiver of rover" in verdict.causes[0].evidence
+
+
+def test_a_few_outliers_do_not_make_a_path_doubtful() -> None:
+    run = run_of(outliers=5)
+    assert np.sum(run.history.outcome == "rejected") == 5
+    assert diagnose(run).map == "ok"
