@@ -111,7 +111,7 @@ def vanished(run: Run) -> list[Moment]:
     chance (1 - p)^n of n vanish together.
     """
     h, found = run.history, list[Moment]()
-    used = (h.id == "") & np.isin(h.outcome, ("associated", "new")) & ~h.of_own
+    used = (h.id == "") & np.isin(h.outcome, ("associated", "new"))
     names, first = np.unique(h.landmark[used], return_index=True)
     begun = dict(zip(names.tolist(), h.step[used][first].tolist(), strict=True))
     for robot in dict.fromkeys(h.robot[h.step[used]].tolist()):
