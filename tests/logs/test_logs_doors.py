@@ -148,12 +148,14 @@ def test_a_graph_of_the_plane_is_a_chain_of_increments_and_observations(tmp_path
     R = np.array([[c, -s], [s, c]])
     np.testing.assert_allclose(controls[0].cov[:2, :2], R @ np.diag([0.01, 0.0025]) @ R.T, atol=1e-15)
     scans = [event for event in log if isinstance(event, Scan)]
-    assert [(scan.t_ns, scan.ids) for scan in scans] == [(0, (9,)), (10**9, (9,))]
-    np.testing.assert_allclose(scans[0].cov, [[[0.04, 0], [0, 0.01]]], atol=1e-15)
+    seen, loops = ([scan for scan in scans if scan.sensor == sensor] for sensor in ("sensor", "loops"))
+    assert [(scan.t_ns, scan.ids) for scan in seen] == [(0, (9,)), (10**9, (9,))]
+    np.testing.assert_allclose(seen[0].cov, [[[0.04, 0], [0, 0.01]]], atol=1e-15)
+    assert [(scan.t_ns, scan.y.tolist(), scan.ids) for scan in loops] == [(0, [], ()), (2 * 10**9, [[2, 0.5, 1]], (0,))]
+    np.testing.assert_allclose(loops[1].cov, [np.eye(3)], atol=1e-15)
     assert log.truth["robot"].poses[-1].tolist() == [2, 0.5, 1] and log.landmarks[9].tolist() == [3, 3]
     assert [line.split(": ", 1)[1] for line in log.skipped] == [
         "1 EDGE_OTHER lines, which are not read",
-        "1 edges between poses that do not follow each other",
         "1 observations of a landmark that pose 3 has already",
     ]
     assert open_log(path).truth == {}
@@ -204,6 +206,7 @@ def test_a_graph_of_space_has_a_mount_and_positions(tmp_path: Path) -> None:
         ("PARAMS_SE3OFFSET 0 1", "a.g2o:13: PARAMS_SE3OFFSET: 1 numbers of a pose, expected 7"),
         ("VERTEX_SE2 8 1 2 3", "no edge from pose 7 to pose 8"),
         ("VERTEX_SE3:QUAT 8 1 2 3 0 0 0 2", "quaternion has length 2, expected 1"),
+        ("EDGE_SE2 7 7 1 0 0.5 1 0 0 1 0 1", "a.g2o:13: EDGE_SE2: an edge from pose 7 to itself"),
         (f"EDGE_SE2 7 {'9' * 5000} 1 0 0 1 0 0 1 0 1", "expected at most 200"),
     ],
 )

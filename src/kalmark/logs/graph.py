@@ -7,7 +7,7 @@ line                    numbers                                                i
 `VERTEX_SE3:QUAT`       id x y z qx qy qz qw                                   the same in space
 `VERTEX_XY`             id x y                                                 a landmark; the same
 `VERTEX_TRACKXYZ`       id x y z                                               the same in space
-`EDGE_SE2`              i j dx dy dtheta, 6 of information                     the increment from a pose to the next
+`EDGE_SE2`              i j dx dy dtheta, 6 of information                     the increment to the next pose; a loop
 `EDGE_SE3:QUAT`         i j x y z qx qy qz qw, 21 of information               the same in space
 `EDGE_SE2_XY`           i l x y, 3 of information                              an observation, x and y in pose i
 `EDGE_SE3_TRACKXYZ`     i l p x y z, 6 of information                          the same in space, sensor offset p
@@ -15,7 +15,7 @@ line                    numbers                                                i
 ======================  =====================================================  =====================================
 
 Poses have no times: in the order of their ids they are one second apart.  An edge between poses that do not follow each
-other, a loop that something else has closed, is left out and counted: the map would need a clone of each such pose.
+other, a loop that something else has closed, is a reading of an `odometer` at the later one, of the way from the other.
 
 Information matrices are upper triangles.  g2o's errors of an edge are in the frame where it ends, and those of a turn
 in space the vector part of a quaternion, half an angle (`EdgeSE3::computeError`).  So the covariance of an increment u
@@ -35,7 +35,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown
-from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix
+from kalmark.geometry import frames, frames3d
+from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew
 from kalmark.logs.columns import INCREMENT2, INCREMENT3, POSITION
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
@@ -50,7 +51,8 @@ from kalmark.logs.source import (
     rows,
 )
 
-ROBOT, SENSOR = "robot", "sensor"
+SECOND_NS = 10**9
+ROBOT, SENSOR, LOOPS = "robot", "sensor", "loops"
 LENGTH = 1e-3
 POSES = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
 PLACES = {"VERTEX_XY": 2, "VERTEX_TRACKXYZ": 3}
@@ -117,6 +119,20 @@ def control(step: Array, C: Array) -> tuple[Array, Array]:
     return np.append(step[:3], turn), J @ C @ J.T
 
 
+def turned_round(step: Array, C: Array) -> tuple[Array, Array]:
+    """Return the edge (3,) or (7,) from its end to its beginning, and the covariance J C J^T of its errors there.
+
+    J = -Ad(Z): (Z o d)^-1 = Z^-1 o (Z o d^-1 o Z^-1).
+    """
+    if len(step) == 3:
+        (x, y, a), back = step, frames.inverse(step)[0]
+        J = -np.array([[np.cos(a), -np.sin(a), y], [np.sin(a), np.cos(a), -x], [0.0, 0.0, 1.0]])
+        return back, J @ C @ J.T
+    R, J = matrix(step[3:].copy()), np.zeros((6, 6))
+    J[:3, :3], J[:3, 3:], J[3:, 3:] = -R, -2.0 * skew(step[:3]) @ R, -R
+    return frames3d.inverse(step)[0], J @ C @ J.T
+
+
 def take(graph: Graph, tag: str, cells: list[str]) -> None:
     """Take one line.  Raises ValueError."""
     if tag in POSES or tag in PLACES:
@@ -128,12 +144,7 @@ def take(graph: Graph, tag: str, cells: list[str]) -> None:
         else:
             graph.places[landmark_id(cells[0])] = np.array([number(cell) for cell in cells[1:]])
     elif tag in EDGES:
-        size, errors = EDGES[tag]
-        a, b = map(pose_id, cells[:2])
-        step, C = control(pose(cells[2 : 2 + size], size), information(cells[2 + size :], errors))
-        if (a, b) in graph.moves:
-            graph.left_out[f"{tag} lines of a pair of poses that has one already"] += 1
-        graph.moves.setdefault((a, b), (step, C))
+        _take_edge(graph, tag, cells)
     elif tag in SIGHTS:
         size, first = SIGHTS[tag], 2 if tag == "EDGE_SE2_XY" else 3
         y = np.array([number(cell) for cell in cells[first : first + size]])
@@ -148,6 +159,20 @@ def take(graph: Graph, tag: str, cells: list[str]) -> None:
         graph.offset = offset
     elif tag not in IGNORED:
         graph.left_out[f"{tag} lines, which are not read"] += 1
+
+
+def _take_edge(graph: Graph, tag: str, cells: list[str]) -> None:
+    """Take an edge between poses, from the one of the smaller id.  Raises ValueError."""
+    size, errors = EDGES[tag]
+    a, b = map(pose_id, cells[:2])
+    step, C = pose(cells[2 : 2 + size], size), information(cells[2 + size :], errors)
+    if a == b:
+        raise ValueError(f"an edge from pose {a} to itself")
+    if a > b:
+        (a, b), (step, C) = (b, a), turned_round(step, C)
+    if (a, b) in graph.moves:
+        graph.left_out[f"{tag} lines of a pair of poses that has one already"] += 1
+    graph.moves.setdefault((a, b), control(step, C))
 
 
 def read(path: Path, request: Request, vertices: Any = None) -> Log:
@@ -177,9 +202,10 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
         if len(u) != size:
             raise LogError(f"{path}: edges of the plane and of space, expected one kind")
         events.append(Control(t_ns=t_ns[b], robot=ROBOT, u=u, cov=C))
-    loops = len(graph.moves) - max(len(ids) - 1, 0)
-    if loops:
-        request.leave_out(loops, f"{path}: {loops} edges between poses that do not follow each other")
+    loops = _loops(graph, ids, t_ns)
+    if any(e.width not in (0, size) for e in loops):
+        raise LogError(f"{path}: edges of the plane and of space, expected one kind")
+    events += loops
     for at, seen in graph.sights.items():
         first = {one: (y, C) for one, y, C in reversed(seen)}
         if len(first) < len(seen):
@@ -193,14 +219,30 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
     if graph.offset is not None:
         sensor["mount"] = placed(graph.offset)
     told: dict[str, Any] = {"motion": {"type": "odometry_3d" if space else "odometry_2d"}}
-    if graph.sights:
-        told["sensors"] = {SENSOR: sensor}
+    told["sensors"] = {SENSOR: sensor} if graph.sights else {}
+    told["sensors"] |= {LOOPS: {"type": "odometer", "keep": 0}} if loops else {}
     rest: dict[str, Any] = {"describes": {"robots": {ROBOT: told}}, "name": path.stem}
     if true and graph.poses:
         path_ = Trajectory.of({t_ns[one]: graph.poses[one] for one in sorted(graph.poses)})
         rest |= {"truth": {ROBOT: path_}, "landmarks": graph.places}
-    columns = {SENSOR: POSITION[:d]} if graph.sights else {}
-    return one_robot("g2o", path, request, ROBOT, events, INCREMENT3 if space else INCREMENT2, columns, **rest)
+    steps = INCREMENT3 if space else INCREMENT2
+    columns = ({SENSOR: POSITION[:d]} if graph.sights else {}) | ({LOOPS: steps} if loops else {})
+    return one_robot("g2o", path, request, ROBOT, events, steps, columns, **rest)
+
+
+def _loops(graph: Graph, ids: list[int], t_ns: dict[int, int]) -> list[Scan]:
+    """Return the edges between poses that do not follow each other as readings, and scans that only keep a pose."""
+    after, rows = dict(pairwise(ids)), dict[int, list[int]]()
+    for a, b in sorted(graph.moves):
+        if after[a] != b:
+            rows.setdefault(a, [])
+            rows.setdefault(b, []).append(a)
+    scans = []
+    for b, begins in rows.items():
+        y, cov = [[graph.moves[a, b][k] for a in begins] for k in (0, 1)]
+        times = [t_ns[a] // SECOND_NS for a in begins]
+        scans.append(Scan(t_ns=t_ns[b], robot=ROBOT, sensor=LOOPS, y=y, ids=times, cov=cov if begins else None))
+    return scans
 
 
 def find(path: Path) -> Path | None:
@@ -209,4 +251,4 @@ def find(path: Path) -> Path | None:
 
 
 WHAT = "a line of g2o with poses, landmarks or edges between them, information matrices positive definite"
-G2O = Format("g2o", "a graph of poses and landmarks, .g2o", find, read, options=("vertices",))
+G2O = Format("g2o", "a graph of poses and landmarks, .g2o", find, read, options=("vertices",), describes_all=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
-from kalmark.declare import Count, NotNegative, Number, Positive, Probability, Within, declared, refuse, register
+from kalmark.declare import NotNegative, Number, Positive, Probability, Within, declared, refuse, register
 from kalmark.errors import EventError
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
 from kalmark.models import seen
@@ -148,6 +148,11 @@ def increment(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tupl
         e[0, 2], E_v[0, 2, 2] = v[0, 2], 1.0
     else:
         turn = log(v[0, 3:].copy())
+        angle = np.sqrt(np.sum(turn**2))
+        if angle > 0.0:  # the same turn the other way round, if that is nearer to y: about half a turn both may be read
+            other = turn * (1.0 - 2.0 * np.pi / angle)
+            if np.sum((other - y[0, 3:]) ** 2) < np.sum((turn - y[0, 3:]) ** 2):
+                turn = other
         e[0, 3:] = turn
         E_v[0, 3:, 3:] = left_jacobian_inverse(turn)
     return e, residual(y, e, angular), E_v
@@ -610,7 +615,10 @@ class _Odometer(_Scaled):
     sigma_rad: Annotated[Positive, "Noise of each angle of one increment."] = 0.01
     _: KW_ONLY
     keep: Annotated[
-        Count, "Poses of its last scans that are kept: an `id`, the time of one, tells what it counts from."
+        int,
+        Within(ge=0),
+        "Poses of its last scans that are kept: an `id`, the time of one, tells what it counts from; 0: of a whole log "
+        "those that later readings count from.",
     ] = 1
 
     views: ClassVar[str] = CHANGE

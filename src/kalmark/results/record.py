@@ -61,7 +61,7 @@ def record(
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
     log = log if isinstance(log, Log) else Log("", tuple(slam.robots), list(log), format="")
     refuse_other_columns(slam, log)
-    slam.reserve(name for event in log.events if type(event) is Scan for name in event.ids or ())
+    slam.foresee(log.events)
     recorder = _Recorder(slam, log, pictures)
     begin = time.perf_counter()
     with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.foresight:

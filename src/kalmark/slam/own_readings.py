@@ -31,8 +31,8 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
     if not len(event.y) and reader.keep == 1:
         return report
     reader.drift(state.map, event.t_ns)
-    held, found = state.clones.of(key), list[Observation]()
-    clones = {state.clones.clones[number].t_ns: state.clones[number] for number in held}
+    clones = {state.clones.clones[number].t_ns: number for number in state.clones.of(key)}
+    found = list[Observation]()
     report.blank(R.shape[1])
     for k, from_ns in enumerate(begins):
         is_loop, since_s = reader.is_loop(event, k), 0.0 if from_ns is None else (event.t_ns - from_ns) * 1e-9
@@ -40,7 +40,7 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
             why = "no pose of the time of its id is kept" if is_loop else "the first reading: none to count from"
             found.append(Observation(k, None, "ignored", event.robot, None, why))
             continue
-        clone = -1 if from_ns is None else clones.get(from_ns, -1)
+        clone = state.clones[clones[from_ns]] if from_ns in clones else -1
         update = reader.update(state.map, state.moving[event.robot], clone, event, k, R[k : k + 1], since_s)
         done = state.corrected(update, event, reader.estimator(state.estimator, is_loop))
         done = done._replace(e=done.e[:, : event.width])
@@ -55,8 +55,9 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
     if reader.counts:
         kept: list[int] = []
         with suppress(MapError):  # it is full: the next reading is the first again
-            here = state.clone(key, event.t_ns)
-            kept = [*(number for number in held if number != here), here][-reader.keep :]
+            if reader.kept({event.t_ns: -1}, event.t_ns):
+                clones[event.t_ns] = state.clone(key, event.t_ns)
+            kept = reader.kept(clones, event.t_ns)
         for slot in state.clones.refer(key, kept):
             state.map.remove(slot)
     return report

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
 from decimal import Decimal
 from typing import Any
 
@@ -37,7 +39,8 @@ class Reader:
     """A sensor of the state of a robot that moves by `motion`; `mount` is the slot of its mount, -1 for none.
 
     `counts`: what it measures counts from its last scan, where a clone of the robot's pose was left, or, by an id that
-    is its time, from another of the last `keep`.  `standing` notices of a `zero_velocity` that its robot stands.
+    is its time, from another of the last `keep`, or of those that it has to `foresee` where that is 0.  `standing`
+    notices of a `zero_velocity` that its robot stands.
     `is_position`: as a fix it says where a lost robot is.
     """
 
@@ -50,6 +53,7 @@ class Reader:
         self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
         self.keep = protocols.poses_kept(sensor)
+        self.until: dict[int, int] | None = None  # of a scan that readings of a log count from, the time of the last
         self.is_position = tuple(sensor.columns) in POSITIONS
         scales = protocols.parameter_covariance(sensor) is not None and "gain" in protocols.parameter_names(sensor)
         self.scales = self.counts and scales  # its scale is estimated of what the robot's controls say
@@ -90,6 +94,27 @@ class Reader:
         if self.counts and any(t_ns is not None and (event.t_ns - t_ns) * 1e-9 < LEAST_S for t_ns in [*begins, *last]):
             raise EventError(f"{when(event)}: {event.sensor!r} was read at that time already, expected one reading")
         return begins
+
+    def foresee(self, scans: Iterable[Scan]) -> None:
+        """Take note of the readings of a whole log: a pose is kept as long as later ones count from it, if `keep` is 0.
+
+        The estimates are those that any other number of poses gives.
+        """
+        if self.keep:
+            return
+        self.until, last = {}, None
+        for scan in scans:
+            for k in range(len(scan.y)):
+                with suppress(EventError):  # `begins_ns` raises it
+                    from_ns = _time(scan, k) if self.is_loop(scan, k) else last
+                    self.until |= {} if from_ns is None else {from_ns: scan.t_ns}
+            last = scan.t_ns
+
+    def kept(self, clones: dict[int, int], t_ns: int) -> list[int]:
+        """Return which clones, by the times of their scans, later readings may count from."""
+        if self.until is None:
+            return [*clones.values()][-(self.keep or 1) :]
+        return [number for from_ns, number in clones.items() if self.until.get(from_ns, t_ns) > t_ns]
 
     def is_loop(self, event: Scan, k: int) -> bool:
         """Return whether a row of a scan says by its id from which earlier one it counts."""
@@ -152,15 +177,18 @@ class Reader:
         many = is_loop and not self.scales
         return estimator.once() if isinstance(estimator, Iterating) and not many else estimator
 
-    def readings(self) -> list[Any] | None:
-        """Return the mean of its readings as it is saved, None where there is none."""
-        return None if self.mean is None else [self.mean.rate.tolist(), self.mean.number, self.sigma.tolist()]
+    def saved(self) -> list[Any]:
+        """Return the mean of its readings and what it foresees as they are saved, None where there is none."""
+        mean = None if self.mean is None else [self.mean.rate.tolist(), self.mean.number, self.sigma.tolist()]
+        return [mean, None if self.until is None else [*self.until.items()]]
 
-    def restore(self, rate: list[float], number: int, sigma: list[float]) -> None:
-        """Take back the mean of its readings."""
-        size = (len(self.sensor.columns),)
-        self.mean = Mean(np.array(rate, dtype=np.float64).reshape(size), max(int(number), 1))
-        self.sigma = np.array(sigma, dtype=np.float64).reshape(size)
+    def restore(self, mean: list[Any] | None = None, until: list[list[int]] | None = None) -> None:
+        """Take back what was saved."""
+        if mean is not None:
+            (rate, number, sigma), size = mean, (len(self.sensor.columns),)
+            self.mean = Mean(np.array(rate, dtype=np.float64).reshape(size), max(int(number), 1))
+            self.sigma = np.array(sigma, dtype=np.float64).reshape(size)
+        self.until = None if until is None else {int(from_ns): int(t_ns) for from_ns, t_ns in until}
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled view, whose addresses mean nothing to another process."""

@@ -118,7 +118,7 @@ def _state(state: State) -> Description:
         "numbered": state.clones.numbered,
         "moving": {name: _moving(m) for name, m in state.moving.items()},
         "readers": [
-            [*key, reader.t_ns, None if reader.standing is None else reader.standing.state(), reader.readings()]
+            [*key, reader.t_ns, None if reader.standing is None else reader.standing.state(), *reader.saved()]
             for key, reader in state.readers.items()
         ],
         "front_ends": [[*key, front_end.state()] for key, front_end in state.front_ends.items()],
@@ -251,13 +251,12 @@ class Saved:
         state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
         state.surveys.misfits = {name: (int(out), frozenset(fit)) for name, out, fit in judged["misfits"]}
         state.surveys.strangers = {str(robot): set(names) for robot, names in judged["strangers"]}
-        for robot, sensor, t_ns, window, *readings in s["readers"]:
+        for robot, sensor, t_ns, window, *saved in s["readers"]:
             reader = state.readers[robot, sensor]
             reader.t_ns = _time(t_ns)
             if reader.standing is not None:
                 reader.standing.restore(window)
-            if readings and readings[0] is not None:
-                reader.restore(*readings[0])
+            reader.restore(*saved)
         self._fill_front_ends(state)
         carried: dict[ChannelKey, Channel | Reader] = {**state.channels, **state.readers}
         for key, channel in carried.items():

@@ -328,9 +328,15 @@ class Slam(Estimate):
             seen[k] = starting.initialize(state, scan, policy, k, name, reason)
 
     # ------------------------------------------------------------------ editing the map
-    def reserve(self, ids: Iterable[Id | None]) -> None:
-        """Keep in mind ids that a log will use, so that no landmark without an id is named like one of them."""
-        tracks = self.tracks
+    def foresee(self, events: Sequence[Event]) -> None:
+        """Take note of what a log to come has: ids, and which scans readings of an `odometer` with `keep` 0 count from.
+
+        No landmark without an id is then named like one of the ids, and no other clones are kept.
+        """
+        readers, scans = self.state.readers, [event for event in events if isinstance(event, Scan)]
+        for key, reader in readers.items():
+            reader.foresee(scan for scan in scans if (scan.robot, scan.sensor) == key)
+        tracks, ids = self.tracks, (i for e in scans if (e.robot, e.sensor) not in readers for i in e.ids or ())
         tracks.reserve(i for i in ids if i not in tracks.confirmed and i not in tracks.tentative)
 
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
