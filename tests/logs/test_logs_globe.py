@@ -77,7 +77,11 @@ def test_a_known_map_counts_from_the_origin_of_the_log(tmp_path: Path) -> None:
         ("lat_deg,lon_deg", "48,", r"measurements.csv:2: lon_deg is '', expected a finite number"),
         ("lat_deg,height_m", "48,11", r"measurements.csv:1: no column lon_deg, expected lat_deg, lon_deg"),
         ("lon_deg,x_m", "48,11", r"measurements.csv:1: no column lat_deg"),
-        ("lat_deg,lon_deg,x_m", "48,11,3", r"measurements.csv:1: columns lat_deg and x_m, expected positions in one"),
+        (
+            "lat_deg,lon_deg,x_m",
+            "48,11,3",
+            r"measurements.csv:1: columns lat_deg and x_m, expected one of them in a file: scans",
+        ),
     ],
 )
 def test_what_is_no_position_on_the_globe_is_refused(tmp_path: Path, header: str, row: str, message: str) -> None:

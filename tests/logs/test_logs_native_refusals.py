@@ -39,6 +39,12 @@ BAD_ROWS = {
     "no sensor": (f"{HEAD}\n0.1,rover,,7,4,0\n", 2, "sensor is empty", "a name"),
     "a missing column": ("t_s,robot,sensor,range_m\n0.1,r,s,4\n", 1, "no column id", "t_s, robot, sensor, id"),
     "a column twice": (f"{HEAD},range_m\n{GOOD},4\n", 1, "'range_m' appears 2 times", "expected"),
+    "a column in two units": (
+        f"{HEAD},range_mm\n{GOOD},4\n",
+        1,
+        "range_m and range_mm are both range_m",
+        "scans.csv and measurements.csv may have one each",
+    ),
     "a header and nothing else": (f"{HEAD}\n", 1, "no rows", "at least one"),
     "an empty file": ("", 1, "empty", "expected"),
     "blanks only": ("\n \n", 1, "empty", "expected"),

@@ -31,6 +31,7 @@ from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, numb
 T = TypeVar("T")
 TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
 CSV, PARQUET = ".csv", ".parquet"
+ONE_IN_A_FILE = "expected one of them in a file: scans.csv and measurements.csv may have one each"
 BATCH = 65_536  # rows of Parquet at a time
 SEPARATORS = {"\t": "tabs", "|": "'|'", " ": "blanks"}
 
@@ -247,7 +248,10 @@ def read_table(
             raise LogError(f"{where}: {what}, expected {', '.join(required)}{hint}")
     for name in header:
         if header.count(name) > 1 or not name:
-            raise LogError(f"{where}: column {name!r} appears {header.count(name)} times, expected named columns")
+            twice = [given for given, meant in zip(content.header, header, strict=True) if meant == name]
+            if len({*twice}) > 1:
+                raise LogError(f"{where}: columns {' and '.join(twice)} are both {name}, {ONE_IN_A_FILE}")
+            raise LogError(f"{where}: column {name!r} appears {len(twice)} times, expected named columns")
     noise = tuple(name for name in header if name.startswith(("sigma_", "cov_")))
     values = [name for name in header if name not in NAMES and name not in noise]
     for name in values:
@@ -269,7 +273,7 @@ def in_plane(where: str, header: list[str], given: dict[str, tuple[str, float]])
             raise LogError(f"{where}: no column {name}, expected lat_deg, lon_deg[, height_m]")
     both = [name for name in GLOBE.values() if name in header]
     if both:
-        raise LogError(f"{where}: columns lat_deg and {both[0]}, expected positions in one of both ways in a file")
+        raise LogError(f"{where}: columns lat_deg and {both[0]}, {ONE_IN_A_FILE}")
     given.update({GLOBE[name]: (name, 1.0) for name in header if name in GLOBE})
     return [GLOBE.get(name, name) for name in header]
 
