@@ -583,6 +583,9 @@ def partial_measurements() -> Iterator[Figure]:
             wanted = "none started" if "straight" in label else "98 to 100 %" if "beacons" in label else ""
             yield Figure(section, f"{label}, {way}: started / squared error within 99 %", wanted, command,
                          row(f"{start} {way}", "{0} / {1}"))  # fmt: skip
+    label = "eight around a circle of 10 m, strengths, path loss unknown"
+    yield Figure(section, f"{label}: started / squared error within 99 % / mean of it (2)", "- / 98 to 100 %", command,
+                 row(f"{label} trilateration", "{0} / {1} / {2}"))  # fmt: skip
     for label, start, wanted in (
         ("Plaza1, scale and bias unknown", "all unknown", ".45 m / .15 m / 1 % of 1.069"),
         ("Plaza1, scale given", "scale given", ".354 / .099 m"),

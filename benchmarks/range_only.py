@@ -2,10 +2,11 @@
 
     python benchmarks/range_only.py [TRIALS] [SEEDS]
 
-Trials: 60 steps of 0.5 m along an arc (radius 10 m) or a line, one beacon or four, range sigma .1 m.  "started" is the
-share of beacons that became landmarks, "honest" the share of those whose squared error in their own sigmas is below
-9.21 (99 % of a consistent filter's), "mean" the mean of it (2 for a consistent filter's), "lost" the runs in which the
-pose is more than 5 sigmas off.  Plaza1: each seed leaves out a tenth of the ranges.
+Trials: 60 steps of 0.5 m along an arc (radius 10 m) or a line, one beacon or four, range sigma .1 m; 250 steps with
+strengths of 2 dB, whose value at 1 m is known to 5 dB and whose exponent to .4.  "started" is the share of beacons that
+became landmarks, "honest" the share of those whose squared error in their own sigmas is below 9.21 (99 % of a
+consistent filter's), "mean" the mean of it (2 for a consistent filter's), "lost" the runs in which the pose is more
+than 5 sigmas off.  Plaza1: each seed leaves out a tenth of the ranges.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from kalmark.geometry import V_inverse
 from kalmark.results.measures import rigid
 
 AT, STEP = np.array([0.2, 0.1, 0.0]), np.array([0.5, 0.0, 0.05])
+STRENGTHS = "eight around a circle of 10 m, strengths, path loss unknown"
 ROWS: dict[str, dict[str, Any]] = {
     "5 to 20 m": {},
     "20 to 80 m": {"near": 20.0, "far": 80.0},
@@ -33,29 +35,36 @@ ROWS: dict[str, dict[str, Any]] = {
         "count": 4,
         "unknown": (0.07, 0.2),
     },
+    STRENGTHS: {"count": 8, "strengths": True, "steps": 250},
 }
 WAYS = {"trilateration": km.initialization.Trilateration(), "hypotheses": km.initialization.Hypotheses()}
 
 
 def trial(
     seed: int, way: Any, near: float = 5.0, far: float = 20.0, noise: float = 1.0, turn: float = 0.05, count: int = 1,
-    unknown: tuple[float, float] = (0.0, 0.0),
+    unknown: tuple[float, float] = (0.0, 0.0), strengths: bool = False, steps: int = 60,
 ) -> tuple[list[float], float]:  # fmt: skip
     """Return the squared errors of the beacons found, and that of the pose."""
     rng = np.random.default_rng(seed)
     sigmas = noise * np.array([0.01, 0.003, 0.005])
-    sensor = km.sensors.Range(sigma_range_m=0.1, sigma_scale=unknown[0], sigma_bias_m=unknown[1])
-    truth = km.sensors.Range(scale=1 + unknown[0] * rng.normal(), bias_m=unknown[1] * rng.normal())
+    sensor: Any = km.sensors.Range(sigma_range_m=0.1, sigma_scale=unknown[0], sigma_bias_m=unknown[1])
+    truth: Any = km.sensors.Range(scale=1 + unknown[0] * rng.normal(), bias_m=unknown[1] * rng.normal())
+    if strengths:
+        sensor = km.sensors.SignalStrength2D(2.0, sigma_strength_db=5.0, sigma_exponent=0.4)
+        truth = km.sensors.SignalStrength2D(strength_dbm=rng.normal(-40, 5), exponent=rng.normal(2, 0.4))
+    sigma = float(np.sqrt(sensor.noise(np.ones((1, 1)))[0, 0, 0]))
     motion, mount = km.motion.Odometry2D(*sigmas), km.Mount(sensor, at=AT, initialization=way)
     slam = km.Slam([km.Robot("r", motion, sensors={"radio": mount})])
     away, around = rng.uniform(near, far, count), rng.uniform(-np.pi, np.pi, count)
     beacons = np.column_stack([away * np.cos(around), away * np.sin(around)])
+    beacons = rng.uniform((-12.0, -2.0), (12.0, 22.0), (count, 2)) if strengths else beacons
     r, u = np.zeros(3), np.array([*STEP[:2], turn])
-    for t in range(60):
+    for t in range(steps):
         slam.process(km.Control(t_s=float(t), robot="r", u=u + rng.normal(size=3) * sigmas))
         r, _, _ = motion.move(r, u, 1.0)
         T, _, _ = km.geometry.compose(r, AT)
-        y = np.abs(truth.expect(beacons - T[:2])[0] + 0.1 * rng.normal(size=(count, 1)))
+        y = truth.expect(beacons - T[:2])[0] + sigma * rng.normal(size=(count, 1))
+        y = y if strengths else np.abs(y)
         slam.process(km.Scan(t_s=float(t), robot="r", sensor="radio", y=y, ids=list(range(count))))
     turned = V_inverse(r[2] - slam.mean("r")[2])
     pose = np.array([*(turned @ (r[:2] - slam.mean("r")[:2])), r[2] - slam.mean("r")[2]])
@@ -70,6 +79,8 @@ def trials(count: int) -> None:
     print(f"{count} trials          way            started   honest    mean   lost")
     for name, keys in ROWS.items():
         for label, way in WAYS.items():
+            if keys.get("strengths") and label == "hypotheses":
+                continue
             runs = [trial(seed, way, **keys) for seed in range(count)]
             d2, poses = np.array([e for found, _ in runs for e in found]), np.array([pose for _, pose in runs])
             share = len(d2) / (count * keys.get("count", 1))

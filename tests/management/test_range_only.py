@@ -243,3 +243,42 @@ def test_in_a_full_map_ranges_are_ignored_with_the_reason_until_there_is_room(wa
     assert slam.landmarks().ids
     slam.save(tmp_path / "map.kmk")
     assert km.Slam.load(tmp_path / "map.kmk").landmarks().ids == slam.landmarks().ids
+
+
+def strengths_heard(seed: int, near: tuple[float, float], steps: int) -> tuple[km.Slam, dict[int, np.ndarray]]:
+    """Return the map of a robot on a circle of 10 m that hears a sender at a distance from it, and where that is."""
+    rng = np.random.default_rng(seed)
+    radio = km.sensors.SignalStrength2D(1.0, sigma_strength_db=3.0)
+    true = km.sensors.SignalStrength2D(strength_dbm=rng.normal(-40, 3))
+    mount = km.Mount(radio, initialization=km.initialization.Trilateration())
+    slam = km.Slam(km.Robot("r", km.motion.Odometry2D(*NOISE), sensors={"radio": mount}))
+    around, side = rng.uniform(-np.pi, np.pi), rng.choice([-1, 1])
+    sender = np.array([0.0, 10.0]) + (10 + side * rng.uniform(*near)) * np.array([np.cos(around), np.sin(around)])
+    x, u = np.zeros(3), np.array([0.5, 0.0, 0.05])
+    for k in range(1, steps):
+        x = km.motion.Odometry2D().move(x, u + rng.normal(size=3) * NOISE, 1.0)[0]
+        slam.process(km.Control(float(k), "r", u))
+        y = true.expect((sender - x[:2])[None])[0] + rng.normal(0, 1, (1, 1))
+        slam.process(km.Scan(float(k), "r", "radio", y, [1]))
+    return slam, {1: sender}
+
+
+def test_strengths_of_a_sender_that_was_passed_closely_start_it_honestly() -> None:
+    squares = []
+    for seed in (5, 13, 20, 21):
+        slam, senders = strengths_heard(seed, (0.2, 0.8), 250)
+        d = slam.mean(1) - senders[1]
+        squares.append(d @ np.linalg.solve(slam.covariance(1), d))
+    assert max(squares) < 9.21
+
+
+def test_strengths_that_fit_on_either_side_of_the_path_start_nothing() -> None:
+    """From a circle around the first place, where the sender is far, only the wrong side was found: 240 in sigmas^2."""
+    slam, _ = strengths_heard(53, (0.8, 2.5), 150)
+    assert 1 not in slam.landmarks().ids
+
+
+def test_strengths_take_no_hypotheses() -> None:
+    mount = km.Mount(km.sensors.SignalStrength2D(), initialization=WAYS[1])
+    with pytest.raises(ModelError, match="SignalStrength2D does not measure ranges alone"):
+        km.Slam([km.Robot("r", km.motion.Odometry2D(), sensors={"radio": mount})])

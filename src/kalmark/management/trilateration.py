@@ -1,4 +1,4 @@
-"""Landmarks from ranges alone, delayed: ranges are kept with the poses they were made from until a position follows.
+"""Landmarks from ranges alone, or from strengths: kept with the poses they were made from until a position follows.
 
 The poses are clones in the map, so that they are corrected with everything else and their errors are correlated as
 they are.  The position l minimises the chi-square of all ranges kept, y_i = h(l - s_i), whose errors are those of the
@@ -89,7 +89,7 @@ class Trilateration:
         if pending.channel != scan.key:
             return Step("ignored", OTHERS)
         if not pending.measurements:
-            return Step("deferred", "", replace(pending, spacing_m=math.sqrt(scan.R[k, 0, 0])), keep=True)
+            return Step("deferred", "", replace(pending, spacing_m=_sigma(scan, k)), keep=True)
         last = scan.channel.pose(scan.map, scan.clones[pending.measurements[-1].clone])[:2]
         if np.linalg.norm(scan.pose()[:2] - last) < pending.spacing_m:
             return Step("deferred", f"within {pending.spacing_m:.2f} m of where the last range kept was taken")
@@ -110,10 +110,11 @@ class Trilateration:
         """Return the step that starts the landmark, or why it cannot start yet."""
         kept = pending.measurements
         problem = _problem(scan, kept)
-        distance = float(scan.channel.calibrated(scan.map).distances(np.array([[kept[0].y[0]]]))[0])
+        distances = scan.channel.calibrated(scan.map).distances(np.array([m.y for m in kept]))
+        nearest = int(np.argmin(distances))  # two positions that fit are mirror images there
         heading = scan.pose()[2]  # whatever it is, it rotates with the world frame
         angles = heading + 2 * np.pi * np.arange(self.directions) / self.directions
-        starts = problem.places[0] + distance * np.column_stack([np.cos(angles), np.sin(angles)])
+        starts = problem.places[nearest] + distances[nearest] * np.column_stack([np.cos(angles), np.sin(angles)])
         minima = _search(problem.fit, starts)
         least = int(np.argmin(minima.cost))
         best = Fits(*(each[least] for each in minima))
@@ -133,6 +134,14 @@ class Trilateration:
         parts = tuple((slot, len(scan.map.rows(slot))) for slot in problem.slots)
         start = Start(POINT2, best.l, parts, -W @ best.H_x @ problem.S_x, (W * best.R) @ W.T)
         return Step("new", f"from {len(kept)} ranges", start=start, measurements=len(kept))
+
+
+def _sigma(scan: ScanContext, k: int) -> float:
+    """Return how uncertain the distance is, m, that a measurement stands for."""
+    sensor = scan.channel.calibrated(scan.map)
+    distance = max(float(sensor.distances(scan.y[k : k + 1])[0]), 1e-3)
+    slope = float(np.linalg.norm(sensor.expect(np.array([[distance, 0.0]]))[1]))
+    return math.sqrt(scan.R[k, 0, 0]) / slope
 
 
 def _varies(scan: ScanContext, m: Measurement) -> bool:
@@ -168,7 +177,9 @@ def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> Problem:
             H_x[:, each, own + 2 * each + axis] = -H[:, :, axis]
         if own:
             H_x[:, :, :own] = sensor.parameters_jacobian(v).reshape(-1, n, own)
-        R = np.where(varies, sensor.range_variance(e).reshape(-1, n), variance)
+        R = np.tile(variance, (len(l), 1))
+        if varies.any():
+            R[:, varies] = sensor.range_variance(e).reshape(-1, n)[:, varies]
         Sigma = H_x @ S @ H_x.transpose(0, 2, 1) + R[:, :, None] * np.eye(n)
         z, inverse = y - e.reshape(-1, n), np.asarray(np.linalg.inv(Sigma), dtype=np.float64)
         chi2 = np.einsum("ji,jik,jk->j", z, inverse, z)
@@ -208,7 +219,7 @@ def _flat(best: Fits, problem: Problem) -> bool:
     if not np.isfinite(values).all() or values[0] <= 0:
         return False
     bulge = 0.5 / values[0] / np.hypot(*(best.l - problem.places).T)
-    return bool(np.median(bulge / np.sqrt(best.R)) < BULGE)
+    return bool(np.median(bulge * np.hypot(*best.H.T) / np.sqrt(best.R)) < BULGE)
 
 
 def _gaussian(fit: Callable[[Array], Fits], best: Fits, information: Array, bent: bool) -> bool:

@@ -414,11 +414,21 @@ class Drifting(Protocol):
 
 
 @runtime_checkable
-class Ranging(Protocol):
-    """A sensor whose first component is a range."""
+class Distant(Protocol):
+    """A sensor whose first component tells the distance."""
 
     def distances(self, y: Array) -> Array:
         """Return the distances (K,) in m that measurements y (K, m) stand for."""
+
+
+def distances_alone(sensor: Sensor) -> bool:
+    """Return whether all that a sensor measures is one number that tells the distance: a range, a strength."""
+    return len(sensor.columns) == 1 and isinstance(sensor, Distant)
+
+
+@runtime_checkable
+class Ranging(Distant, Protocol):
+    """A sensor whose first component is a range."""
 
     def range_variance(self, y: Array) -> Array:
         """Return the variances (K,) of the ranges of measurements y (K, m), m^2."""

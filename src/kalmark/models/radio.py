@@ -1,6 +1,7 @@
 """What radio receivers and microphones measure of a landmark that sends: its strength, its difference of arrival.
 
 Neither finds where a landmark is at once: they correct landmarks that other sensors have started, or a survey.
+Strengths from several places do, in the plane: `management/trilateration.py`.
 """
 
 from __future__ import annotations
@@ -123,6 +124,10 @@ class SignalStrength2D(_SignalStrength):
 
     world: ClassVar[str] = "plane"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
+
+    def distances(self, y: Array) -> Array:
+        """Return the distances (K,) at which strengths y (K, 1) are expected."""
+        return np.asarray(10.0 ** ((self.strength_dbm - y[:, 0]) / (10.0 * self.exponent)))
 
 
 @register("sensor", "signal_strength")

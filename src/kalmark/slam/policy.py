@@ -12,6 +12,7 @@ from kalmark.events import Scan
 from kalmark.filter.estimators import Estimator
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
+from kalmark.management.hypotheses import Hypotheses
 from kalmark.management.pending import Initialization
 from kalmark.management.tags import Mirrored
 from kalmark.management.trilateration import Trilateration
@@ -25,6 +26,7 @@ from kalmark.models.protocols import (
     Ranging,
     Reparametrizable,
     Segmented,
+    distances_alone,
     world_of,
 )
 from kalmark.slam.robot import Mount, Robot
@@ -89,15 +91,17 @@ def policy_of(
 
 def _deferred(mount: Mount) -> Initialization | None:
     """Return how a mounted sensor starts landmarks from several measurements, None if one is enough for it."""
-    ranging, way = tuple(mount.sensor.columns) == ("range_m",) and isinstance(mount.sensor, Ranging), None
-    if mount.initialization is not None and not isinstance(mount.initialization, Delayed):
-        way = mount.initialization
-        if not ranging:
-            what = f"{type(mount.sensor).__name__} does not measure ranges alone"
-            raise ModelError(f"Mount: initialization is {way!r}, but its {what}")
-    if ranging and not isinstance(mount.initialization, Delayed):
-        return way or Trilateration()
-    return Mirrored() if isinstance(mount.sensor, Ambiguous) else None
+    sensor, way = mount.sensor, mount.initialization
+    if way is None:
+        if distances_alone(sensor) and isinstance(sensor, Ranging):
+            return Trilateration()
+        return Mirrored() if isinstance(sensor, Ambiguous) else None
+    if isinstance(way, Delayed):
+        return None
+    if not distances_alone(sensor) or (isinstance(way, Hypotheses) and not isinstance(sensor, Ranging)):
+        what = f"{type(sensor).__name__} does not measure ranges alone"
+        raise ModelError(f"Mount: initialization is {way!r}, but its {what}")
+    return way
 
 
 def _starts(association: Association, upkeep: Upkeep) -> tuple[Answer, ...]:
