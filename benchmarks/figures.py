@@ -270,14 +270,14 @@ def inertial() -> Iterator[Figure]:
         yield Figure("Inertial", f"5 min at rest, `{estimator}`: least and most information about position and yaw", wanted,
                      f"python benchmarks/inertial.py still --estimator {estimator}",
                      row(f"still {estimator}:", "{2} / {4}"))  # fmt: skip
-    for heading, estimator, sigma_m in (
-        (30, "invariant", 0),
-        (0.01, "invariant", 0),
-        (30, "ekf", 0),
-        (30, "invariant", 0.05),
+    for of, heading, estimator, more in (
+        ("a receiver", 30, "invariant", ""),
+        ("a receiver", 0.01, "invariant", ""),
+        ("a receiver", 30, "ekf", ""),
+        ("a receiver of 0.05 m", 30, "invariant", " --receiver 0.05"),
+        ("a tower that sees it", 30, "invariant", " --seen"),
     ):
-        of, more = (f" of {sigma_m} m", f" --receiver {sigma_m}") if sigma_m else ("", "")
-        label = f"a drive with a receiver{of} and wheels, heading at the start {heading} deg, `{estimator}`"
+        label = f"a drive with {of} and wheels, heading at the start {heading} deg, `{estimator}`"
         yield Figure("Inertial", f"{label}: state NEES (15) after 30 s / 60 s / 180 s, mean of 40 runs",
                      "below 16.8, its 97.5 %" if estimator == "invariant" else "",
                      f"python benchmarks/drive.py --heading {heading} --estimator {estimator}{more}",

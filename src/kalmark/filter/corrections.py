@@ -53,30 +53,29 @@ from kalmark.filter.observed import (
     within,
 )
 from kalmark.filter.parallax import anchored
-from kalmark.geometry.angles import exponential_v
-from kalmark.geometry.rotations import exp, left_jacobian, matrix
-from kalmark.geometry.spaces import (
-    ANGLE,
-    SCALAR,
-    TURNED,
-    VECTOR,
-    VECTOR3,
-    Table,
-    generator,
-    generator_plane,
-    retract,
-    retract_plane,
+from kalmark.filter.turning import (
+    carry,
+    displaced,
+    frame_of,
+    gauge,
+    leaning,
+    turning_rows,
+    turns_of,
+    units,
+    widened,
 )
+from kalmark.geometry.spaces import Table, generator, generator_plane, retract, retract_plane
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
 Routines = tuple[int, int, int, int, int, int, int, int]  # addresses, see `routines`
 Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
+Sizes = tuple[int, int, int, int, int]  # of a pose, of a head, axes of the gauge; rows of the head, of other units
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
 TO_ITERATE = (
-    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 4), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
+    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 5), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
     "Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
 )
 ITERATE = signature_of(f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({TO_ITERATE})")
@@ -85,7 +84,6 @@ TO_CORRECT = (  # all but the last argument
     "Tuple((i8, i8, i8[::1], i8, f8[:, ::1], f8[:, :, ::1], f8))"
 )
 ROUNDS, SETTLED = 20, 0.01  # of Huber's weights, and by how much these may still change
-BLIND = 1e-6  # of a Jacobian's largest number: what is smaller is zero, of a user's model by differences, too
 call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
 _RETRACT, _GENERATOR, _ITERATE, _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8)
 
@@ -115,191 +113,16 @@ def compile_correction(name: str, option: str, axes: int, inverse_depths: bool) 
 
 
 @compiled
-def turning_rows(table: Table, pose: int, head: int, axes: int, alone: int, H: Array) -> Index:
-    """Return the rows of the head that turn the map: of the pose (axes,), then of a mount that is in the map (1 or 3).
-
-    The map turns with the sensor that observes it, so with its mount (docs/invariant.md).  A second block that is no
-    mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation in H are zero.
-    Of such a mount the rows of its position (2 or 3) follow, which turns with the robot: its lever arm.  So it is of a
-    robot that is `alone`: landmarks lean on the arm as the robot does, and would have to turn with it.
-    """
-    dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
-    mounted = head > pose and table[2, 0] == SCALAR and table[last, 0] == (ANGLE if pose == 3 else TURNED)
-    begin, more = 2 * dof - turns, turns
-    if mounted:
-        most = turning = 0.0
-        for i in range(len(H)):
-            for j in range(H.shape[1]):
-                most = max(most, abs(H[i, j]))
-                if 2 * dof - turns <= j < 2 * dof:
-                    turning = max(turning, abs(H[i, j]))
-        if turning <= BLIND * most:
-            begin, more = dof, (dof - turns) * alone
-    rows = np.empty(axes + more if mounted else axes, np.int64)
-    for a in range(len(rows)):
-        rows[a] = dof - axes + a if a < axes else begin + a - axes
-    return rows
-
-
-@compiled
-def is_alone(blocks: Table, atoms: Table, robot: int, mount: int) -> int:
-    """Return 1 if nothing but a robot with a mount in the map has a place in it, else 0."""
-    first, last = blocks[robot, 0], blocks[robot, 0] + blocks[robot, 1]
-    for a in range(len(atoms)):
-        kind, at = atoms[a, 0], atoms[a, 1]
-        if (kind == VECTOR or kind >= VECTOR3) and not first <= at < last and kind != TURNED:
-            return 0
-    return 1 if mount >= 0 else 0
-
-
-@compiled
-def arm_of(rows: Index, axes: int, pose: int) -> int:
-    """Return how many of the `turning_rows` are of a lever arm: 2, 3 or 0."""
-    return len(rows) - axes if len(rows) > axes and rows[axes] == (3 if pose == 3 else 6) else 0
-
-
-@compiled
-def frame_of(x: Array, at: int, size: int) -> Array:
-    """Return R_r (size, size) of the pose at this place of a mean x, in whose frame its mounts are.
-
-    `size`: 3 in space, in the plane 2 of positions, and 1 of rotations.
-    """
-    if size < 2:
-        return np.eye(1)
-    if size == 2:
-        R = np.empty((2, 2))
-        R[0, 0] = R[1, 1] = np.cos(x[at + 2])
-        R[1, 0], R[0, 1] = np.sin(x[at + 2]), -np.sin(x[at + 2])
-        return R
-    q = np.empty(4)
-    for i in range(4):
-        q[i] = x[at + 3 + i]
-    return matrix(q)
-
-
-@compiled
-def turns_of(g: Array, R: Array, x: Array, at: int, last: int, columns: int, arm: int) -> Array:
-    """Return a generator g (n, axes) with, up to so many columns, how a turn of the mount moves everything: g R.
-
-    R is R_r before the correction, the pose of the robot is at this place of the mean x now.  Its own rotation, whose
-    rows end with `last`, moves by -R_r: a correction leaves d_theta_r + R_r d_theta_s as it is, that of the sensor.
-    Its position moves by -R_r B with a lever arm (`arm` rows), where R is the B of `leaning`.
-    """
-    n, axes = g.shape
-    turns = columns - axes
-    if turns == 0:
-        return g
-    out = np.zeros((n, columns))
-    for i in range(n):
-        for a in range(axes):
-            out[i, a] = g[i, a]
-        for c in range(turns - arm):
-            for a in range(turns):
-                out[i, axes + c] += g[i, axes - turns + a] * R[a, c]
-    now, first = frame_of(x, at, turns), last + 1 - (turns if arm == 0 else 3 if arm == 2 else 6)
-    now = product(now, R) if arm > 0 else now
-    for a in range(turns):
-        for c in range(turns):
-            out[first + a, axes + c] = -now[a, c]
-    return out
-
-
-@compiled
-def product(A: Array, B: Array) -> Array:
-    """Return A B of two small square matrices."""
-    out = np.zeros(A.shape)
-    for i in range(len(A)):
-        for j in range(len(A)):
-            for c in range(len(A)):
-                out[i, j] += A[i, c] * B[c, j]
-    return out
-
-
-@compiled
-def leaning(P: Array, R: Array, arm: int) -> Array:
-    """Return B (arm, arm): in the robot's frame, R = R_r, its position leans on the lever arm by -B.
-
-    That is d_p = -R_r B d_a + C d_theta + what both do not explain, of the covariance P of the head: B is I where an
-    antenna's place is known and the heading is not, 0 where the robot's place is known.
-    """
-    turns = 1 if arm == 2 else 3
-    pose, n = arm + turns, arm + turns
-    A, B, most = np.empty((n, n)), np.zeros((arm, arm)), 0.0
-    rows = np.empty(n, np.int64)
-    for i in range(n):
-        rows[i] = pose + i if i < arm else i  # of the arm, then of the rotation
-    for i in range(n):
-        for j in range(n):
-            A[i, j] = P[rows[i], rows[j]]
-        A[i, i] += RAISED * max(A[i, i], 1.0)
-        most = max(most, A[i, i] if i < arm else 0.0)
-    M, positive = cholesky_inverse(A)
-    if most <= RAISED or not positive:
-        return B
-    for i in range(arm):
-        for j in range(arm):
-            for a in range(arm):
-                for b in range(n):
-                    for c in range(n):  # R' P_p. M' M
-                        B[i, j] -= R[a, i] * P[a, rows[b]] * M[c, b] * M[c, j]
-    return B
-
-
-@compiled
-def frames_of(P: Array, x: Array, at: int, columns: int, arm: int) -> tuple[Array, Array]:
-    """Return R_r, before a correction, and what `turns_of` takes for it, of the covariance P of the head."""
-    R = frame_of(x, at, columns)
-    return R, leaning(P, R, arm) if arm > 0 else R
-
-
-@compiled
-def carry_arm(x: Array, at: int, R: Array, turn: Array, d: Array) -> None:
-    """Move the position of a robot, at this place of the mean x, for what a correction d (k,) of its lever arm does.
-
-    With a turn E it moves by (V - E) R d, R = R_r B: what the arm explains of it turns with E.
-    """
-    k, M = len(d), np.zeros((3, 3))  # V - E
-    if k == 2:
-        p, q = exponential_v(turn[0])
-        M[0, 0] = M[1, 1] = p - np.cos(turn[0])
-        M[1, 0], M[0, 1] = q - np.sin(turn[0]), np.sin(turn[0]) - q
-    else:
-        whole = turn[len(turn) - 3 :].copy()
-        M = left_jacobian(whole) - matrix(exp(whole))
-    for i in range(k):
-        for j in range(k):
-            for c in range(k):
-                x[at + i] += M[i, j] * R[j, c] * d[c]
-
-
-@compiled
-def arm_in(correction: Array, rows: Index, axes: int) -> Array:
-    """Return what a correction of the head is of the lever arm (2,) or (3,), whose rows are the last ones."""
-    d = np.empty(len(rows) - axes)
-    for i in range(len(d)):
-        d[i] = correction[rows[axes + i]]
-    return d
-
-
-@compiled
-def gauge(mean: Array, correction: Array, rows: Index, axes: int, arm: int) -> Array:
-    """Return the motion of the gauge (axes,), d_theta or (xi_p, d_theta), in a correction of the head.
-
-    The observing robot's pose comes first in `mean` and in `correction`; `rows` are its `turning_rows`.
-    """
-    turn, turns = np.empty(axes), len(rows) - axes - arm
-    for a in range(axes):
-        turn[a] = correction[rows[a]]
-    if turns > 0:  # of the sensor: d_theta + R_r d_theta_s
-        R = frame_of(mean, 0, turns)
-        for a in range(turns):
-            for c in range(turns):
-                turn[axes - turns + a] += R[a, c] * correction[rows[axes + c]]
-    if axes == 6:  # xi_p = d_p - generator_p d_theta
-        turn[0] += mean[1] * turn[5] - mean[2] * turn[4]
-        turn[1] += mean[2] * turn[3] - mean[0] * turn[5]
-        turn[2] += mean[0] * turn[4] - mean[1] * turn[3]
-    return turn
+def observed(map_: Map, scan: Scan, slots: Index) -> tuple[Index, Table, Array, Sizes]:
+    """Return the `observed_block` of these slots, the rows of other units that turn behind its head, and its sizes."""
+    x, _P, _n, blocks, atoms, axes, _ways = map_
+    index, table, mean = observed_block(x, blocks, atoms, scan[0], scan[1], slots, scan[3])
+    pose, head = head_sizes(blocks, atoms, scan[0], scan[1])
+    others, h = units(atoms, blocks[scan[0], 2]), 3 if pose == 3 else 6
+    h += blocks[scan[1], 3] if scan[1] >= 0 else 0
+    if len(others):
+        index, table = widened(index, table, h, others)
+    return index, table, mean, (pose, head, axes, h, len(others))
 
 
 @compiled
@@ -312,7 +135,7 @@ def picked(index: Index, rows: Index) -> Index:
 
 
 def iterate(
-    model: Any, ways: Routines, sizes: tuple[int, int, int, int], table: Table, mean: Array, P_ss: Array, y: Array,
+    model: Any, ways: Routines, sizes: Sizes, table: Table, mean: Array, P_ss: Array, y: Array,
     R: Array, linear: Linear, limits: tuple[int, float],
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
@@ -324,15 +147,14 @@ def iterate(
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
     back where inverse distances are corrected by their parallax.
     """
-    (pose, head, axes, alone), (most, tolerance) = sizes, limits
+    (_pose, head, axes, h, others), (most, tolerance) = sizes, limits
     k = len(y)
-    theta = turning_rows(table, pose, head, axes, alone, linear[1])
-    correction = np.zeros(len(P_ss))
-    origin = mean[:3].copy()
-    last, arm = theta[axes - 1], arm_of(theta, axes, pose)
-    R_r, B = frames_of(P_ss, mean, 0, len(theta) - axes, arm)
-    turned = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
-    turned = turns_of(turned, B, mean, 0, last, len(theta), arm)
+    turning = turning_rows(table, sizes, linear[1])
+    theta, turns, _ = turning
+    correction, origin = np.zeros(len(P_ss)), mean[:3].copy()
+    L = leaning(rows_of(P_ss, theta, len(P_ss)), theta, table, turning, axes)
+    R_r, then = frame_of(mean, 0, turns), call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
+    turn = np.zeros(axes)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
     depths = anchored(table if parallaxes else table[:0])
     v, H, HP, Z = linear
@@ -343,16 +165,17 @@ def iterate(
         rows = np.arange(S.shape[1])
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P_ss, rows, mean, s, S, depths)))
         s_j, S_j = s, S
-    x_j = mean
+    x_j, (E, W, d) = mean, turns_of(turn, correction, turning, axes)
     for j in range(most):
         if j > 0:
             _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, (len(mean) - head) // k), y)
-            H, v = stacked(E_r, E_l), raveled(z)
+            H, v = stacked(E_r, E_l, len(P_ss)), raveled(z)
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            transport_rows(H, v, turns_of(now, B, x_j, 0, last, len(theta), arm), turned, theta, correction)
-            HP, Z = joint_innovation(H, P_ss, R, E_r.shape[2])
+            a = displaced(table, now, then, L, E, turning, theta, R_r, frame_of(x_j, 0, turns))
+            transport_rows(H, v, a, theta, correction)
+            HP, Z = joint_innovation(H, P_ss, R, h + others)
         M, positive = cholesky_inverse(Z)
         if not positive:
             break
@@ -360,10 +183,10 @@ def iterate(
         if settled(table, correction, before, P_ss, tolerance):
             break
         x_j = mean.copy()
-        turn = gauge(mean, correction, theta, axes, arm)
+        turn = gauge(mean, correction, turning, axes)
+        E, W, d = turns_of(turn, correction, turning, axes)
         call_retract(ways[_RETRACT], (table, x_j, correction, turn))
-        if arm > 0:
-            carry_arm(x_j, 0, product(R_r, B), turn, arm_in(correction, theta, axes))
+        carry(table, x_j, L, W, d)
         if len(depths):
             s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
             d_head = correction[: S.shape[1]]
@@ -375,7 +198,7 @@ compiled_iterate = compiled(iterate)
 
 
 def iterated(
-    model: Any, ways: Routines, sizes: tuple[int, int, int, int], table: Table, mean: Array, P_ss: Array, y: Array,
+    model: Any, ways: Routines, sizes: Sizes, table: Table, mean: Array, P_ss: Array, y: Array,
     R: Array, linear: Linear, limits: tuple[int, float],
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Return what `iterate` returns, compiled for a compiled model."""
@@ -442,11 +265,9 @@ def invariant(
     """
     x, P, n, blocks, atoms, axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
-    index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
-    pose, head = head_sizes(blocks, atoms, robot, mount)
-    alone = is_alone(blocks, atoms, robot, mount)
+    index, table, mean, sizes = observed(map_, scan, slots)
+    head, h = sizes[1], sizes[3]
     e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
-    h = E_r.shape[2]
     P_ss = submatrix(P, index)
     linear = linearized(z, E_r, E_l, P_ss, R)
     Z = diagonal_blocks(linear[3], z.shape[1])
@@ -456,19 +277,19 @@ def invariant(
         return e, z, Z, d2, near, valid
     if count < len(near):
         slots, y, R = chosen(near, count, slots, y, R)
-        index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+        index, table, mean, sizes = observed(map_, scan, slots)
         P_ss = submatrix(P, index)
         _e, z_near, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(count, d), y)
         linear = linearized(z_near, E_r, E_l, P_ss, R)
-    H, M, v, positive = iterated(model, ways, (pose, head, axes, alone), table, mean, P_ss, y, R, linear, limits)
+    H, M, v, positive = iterated(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return e, z, Z, d2, within(d2, -1.0)[0], False
-    origin = mean[:3].copy()
-    theta, at = turning_rows(table, pose, head, axes, alone, linear[1]), blocks[robot, 0]
-    last, arm = index[theta[axes - 1]], arm_of(theta, axes, pose)
-    R_r, B = frames_of(P_ss, x, at, len(theta) - axes, arm)
-    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
-    V, correction = gain(sparse_product(H, rows_of(P, index, n), h, count), M, v)
+    at, origin = blocks[robot, 0], mean[:3].copy()
+    turning = turning_rows(table, sizes, linear[1])
+    theta, turns = picked(index, turning[0]), turning[1]
+    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes)
+    R_r, then = frame_of(x, at, turns), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    V, correction = gain(sparse_product(H, rows_of(P, index, n), h + sizes[4], count), M, v)
     depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
     rows, baselines, x_before = index[:h], (depths, s, S, s), x
@@ -476,22 +297,20 @@ def invariant(
         s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
         x_before = x.copy()
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
-    d_head = np.empty(h)
-    for i in range(h):
-        d_head[i] = correction[rows[i]]
-    turn = gauge(mean, d_head, theta, axes, arm)
+    own = np.empty(len(index))
+    for i in range(len(index)):
+        own[i] = correction[index[i]]
+    turn = gauge(mean, own, turning, axes)
+    E, W, d_lean = turns_of(turn, own, turning, axes)
     call_retract(ways[_RETRACT], (atoms, x, correction, turn))
-    if arm > 0:
-        carry_arm(x, at, product(R_r, B), turn, arm_in(d_head, theta, axes))
-    now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
-    for i in range(n):
-        for a in range(len(theta)):
-            now[i, a] -= before[i, a]
-    downdate_and_transport(P, V, now, picked(index, theta))
+    carry(atoms, x, L, W, d_lean)
+    now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    a = displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, turns))
+    downdate_and_transport(P, V, a, theta)
     if len(depths):
         observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
         s, S = sensor_at(model, observer, ways[_SENSOR_AT])
-        parallax.call_retract(ways[_RETRACT_PARALLAX], (x, x_before, baselines, correction, d_head, s))
+        parallax.call_retract(ways[_RETRACT_PARALLAX], (x, x_before, baselines, correction, own[:h], s))
         parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, rows, x_before, x, baselines, s, S))
     return e, z, Z, d2, near, valid
 
@@ -520,7 +339,7 @@ def weighed(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
     head, p = head_sizes(blocks, atoms, robot, mount)[1], R.shape[1]
     _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
-    P_ss, H, v, inflated = submatrix(P, index), stacked(E_r, E_l), raveled(z), R.copy()
+    P_ss, H, v, inflated = submatrix(P, index), stacked(E_r, E_l, len(index)), raveled(z), R.copy()
     r = np.empty((len(y), p))
     for _ in range(ROUNDS):
         HP, Z = joint_innovation(H, P_ss, inflated, E_r.shape[2])
@@ -548,15 +367,14 @@ def weighed(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
 
 def fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
     """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if not valid."""
-    x, P, _n, blocks, atoms, axes, ways = map_
-    robot, mount, slots, d, y, R, _gate = scan
-    index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
-    pose, head = head_sizes(blocks, atoms, robot, mount)
-    alone = is_alone(blocks, atoms, robot, mount)
+    P, ways = map_[1], map_[6]
+    _robot, _mount, slots, d, y, R, _gate = scan
+    index, table, mean, sizes = observed(map_, scan, slots)
+    head = sizes[1]
     _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     P_ss = submatrix(P, index)
     linear = linearized(z, E_r, E_l, P_ss, R)
-    _H, M, v, positive = iterated(model, ways, (pose, head, axes, alone), table, mean, P_ss, y, R, linear, limits)
+    _H, M, v, positive = iterated(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return np.inf, np.inf
     w, log_det = M @ v, 0.0
@@ -575,47 +393,43 @@ def averaged(
     for itself, NaN for none, and whether the covariances are valid.
     """
     x, P, n, blocks, atoms, axes, ways = map_
-    robot, mount, slots, d, y, R, _gate = scan
-    pose, head = head_sizes(blocks, atoms, robot, mount)
-    alone = is_alone(blocks, atoms, robot, mount)
-    q = R.shape[1]
-    V, D, H = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, head))
+    robot, _mount, slots, d, y, R, _gate = scan
+    index, table, mean, sizes = observed(map_, scan, slots[:0])
+    (_pose, head, _axes, h, others), q = sizes, R.shape[1]
+    V, D, H = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, h))
     d2, used = np.full(len(y), np.nan), 0
     for i in range(len(pairs)):
         rows = np.flatnonzero(pairs[i] >= 0)
         if len(rows) == 0:
             continue
-        index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[pairs[i][rows]], d)
+        index, table, mean, sizes = observed(map_, scan, slots[pairs[i][rows]])
         _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(rows), d), y[rows])
         if i == 0:
             d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
         S = submatrix(P, index)
         linear = linearized(z, E_r, E_l, S, R[rows])
-        H, M, v, positive = iterated(
-            model, ways, (pose, head, axes, alone), table, mean, S, y[rows], R[rows], linear, limits
-        )
+        H, M, v, positive = iterated(model, ways, sizes, table, mean, S, y[rows], R[rows], linear, limits)
         if not positive:
             return d2, False
-        V_i, D[:, i] = gain(sparse_product(H, rows_of(P, index, n), E_r.shape[2], len(rows)), M, v)
+        V_i, D[:, i] = gain(sparse_product(H, rows_of(P, index, n), h + others, len(rows)), M, v)
         V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
         used += len(V_i)
-    index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)
-    theta, at = turning_rows(table, pose, head, axes, alone, H), blocks[robot, 0]
+    index, table, mean, sizes = observed(map_, scan, slots[:0])
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
-    origin = mean[:3].copy()
-    last, arm = index[theta[axes - 1]], arm_of(theta, axes, pose)
-    R_r, B = frames_of(submatrix(P, index), x, at, len(theta) - axes, arm)
-    before = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
-    turn = gauge(mean, correction[index], theta, axes, arm) if transports else np.zeros(0)
+    at, origin, turning = blocks[robot, 0], mean[:3].copy(), turning_rows(table, sizes, H)
+    theta, turns, own = picked(index, turning[0]), turning[1], correction[index]
+    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes)
+    R_r, then = frame_of(x, at, turns), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    turn = gauge(mean, own, turning, axes) if transports else np.zeros(0)
     call_retract(ways[_RETRACT], (atoms, x, correction, turn))
-    if transports and arm > 0:
-        carry_arm(x, at, product(R_r, B), turn, correction[index[theta[axes:]]])
     downdate(P, V)
     add_square(P, spread)
     if transports:
-        now = turns_of(call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin)), B, x, at, last, len(theta), arm)
-        transport(P, now - before, picked(index, theta))
+        E, W, d_lean = turns_of(turn, own, turning, axes)
+        carry(atoms, x, L, W, d_lean)
+        now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+        transport(P, displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, turns)), theta)
     return d2, True
 
 
@@ -678,7 +492,7 @@ def first_estimates(
     if count == 0:
         return e, z, Z, d2, near, valid
     index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
-    H = stacked(E_r[near], E_l[near])
+    H = stacked(E_r[near], E_l[near], len(index))
     M, positive = cholesky_inverse(joint_innovation(H, submatrix(P, index), R[near], E_r.shape[2])[1])
     if not positive:
         return e, z, Z, d2, within(d2, -1.0)[0], False

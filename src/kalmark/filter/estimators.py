@@ -170,13 +170,13 @@ class _Estimator:
             return _joined([self.correct(map_, part) for part in _parts(update)])
         model, robot, mount, slots, d, y, R, gate, parallax = update
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
-        before = m.mean(robot_here) if self.transports else None
+        before = m.x.copy() if self.transports else None
         scan = robot_here, mount_here, here, d, y, R, gate
         done = self._fused(model, m, scan, parallax)
         if not done.valid and not done.fused.any():
             done = self._one_by_one(model, m, scan, done, parallax)
         if before is not None:
-            turn_own_errors(m, robot_here, before)
+            turn_own_errors(m, before)
         map_.corrected(robot, self.transports)
         return done
 
@@ -206,11 +206,11 @@ class _Estimator:
         """
         model, *scan = update[:-1]
         run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
-        m, robot_here, _, _ = map_.opened(update.robot, update.mount, update.slots, self.transports)
-        before = m.mean(robot_here)
+        m = map_.opened(update.robot, update.mount, update.slots, self.transports)[0]
+        before = m.x.copy()
         d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)
         if self.transports:
-            turn_own_errors(m, robot_here, before)
+            turn_own_errors(m, before)
         return d2, bool(valid)
 
     def _option(self, map_: StochasticMap) -> Any:

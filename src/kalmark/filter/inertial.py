@@ -16,16 +16,17 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry.rotations import exp, matrix, skew
-from kalmark.geometry.spaces import ROTATION, SCALAR, VECTOR3, Space
+from kalmark.geometry.spaces import OWN, ROTATION, SCALAR, VECTOR3, Space
 
-UNIT = VECTOR3, ROTATION, VECTOR3, *(SCALAR,) * 6  # pose, velocity, biases; what follows is the gravity
+UNIT = VECTOR3, ROTATION, OWN, *(SCALAR,) * 6  # pose, velocity, biases; what follows is the gravity
 
 
-def turn_own_errors(map_: StochasticMap, robot: int, before: Array) -> None:
-    """Let the errors of an inertial unit turn as it did in a correction of its mean `before`; other robots stay."""
-    space = map_.spaces[robot]
-    if space is not None and space.kinds[: len(UNIT)] == UNIT:
-        map_.predict(map_.index(robot), carried(space, before, map_.mean(robot)), np.zeros((space.dof, space.dof)))
+def turn_own_errors(map_: StochasticMap, before: Array) -> None:
+    """Let the errors of each inertial unit turn as it did in a correction of the whole mean `before`."""
+    for slot, space in enumerate(map_.spaces):
+        if space is not None and space.kinds[: len(UNIT)] == UNIT:
+            T = carried(space, before[map_.numbers(slot)], map_.mean(slot))
+            map_.predict(map_.index(slot), T, np.zeros((space.dof, space.dof)))
 
 
 def carried(space: Space, before: Array, after: Array) -> Array:
@@ -39,7 +40,7 @@ def carried(space: Space, before: Array, after: Array) -> Array:
         E = matrix(exp(np.array([0.0, 0.0, math.atan2(E[1, 0] - E[0, 1], E[0, 0] + E[1, 1])])))
     T[3:6, 3:6] = E
     for kind, at, k in space.atoms[2:]:
-        if kind == VECTOR3:
+        if kind == OWN:
             g = -skew(after[at : at + 3])
             T[k : k + 3, k : k + 3], T[k : k + 3, 3:6] = E, g @ E - E @ g
     return T

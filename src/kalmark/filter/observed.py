@@ -134,14 +134,17 @@ def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
 
 
 @compiled
-def stacked(E_r: Array, E_l: Array) -> Array:
-    """Return the Jacobian H (K p, head + K d) of all observations of a scan with respect to the observed block."""
+def stacked(E_r: Array, E_l: Array, n: int) -> Array:
+    """Return the Jacobian H (K p, n) of all observations of a scan with respect to the observed block of n rows.
+
+    It is zero in rows between those of the head and those of the landmarks.
+    """
     k, p, d = E_l.shape
-    head = E_r.shape[2]
-    H = np.zeros((k * p, head + k * d))
+    head = n - k * d
+    H = np.zeros((k * p, n))
     for i in range(k):
         for a in range(p):
-            for c in range(head):
+            for c in range(E_r.shape[2]):
                 H[i * p + a, c] = E_r[i, a, c]
             for c in range(d):
                 H[i * p + a, head + i * d + c] = E_l[i, a, c]
@@ -189,8 +192,9 @@ def linearized(z: Array, E_r: Array, E_l: Array, P_ss: Array, R: Array) -> Linea
 
     P_ss is the covariance of the observed block.
     """
-    H = stacked(E_r, E_l)
-    HP, Z = joint_innovation(H, P_ss, R, E_r.shape[2])
+    k, _p, d = E_l.shape
+    H = stacked(E_r, E_l, len(P_ss))
+    HP, Z = joint_innovation(H, P_ss, R, len(P_ss) - k * d)
     return raveled(z), H, HP, Z
 
 
@@ -254,20 +258,17 @@ def chosen(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[I
 
 
 @compiled
-def transport_rows(H: Array, v: Array, now: Array, then: Array, theta: Index, correction: Array) -> None:
-    """Transport the rows of H from an iterate to the mean, H <- H (I + (now - then) e_theta'), then v += H correction.
-
-    `now` and `then` (n, axes) are the generators there and here.
-    """
-    n, axes = now.shape
-    added = np.empty(axes)
+def transport_rows(H: Array, v: Array, a: Array, theta: Index, correction: Array) -> None:
+    """Transport the rows of H from an iterate to the mean, H <- H (I + a e_theta'), then v += H correction."""
+    n, k = a.shape
+    added = np.empty(k)
     for r in range(len(H)):
-        for a in range(axes):
-            added[a] = 0.0
+        for i in range(k):
+            added[i] = 0.0
             for c in range(n):
-                added[a] += H[r, c] * (now[c, a] - then[c, a])
-        for a in range(axes):
-            H[r, theta[a]] += added[a]
+                added[i] += H[r, c] * a[c, i]
+        for i in range(k):
+            H[r, theta[i]] += added[i]
         for c in range(n):
             v[r] += H[r, c] * correction[c]
 

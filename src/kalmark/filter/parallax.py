@@ -137,7 +137,7 @@ def carried(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: 
             k, l = ((j + 1) % 3, (j + 2) % 3) if size == 3 else (0, 1)
             turned[j] = g[k] * t[l] - g[l] * t[k]
             C[i, pose - turns + j] += turned[j]
-        if mounted:  # the map turns with it, too: corrections.turning_rows
+        if mounted:  # the map turns with it, too: turning.turning_rows
             for j in range(turns):
                 then = 0.0
                 for b in range(size):

@@ -19,6 +19,8 @@ PLUECKER     6 / 6          E n, E v (the line of direction v, moment n)        
 ANCHOR       3 / 3          as VECTOR3: where inverse distances count from      -[x]x
 RHO          1 / 1          as SCALAR: the inverse of a distance to the ANCHOR  0
                             (in the plane, to the VECTOR its block begins with)
+OWN          3 / 3          as VECTOR3: of a robot, moved by its own rotation   -[x]x
+                            (the ROTATION before it)
 ===========  =============  ==================================================  =================
 
 Orientation errors are world errors, R = Exp(d) R_hat, positions and landmarks are additive world vectors: Sola's 2-D
@@ -45,11 +47,12 @@ from kalmark.geometry.rotations import conjugate, exp, left_jacobian, log, matri
 
 Table = Index
 
-SCALAR, VECTOR, HEADING, ANGLE, VECTOR3, ROTATION, DIRECTION, TURNED, HOMOGENEOUS, PLUECKER, ANCHOR, RHO = range(12)
+SCALAR, VECTOR, HEADING, ANGLE, VECTOR3, ROTATION, DIRECTION, TURNED = range(8)
+HOMOGENEOUS, PLUECKER, ANCHOR, RHO, OWN = range(8, 13)
 REMOVED = -1
-MEAN_SIZE = np.array([1, 2, 1, 1, 3, 4, 2, 4, 4, 6, 3, 1])
-ERROR_SIZE = np.array([1, 2, 1, 1, 3, 3, 2, 3, 4, 6, 3, 1])
-LINEAR = np.array([0, 0, 0, 0, 3, 0, 0, 0, 3, 6, 3, 0])  # leading numbers that are vectors of space
+MEAN_SIZE = np.array([1, 2, 1, 1, 3, 4, 2, 4, 4, 6, 3, 1, 3])
+ERROR_SIZE = np.array([1, 2, 1, 1, 3, 3, 2, 3, 4, 6, 3, 1, 3])
+LINEAR = np.array([0, 0, 0, 0, 3, 0, 0, 0, 3, 6, 3, 0, 3])  # leading numbers that are vectors of space
 
 KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 
@@ -79,11 +82,11 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
     """
     retract_plane(atoms, x, d, turn)
     whole = turn[len(turn) - 3 :] if len(turn) >= 3 else np.zeros(3)
-    V = left_jacobian(whole) if len(turn) >= 3 else np.eye(3)
+    V = V_own = left_jacobian(whole) if len(turn) >= 3 else np.eye(3)
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
         if kind == ROTATION:
-            own = exp(d[k : k + 3] - whole)
+            own, V_own = exp(d[k : k + 3] - whole), left_jacobian(d[k : k + 3]) if len(turn) >= 3 else np.eye(3)
             x[at : at + 4] = multiply(exp(whole), multiply(own, x[at : at + 4]))
         elif kind == TURNED:
             x[at : at + 4] = multiply(exp(d[k : k + 3]), x[at : at + 4])
@@ -92,7 +95,7 @@ def retract(atoms: Table, x: Array, d: Array, turn: Array) -> None:
         elif kind >= VECTOR3 and kind != RHO:
             if kind == PLUECKER and len(turn) == 6:
                 _move_moment(x[at : at + 6], turn[:3].copy(), V, whole)
-            _add_vectors(x[at : at + LINEAR[kind]], V, d[k : k + LINEAR[kind]])
+            _add_vectors(x[at : at + LINEAR[kind]], V_own if kind == OWN else V, d[k : k + LINEAR[kind]])
             if kind == HOMOGENEOUS:
                 x[at + 3] += d[k + 3]
 

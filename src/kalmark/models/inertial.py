@@ -25,7 +25,7 @@ from kalmark.geometry.rotations import (
     multiply,
     skew,
 )
-from kalmark.geometry.spaces import ROTATION, SCALAR, VECTOR3, Space
+from kalmark.geometry.spaces import OWN, ROTATION, SCALAR, VECTOR3, Space
 from kalmark.models.kinematics import NODES, WEIGHTS, MotionModel
 
 GRAVITY = 16  # where the gravity begins in a state that has it
@@ -169,7 +169,7 @@ class Inertial(MotionModel):
     accelerometer_random_walk_mps2_per_sqrt_s: Annotated[NotNegative, "Random walk of the force's bias."] = 3.0e-3
     gravity_mps2: Annotated[Positive, "What an accelerometer at rest reads."] = 9.81
 
-    space: ClassVar[Space] = Space("SE2(3) with biases", (VECTOR3, ROTATION, VECTOR3, *(SCALAR,) * 6))
+    space: ClassVar[Space] = Space("SE2(3) with biases", (VECTOR3, ROTATION, OWN, *(SCALAR,) * 6))
     columns: ClassVar[tuple[str, ...]] = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
     held: ClassVar[bool] = True
     moves: ClassVar[Any] = inertial
@@ -224,7 +224,7 @@ class InertialGravity(Inertial):
     The state is that of `inertial` with the gravity in the world behind it, (3,) m/s^2, 19 numbers and 18 errors.
     """
 
-    space: ClassVar[Space] = Space("SE2(3) with biases and gravity", (*Inertial.space.kinds, VECTOR3))
+    space: ClassVar[Space] = Space("SE2(3) with biases and gravity", (*Inertial.space.kinds, OWN))
     state_columns: ClassVar[tuple[str, ...]] = (
         *Inertial.state_columns, "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
     )  # fmt: skip

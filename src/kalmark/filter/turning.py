@@ -1,0 +1,255 @@
+"""What turns in a correction of the invariant filter, and with which rotation.  docs/invariant.md.
+
+The map turns with the sensor that observes it: the gauge.  What leans on a lever arm, or on the heading of another
+inertial unit, turns with that.  With the rotation errors of the observing robot and of other units r, and an arm a,
+
+    d = ... + L_a d_a + L_r (d_theta_r - d_theta) + what these do not explain
+
+of each vector of the world, by the covariance before the correction.  It becomes E d of the leaning part, E the turn
+of the robot that has the arm, or of r; a turn of the whole world changes no difference, so nothing is lost of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kalmark.arrays import Array, Index
+from kalmark.compiled import compiled
+from kalmark.filter.kernels import RAISED, cholesky_inverse, product
+from kalmark.filter.observed import transposed
+from kalmark.geometry.angles import exponential_v
+from kalmark.geometry.rotations import exp, left_jacobian, matrix
+from kalmark.geometry.spaces import ANGLE, LINEAR, OWN, ROTATION, SCALAR, TURNED, VECTOR, Table
+
+BLIND = 1e-6  # of a Jacobian's largest number: what is smaller is zero, of a user's model by differences, too
+
+Turning = tuple[Index, int, int]  # rows of what turns, and how many are of the mount's rotation and of a lever arm
+
+
+@compiled
+def units(atoms: Table, observer: int) -> Index:
+    """Return the rows (3 k,) of the rotations of all inertial units but the one whose rows begin at `observer`."""
+    rows, count = np.empty(3 * len(atoms), np.int64), 0
+    for i in range(len(atoms) - 1):
+        if atoms[i, 0] == ROTATION and atoms[i + 1, 0] == OWN and atoms[i, 2] != observer + 3:
+            for a in range(3):
+                rows[count + a] = atoms[i, 2] + a
+            count += 3
+    return rows[:count]
+
+
+@compiled
+def widened(index: Index, table: Table, head: int, rows: Index) -> tuple[Index, Table]:
+    """Return the rows of P and the atoms of an observed block that has further rows of P behind those of its head."""
+    k, out, moved = len(rows), np.empty(len(index) + len(rows), np.int64), table.copy()
+    for i in range(len(out)):
+        out[i] = index[i] if i < head else rows[i - head] if i < head + k else index[i - k]
+    for i in range(len(table)):
+        if table[i, 2] >= head:
+            moved[i, 2] += k
+    return out, moved
+
+
+@compiled
+def turning_rows(table: Table, sizes: tuple[int, int, int, int, int], H: Array) -> Turning:
+    """Return the rows of the observed block that turn the map: of the pose (axes,), of a mount, of other units.
+
+    The map turns with the sensor that observes it, so with its mount (1 or 3 rows, if it is in the map).  A second
+    block that is no mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation
+    in H are zero.  Of such a mount the rows of its position (2 or 3) are here, its lever arm.
+    """
+    pose, head, axes, behind, others = sizes
+    dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
+    first, arm = 2 * dof - turns, 0
+    if head <= pose or table[2, 0] != SCALAR or table[last, 0] != (ANGLE if pose == 3 else TURNED):
+        turns = 0
+    else:
+        most = turning = 0.0
+        for i in range(len(H)):
+            for j in range(H.shape[1]):
+                most = max(most, abs(H[i, j]))
+                if first <= j < 2 * dof:
+                    turning = max(turning, abs(H[i, j]))
+        if turning <= BLIND * most:
+            first, turns, arm = dof, 0, dof - turns
+    rows, own = np.empty(axes + turns + arm + others, np.int64), turns + arm
+    for i in range(len(rows)):
+        rows[i] = dof - axes + i if i < axes else first + i - axes if i < axes + own else behind + i - axes - own
+    return rows, turns, arm
+
+
+@compiled
+def frame_of(x: Array, at: int, size: int) -> Array:
+    """Return R_r (size, size) of the rotation of the pose at this place of a mean x: 3 in space, 1 in the plane."""
+    if size < 3:
+        return np.eye(1)
+    q = np.empty(4)
+    for i in range(4):
+        q[i] = x[at + 3 + i]
+    return matrix(q)
+
+
+@compiled
+def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
+    """Return the motion of the gauge (axes,), d_theta or (xi_p, d_theta), in a correction of the head.
+
+    The observing robot's pose comes first in `mean` and in `correction`.
+    """
+    rows, turns, _ = turning
+    turn = np.empty(axes)
+    for a in range(axes):
+        turn[a] = correction[rows[a]]
+    if turns > 0:  # of the sensor: d_theta + R_r d_theta_s
+        R = frame_of(mean, 0, turns)
+        for a in range(turns):
+            for c in range(turns):
+                turn[axes - turns + a] += R[a, c] * correction[rows[axes + c]]
+    if axes == 6:  # xi_p = d_p - generator_p d_theta
+        turn[0] += mean[1] * turn[5] - mean[2] * turn[4]
+        turn[1] += mean[2] * turn[3] - mean[0] * turn[5]
+        turn[2] += mean[0] * turn[4] - mean[1] * turn[3]
+    return turn
+
+
+@compiled
+def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int) -> Array:
+    """Return L (n, m): how each vector of some atoms leans on the m rows of an arm and of other units' rotations.
+
+    `B` (k, n) are the rows of P, before the correction, of all rows that turn; `index` are these rows.  The rotation of
+    the observing robot explains its part, too.
+    """
+    first, t = axes + turning[1], 1 if axes == 1 else 3
+    m = len(index) - first
+    L = np.zeros((B.shape[1], m))
+    if m == 0:
+        return L
+    used, S = np.empty(t + m, np.int64), np.empty((t + m, t + m))
+    for i in range(t + m):
+        used[i] = axes - t + i if i < t else first + i - t
+    for i in range(t + m):
+        for j in range(t + m):
+            S[i, j] = B[used[i], index[used[j]]]
+        S[i, i] += RAISED * max(S[i, i], 1.0)
+    M, positive = cholesky_inverse(S)
+    if not positive:
+        return L
+    W = product(transposed(M), M)  # S^-1
+    for a in range(len(atoms)):
+        for j in range(atoms[a, 2], atoms[a, 2] + vectors(atoms[a, 0])):
+            for c in range(m):
+                for b in range(t + m):
+                    L[j, c] += W[t + c, b] * B[used[b], j]
+    return L
+
+
+@compiled
+def vectors(kind: int) -> int:
+    """Return how many leading numbers of an atom are vectors of the world that may lean on what turns."""
+    return 2 if kind == VECTOR else 0 if kind < 0 or kind == OWN else LINEAR[kind]
+
+
+@compiled
+def rotation_of(turn: Array) -> tuple[Array, Array]:
+    """Return V and E of a turn: (1,) in the plane, in space the last three of (3,) or (6,)."""
+    if len(turn) > 1:
+        whole = turn[len(turn) - 3 :].copy()
+        return left_jacobian(whole), matrix(exp(whole))
+    V, E = np.empty((2, 2)), np.empty((2, 2))
+    V[0, 0], V[1, 0] = exponential_v(turn[0])
+    E[0, 0], E[1, 0] = np.cos(turn[0]), np.sin(turn[0])
+    V[1, 1], V[0, 1], E[1, 1], E[0, 1] = V[0, 0], -V[1, 0], E[0, 0], -E[1, 0]
+    return V, E
+
+
+@compiled
+def turns_of(turn: Array, correction: Array, turning: Turning, axes: int) -> tuple[Array, Array, Array]:
+    """Return E - 1 and W - V (m, s, s) of the m rows that others lean on, and their errors (m,) by a correction.
+
+    A leaning part becomes E of it, and moves the mean by W, where a vector moves by V otherwise: V of the gauge's
+    `turn`, E and W of the turn of the robot; that of another unit goes on from that of the gauge.
+    """
+    rows, turns, arm = turning
+    first, s = axes + turns, 2 if axes == 1 else 3
+    m = len(rows) - first
+    E, W, d, own = np.empty((m, s, s)), np.empty((m, s, s)), np.empty(m), np.zeros(3)
+    if m == 0:
+        return E, W, d
+    V, E_r = rotation_of(turn)
+    E_c = W_c = E_r
+    for c in range(m):
+        d[c], axis = correction[rows[first + c]], (c - arm) % 3
+        if c >= arm and axis == 0:
+            for a in range(3):
+                own[a] = correction[rows[first + c + a]] - turn[axes - 3 + a]
+            V_own, E_own = rotation_of(own)
+            E_c, W_c = product(E_r, E_own), product(E_r, V_own)
+        if c >= arm:
+            d[c] = own[axis]
+        for a in range(s):
+            for b in range(s):
+                E[c, a, b] = E_c[a, b] - (1.0 if a == b else 0.0)
+                W[c, a, b] = W_c[a, b] - V[a, b]
+    return E, W, d
+
+
+@compiled
+def carry(atoms: Table, x: Array, L: Array, W: Array, d: Array) -> None:
+    """Move the vectors of a mean x by what a correction d (m,) does to them by their leaning L (n, m)."""
+    s = W.shape[1]
+    for i in range(len(atoms)):
+        at, k = atoms[i, 1], atoms[i, 2]
+        for v in range(0, vectors(atoms[i, 0]), s):
+            for c in range(len(d)):
+                for a in range(s):
+                    for b in range(s):
+                        x[at + v + a] += W[c, a, b] * L[k + v + b, c] * d[c]
+
+
+@compiled
+def displaced(
+    atoms: Table, now: Array, then: Array, L: Array, E: Array, turning: Turning, index: Index, R: Array, R_now: Array
+) -> Array:  # fmt: skip
+    """Return the columns (n, rows that turn) by which errors change from a mean to a corrected one.
+
+    `now` and `then` (n, axes) are the generators there, `index` the rows that turn, R and R_now those of the robot's
+    rotation, before and now, which only a mount's rotation needs.
+    """
+    _rows, turns, arm = turning
+    n, axes = now.shape
+    first = axes + turns
+    out = np.zeros((n, len(index)))
+    for i in range(n):
+        for a in range(axes):
+            out[i, a] = now[i, a] - then[i, a]
+    lean(out, atoms, L, E, axes, first + arm, index)
+    for i in range(n):  # other units turn by d_theta_r - d_theta
+        for c in range(first + arm, len(index)):
+            out[i, axes - 3 + (c - first - arm) % 3] -= out[i, c]
+    for c in range(turns):  # a mount moves all as d_theta does, but the robot's own rotation by -R_r
+        for a in range(turns):
+            for i in range(n):
+                out[i, axes + c] += out[i, axes - turns + a] * R[a, c]
+            out[index[axes - turns + a], axes + c] -= R_now[a, c] - R[a, c]
+    return out
+
+
+@compiled
+def lean(out: Array, atoms: Table, L: Array, E: Array, axes: int, others: int, index: Index) -> None:
+    """Set the last columns of `out` (n, .), those of an arm and from `others` on of other units, to (E - 1) L.
+
+    A vector of a unit's own turns with it by its generator, in the first columns, whatever it leans on.
+    """
+    m, s, rotation = L.shape[1], E.shape[1], -1
+    first = out.shape[1] - m
+    for i in range(len(atoms) if m else 0):
+        kind, k = atoms[i, 0], atoms[i, 2]
+        for v in range(0, vectors(kind), s):
+            for c in range(m):
+                for a in range(s):
+                    for b in range(s):
+                        out[k + v + a, first + c] += E[c, a, b] * L[k + v + b, c]
+        rotation = k if kind == ROTATION else rotation
+        for c in range(others if kind == OWN else len(index), len(index), 3):
+            for a in range(3 if index[c] == rotation else 0):
+                for b in range(3):
+                    out[k + a, c + b] = out[k + a, axes - 3 + b]
