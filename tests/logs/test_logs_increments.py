@@ -194,3 +194,7 @@ def test_halves_are_no_copies() -> None:
     controls = Controls(log, PLANE, "rover")
     assert controls.interval_s == 1.0
     assert_allclose(controls.u[1:3], 2 * np.array([e.u for e in log if isinstance(e, Control)][1:3]))
+
+
+def test_a_robot_without_controls_has_none_that_is_far_larger_than_the_others() -> None:
+    assert Controls(log_of([]), PLANE, "rover").odd(1.0) is None

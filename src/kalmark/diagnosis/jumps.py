@@ -42,7 +42,7 @@ class Controls:
     def __init__(self, log: Log, columns: Sequence[str], robot: str) -> None:
         mine = [e for e in log.events if isinstance(e, Control) and e.robot == robot]
         self.columns, self.t_s, share = columns, np.array([e.t_s for e in mine]), np.array([e.share for e in mine])
-        self.u = np.array([e.u for e in mine]).reshape(len(mine), -1) / share[:, None]
+        self.u = np.array([e.u for e in mine]).reshape(len(mine), len(columns)) / share[:, None]
         self.interval_s = float(np.median(np.diff(self.t_s) / share[1:])) if len(mine) > 1 else 0.0
         self.usual = np.quantile(np.abs(self.u), USUAL, axis=0) if mine else np.zeros(0)
 
