@@ -13,14 +13,17 @@ from kalmark.diagnosis.verdict import diagnose
 from kalmark.results.evaluate import headline
 from kalmark.results.run import Run
 from kalmark.results.verdict import verdict_lines
+from kalmark.results.warnings import autocorrelations
 
 STEPS, DT = 600, 0.1
 
 
-def run_of(sigma_m: float = 0.5, bias_radps: float = 0.0, outliers: int = 0) -> Run:
+def run_of(
+    sigma_m: float = 0.5, bias_radps: float = 0.0, outliers: int = 0, steps: int = STEPS, seed: int = 1
+) -> Run:  # fmt: skip
     """Return the run of a robot with wheels, a gyroscope of a bias and a receiver of 0.5 m, stated as `sigma_m`."""
-    rng, x, events = np.random.default_rng(1), np.zeros(3), list[Any]()
-    for k in range(STEPS):
+    rng, x, events = np.random.default_rng(seed), np.zeros(3), list[Any]()
+    for k in range(steps):
         v, w = 1.0, 0.05 + 0.15 * np.sin(k * DT / 9)
         events.append(km.Control(k * DT, "rover", [v + rng.normal(0, 0.1), w + rng.normal(0, 0.1)]))
         x += DT * np.array([v * np.cos(x[2] + w * DT / 2), v * np.sin(x[2] + w * DT / 2), w])
@@ -58,4 +61,11 @@ def test_readings_that_are_off_make_a_path_doubtful(keys: dict[str, float]) -> N
 def test_a_few_outliers_do_not_make_a_path_doubtful() -> None:
     run = run_of(outliers=5)
     assert np.sum(run.history.outcome == "rejected") == 5
+    assert diagnose(run).map == "ok"
+
+
+def test_single_numbers_that_are_white_make_no_path_doubtful() -> None:
+    """Of 40 windows of 60 pairs one has an autocorrelation of .56 by chance: of two numbers that would be none."""
+    run = run_of(steps=2400, seed=2)
+    assert max(w.value for w in autocorrelations(run.history)) > 0.5
     assert diagnose(run).map == "ok"

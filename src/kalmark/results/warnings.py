@@ -45,6 +45,7 @@ TIMES = 3.0  # a window's NIS over the median window's
 LEFT_OUT = 0.5  # share of a window's observations that fit nothing, where the median window has less than half of it
 CORRELATED = 0.5  # by which a window's autocorrelation of innovations exceeds the median window's
 PAIRS = 60  # of successive innovations in a window
+SIGMAS = 4.0  # of what white innovations have, that an autocorrelation exceeds: of single numbers .2 in a window
 WINDOW_SCANS = 10  # at least, as good as, in a window: the observations of one share the error of the pose
 SCANS_PAIRED = 30  # in a window of pairs
 MOST_GAP_STEPS = 5
@@ -68,12 +69,16 @@ COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 
 @dataclass(frozen=True)
 class Window:
-    """A stretch of time: when it begins and ends, in seconds since the first step, and its figure."""
+    """A stretch of time: when it begins and ends, in seconds since the first step, and its figure.
+
+    `chance` is the part of the figure that says nothing, as it may be by chance.
+    """
 
     start_s: float
     end_s: float
     value: float
     number: int
+    chance: float = 0.0
 
 
 def window_figures(history: History) -> dict[str, Any]:
@@ -119,14 +124,21 @@ def autocorrelations(history: History) -> list[Window]:
     one, two = one[same], two[same]
     turn = np.argsort(history.step[rows[two]], kind="stable")
     a, b, step = white[one[turn]], white[two[turn]], history.step[rows[two[turn]]]
-    both = np.nansum(a * b, axis=1)
+    both, numbers = np.nansum(a * b, axis=1), np.isfinite(a).sum(axis=1)
     size = np.sqrt(np.nansum(a**2, axis=1) * np.nansum(b**2, axis=1))
     ones = np.ones(len(both), dtype=np.int64)
-    products, sizes = (_windows(history, step, value, ones, PAIRS, SCANS_PAIRED) for value in (both, size))
+    sums = (both, size, size**2 / numbers)  # the last: the variance of the first, if directions are random
+    windows = zip(*(_windows(history, step, value, ones, PAIRS, SCANS_PAIRED) for value in sums), strict=True)
     return [
-        Window(p.start_s, p.end_s, p.value / max(s.value, 1e-300), p.number)
-        for p, s in zip(products, sizes, strict=True)
+        Window(p.start_s, p.end_s, p.value / s.value, p.number, max(_by_chance(s, v) - CORRELATED, 0.0))
+        for p, s, v in windows
+        if s.value > 0
     ]
+
+
+def _by_chance(size: Window, variance: Window) -> float:
+    """Return what an autocorrelation may be of white innovations, of the mean sizes and variances of its products."""
+    return SIGMAS * float(np.sqrt(variance.value / size.number)) / size.value
 
 
 def _whitened(history: History, rows: Ints) -> Array:
@@ -167,7 +179,7 @@ def window_warnings(run: Recording) -> Iterator[str]:
     for windows, told in ((of(history), told) for of, told in signs):
         if len(windows) < 3:
             continue
-        worst = max(windows, key=lambda w: w.value)
+        worst = max(windows, key=lambda w: w.value - w.chance)
         line = told(worst, float(np.median([w.value for w in windows])), len(windows))
         if line:
             when = f"from t={worst.start_s:.1f} to {worst.end_s:.1f} s"
@@ -184,7 +196,7 @@ def _high_nis(worst: Window, median: float, count: int) -> str:
 
 
 def _correlated(worst: Window, median: float, count: int) -> str:
-    if worst.value - max(median, 0.0) < CORRELATED:
+    if worst.value - worst.chance - max(median, 0.0) < CORRELATED:
         return ""
     return f"successive innovations are correlated by {figure(worst.value, 2)}, median {figure(median, 2)},"
 
