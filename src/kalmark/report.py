@@ -18,6 +18,7 @@ from kalmark.geometry.gaussian import ellipses
 
 Late = tuple[int, str, str, int]
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
+ALONE = "measurement alone cannot start a landmark"
 INDEFINITE = "the covariance of its innovation is not positive definite"
 NOTHING = np.zeros((0, 0))
 NOTHING.flags.writeable = False

@@ -446,6 +446,13 @@ def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:
         assert verdict.causes[0].name == "start" and " 3" in verdict.causes[0].evidence  # some 34 deg
 
 
+def test_a_start_that_may_be_anywhere_is_not_said_to_be_surer(tmp_path: Path) -> None:
+    log = simulate(world_of(), 3)
+    start = "robots.rover.start={x_m: 12, y_m: 12, sigma_xy_m: 10, sigma_theta_rad: 3}"
+    verdict = km.diagnose(recorded(log, start, surveyed(tmp_path, log, 0.0, {})))
+    assert (verdict.map, verdict.causes) == ("ok", ())
+
+
 def test_a_landmark_that_began_with_an_outlier_is_named_where_the_gate_leaves_out_the_rest() -> None:
     log, begun = simulate(world_of(), 3), set[Any]()
 
@@ -677,6 +684,19 @@ def test_the_verdict_on_a_run_without_landmarks_is_on_its_path() -> None:
     log = hall(0)
     run = mapped(replace(log, events=[e for e in log.events if isinstance(e, km.Control)]))
     assert next(verdict_lines(km.diagnose(run).as_dict())).startswith("the path is ok, by innovations alone")
+
+
+def test_a_run_that_used_no_observation_is_not_ok() -> None:
+    t_s = [0.5 * k for k in range(1, 40)]
+    log = km.log_from(
+        controls={"t_s": t_s, "robot": "r", "v_mps": 0.5, "w_radps": 0.1},
+        scans={"t_s": t_s, "robot": "r", "sensor": "radio", "id": 1, "rssi_dbm": -60.0},
+    )
+    radio = km.Mount(km.sensors.SignalStrength2D())
+    slam = km.Slam(km.Robot("r", motion=km.motion.Unicycle(), sensors={"radio": radio}))
+    verdict = km.diagnose(km.record(slam, log, progress=False))
+    assert verdict.map == "doubtful"
+    assert [cause.evidence for cause in verdict.causes] == ["none of the 39 observations was used"]
 
 
 def test_a_hall_that_is_mapped_twice_after_a_gap_is_wrong_and_its_wheel_is_named() -> None:

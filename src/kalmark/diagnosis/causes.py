@@ -170,7 +170,7 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
     for kind in dict.fromkeys(k for k in linear.problem.motions.kinds if k != UNKNOWN):
         mine = kinds == kind
         factor_of = _ratio(e2[mine].sum(), simulated2[mine].sum(axis=0))
-        if factor_of is not None:
+        if factor_of is not None and (kind != START or factor_of[0] > 1.0):  # a start may be surer than stated
             name = "start" if kind == START else "control_sigma"
             found.append(_noise(name, tuple(kind.split(".")), *factor_of, errors=mine))
     return [replace(f, gain=min(f.gain, most)) if f.value > 1.0 else f for f in found]

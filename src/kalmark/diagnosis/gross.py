@@ -24,6 +24,7 @@ from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
+from kalmark.report import ALONE
 from kalmark.results.gaps import while_lost
 from kalmark.results.history import Start
 from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_robust, rmse
@@ -93,14 +94,16 @@ def fit(run: Run) -> Fit:
 
     What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
     time, and clutter fits none either.  What is deferred after a gap, until the robot is known again, contradicts
-    nothing.
+    nothing, nor does what is of a landmark that no sensor has started.
     """
     history = run.history
     dof = np.maximum(np.isfinite(history.z).sum(axis=1), 1)
     d2 = np.minimum(np.nan_to_num(history.d2, nan=0.0) / dof, MOST)
     d2 = np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2)
     d2 = np.where((history.id == "") & (history.outcome != "associated"), LOST, d2)
-    return Fit(np.where((history.outcome == "deferred") & while_lost(history)[history.step], 1.0, d2), dof)
+    early = np.char.find(history.reason, ALONE) >= 0
+    early |= (history.outcome == "deferred") & while_lost(history)[history.step]
+    return Fit(np.where(early, 1.0, d2), dof)
 
 
 def explained(before: Fit, after: Fit) -> float:

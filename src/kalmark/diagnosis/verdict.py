@@ -173,7 +173,10 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
 
 
 def _all_misfit(run: Run) -> Iterator[str]:
-    """Tell that the observations do not fit, all over the run."""
+    """Tell that the observations do not fit, all over the run, or that none was used."""
+    outcome = run.history.outcome
+    if len(outcome) and not np.isin(outcome, ("associated", "new")).any():
+        yield f"none of the {len(outcome)} observations was used"
     mean = fit(run).mean
     if MISFITS_ALL < mean < np.inf:
         yield f"d2 per degree of freedom is {figure(mean, 2)} over all observations, where 1 is expected"

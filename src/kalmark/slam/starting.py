@@ -14,7 +14,7 @@ from kalmark.events import Id
 from kalmark.management import baselines, delayed, tags, walls
 from kalmark.management.pending import Initialization, Step
 from kalmark.models.protocols import distances_alone
-from kalmark.report import Observation
+from kalmark.report import ALONE, Observation
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import ObservationModel
@@ -110,7 +110,7 @@ def _refusal(state: State, scan: ScanContext, policy: Policy, k: int, name: Any,
         return Observation(k, id_, "rejected", name, None, f"it is no {scan.channel.landmark.kind}")
     if policy.deferred is None and not scan.channel.starts_landmarks:
         several = "; several can, with initialization: trilateration" if distances_alone(scan.channel.sensor) else ""
-        why = f"a {sensor} measurement alone cannot start a landmark{several}"
+        why = f"a {sensor} {ALONE}{several}"
         return Observation(k, id_, "ignored", None, None, why)
     if not isinstance(name, Answer) or policy.deferred is None:
         return None
