@@ -102,10 +102,12 @@ def test_another_sensor_tells_the_depth_of_what_a_camera_began(landmark: Any, ra
     assert 1.5 < np.mean([run.landmark_nees for run in runs]) < 4.5
 
 
-def in_plane(seed: int) -> Outcome:
+def in_plane(seed: int, noise: np.ndarray, sigma_scale: float, sigma_bias_m: float) -> Outcome:
     rng = np.random.default_rng(seed)
-    motion = km.motion.Odometry2D(sigma_x_m=0.02, sigma_y_m=0.02, sigma_theta_rad=0.005)
-    camera, radio = km.sensors.Bearing(sigma_bearing_rad=0.01), km.sensors.Range(sigma_range_m=0.1)
+    scale, bias_m = rng.normal([1.0, 0.0], [sigma_scale, sigma_bias_m])
+    motion = km.motion.Odometry2D(*noise)
+    camera = km.sensors.Bearing(sigma_bearing_rad=0.01)
+    radio = km.sensors.Range(sigma_range_m=0.1, sigma_scale=sigma_scale, sigma_bias_m=sigma_bias_m)
     prior = km.landmarks.InverseDepth2D(0.12, 0.06)
     mounts = {"camera": km.Mount(camera, landmark=prior), "radio": km.Mount(radio)}
     slam = km.Slam([km.Robot("r", motion, sensors=mounts)])
@@ -115,12 +117,12 @@ def in_plane(seed: int) -> Outcome:
     for k in range(STEPS):
         u, t = np.array([0.15, 0, 0.02]), 0.1 * (k + 1)
         x = frames.compose(x, u)[0]
-        slam.process(km.Control(t, "r", u + rng.normal(size=3) * [0.02, 0.02, 0.005]))
+        slam.process(km.Control(t, "r", u + rng.normal(size=3) * noise))
         v = frames.to_frame_many(x, points)[0]
         y = np.arctan2(v[:, 1], v[:, 0]) + 0.01 * rng.normal(size=POINTS)
         slam.process(km.Scan(t, "r", "camera", y[:, None], [*range(POINTS)]))
         if k % 2:
-            y = np.hypot(v[:, 0], v[:, 1]) + 0.1 * rng.normal(size=POINTS)
+            y = scale * np.hypot(v[:, 0], v[:, 1]) + bias_m + 0.1 * rng.normal(size=POINTS)
             found.update(
                 o.outcome for o in slam.process(km.Scan(t, "r", "radio", y[:, None], [*range(POINTS)])).observations
             )
@@ -129,8 +131,11 @@ def in_plane(seed: int) -> Outcome:
     return Outcome(found, float(np.mean(nees)), of_landmarks(slam, points))
 
 
-def test_a_range_tells_the_depth_of_what_a_bearing_began() -> None:
-    runs = [in_plane(seed) for seed in range(20)]
+@pytest.mark.parametrize(
+    ("noise", "unknown"), [((0.02, 0.02, 0.005), (0.0, 0.0)), ((0.005, 0.005, 0.002), (0.05, 0.3))]
+)
+def test_a_range_tells_the_depth_of_what_a_bearing_began(noise: Any, unknown: tuple[float, float]) -> None:
+    runs = [in_plane(seed, np.array(noise), *unknown) for seed in range(20)]
     for run in runs:
         assert run.outcomes["associated"] == STEPS // 2 * POINTS
     assert 2.0 < np.mean([run.pose_nees for run in runs]) < 4.2

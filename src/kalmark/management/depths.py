@@ -28,17 +28,22 @@ STEPS = 5  # of Gauss-Newton from the best of them
 
 @dataclass(frozen=True)
 class InverseRange:
-    """The observation model of inverse distances, negative where the estimate of a landmark is: in front it is not."""
+    """The observation model of inverse distances, negative where the estimate of a landmark is: in front it is not.
+
+    `E_p` (K, 1, p): what they change by with the parameters of the sensor in the map, if it has any.
+    """
 
     landmark: AsPoint
     mount: Array
+    E_p: Array
 
     def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Return e (K, 1), z = y - e, E_h (K, 1, h) and E_l (K, 1, n) of landmarks l (K, n), whose last is rho."""
-        view = PythonView(Inverse(), self.landmark, self.mount, np.zeros(1, dtype=np.bool_))
+        view, pose = PythonView(Inverse(), self.landmark, self.mount, np.zeros(1, dtype=np.bool_)), 2 * len(self.mount)
         sign = np.where(l[:, -1] < 0, -1.0, 1.0)[:, None]
-        e, _, E_h, E_l = view.linearize(head, l, y)
-        return sign * e, y - sign * e, sign[:, None] * E_h, sign[:, None] * E_l
+        e, _, E_h, E_l = view.linearize(head[:pose], l, y)
+        E_h = np.concatenate([sign[:, None] * E_h, self.E_p], axis=2)
+        return sign * e, y - sign * e, E_h, sign[:, None] * E_l
 
 
 class Inverse:
@@ -68,20 +73,23 @@ def approach(scan: ScanContext, model: ObservationModel, slots: Index, rows: lis
     behind = l[:, -1] < 0
     l[:, -1] = np.abs(l[:, -1])
     v = model.landmark.seen_from(scan.pose(), l)[0]
-    log_scale, variance = _scales(scan, v, scan.y[rows], scan.noise(model, slots, rows))
-    far = np.flatnonzero(behind | ((np.abs(log_scale) > FAR) & (log_scale**2 > SIGMAS**2 * variance)))
+    log_scale, variance, by = _scales(scan, v, scan.y[rows], scan.noise(model, slots, rows))
+    P = scan.map.covariance([scan.channel.mount])[scan.channel.pose_dof :, scan.channel.pose_dof :] if by.size else None
+    open_ = variance if P is None else variance + np.einsum("kp,pq,kq->k", by, P, by)
+    far = np.flatnonzero(behind | ((np.abs(log_scale) > FAR) & (log_scale**2 > SIGMAS**2 * open_)))
     if not len(far):
         return None
     inverse = np.exp(-log_scale[far, None]) / np.linalg.norm(v[far], axis=1)[:, None]
     R_far = SHARE * (variance[far, None] * inverse**2)[:, None]
-    view = InverseRange(model.landmark, scan.channel.at)
+    view = InverseRange(model.landmark, scan.channel.at, (inverse * by[far])[:, None])
     return Update(view, scan.robot, scan.channel.mount, slots[far], model.d, inverse, R_far, scan.channel.gate, False)
 
 
-def _scales(scan: ScanContext, v: Array, y: Array, R: Array) -> tuple[Array, Array]:
+def _scales(scan: ScanContext, v: Array, y: Array, R: Array) -> tuple[Array, Array, Array]:
     """Return by what factor points v (K, d) are farther for measurements y (K, m) with the noise R (K, m, m).
 
-    The logarithms (K,) of the likeliest factors and their variances (K,).
+    The logarithms (K,) of the likeliest factors, their variances (K,), and what they change by with the sensor's
+    parameters in the map (K, p).
     """
     sensor, W = scan.channel.calibrated(scan.map), np.linalg.inv(R)
     angular, d = np.array(sensor.angular, dtype=np.bool_), v.shape[1]
@@ -102,4 +110,8 @@ def _scales(scan: ScanContext, v: Array, y: Array, R: Array) -> tuple[Array, Arr
         z, Z_s = compared(np.exp(best))
         information = np.einsum("km,kmn,kn->k", Z_s, W, Z_s)
         best = best - np.einsum("km,kmn,kn->k", Z_s, W, z) / np.maximum(information, TINY)
-    return best, 1.0 / np.maximum(information, TINY)
+    variance = 1.0 / np.maximum(information, TINY)
+    if sensor is scan.channel.sensor:
+        return best, variance, np.zeros((len(v), 0))
+    E_p = sensor.parameters_jacobian(np.exp(best)[:, None] * v)
+    return best, variance, variance[:, None] * np.einsum("km,kmn,knp->kp", Z_s, W, E_p)
