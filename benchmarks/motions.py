@@ -12,8 +12,8 @@ textbook filter.
 
 Two ways to see how much of a row is chance (docs/evaluation.md).  `--noise 0.1`: all sigmas of the robots a tenth.  The
 draws are the same, and the filter, first order in the errors, is as good as exact: what it misses then is chance.
-`--runs 400`: the steps in the band of `--of` runs, for each so many runs of these, and how often so many drawn of all
-have 90 %.
+`--runs 400`: the row of the first `--of` runs, that of all, the steps in the band of each `--of` runs, and how often so
+many drawn of all have 90 %.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from numpy.random import SeedSequence
 from scipy.stats import chi2
 from ways import pin
 
-from kalmark.campaign.campaign import Anees
+from kalmark.campaign.campaign import Anees, figures
 from kalmark.campaign.scoring import Scores, score
 from kalmark.config.building import build_slam
 from kalmark.geometry.spaces import mount_space
@@ -103,11 +103,10 @@ def overrides(name: str, estimator: str, noise: float) -> list[str]:
     return [f"filter.estimator.type={estimator}", *scaled(robots, noise)]
 
 
-def report(name: str, runs: int, estimator: str, seed: int, noise: float, of: int) -> None:
-    """Print the row of a world."""
-    scored = Parallel(n_jobs=2)(delayed(run)(name, s, estimator, noise) for s in SeedSequence(seed).spawn(runs))
-    scores = [one.scores for one in scored]
-    pose, state = Anees("pose", scores), Anees("state", scores)
+def row(name: str, scored: list[Scored]) -> str:
+    """Return the row of runs of a world."""
+    scores, runs = [one.scores for one in scored], len(scored)
+    pose, state, found = Anees("pose", scores), Anees("state", scores), figures(scores)
     line = f"{name:20s} pose {pose.average:5.2f}, in the band {pose.inside:5.1%}"
     if np.isfinite(state.average):
         line += f"; state {state.average / state.ideal:5.2f}"
@@ -117,16 +116,25 @@ def report(name: str, runs: int, estimator: str, seed: int, noise: float, of: in
         better = np.mean([one.better for one in scored], axis=0)
         line += f"; constants {np.mean(values) / scored[0].count:5.2f}, inside {within} of {runs}"
         line += f", known better by {', '.join(f'{factor:.1f}' for factor in better)}"
-    error = np.std([np.nanmean(one.series["pose"]) for one in scores]) / np.sqrt(runs)
-    line += f"; diverged {sum(one.diverged for one in scores)}; pose +- {error:.2f}"
+    return line + f"; diverged {found['diverged']}; pose +- {found['pose_anees_sigma']:.2f}"
+
+
+def shares(scored: list[Scored], of: int) -> str:
+    """Return what share of the steps is in the band of so many runs: of each so many, and of many drawn of all."""
+    scores, runs, rng = [one.scores for one in scored], len(scored), np.random.default_rng(0)
+    each = [Anees("pose", scores[i : i + of]).inside for i in range(0, runs - of + 1, of)]
+    drawn = [rng.choice(runs, of, replace=False) for _ in range(DRAWS)]
+    often = np.mean([Anees("pose", [scores[i] for i in few]).inside >= WANTED for few in drawn])
+    shown = " ".join(f"{share:.0%}" for share in each)
+    return f"in the band of {of} runs {shown}; of {of} drawn {often:.0%} have {WANTED:.0%}"
+
+
+def report(name: str, runs: int, estimator: str, seed: int, noise: float, of: int) -> None:
+    """Print the row of a world for its first `of` runs, and that of all."""
+    scored = Parallel(n_jobs=2)(delayed(run)(name, s, estimator, noise) for s in SeedSequence(seed).spawn(runs))
+    print(row(name, scored[:of]), flush=True)
     if runs > of:
-        shares = [Anees("pose", scores[i : i + of]).inside for i in range(0, runs - of + 1, of)]
-        rng = np.random.default_rng(0)
-        drawn = [rng.choice(runs, of, replace=False) for _ in range(DRAWS)]
-        often = np.mean([Anees("pose", [scores[i] for i in few]).inside >= WANTED for few in drawn])
-        line += f"; each {of} runs {', '.join(f'{share:.1%}' for share in shares)}"
-        line += f"; of {of} drawn {often:.0%} have {WANTED:.0%}"
-    print(line, flush=True)
+        print(f"{row(f'{name}, {runs} runs:', scored)}; {shares(scored, of)}", flush=True)
 
 
 def main() -> None:

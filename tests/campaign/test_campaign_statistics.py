@@ -85,6 +85,16 @@ def test_the_joint_nees_is_the_quadratic_form_and_nothing_for_a_singular_covaria
     assert np.isnan(joint_nees(d, np.zeros((6, 6)))).all()
 
 
+def test_the_standard_error_of_the_anees_is_that_of_runs_not_of_steps() -> None:
+    rng = np.random.default_rng(0)
+    runs = [scores(rng) for _ in range(400)]
+    assert figures(runs)["pose_anees_sigma"] == pytest.approx(np.sqrt(6 / 400 / STEPS), rel=0.1)
+    for s in runs:  # an error that lasts: all steps of a run have one NEES
+        s.series["pose"][:] = rng.chisquare(3)
+    assert figures(runs)["pose_anees_sigma"] == pytest.approx(np.sqrt(6 / 400), rel=0.1)
+    assert np.isnan(figures(runs[:1])["pose_anees_sigma"])
+
+
 def test_the_first_steps_can_be_left_out_of_the_averages() -> None:
     rng = np.random.default_rng(0)
     runs = [scores(rng) for _ in range(4)]

@@ -27,6 +27,7 @@ COARSE, FINE = (1.0, 2.0, 5.0), (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  #
 FIGURES = (
     ("diverged", "diverged"),
     *((f"{name}_anees", name) for name in ("joint", "pose", "state", "heading", "landmarks", "mount")),
+    ("pose_anees_sigma", "pose, standard error"),
     ("pose_inside", "pose in its band, %"),
     ("position_rmse_m", "position RMSE, m"),
     ("heading_rmse_deg", "heading RMSE, deg"),
@@ -91,8 +92,9 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> dict[str, Any]:
     """Return the figures of one estimator over all runs, diverged ones included.
 
     `..._anees` is the average over steps, `..._inside` the share of steps inside the 95 % band, both after the first
-    `skip` steps; joint ANEES is per dimension.  `..._median` of pose NEES over all runs and steps is not moved by a run
-    that diverges.  What the runs do not have (velocities, uncertain mounts) is left out.
+    `skip` steps; joint ANEES is per dimension.  `pose_anees_sigma` is the standard error of the pose's, as the means of
+    the runs scatter: the steps of one are correlated.  `..._median` of pose NEES over all runs and steps is not moved
+    by a run that diverges.  What the runs do not have (velocities, uncertain mounts) is left out.
     """
     result: dict[str, Any] = {"runs": len(scores), "diverged": sum(s.diverged for s in scores)}
     stopped = sorted({s.stopped for s in scores if s.stopped})
@@ -104,6 +106,9 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> dict[str, Any]:
             result[f"{name}_anees{suffix}"] = anees.average
             result[f"{name}_inside{suffix}"] = anees.inside
     pose = np.array([s.series["pose"] for s in scores])
+    each = np.array([mean(nees[:, skip:]) for nees in pose])
+    each = each[np.isfinite(each)]
+    result["pose_anees_sigma"] = float(np.std(each, ddof=1)) / len(each) ** 0.5 if len(each) > 1 else float("nan")
     pose = pose[np.isfinite(pose)]
     result["pose_nees_median"] = float(np.median(pose)) if len(pose) else float("nan")
     result["position_rmse_m"] = rms([s.series["position_m"] for s in scores])
