@@ -20,10 +20,10 @@ import numpy as np
 from numpy.random import SeedSequence
 from ways import pin
 
-from kalmark.campaign.scoring import score
+from kalmark.campaign.campaign import Anees
+from kalmark.campaign.scoring import Scores, score
 from kalmark.config.building import build_slam
 from kalmark.events import Scan
-from kalmark.results.measures import anees_interval
 from kalmark.simulate import World, load_world
 from kalmark.simulate.robots import simulation
 
@@ -63,12 +63,11 @@ WORLDS = {"bearing and range": IN_PLANE} | {
 
 
 class Scored(NamedTuple):
-    """One run: measurements of the radio and how many were used, NEES of the pose and of the landmarks (steps,)."""
+    """One run: measurements of the radio and how many were used, and its scores."""
 
     ranges: int
     used: int
-    pose: np.ndarray
-    landmarks: np.ndarray
+    scores: Scores
 
 
 def world_of(case: str, estimator: str) -> World:
@@ -86,26 +85,24 @@ def run(world: World, seed: SeedSequence) -> Scored:
     reports = [(event, slam.process(event)) for event in simulated.log.events]
     of_radio = [r for event, r in reports if isinstance(event, Scan) and event.sensor == "radio"]
     outcomes = [o.outcome for report in of_radio for o in report.observations]
-    scores = score(build_slam(world.config(), simulated.log), simulated, world.times(), map_every=1).series
-    return Scored(len(outcomes), outcomes.count("associated"), scores["pose"][0], scores["landmarks"][0])
+    scores = score(build_slam(world.config(), simulated.log), simulated, world.times(), map_every=1)
+    return Scored(len(outcomes), outcomes.count("associated"), scores)
 
 
-def in_band(nees: np.ndarray, dof: int) -> str:
-    """Return the mean of NEES (runs, steps) and how many steps are inside the band of so many runs."""
-    means = np.nanmean(nees[:, np.isfinite(nees).all(axis=0)], axis=0)
-    low, high = anees_interval(dof, len(nees))
-    return f"{np.mean(means):5.2f} ({dof}), in the band {np.mean((means > low) & (means < high)):5.1%}"
+def in_band(name: str, scored: list[Scored]) -> str:
+    """Return the average NEES of something over runs and steps, and how many steps are inside the band."""
+    anees = Anees(name, [one.scores for one in scored])
+    return f"{anees.average:5.2f} ({anees.ideal:.0f}), in the band {anees.inside:5.1%}"
 
 
 def report(case: str, runs: int, seed: int, estimator: str) -> None:
     """Print the row of a case."""
     world = world_of(case, estimator)
     scored = [run(world, s) for s in SeedSequence(seed).spawn(runs)]
-    d, used, ranges = world.dimensions, [one.used for one in scored], np.mean([one.ranges for one in scored])
+    used, ranges = [one.used for one in scored], np.mean([one.ranges for one in scored])
     print(
         f"{case}: used {min(used)} at least, {np.mean(used):.1f} on average of {ranges:.0f}; "
-        f"pose {in_band(np.array([s.pose for s in scored]), 3 * d - 3)}; "
-        f"landmarks {in_band(np.array([s.landmarks for s in scored]), d)}",
+        f"pose {in_band('pose', scored)}; landmarks {in_band('landmarks', scored)}",
         flush=True,
     )
 

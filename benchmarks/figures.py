@@ -237,6 +237,18 @@ def motions() -> Iterator[Figure]:
     ):  # fmt: skip
         part = start.split()[0].strip(",:")
         yield Figure("Sensors of the state", name, wanted, f"{on_logs} {part}", row(start, text))
+    for world, runs, of in (
+        ("constant_velocity", 400, 100),
+        ("wheels_and_gyro", 300, 100),
+        ("compass_and_gyro", 300, 100),
+        ("quick_turns", 200, 50),
+    ):
+        name = f"`{world}`, {runs} runs: pose ANEES ({6 if world == 'quick_turns' else 3}) / in the band of each {of} / campaigns of {of} drawn of them with 90 %"
+        yield Figure("Chance", name, "within two standard errors", f"python benchmarks/motions.py {world} --runs {runs}{f' --of {of}' if of != 100 else ''}",
+                     row(f"{world}, {runs} runs:", "{1} ± {3} / {12} / {16}"))  # fmt: skip
+    for world in ("wheels_and_gyro", "compass_and_gyro"):
+        yield Figure("Chance", f"`{world}`, a tenth of all noise, the same draws: pose ANEES (3) / in band", "",
+                     f"python benchmarks/motions.py {world} --noise 0.1", row(world, "{1} / {5}"))  # fmt: skip
     for world in ("slipping_unicycle", "constant_velocity", "constant_turn_rate"):
         yield Figure("Motions", f"`{world}`: pose ANEES (3) / in band / ANEES of the whole state (1)", "90 % in the band",
                      f"python benchmarks/motions.py {world}", row(world, "{1} / {5} / {7}"))  # fmt: skip

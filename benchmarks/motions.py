@@ -12,8 +12,8 @@ textbook filter.
 
 Two ways to see how much of a row is chance (docs/evaluation.md).  `--noise 0.1`: all sigmas of the robots a tenth.  The
 draws are the same, and the filter, first order in the errors, is as good as exact: what it misses then is chance.
-`--runs 400`: the row of the first `--of` runs, that of all, the steps in the band of each `--of` runs, and how often so
-many drawn of all have 90 %.
+`--runs 400`: the row of the first `--of` runs; of all the pose ANEES, the steps in the band of each `--of` runs, and
+how often so many drawn of all have 90 %.
 """
 
 from __future__ import annotations
@@ -119,14 +119,18 @@ def row(name: str, scored: list[Scored]) -> str:
     return line + f"; diverged {found['diverged']}; pose +- {found['pose_anees_sigma']:.2f}"
 
 
-def shares(scored: list[Scored], of: int) -> str:
-    """Return what share of the steps is in the band of so many runs: of each so many, and of many drawn of all."""
+def together(scored: list[Scored], of: int) -> str:
+    """Return the pose ANEES of all runs, and what share of the steps is in the band, of each `of` and of many drawn."""
     scores, runs, rng = [one.scores for one in scored], len(scored), np.random.default_rng(0)
+    pose, sigma = Anees("pose", scores), figures(scores)["pose_anees_sigma"]
     each = [Anees("pose", scores[i : i + of]).inside for i in range(0, runs - of + 1, of)]
     drawn = [rng.choice(runs, of, replace=False) for _ in range(DRAWS)]
     often = np.mean([Anees("pose", [scores[i] for i in few]).inside >= WANTED for few in drawn])
-    shown = " ".join(f"{share:.0%}" for share in each)
-    return f"in the band of {of} runs {shown}; of {of} drawn {often:.0%} have {WANTED:.0%}"
+    shown = "/".join(f"{share:.0%}" for share in each)
+    return (
+        f"{runs} runs: pose {pose.average:.2f} +- {sigma:.2f}, in the band {pose.inside:.1%}; "
+        f"in that of {of} {shown}; of {of} drawn {often:.0%} have {WANTED:.0%}"
+    )
 
 
 def report(name: str, runs: int, estimator: str, seed: int, noise: float, of: int) -> None:
@@ -134,7 +138,7 @@ def report(name: str, runs: int, estimator: str, seed: int, noise: float, of: in
     scored = Parallel(n_jobs=2)(delayed(run)(name, s, estimator, noise) for s in SeedSequence(seed).spawn(runs))
     print(row(name, scored[:of]), flush=True)
     if runs > of:
-        print(f"{row(f'{name}, {runs} runs:', scored)}; {shares(scored, of)}", flush=True)
+        print(f"{name}, {together(scored, of)}", flush=True)
 
 
 def main() -> None:

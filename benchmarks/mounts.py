@@ -21,9 +21,9 @@ from numpy.random import SeedSequence
 from scipy.stats import chi2
 from ways import pin
 
-from kalmark.campaign.scoring import score
+from kalmark.campaign.campaign import Anees
+from kalmark.campaign.scoring import Scores, score
 from kalmark.config.building import build_slam
-from kalmark.results.measures import anees_interval
 from kalmark.simulate import World, load_world
 from kalmark.simulate.robots import simulation
 
@@ -73,14 +73,13 @@ BOUND = 0.9973  # of three sigmas
 
 
 class Scored(NamedTuple):
-    """One run: NEES of the pose (steps,), of the mount at the end, its error and what it is known better by."""
+    """One run: its scores, the NEES of the mount at the end, its error and what it is known better by."""
 
-    pose: np.ndarray
+    scores: Scores
     mount: float
     dof: int
     error: np.ndarray
     better: np.ndarray
-    diverged: bool
 
 
 def world_of(name: str) -> World:
@@ -103,24 +102,21 @@ def run(name: str, seed: SeedSequence) -> Scored:
     assert before is not None
     error = np.array([scores.series["mount_m"][0, -1], np.rad2deg(scores.series["mount_rad"][0, -1])])
     better = np.sqrt(np.diag(before)[:dof] / np.diag(after))
-    return Scored(scores.series["pose"][0], float(scores.series["mount"][0, -1]), dof, error, better, scores.diverged)
+    return Scored(scores, float(scores.series["mount"][0, -1]), dof, error, better)
 
 
 def report(name: str, runs: int) -> None:
     """Print the row of a sensor."""
     scored = Parallel(n_jobs=2)(delayed(run)(name, seed) for seed in SeedSequence(0).spawn(runs))
-    pose, dof = np.mean([one.pose for one in scored], axis=0), scored[0].dof
-    low, high = anees_interval(dof, runs)
-    known = np.isfinite(pose)
-    inside = np.mean((pose[known] > low) & (pose[known] < high))
+    pose, dof = Anees("pose", [one.scores for one in scored]), scored[0].dof
     mounts = np.array([one.mount for one in scored])
     within = int(np.sum(mounts < chi2.ppf(BOUND, dof)))
     metres, degrees = np.sqrt(np.mean([one.error**2 for one in scored], axis=0))
     better = ", ".join(f"{factor:.1f}" for factor in np.mean([one.better for one in scored], axis=0))
     print(
-        f"{name:15s} pose {np.mean(pose[known]):5.2f} ({dof}), in the band {inside:5.1%}; "
+        f"{name:15s} pose {pose.average:5.2f} ({dof}), in the band {pose.inside:5.1%}; "
         f"mount {np.mean(mounts):5.2f}, inside {within} of {runs}, off {1e3 * metres:.1f} mm {degrees:.2f} deg, "
-        f"known better by {better}; diverged {sum(one.diverged for one in scored)}",
+        f"known better by {better}; diverged {sum(one.scores.diverged for one in scored)}",
         flush=True,
     )
 
