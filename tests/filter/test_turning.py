@@ -108,6 +108,37 @@ def test_a_heading_that_a_tower_finds_leaves_a_unit_as_sure_as_it_may_be(kind: s
     assert low < sum(found) < high, (sum(found) / len(found), found)
 
 
+@pytest.mark.parametrize("cov", [None, 1e-6 * np.eye(3)], ids=["exactly", "to 1 mm"])
+def test_a_heading_that_one_scan_of_known_landmarks_finds_leaves_biases_as_sure_as_they_may_be(cov: Any) -> None:
+    """Errors of tilt, which a bias of the force makes at rest, turn in each iteration as in the correction."""
+    places, found = np.array([[10.0, 2, 1], [-6, 8, -2], [3, -9, 2]]), []
+    laser = km.Mount(km.sensors.RangeBearing3D(0.01, 3e-4, 3e-4), at=AT)
+    prior = np.diag([1e-4] * 3 + [0.0, 0.0, 0.25] + [0.0] * 3 + [1e-6] * 3 + [9e-4] * 3)
+    for seed in range(12):
+        rng, x = np.random.default_rng(seed), AT16.copy()
+        x[3:7], x[:3], x[10:] = (
+            rotated(rng.normal(0, 0.5)),
+            rng.normal(0, 0.01, 3),
+            rng.normal(0, [1e-3] * 3 + [0.03] * 3),
+        )
+        read = np.array([0.0, 0, 0, 0, 0, 9.81]) + x[10:] + rng.normal(0, UNIT.densities[:6] / DT_S**0.5, (100, 6))
+        rest = km.motion.at_rest(UNIT, DT_S * np.arange(100), read, AT16, prior)
+        until_ns = round(rest.until_s * 1e9)
+        slam = km.Slam(km.Robot("unit", UNIT, rest.start, {"laser": laser}, rest.cov, rests_until_ns=until_ns))
+        for i, place in enumerate(places):
+            slam.add_landmark(i, mean=place, cov=cov)
+        slam.process(km.Control(0.0, "unit", read[0]))
+        p = (places - x[:3]) @ matrix(x[3:7])
+        y = np.column_stack(
+            [np.linalg.norm(p, axis=1), np.arctan2(*p.T[1::-1]), np.arctan2(p[:, 2], np.hypot(*p.T[:2]))]
+        )
+        slam.process(km.Scan(DT_S, "unit", "laser", y + rng.normal(0, [0.01, 3e-4, 3e-4], y.shape), [0, 1, 2]))
+        d = UNIT.space.minus(slam.mean("unit"), x)
+        found.append(float(d @ np.linalg.solve(slam.covariance("unit"), d)))
+    low, high = chi2.ppf([0.0005, 0.9995], 15 * len(found))
+    assert low < sum(found) < high, (sum(found) / len(found), found)
+
+
 @pytest.mark.parametrize("beside", ["nothing", "landmarks"])
 def test_a_heading_is_found_with_a_lever_arm_that_is_not_known(beside: str) -> None:
     """Landmarks lean on the arm as their robot does, and turn with it."""

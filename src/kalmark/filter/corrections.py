@@ -58,6 +58,8 @@ from kalmark.filter.turning import (
     displaced,
     frame_of,
     gauge,
+    heading_last,
+    is_level,
     leaning,
     turning_rows,
     turns_of,
@@ -69,13 +71,13 @@ from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
 Routines = tuple[int, int, int, int, int, int, int, int]  # addresses, see `routines`
 Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
-Sizes = tuple[int, int, int, int, int]  # of a pose, of a head, axes of the gauge; rows of the head, of other units
+Sizes = tuple[int, int, int, int, int, int]  # see `observed`
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
 TO_ITERATE = (
-    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 5), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
+    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 6), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
     "Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
 )
 ITERATE = signature_of(f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({TO_ITERATE})")
@@ -114,7 +116,11 @@ def compile_correction(name: str, option: str, axes: int, inverse_depths: bool) 
 
 @compiled
 def observed(map_: Map, scan: Scan, slots: Index) -> tuple[Index, Table, Array, Sizes]:
-    """Return the `observed_block` of these slots, the rows of other units that turn behind its head, and its sizes."""
+    """Return the `observed_block` of these slots, the rows of other units that turn behind its head, and its sizes.
+
+    These are the numbers of the pose and of the head, the axes of the gauge, the rows of the head and of other units,
+    and whether the robot is an inertial unit whose gravity is known, whose errors of tilt turn.
+    """
     x, _P, _n, blocks, atoms, axes, _ways = map_
     index, table, mean = observed_block(x, blocks, atoms, scan[0], scan[1], slots, scan[3])
     pose, head = head_sizes(blocks, atoms, scan[0], scan[1])
@@ -122,7 +128,17 @@ def observed(map_: Map, scan: Scan, slots: Index) -> tuple[Index, Table, Array, 
     h += blocks[scan[1], 3] if scan[1] >= 0 else 0
     if len(others):
         index, table = widened(index, table, h, others)
-    return index, table, mean, (pose, head, axes, h, len(others))
+    level = is_level(atoms, blocks[scan[0], 4], blocks[scan[0], 5])
+    return index, table, mean, (pose, head, axes, h, len(others), level)
+
+
+@compiled
+def taken(values: Array, index: Index) -> Array:
+    """Return values[index]."""
+    out = np.empty(len(index))
+    for i in range(len(index)):
+        out[i] = values[index[i]]
+    return out
 
 
 @compiled
@@ -147,13 +163,13 @@ def iterate(
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
     back where inverse distances are corrected by their parallax.
     """
-    (_pose, head, axes, h, others), (most, tolerance) = sizes, limits
+    (_pose, head, axes, h, others, level), (most, tolerance) = sizes, limits
     k = len(y)
     turning = turning_rows(table, sizes, linear[1])
-    theta, turns, _ = turning
+    theta = turning[0]
     correction, origin = np.zeros(len(P_ss)), mean[:3].copy()
     L = leaning(rows_of(P_ss, theta, len(P_ss)), theta, table, turning, axes)
-    R_r, then = frame_of(mean, 0, turns), call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
+    R_r, then = frame_of(mean, 0, axes), call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
     turn = np.zeros(axes)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
     depths = anchored(table if parallaxes else table[:0])
@@ -173,7 +189,7 @@ def iterate(
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            a = displaced(table, now, then, L, E, turning, theta, R_r, frame_of(x_j, 0, turns))
+            a = displaced(table, now, then, L, E, turning, theta, R_r, frame_of(x_j, 0, axes), level)
             transport_rows(H, v, a, theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, h + others)
         M, positive = cholesky_inverse(Z)
@@ -185,7 +201,8 @@ def iterate(
         x_j = mean.copy()
         turn = gauge(mean, correction, turning, axes)
         E, W, d = turns_of(turn, correction, turning, axes)
-        call_retract(ways[_RETRACT], (table, x_j, correction, turn))
+        step = heading_last(correction, turn, level, 3)
+        call_retract(ways[_RETRACT], (table, x_j, step, turn))
         carry(table, x_j, L, W, d)
         if len(depths):
             s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
@@ -286,9 +303,9 @@ def invariant(
         return e, z, Z, d2, within(d2, -1.0)[0], False
     at, origin = blocks[robot, 0], mean[:3].copy()
     turning = turning_rows(table, sizes, linear[1])
-    theta, turns = picked(index, turning[0]), turning[1]
+    theta = picked(index, turning[0])
     L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes)
-    R_r, then = frame_of(x, at, turns), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    R_r, then = frame_of(x, at, axes), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     V, correction = gain(sparse_product(H, rows_of(P, index, n), h + sizes[4], count), M, v)
     depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
@@ -297,15 +314,14 @@ def invariant(
         s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
         x_before = x.copy()
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
-    own = np.empty(len(index))
-    for i in range(len(index)):
-        own[i] = correction[index[i]]
+    own = taken(correction, index)
     turn = gauge(mean, own, turning, axes)
     E, W, d_lean = turns_of(turn, own, turning, axes)
-    call_retract(ways[_RETRACT], (atoms, x, correction, turn))
+    step = heading_last(correction, turn, sizes[5], blocks[robot, 2] + 3)
+    call_retract(ways[_RETRACT], (atoms, x, step, turn))
     carry(atoms, x, L, W, d_lean)
     now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    a = displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, turns))
+    a = displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, axes), sizes[5])
     downdate_and_transport(P, V, a, theta)
     if len(depths):
         observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
@@ -395,7 +411,7 @@ def averaged(
     x, P, n, blocks, atoms, axes, ways = map_
     robot, _mount, slots, d, y, R, _gate = scan
     index, table, mean, sizes = observed(map_, scan, slots[:0])
-    (_pose, head, _axes, h, others), q = sizes, R.shape[1]
+    (_pose, head, _axes, h, others, _level), q = sizes, R.shape[1]
     V, D, H = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, h))
     d2, used = np.full(len(y), np.nan), 0
     for i in range(len(pairs)):
@@ -418,18 +434,20 @@ def averaged(
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
     at, origin, turning = blocks[robot, 0], mean[:3].copy(), turning_rows(table, sizes, H)
-    theta, turns, own = picked(index, turning[0]), turning[1], correction[index]
+    theta, own = picked(index, turning[0]), correction[index]
     L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes)
-    R_r, then = frame_of(x, at, turns), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    turn = gauge(mean, own, turning, axes) if transports else np.zeros(0)
-    call_retract(ways[_RETRACT], (atoms, x, correction, turn))
+    R_r, then = frame_of(x, at, axes), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    step, turn = correction, gauge(mean, own, turning, axes) if transports else np.zeros(0)
+    if transports:
+        step = heading_last(correction, turn, sizes[5], blocks[robot, 2] + 3)
+    call_retract(ways[_RETRACT], (atoms, x, step, turn))
     downdate(P, V)
     add_square(P, spread)
     if transports:
         E, W, d_lean = turns_of(turn, own, turning, axes)
         carry(atoms, x, L, W, d_lean)
         now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-        transport(P, displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, turns)), theta)
+        transport(P, displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, axes), sizes[5]), theta)
     return d2, True
 
 

@@ -176,7 +176,7 @@ class _Estimator:
         if not done.valid and not done.fused.any():
             done = self._one_by_one(model, m, scan, done, parallax)
         if before is not None:
-            turn_own_errors(m, before)
+            turn_own_errors(m, robot_here, before)
         map_.corrected(robot, self.transports)
         return done
 
@@ -206,11 +206,11 @@ class _Estimator:
         """
         model, *scan = update[:-1]
         run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
-        m = map_.opened(update.robot, update.mount, update.slots, self.transports)[0]
+        m, robot_here, _, _ = map_.opened(update.robot, update.mount, update.slots, self.transports)
         before = m.x.copy()
         d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)
         if self.transports:
-            turn_own_errors(m, before)
+            turn_own_errors(m, robot_here, before)
         return d2, bool(valid)
 
     def _option(self, map_: StochasticMap) -> Any:

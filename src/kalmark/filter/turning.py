@@ -18,7 +18,7 @@ from kalmark.compiled import compiled
 from kalmark.filter.kernels import RAISED, cholesky_inverse, product
 from kalmark.filter.observed import transposed
 from kalmark.geometry.angles import exponential_v
-from kalmark.geometry.rotations import exp, left_jacobian, matrix
+from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
 from kalmark.geometry.spaces import ANGLE, LINEAR, OWN, ROTATION, SCALAR, TURNED, VECTOR, Table
 
 BLIND = 1e-6  # of a Jacobian's largest number: what is smaller is zero, of a user's model by differences, too
@@ -39,6 +39,44 @@ def units(atoms: Table, observer: int) -> Index:
 
 
 @compiled
+def is_level(atoms: Table, first: int, count: int) -> int:
+    """Return 1 if a robot, the `count` atoms from `first` on, is an inertial unit whose gravity is known, else 0."""
+    own = 0
+    for i in range(first, first + count):
+        own += atoms[i, 0] == OWN
+    return 1 if own == 1 else 0
+
+
+@compiled
+def about_vertical(E: Array) -> Array:
+    """Return the part (3, 3) about z of a rotation matrix."""
+    c, s = E[0, 0] + E[1, 1], E[1, 0] - E[0, 1]
+    out, n = np.eye(3), np.hypot(c, s)
+    if n > 0.0:
+        out[0, 0] = out[1, 1] = c / n
+        out[1, 0], out[0, 1] = s / n, -s / n
+    return out
+
+
+@compiled
+def heading_last(correction: Array, turn: Array, level: int, at: int) -> Array:
+    """Return the correction (n,) that moves the mean: a unit whose rotation is at the row `at` is tilted first.
+
+    Then it turns by its heading, S(psi) Exp(tau): its errors of tilt tau turn by psi, in `displaced`.
+    """
+    if level == 0:
+        return correction
+    d, tilt, heading, whole = correction.copy(), np.zeros(3), np.zeros(3), np.empty(3)
+    tilt[0], tilt[1], heading[2] = d[at], d[at + 1], d[at + 2]
+    for a in range(3):
+        whole[a] = turn[len(turn) - 3 + a]
+    own = log(multiply(exp(-whole), multiply(exp(heading), exp(tilt))))
+    for a in range(3):
+        d[at + a] = whole[a] + own[a]
+    return d
+
+
+@compiled
 def widened(index: Index, table: Table, head: int, rows: Index) -> tuple[Index, Table]:
     """Return the rows of P and the atoms of an observed block that has further rows of P behind those of its head."""
     k, out, moved = len(rows), np.empty(len(index) + len(rows), np.int64), table.copy()
@@ -51,14 +89,14 @@ def widened(index: Index, table: Table, head: int, rows: Index) -> tuple[Index, 
 
 
 @compiled
-def turning_rows(table: Table, sizes: tuple[int, int, int, int, int], H: Array) -> Turning:
+def turning_rows(table: Table, sizes: tuple[int, int, int, int, int, int], H: Array) -> Turning:
     """Return the rows of the observed block that turn the map: of the pose (axes,), of a mount, of other units.
 
     The map turns with the sensor that observes it, so with its mount (1 or 3 rows, if it is in the map).  A second
     block that is no mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation
     in H are zero.  Of such a mount the rows of its position (2 or 3) are here, its lever arm.
     """
-    pose, head, axes, behind, others = sizes
+    pose, head, axes, behind, others, _ = sizes
     dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
     first, arm = 2 * dof - turns, 0
     if head <= pose or table[2, 0] != SCALAR or table[last, 0] != (ANGLE if pose == 3 else TURNED):
@@ -79,9 +117,9 @@ def turning_rows(table: Table, sizes: tuple[int, int, int, int, int], H: Array) 
 
 
 @compiled
-def frame_of(x: Array, at: int, size: int) -> Array:
-    """Return R_r (size, size) of the rotation of the pose at this place of a mean x: 3 in space, 1 in the plane."""
-    if size < 3:
+def frame_of(x: Array, at: int, axes: int) -> Array:
+    """Return R_r of the rotation of the pose at this place of a mean x: (3, 3) in space, (1, 1) in the plane."""
+    if axes == 1:
         return np.eye(1)
     q = np.empty(4)
     for i in range(4):
@@ -100,7 +138,7 @@ def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
     for a in range(axes):
         turn[a] = correction[rows[a]]
     if turns > 0:  # of the sensor: d_theta + R_r d_theta_s
-        R = frame_of(mean, 0, turns)
+        R = frame_of(mean, 0, axes)
         for a in range(turns):
             for c in range(turns):
                 turn[axes - turns + a] += R[a, c] * correction[rows[axes + c]]
@@ -207,12 +245,13 @@ def carry(atoms: Table, x: Array, L: Array, W: Array, d: Array) -> None:
 
 @compiled
 def displaced(
-    atoms: Table, now: Array, then: Array, L: Array, E: Array, turning: Turning, index: Index, R: Array, R_now: Array
+    atoms: Table, now: Array, then: Array, L: Array, E: Array, turning: Turning, index: Index, R: Array, R_now: Array,
+    level: int,
 ) -> Array:  # fmt: skip
     """Return the columns (n, rows that turn) by which errors change from a mean to a corrected one.
 
     `now` and `then` (n, axes) are the generators there, `index` the rows that turn, R and R_now those of the robot's
-    rotation, before and now, which only a mount's rotation needs.
+    rotation, before and now.  The errors of tilt of a unit whose gravity is known, `level`, turn with its heading.
     """
     _rows, turns, arm = turning
     n, axes = now.shape
@@ -230,6 +269,11 @@ def displaced(
             for i in range(n):
                 out[i, axes + c] += out[i, axes - turns + a] * R[a, c]
             out[index[axes - turns + a], axes + c] -= R_now[a, c] - R[a, c]
+    if level:
+        E_z = about_vertical(product(R_now, transposed(R)))
+        for a in range(3):
+            for b in range(3):
+                out[index[axes - 3 + a], axes - 3 + b] += E_z[a, b] - (1.0 if a == b else 0.0)
     return out
 
 
