@@ -30,8 +30,9 @@ from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict import INNOVATIONS, NO_LANDMARKS, NO_MAP
-from kalmark.results.warnings import CHANCE, NO_ID, TOO_SMALL, window_warnings
+from kalmark.results.warnings import CHANCE, NO_ID, TOO_SMALL, placements, window_warnings, words_of
 from kalmark.results.words import count, figure
+from kalmark.slam.replacing import NEEDED
 from kalmark.slam.surveyed import ELSEWHERE
 from kalmark.tracks.surveys import MISFITS
 
@@ -275,6 +276,7 @@ def _structural(run: Run, log: Log) -> list[Cause]:
         *readings_off(run),
         *given_up(run),
         *_started_elsewhere(run),
+        *_placed_elsewhere(run),
         *_copied(run, log),
     ]
 
@@ -289,6 +291,20 @@ def _started_elsewhere(run: Run) -> Iterator[Cause]:
             first = run.history.fixes[: restart.fixes]
             score = 0.5 * sum(float(fix.z @ np.linalg.solve(fix.Z, fix.z)) for fix in first)
             yield Cause("start", start.t_ns * 1e-9, score, evidence, cure, True)
+
+
+def _placed_elsewhere(run: Run) -> Iterator[Cause]:
+    """Yield the times when readings that agree moved a robot that others had placed: one of both is wrong."""
+    for mine in placements(run.history):
+        first, of = mine[0], words_of(mine)
+        if first.before < NEEDED and len(mine) == 1:
+            yield Cause("start", first.t_ns * 1e-9, 0.0, f"{of}, as few had fitted before", "", True)
+        else:
+            evidence = (
+                f"{of}, from t={first.t_ns * 1e-9:.1f} s on: it was lost, or they jumped, as those of receivers do"
+            )
+            cure = "leave their rows out where they jump, or state more noise for them"
+            yield Cause(MISFIT, first.t_ns * 1e-9, 0.5 * MOST_D2 * NEEDED, evidence, cure)
 
 
 def misplaced_landmarks(run: Run) -> list[Cause]:

@@ -55,6 +55,19 @@ class UsedFix(NamedTuple):
     moved_m: float = 0.0
 
 
+class Placed(NamedTuple):
+    """A robot that readings of a sensor placed elsewhere, as the last ones agreed on it: how far, m.
+
+    `before` are the readings of that sensor that the filter used until then.
+    """
+
+    t_ns: int
+    robot: str
+    sensor: str
+    moved_m: float
+    before: int
+
+
 class Change(NamedTuple):
     """What became of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now."""
 
@@ -163,6 +176,7 @@ ROWS: dict[
 ] = {  # fields of a history: their prefix in the file, and whether texts are joined
     "changes": ("change", Change, False),
     "fixes": ("used_fix", UsedFix, False),
+    "placed": ("placed", Placed, False),
     "starts": ("start", Start, False),
     "priors": ("prior", Prior, False),
     "cameras": ("camera", Camera, True),
@@ -252,6 +266,7 @@ class History:
     sensors: tuple[Measuring, ...] = ()
     mounts: tuple[Mounted, ...] = ()
     biases: tuple[Biased, ...] = ()
+    placed: tuple[Placed, ...] = ()
     gaps: tuple[Gap, ...] = ()
     repeats: tuple[Repeated, ...] = ()
     stepped: str = "scan"

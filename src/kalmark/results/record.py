@@ -20,7 +20,18 @@ from kalmark.logs.source import nearest
 from kalmark.report import Report
 from kalmark.results.foresight import Foresight
 from kalmark.results.gaps import joined
-from kalmark.results.history import Change, Controlled, History, MapSnapshot, Prior, Start, UsedFix, padded, texts
+from kalmark.results.history import (
+    Change,
+    Controlled,
+    History,
+    MapSnapshot,
+    Placed,
+    Prior,
+    Start,
+    UsedFix,
+    padded,
+    texts,
+)
 from kalmark.results.landmarks import MapLandmarks
 from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
 from kalmark.results.recording import LogReference
@@ -137,6 +148,7 @@ class _Recorder:
         self.dead: list[Array] = []
         self.fixes: list[UsedFix] = []
         self.gaps: list[Gap] = []
+        self.placed: list[Placed] = []
         self.skipped: list[str] = []
         self.stopped = ""
         self.scans: list[Scan] = []
@@ -175,6 +187,11 @@ class _Recorder:
             self.fixes.append(
                 UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0], report.replaced)
             )
+        elif report.replaced and type(event) is Scan:
+            of = zip(self.scans, self.reports, strict=True)
+            mine = [each for scan, each in of if (scan.robot, scan.sensor) == (event.robot, event.sensor)]
+            before = sum(o.outcome == "associated" for each in mine for o in each.observations)
+            self.placed.append(Placed(event.t_ns, event.robot, event.sensor, report.replaced, before))
         if type(event) not in self.stepped:
             return
         scan = report.event  # of a frame, what its detector found
@@ -272,6 +289,7 @@ class _Recorder:
             sensors=sensors(self.slam),
             mounts=mounts(self.slam),
             biases=biases(self.slam),
+            placed=tuple(self.placed),
             gaps=joined(self.gaps),
             repeats=repeated(self.slam),
             stepped=self.stepped_by,

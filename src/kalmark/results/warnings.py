@@ -30,7 +30,7 @@ from kalmark.geometry.gaussian import gate, quantile
 from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
 from kalmark.results.gaps import gap_warnings
-from kalmark.results.history import History, Ints, UsedFix
+from kalmark.results.history import History, Ints, Placed, UsedFix
 from kalmark.results.matching import LEAST, no_ids
 from kalmark.results.measures import cut_off, nis
 from kalmark.results.recording import Recording
@@ -58,6 +58,7 @@ FIRST_FIX = 0.9999  # of right starts pass the test of the first fix
 BEARINGS = ("range_bearing", "range_bearing_3d")
 ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
 MARGIN = 0.1  # of an image, by which its measurements may lie outside it
+LISTED = 5  # of the times when readings moved a robot
 FEW_FIXES = 5  # fewer say little of the noise
 LOW = 0.5  # squares of innovations over those of the stated noise: it is 1.4 times too large
 TINY_NIS = 0.1
@@ -234,10 +235,27 @@ def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         again = restarts(run.history).get(fix.robot)
         what = "it was" if again is None or again.t_ns != fix.t_ns else "with all of the map it was"
         yield f"{fix.robot} was lost {when}: its fixes agreed that it was {fix.moved_m:.1f} m away; {what} moved there"
+    for mine in placements(run.history):
+        when = f"first {(mine[0].t_ns - begin_ns) * 1e-9:.1f} s after the first scan"
+        yield f"{words_of(mine)}, {when}: it was lost, or they jumped"
     lost = [name for name, figures in summary["robots"].items() if figures.get("diverged")]
     if lost:
         names = ", ".join(lost)
         yield f"DIVERGED: the error of {names} exceeds 10 of its own sigmas and 5 % of the path; do not use this map"
+
+
+def placements(history: History) -> list[list[Placed]]:
+    """Return the times when robots were placed elsewhere, those of a sensor together."""
+    of = {(one.robot, one.sensor): list[Placed]() for one in history.placed}
+    for one in history.placed:
+        of[one.robot, one.sensor].append(one)
+    return [*of.values()]
+
+
+def words_of(placed: list[Placed]) -> str:
+    """Return what readings of one sensor did."""
+    far = ", ".join(figure(one.moved_m, 2) for one in placed[:LISTED]) + " m" + " and so on" * (len(placed) > LISTED)
+    return f"readings of {placed[0].sensor} that agree moved {placed[0].robot} by {far}"
 
 
 def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:

@@ -128,7 +128,8 @@ def _replace(state: State, name: str) -> float:
     state.placed = replacing.NEEDED
     state.clones.moved(name)
     moving.left_out.clear()
-    return float(np.linalg.norm(found.pose[: dof // 2] - mean[: dof // 2]))
+    d = len(found.shift.t)
+    return float(np.linalg.norm(found.pose[:d] - mean[:d]))
 
 
 def _put(state: State, moving: Moving, found: replacing.Replaced) -> None:
