@@ -40,7 +40,7 @@ from kalmark.slam.motion import bias_name
 WORLDS = (
     "differential_drive", "tricycle", "omnidirectional", "mecanum", "slipping_unicycle", "constant_velocity",
     "constant_turn_rate", "compass_and_gyro", "diver", "radar", "radar_in_space", "radio", "microphones", "lever_arm",
-    "wheels_and_gyro",
+    "wheels_and_gyro", "scan_matching",
 )  # fmt: skip
 BOUND = 0.9973  # of three sigmas
 WANTED, DRAWS = 0.9, 1000  # steps in the band, and how often runs are drawn of all

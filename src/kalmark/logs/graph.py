@@ -231,14 +231,12 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
 
 
 def _loops(graph: Graph, ids: list[int], t_ns: dict[int, int]) -> list[Scan]:
-    """Return the edges between poses that do not follow each other as readings, and scans that only keep a pose."""
-    after, rows = dict(pairwise(ids)), dict[int, list[int]]()
-    for a, b in sorted(graph.moves):
-        if after[a] != b:
-            rows.setdefault(a, [])
-            rows.setdefault(b, []).append(a)
-    scans = []
-    for b, begins in rows.items():
+    """Return the edges between poses that do not follow each other as readings; if any, a scan at each pose."""
+    rows: dict[int, list[int]] = {one: [] for one in ids}
+    for a, b in sorted({*graph.moves} - {*pairwise(ids)}):
+        rows[b].append(a)
+    scans = list[Scan]()
+    for b, begins in rows.items() if any(rows.values()) else ():
         y, cov = [[graph.moves[a, b][k] for a in begins] for k in (0, 1)]
         times = [t_ns[a] // SECOND_NS for a in begins]
         scans.append(Scan(t_ns=t_ns[b], robot=ROBOT, sensor=LOOPS, y=y, ids=times, cov=cov if begins else None))

@@ -186,7 +186,7 @@ def window_warnings(run: Recording) -> Iterator[str]:
             when = f"from t={worst.start_s:.1f} to {worst.end_s:.1f} s"
             if begin_s:
                 when += f" ({begin_s + worst.start_s:.1f} to {begin_s + worst.end_s:.1f} s in the log)"
-            yield f"{line} {when}: the map may be wrong from there on"
+            yield f"{line} {when}: the {'path' if history.localizes else 'map'} may be wrong from there on"
 
 
 def _high_nis(worst: Window, median: float, count: int) -> str:

@@ -352,6 +352,16 @@ class Listed(Section):
         return Scenery(points, segments, tags, np.array([tag.size_m for tag in self.tags]))
 
 
+class Empty(Section):
+    """No landmark: for sensors of the robot itself."""
+
+    type: Literal["empty"] = "empty"
+
+    def scenery(self, rng: Generator) -> Scenery:
+        """Return nothing to see."""
+        return Scenery(np.empty((0, 2)))
+
+
 class ListedPlane(_Placed):
     """A rectangle with a random texture; its axes are those of a tag."""
 
@@ -427,5 +437,5 @@ class TexturedRoom(_Textured):
 
 
 Layout = Annotated[Any, OneOf(
-    Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed, TexturedPlanes, TexturedRoom,
+    Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed, Empty, TexturedPlanes, TexturedRoom,
 )]  # fmt: skip

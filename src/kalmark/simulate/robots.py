@@ -21,11 +21,12 @@ from numpy.random import Generator, SeedSequence
 from kalmark.arrays import Array
 from kalmark.config.building import build_robot
 from kalmark.detect.scan import RAW, Laser
-from kalmark.events import Control, Event, Frame, Id, Scan, order
+from kalmark.events import Control, Event, Frame, Id, Scan, order, seconds
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.source import landmark_id
 from kalmark.models.observe import composed
 from kalmark.models.protocols import (
     POSE,
@@ -38,6 +39,7 @@ from kalmark.models.protocols import (
     coasts,
     diffusion_of,
     parameter_covariance,
+    poses_kept,
     range_limit,
     tells_velocity,
     true_control,
@@ -71,7 +73,10 @@ class SimSensor:
     sensing: Sensing
     laser: Laser | None = None
     renderer: Renderer | None = None
+    walked: int = 0  # the step up to which its constants have walked
     last: tuple[int, Array] | None = None  # step and robot's pose of the last reading or scan
+    kept: dict[int, Array] = field(default_factory=dict)  # of an odometer that closes loops: poses by steps,
+    left: set[int] = field(default_factory=set)  # and those of them that the robot has left since
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -185,7 +190,7 @@ def area_of(scenery: Scenery, things: dict[str, Things]) -> Array:
     """Return the lower and the upper corner of all there is (2, D)."""
     places = [sort.centres() for sort in things.values() if len(sort.values)]
     places += [plane.corners() for plane in scenery.planes]
-    centres = np.concatenate(places)
+    centres = np.concatenate(places or [np.zeros((1, things[POINTS].values.shape[1]))])
     return np.array([centres.min(axis=0), centres.max(axis=0)])
 
 
@@ -301,9 +306,12 @@ def scans(
                 found.append((scan, (None,) * len(y)))
             continue
         if isinstance(carried.sensor, OfState):
-            read = reading(robot, carried, k, world.dt_s, chance)
+            read, ids = reading(robot, carried, k, world.dt_s, chance), None
+            if carried.sensing.loop_reach_m is not None:
+                read, ids = with_loop(robot, carried, k, world.dt_s, read, chance)
             if read is not None:
-                found.append((Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=read), (robot.name,)))
+                scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=read, ids=ids)
+                found.append((scan, (robot.name,) * len(read)))
             continue
         sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
@@ -365,20 +373,52 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
     Its constants walk at random.  A twist that is not in the robot's state is the mean since the last reading.
     """
     of, at = carried.sensor, carried.at
-    before, k_before = (robot.states[0][: len(robot.pose)], 0) if carried.last is None else carried.last[::-1]
-    since_s, first, carried.last = (k - k_before) * dt_s, carried.last is None, (k, robot.pose.copy())
-    if isinstance(of, Drifting) and (Q := of.drift(since_s)).any():
+    last, walked_s = carried.last, (k - carried.walked) * dt_s
+    before, k_before = (robot.states[0][: len(robot.pose)], 0) if last is None else last[::-1]
+    since_s, carried.last, carried.walked = (k - k_before) * dt_s, (k, robot.pose.copy()), k
+    if isinstance(of, Drifting) and (Q := of.drift(walked_s)).any():
         of = carried.sensor = of.with_parameters(of.parameters + chance.sight.normal(0.0, np.sqrt(Q)))  # type: ignore[attr-defined]
     counts = of.views != POSE and not sees_state(of, robot.motion)
     v = view_of_state(of, robot.motion, at, robot.state, np.array(before), np.array([since_s, *robot.u]))
-    e, wild = of.expect(v[None])[0], chance.faults.uniform(size=2)
-    R = of.noise_since(since_s)[0] if counts and isinstance(of, TimedNoise) else of.noise(e)[0]
-    error = gaussian(R, chance.sight) * (WILD if wild[0] < carried.sensing.outliers else 1.0)
-    if (counts and first) or wild[1] < (carried.sensing.dropouts or 0.0):
+    y, wild = measured(carried, v, since_s if counts else 0.0, chance)
+    if wild < (carried.sensing.dropouts or 0.0):
+        carried.last = last if counts else carried.last
         return None
+    return None if counts and last is None else y
+
+
+def measured(carried: SimSensor, v: Array, since_s: float, chance: Chance) -> tuple[Array, float]:
+    """Return what a sensor of the state measures of its view v (1, m), and a random number that may drop it."""
+    of: Any = carried.sensor
+    e, wild = of.expect(v[None])[0], chance.faults.uniform(size=2)
+    R = of.noise_since(since_s)[0] if since_s and isinstance(of, TimedNoise) else of.noise(e)[0]
+    error = gaussian(R, chance.sight) * (WILD if wild[0] < carried.sensing.outliers else 1.0)
     if len(error) == len(e[0]):
-        return np.asarray(e + error)
-    return SE3.plus(e[0], error)[None]  # a pose of space has more numbers than errors
+        return np.asarray(e + error), wild[1]
+    return SE3.plus(e[0], error)[None], wild[1]  # a pose of space has more numbers than errors
+
+
+def with_loop(
+    robot: SimRobot, carried: SimSensor, k: int, dt_s: float, read: Array | None, chance: Chance
+) -> tuple[Array, list[Id | None]]:
+    """Return what an odometer reads at step k (n, m): since its last scan, and since one near which it is again.
+
+    That is the nearest of those that are kept, of which the robot has been farther since.  An id is its time.
+    """
+    of, reach_m, d = carried.sensor, carried.sensing.loop_reach_m or 0.0, len(robot.pose) // 3 + 1
+    rows, ids = ([], []) if read is None else ([*read], list[Id | None]([None]))
+    far = {j: float(np.linalg.norm(robot.pose[:d] - pose[:d])) for j, pose in carried.kept.items()}
+    carried.left |= {j for j, far_m in far.items() if far_m > reach_m}
+    near = [j for j in far if j in carried.left and far[j] <= reach_m]
+    if near:
+        j = min(near, key=far.__getitem__)
+        since = np.array([(k - j) * dt_s])
+        v = view_of_state(of, robot.motion, carried.at, robot.state, carried.kept[j], since)
+        rows, ids = [*rows, *measured(carried, v, 0.0, chance)[0]], [*ids, landmark_id(seconds(round(j * dt_s * 1e9)))]
+    carried.kept[k], carried.last = robot.pose.copy(), (k, robot.pose.copy())
+    for j in [*carried.kept][: -poses_kept(of)]:
+        del carried.kept[j]
+    return np.array(rows).reshape(len(rows), len(of.columns)), ids
 
 
 def seen_by(

@@ -79,6 +79,8 @@ class Sensing(Section):
     """Probability that something seen is not reported: 0, or as the sensor's `preset` says."""
     outliers: Share = 0.0
     """Probability that a measurement is false: of a place drawn from all that the sensor sees."""
+    loop_reach_m: Annotated[float, Field(gt=0)] | None = None
+    """An `odometer` that keeps poses: read a scan against an earlier one, too, if the robot is so near to it again."""
     swapped: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
     """Pairs of ids that are taken for each other."""
     hidden: Annotated[tuple[int, ...], Field(strict=False)] = ()
