@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 import pytest
@@ -27,8 +28,9 @@ def yaml_text(content: dict[str, Any]) -> str:
 @pytest.mark.parametrize("name", presets.ALL)
 def test_every_number_of_a_preset_names_its_source(name: str) -> None:
     preset = presets.ALL[name]
-    plain = type(preset.sensor)()
-    own = {f.name for f in dataclasses.fields(plain) if getattr(preset.sensor, f.name) != getattr(plain, f.name)}
+    sensor = preset.in_space or preset.sensor
+    plain = type(sensor)()
+    own = {f.name for f in dataclasses.fields(plain) if getattr(sensor, f.name) != getattr(plain, f.name)}
     assert set(preset.sources) == own | {"rate_hz", "dropouts"}
     assert all(len(source) > 20 for source in preset.sources.values())
     assert 0 <= preset.dropouts < 1
@@ -57,6 +59,8 @@ def test_devices_are_those_of_the_plane_and_of_space(motion: str, world: str, tm
     imu, rtk = robot.sensors["imu"].sensor, robot.sensors["rtk"].sensor
     assert imu.world == rtk.world == world
     assert (imu.sigma_rad_per_sqrt_s, rtk.sigma_m) == (presets.MEMS_IMU.sensor.sigma_rad_per_sqrt_s, 0.1)
+    if world == "space":
+        assert NormalDist(sigma=rtk.sigma_z_m).cdf(0.01) == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from statistics import NormalDist
 from typing import Any
 
 from kalmark.models.inertial import Inertial
-from kalmark.models.sensors import Bearing, Gps2D, Gyro2D, Range, RangeBearing, Speed
+from kalmark.models.sensors import Bearing, Gps2D, Gps3D, Gyro2D, Range, RangeBearing, Speed
 
 HOKUYO = "Hokuyo, Communication Protocol Specification for SCIP2.0, C-42-03320B"
 WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat, a laser that sees cylinders"
@@ -42,20 +43,23 @@ MULTI_TAG = "Bolotnyy, Krize and Robins, The practicality of multi-tag RFID syst
 class Preset:
     """A sensor, or an inertial unit as a motion, as documented: `sensor`, its rate, its dropouts.
 
-    `sources` are those of each number that is not a default.
+    `sources` are those of each number that is not a default; `in_space` is the sensor of space where that has more.
     """
 
     sensor: Any
     rate_hz: float
     dropouts: float
     sources: Mapping[str, str]
+    in_space: Any = None
 
 
-def _preset(sensor: Any, /, **documented: tuple[float, str]) -> Preset:
+def _preset(sensor: Any, in_space: Any = None, /, **documented: tuple[float, str]) -> Preset:
     """Return a preset of a sensor's class by its parameters, rate and dropouts, each with its source."""
     numbers = {name: value for name, (value, _) in documented.items()}
     rate_hz, dropouts = numbers.pop("rate_hz"), numbers.pop("dropouts")
-    return Preset(sensor(**numbers), rate_hz, dropouts, {name: source for name, (_, source) in documented.items()})
+    plane = sensor(**{name: value for name, value in numbers.items() if name in {f.name for f in fields(sensor)}})
+    sources = {name: source for name, (_, source) in documented.items()}
+    return Preset(plane, rate_hz, dropouts, sources, in_space and in_space(**numbers))
 
 
 LASER = _preset(
@@ -179,9 +183,15 @@ INERTIAL_UNIT = _preset(
 F9P = "u-blox, ZED-F9P data sheet UBX-17051259"
 RTK_RECEIVER = _preset(
     Gps2D,
+    Gps3D,
     sigma_m=(
         0.01 / math.sqrt(2.0 * math.log(2.0)),
         f"{F9P}: RTK 0.01 m + 1 ppm CEP, near its base; half of a Gaussian is within 1.177 sigmas",
+    ),
+    sigma_z_m=(
+        0.01 / NormalDist().inv_cdf(0.75),
+        f"{F9P}: vertically RTK 0.01 m + 1 ppm R50, as the specification of CubePilot's Here 4 has it of the same "
+        "engine (NEO-F9P); half of a Gaussian is within 0.674 sigmas",
     ),
     rate_hz=(1.0, "assumption: one position a second, as u-blox receivers are set when they are new"),
     dropouts=(0.0, "assumption: none under an open sky; where the ambiguities are not fixed it is worse"),

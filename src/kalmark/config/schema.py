@@ -219,7 +219,8 @@ class Mounted(ModelSection):
         preset = presets.ALL[value["preset"]]
         if cls.of_name != (name := registered_name(type(preset.sensor))):
             raise expected(f"a preset of this type of sensor: {value['preset']} is a {name}", "preset")
-        of_it = {key: getattr(preset.sensor, key) for key in preset.sources if key in cls.model_fields}
+        sensor = preset.in_space or preset.sensor
+        of_it = {key: getattr(sensor, key) for key in preset.sources if key in cls.model_fields}
         return of_it | value
 
 
