@@ -101,6 +101,20 @@ def test_a_part_that_is_none_is_refused_and_changes_nothing(part: dict[str, Any]
     assert_allclose(slam.covariance("rover"), before[1], rtol=0)
 
 
+@pytest.mark.parametrize(
+    "motion", [km.motion.Unicycle(), km.motion.Inertial(), km.motion.ConstantTurnRate()], ids=lambda m: type(m).__name__
+)
+def test_a_part_of_rates_is_refused_and_changes_nothing(motion: Any) -> None:
+    slam = km.Slam([km.Robot("rover", motion)])
+    u = np.full(len(motion.columns), 0.1)
+    slam.process(Control(0.0, "rover", u))
+    before = slam.mean("rover"), slam.covariance("rover")
+    with pytest.raises(EventError, match=r"t=1 s: share is 0.5, expected 1: .*: no increment$"):
+        slam.process(Control(1.0, "rover", u, share=0.5, uneven=np.ones(len(u))))
+    assert_allclose(slam.mean("rover"), before[0], rtol=0)
+    assert_allclose(slam.covariance("rover"), before[1], rtol=0)
+
+
 def test_the_first_increment_began_one_interval_before_its_end() -> None:
     log = cut(log_of(drive(-0.5, 0.25)))
     assert [e.t_s for e in log][:3] == [-0.5, 0.25, 0.25]

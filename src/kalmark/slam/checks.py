@@ -11,7 +11,7 @@ from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError, ModelError
 from kalmark.events import MOST, Control, Fix, Scan, finite, refuse_huge, shown, when
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.protocols import Landmark, OwnNoise, Sensor, innovation_size
+from kalmark.models.protocols import Landmark, Motion, OwnNoise, Sensor, coasts, innovation_size
 
 LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
 MOST_OBSERVATIONS = 5000  # of one scan: a map of as many takes 2 GB, and a scan of all of them half a minute
@@ -113,8 +113,11 @@ def refuse_vague(cov: Array, columns: tuple[str, ...], what: str) -> None:
         refuse_huge(sigmas, tuple(f"sigma_{column}" for column in columns), f"{what}: cov")
 
 
-def refuse_bad_control(event: Control, columns: tuple[str, ...]) -> None:
-    """Refuse a control that is not of these components, or whose own noise is no covariance."""
+def refuse_bad_control(event: Control, motion: Motion) -> None:
+    """Refuse a control that is not of a motion's components, a part of one that is no increment, and bad noise."""
+    columns = motion.columns
+    if event.share != 1.0 and (motion.held or coasts(motion)):
+        raise EventError(f"{when(event)}: share is {event.share:g}, expected 1: {', '.join(columns)}: no increment")
     if event.u.shape != (len(columns),):
         raise EventError(f"{when(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
     if event.largest > SMALLEST_BOUND:

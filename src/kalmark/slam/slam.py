@@ -130,7 +130,7 @@ class Slam(Estimate):
     def _control(self, event: Control) -> Report:
         state = self.state
         moving, report = state.moving[event.robot], Report(event)
-        refuse_bad_control(event, moving.motion.columns)
+        refuse_bad_control(event, moving.motion)
         state.t_ns = event.t_ns
         with moving.held as held:
             parts = held.accept(event)
