@@ -15,7 +15,7 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import ahead
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
-from kalmark.filter.inertial import turn_own_errors
+from kalmark.filter.inertial import has_units, turn_own_errors
 from kalmark.filter.map import Map, StochasticMap
 
 
@@ -170,7 +170,7 @@ class _Estimator:
             return _joined([self.correct(map_, part) for part in _parts(update)])
         model, robot, mount, slots, d, y, R, gate, parallax = update
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
-        before = m.x.copy() if self.transports else None
+        before = m.x.copy() if self.transports and has_units(m) else None
         scan = robot_here, mount_here, here, d, y, R, gate
         done = self._fused(model, m, scan, parallax)
         if not done.valid and not done.fused.any():
@@ -207,9 +207,9 @@ class _Estimator:
         model, *scan = update[:-1]
         run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
         m, robot_here, _, _ = map_.opened(update.robot, update.mount, update.slots, self.transports)
-        before = m.x.copy()
+        before = m.x.copy() if self.transports and has_units(m) else None
         d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)
-        if self.transports:
+        if before is not None:
             turn_own_errors(m, robot_here, before)
         return d2, bool(valid)
 

@@ -20,6 +20,11 @@ from kalmark.geometry.spaces import OWN, ROTATION, SCALAR, VECTOR3, Space
 UNIT = VECTOR3, ROTATION, OWN, *(SCALAR,) * 6  # pose, velocity, biases; what follows is the gravity
 
 
+def has_units(map_: StochasticMap) -> bool:
+    """Return whether there is an inertial unit in a map."""
+    return map_.axes > 1 and bool((map_.atoms[:, 0] == OWN).any())
+
+
 def turn_own_errors(map_: StochasticMap, robot: int, before: Array) -> None:
     """Let the errors of each inertial unit turn as it did in a correction, by `robot`, of the whole mean `before`."""
     for slot, space in enumerate(map_.spaces):
