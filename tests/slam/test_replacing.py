@@ -58,7 +58,7 @@ def test_one_wild_fix_moves_nothing() -> None:
 @pytest.mark.parametrize("sensor", [False, True], ids=["fixes", "antenna"])
 @pytest.mark.parametrize("seed", range(5))
 def test_a_robot_that_was_carried_away_is_placed_by_the_fixes_that_agree(seed: int, sensor: bool) -> None:
-    slam, truth, reports = driven(80, (40.0, -25.0, 1.2), seed, sensor)
+    slam, truth, reports = driven(180, (40.0, -25.0, 1.2), seed, sensor)
     moved = [report.replaced for report in reports if report.replaced]
     assert len(moved) == 1
     assert moved[0] > 10
@@ -138,7 +138,7 @@ def test_a_robot_of_space_is_placed_too() -> None:
     robot = km.Robot("r", motion=km.motion.Odometry3D(), sensors=sensors, cov=np.diag([0.01] * 3 + [0.001] * 3))
     slam, rng, moved = km.Slam(robot), np.random.default_rng(0), 0.0
     x = np.zeros(3)
-    for k in range(1, 61):
+    for k in range(1, 121):
         x = compose(x, np.array([0.5, 0.0, 0.05]))[0]
         x = compose(np.array([30.0, 10.0, 2.0]), x)[0] if k == 30 else x
         slam.process(km.Control(float(k), "r", [0.5, 0, 0, 0, 0, 0.05]))

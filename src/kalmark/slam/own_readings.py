@@ -6,15 +6,16 @@ from contextlib import suppress
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.errors import MapError
 from kalmark.events import Event, Fix, Scan
-from kalmark.filter.estimators import Update
+from kalmark.filter.estimators import Correction, Update
 from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.observe import fix_view
 from kalmark.report import Judged, Observation, Report, outcomes_of
 from kalmark.slam import moves, replacing
+from kalmark.slam.alternative import Alternative, put
 from kalmark.slam.checks import refuse_bad_fix
-from kalmark.slam.motion import Moving
 from kalmark.slam.reader import Reader
 from kalmark.slam.state import State
 
@@ -30,7 +31,8 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
     report.gaps = moves.advance(state, event.robot)
     if not len(event.y) and reader.keep == 1:
         return report
-    reader.drift(state.map, event.t_ns)
+    other = state.alternatives.get(event.robot)
+    reader.drift(event.t_ns, state.map, *([] if other is None else [other.map]))
     clones = {state.clones.clones[number].t_ns: number for number in state.clones.of(key)}
     found = list[Observation]()
     report.blank(R.shape[1])
@@ -42,15 +44,16 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
             continue
         clone = state.clones[clones[from_ns]] if from_ns in clones else -1
         update = reader.update(state.map, state.moving[event.robot], clone, event, k, R[k : k + 1], since_s)
-        done = state.corrected(update, event, reader.estimator(state.estimator, is_loop))
+        estimator = reader.estimator(state.estimator, is_loop)
+        fits = other is not None and not reader.counts and other.correct(estimator, update)
+        done = state.corrected(update, event, estimator)
         done = done._replace(e=done.e[:, : event.width])
         report.fill([k], done)
         found += outcomes_of(Judged([k], [None] * len(event.y), [event.robot], done, reader.gate))
         if done.fused[0] and not is_loop:
             reader.take(event.y[k : k + 1], done.Z, since_s)
         if reader.is_position:
-            position = replacing.LeftOut(event.y[0], R[0], done.e[0])
-            report.replaced = _believed(state, event.robot, position, done.fused[0])
+            report.replaced = _believed(state, event.robot, event.y[0], R[0], done, fits)
     report.observations = found
     if reader.counts:
         kept: list[int] = []
@@ -88,55 +91,67 @@ def fix(state: State, event: Fix) -> Report:
     report.gaps = gaps
     gate, R = state.settings.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
     update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
-    done = state.corrected(update, event, state.estimator.for_fixes())
+    estimator, other = state.estimator.for_fixes(), state.alternatives.get(event.robot)
+    fits = other is not None and other.correct(estimator, update)
+    done = state.corrected(update, event, estimator)
     report.e, report.z, report.Z = done.e, done.z, done.Z
     report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)
-    report.replaced = _believed(state, event.robot, replacing.LeftOut(event.y, event.cov, done.e[0]), done.fused[0])
+    report.replaced = _believed(state, event.robot, event.y, event.cov, done, fits)
     return report
 
 
-def _believed(state: State, name: str, position: replacing.LeftOut, fused: bool) -> float:
-    """Keep a measured position that was left out; return how far, m, the robot is moved if these agree, 0 if not."""
-    left_out = state.moving[name].left_out
-    if fused:
-        left_out.clear()
+def _believed(state: State, name: str, y: Array, R: Array, done: Correction, fits: bool) -> float:
+    """Take note whether a position y (d,) of noise R (d, d) fitted; return how far, m, it moved the robot, 0 if not.
+
+    Where none has said yet where the map is, the first that agree do.  Later they may be wrong: then the robot moves
+    if they fit an alternative for long.  `fits` tells whether this one does.
+    """
+    moving, other = state.moving[name], state.alternatives.get(name)
+    if done.fused[0]:
+        moving.left_out.clear()
+        state.alternatives.pop(name, None)
         state.placed += 1
         return 0.0
-    del left_out[: len(left_out) + 1 - replacing.KEPT]
-    left_out.append(position)
-    return _replace(state, name)
-
-
-def _replace(state: State, name: str) -> float:
-    """Move a robot to where its fixes place it, if they agree; return how far, m, 0 where they do not."""
-    moving = state.moving[name]
-    space = moving.motion.space
-    size, dof = (3, 3) if space.axes == 1 else (7, 6)
+    assert state.t_ns is not None
+    del moving.left_out[: len(moving.left_out) + 1 - replacing.KEPT]
+    moving.left_out.append(replacing.LeftOut(y, R, done.e[0, : len(y)]))
+    size, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
     mean = state.map.mean(moving.slot)
     found = replacing.replaced(mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out)
-    if found is None:
-        return 0.0
-    blocks = _blocks(state)
-    if (
-        state.placed < replacing.NEEDED
-        and len(state.robots) == 1
-        and all(replacing.can_move(space) for _, space in blocks)
-    ):
-        _move(state, blocks, found.shift)
+    if state.placed < replacing.NEEDED and found is not None:
+        blocks = _blocks(state)
+        if len(state.robots) == 1 and all(replacing.can_move(space) for _, space in blocks):
+            _move(state, blocks, found.shift)
+        else:
+            put(state.map, moving.slot, found.pose, found.cov)
+    elif other is not None and fits and other.explains(state.t_ns):
+        put(state.map, moving.slot, other.map.mean(moving.slot), other.map.covariance([moving.slot]))
     else:
-        _put(state, moving, found)
+        _doubt(state, name, found, done, R, fits)
+        return 0.0
     state.placed = replacing.NEEDED
     state.clones.moved(name)
+    state.alternatives.clear()
     moving.left_out.clear()
-    d = len(found.shift.t)
-    return float(np.linalg.norm(found.pose[:d] - mean[:d]))
+    return float(np.linalg.norm(state.map.mean(moving.slot)[: len(y)] - mean[: len(y)]))
 
 
-def _put(state: State, moving: Moving, found: replacing.Replaced) -> None:
-    """Move a robot alone."""
-    mean, dof = state.map.mean(moving.slot), len(found.cov)
-    state.map.predict(state.map.index(moving.slot)[:dof], np.zeros((dof, dof)), found.cov)
-    state.map.set_predicted(moving.slot, np.concatenate([found.pose, mean[len(found.pose) :]]))
+def _doubt(state: State, name: str, found: replacing.Replaced | None, done: Correction, R: Array, fits: bool) -> None:
+    """Keep the alternative for a position that was left out, or begin another if that does not fit either.
+
+    It begins where the last ones place the robot, if they agree, else with the robot less certain.
+    """
+    other = state.alternatives.get(name)
+    if other is not None:
+        other.misses = 0 if fits else other.misses + 1
+        if not other.failed:
+            return
+    assert state.t_ns is not None
+    other = state.alternatives[name] = Alternative.of(state.map, state.moving[name], state.blocks, state.t_ns)
+    if found is None:
+        other.widen(done.z[0], done.Z[0], R)
+    else:
+        put(other.map, other.moving.slot, found.pose, found.cov)
 
 
 def _blocks(state: State) -> list[tuple[int, Space]]:

@@ -127,13 +127,13 @@ class Reader:
             return None
         return map_.mean(self.mount)[-own:], map_.covariance([self.mount])[-own:, -own:]
 
-    def drift(self, map_: Map, t_ns: int) -> None:
-        """Let the sensor's constants walk from its last scan to the one at `t_ns`."""
+    def drift(self, t_ns: int, *maps: Map) -> None:
+        """Let the sensor's constants in some maps walk from its last scan to the one at `t_ns`."""
         since_s, self.t_ns = 0.0 if self.t_ns is None else (t_ns - self.t_ns) * 1e-9, t_ns
         if self.mount < 0 or not isinstance(self.sensor, protocols.Drifting):
             return
         Q = self.sensor.drift(since_s)
-        if Q.any():
+        for map_ in maps if Q.any() else ():
             rows = map_.index(self.mount)[-len(Q) :]
             map_.predict(rows, np.eye(len(Q)), np.diag(Q))
 

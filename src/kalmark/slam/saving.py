@@ -40,6 +40,7 @@ from kalmark.filter.maps import restored as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
+from kalmark.slam.alternative import Alternative, alone
 from kalmark.slam.motion import Mean, Moving, bias_block, bias_name
 from kalmark.slam.reader import Reader
 from kalmark.slam.replacing import LeftOut
@@ -51,7 +52,7 @@ from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 12
+VERSION = 13
 DESCRIPTION, SUMS = "slam.json", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
 OF_TRACKS = ("recent", "last_scan", "changes", "searched", "unnamed", "experience")  # beside the tracks
@@ -113,6 +114,9 @@ def _state(state: State) -> Description:
         ],
         "reserved": sorted(map(_id, tracks.reserved)),
         **{name: getattr(tracks, name) for name in OF_TRACKS},
+        "alternatives": [
+            [name, other.since_ns, other.misses, other.map.state()] for name, other in state.alternatives.items()
+        ],
         "clones": [[number, _record(clone)] for number, clone in state.clones.clones.items()],
         "latest": state.clones.latest,
         "numbered": state.clones.numbered,
@@ -176,6 +180,9 @@ def _arrays(state: State) -> Iterator[tuple[str, Array]]:
     for i, front_end in enumerate(state.front_ends.values()):
         for name, array in front_end.arrays().items():
             yield f"{name}{i}", array
+    for i, other in enumerate(state.alternatives.values()):
+        for name, array in other.map.arrays():
+            yield f"alternative{i}.{name}", array
     for i, moving in enumerate(state.moving.values()):
         if moving.held.u is not None and moving.held.N is not None:
             yield f"u{i}", moving.held.u
@@ -247,6 +254,10 @@ class Saved:
         clones.latest = {robot: _count(number, "number of a clone") for robot, number in s["latest"].items()}
         clones.numbered = _count(s["numbered"], "number of clones")
         self._fill_moving(state)
+        for i, (name, since_ns, misses, of) in enumerate(s["alternatives"]):
+            own = restored_map(of, lambda key, *shape, i=i: _array(self._members, f"alternative{i}.{key}", *shape))
+            moving = alone(state.moving[name])
+            state.alternatives[name] = Alternative(own, moving, int(since_ns), _count(misses, "misses"))
         judged = s.get("surveys", {"trial": (), "misfits": (), "strangers": ()})
         state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
         state.surveys.misfits = {name: (int(out), frozenset(fit)) for name, out, fit in judged["misfits"]}

@@ -17,6 +17,7 @@ from kalmark.filter.maps import DENSE, grown, new_map
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
+from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
 from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
@@ -50,7 +51,8 @@ class State:
     """The map, the tracks and the clones of some robots, with the channels and readers of their sensors.
 
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
-    `standing` are, of robots that are noticed to stand, the names of the sensors that do.
+    `standing` are, of robots that are noticed to stand, the names of the sensors that do; `alternatives` are, of robots
+    whose readings do not fit, the other explanations of these.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
@@ -60,6 +62,7 @@ class State:
         self.map: Map = new_map(settings.map, settings.numbers)
         self.tracks, self.clones, self.surveys = Tracks(robots), Clones(), Surveys()
         self.placed = 0  # fixes that have told where the map is in the world; a survey counts as many
+        self.alternatives: dict[str, Alternative] = {}
         self.moving: dict[str, Moving] = {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
@@ -70,6 +73,7 @@ class State:
         self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}
         for robot in robots.values():
             self._place(robot)
+        self.blocks = len(self.tracks.slots)  # the first of the map: they stay
         alone = [front_end for front_end in self.front_ends.values() if not front_end.waits]
         if len(robots) == 1 and len(alone) == 1 and len(self.front_ends) == len(next(iter(robots.values())).sensors):
             alone[0].watch_beginning()

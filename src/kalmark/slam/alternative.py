@@ -1,0 +1,96 @@
+"""The other explanation of readings that do not fit: that the robot is elsewhere than the map has it.
+
+Where readings have placed a robot, some that do not fit are wrong, as those of a receiver that jumps, or the robot is
+lost: its wheels slipped, it was carried away, its inertial unit was wrong for a second.  One reading does not tell
+which.  So a second filter of the robot alone begins at it, more uncertain than it takes for that reading to fit.  It
+moves by the same controls and is corrected by the same readings of the state.  A receiver that jumps comes back, and
+readings fit the map again.  If they fit the alternative for longer than receivers usually are wrong, it is right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve
+
+from kalmark.arrays import Array
+from kalmark.filter.estimators import Estimator, Update
+from kalmark.filter.map import Map, StochasticMap
+from kalmark.slam.motion import Moving, Part
+from kalmark.slam.replacing import NEEDED
+
+LASTS_S = 30.0  # readings fit an alternative that is right; the errors of receivers among houses seldom last so long
+LASTS_UNIT_S = 10.0  # the same if the state has a velocity: what is wrong with it grows with the square of the time
+WIDER = 100.0  # times the covariance by which a reading fits: it does not show yet what else is wrong, as a bias
+WIDEST, WIDEST_RAD = 1e12, 0.5  # times a covariance, and sigma of an attitude: of what a filter begins with
+
+
+@dataclass
+class Alternative:
+    """A robot alone in a map of its own, which has the robots, constants and mounts of the other one in the same slots.
+
+    Since `since_ns` its readings fit, but for the last `misses`.
+    """
+
+    map: Map
+    moving: Moving
+    since_ns: int
+    misses: int = 0
+
+    @classmethod
+    def of(cls, map_: Map, moving: Moving, blocks: int, since_ns: int) -> Alternative:
+        """Return what a map with so many blocks that are no landmarks, its first, says now."""
+        own, slots = StochasticMap(), range(blocks)
+        for slot, space in enumerate(map_.spaces[:blocks]):
+            assert space is not None
+            own.add(space, map_.mean(slot))
+        rows = np.concatenate([own.index(slot) for slot in slots])
+        own.predict(rows, np.eye(len(rows)), map_.covariance(slots))
+        return cls(own, alone(moving), since_ns)
+
+    def widen(self, z: Array, Z: Array, R: Array) -> None:
+        """Make the robot more uncertain, in the proportions it has, than it takes for a position of it to fit.
+
+        z (d,) is its innovation, Z (d, d) the covariance of that and R (d, d) the noise in it.
+        """
+        space, rows = self.moving.motion.space, self.map.index(self.moving.slot)
+        P, d, s2 = self.map.covariance([self.moving.slot]), len(z), 1.0
+        while s2 < WIDEST and z @ solve(s2 * (Z - R) + R, z, assume_a="pos") > d:
+            s2 *= 2.0
+        s2 *= WIDER
+        factor = np.full(len(P), np.sqrt(s2))
+        for i in range(d, d + space.axes):
+            factor[i] = min(factor[i], max(WIDEST_RAD / max(np.sqrt(P[i, i]), 1e-12), 1.0))
+        self.map.predict(rows, np.diag(factor), np.zeros_like(P))
+
+    def move(self, estimator: Estimator, part: Part) -> bool:
+        """Move the robot by a part of its control; return whether that leads anywhere."""
+        return estimator.predict(self.map, self.moving.movement(self.map, part))
+
+    def correct(self, estimator: Estimator, update: Update) -> bool:
+        """Correct by a reading of the state; return whether it fits."""
+        done = estimator.correct(self.map, update)
+        return bool(done.valid and done.fused[0])
+
+    def explains(self, t_ns: int) -> bool:
+        """Return whether its readings have fitted for so long that they are right."""
+        space = self.moving.motion.space
+        lasts_s = LASTS_S if space.dof == (3 if space.axes == 1 else 6) else LASTS_UNIT_S
+        return (t_ns - self.since_ns) * 1e-9 >= lasts_s
+
+    @property
+    def failed(self) -> bool:
+        """Whether its readings do not fit either."""
+        return self.misses >= NEEDED
+
+
+def alone(moving: Moving) -> Moving:
+    """Return how a robot moves in the map of an alternative."""
+    return replace(moving, error=None, left_out=[])
+
+
+def put(map_: Map, slot: int, mean: Array, cov: Array) -> None:
+    """Write the first numbers of a robot's block, and the covariance (d, d) of these, independent of all else."""
+    map_.predict(map_.index(slot)[: len(cov)], np.zeros_like(cov), cov)
+    map_.set_predicted(slot, np.concatenate([mean, map_.mean(slot)[len(mean) :]]))

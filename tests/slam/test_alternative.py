@@ -1,0 +1,118 @@
+"""Readings that do not fit: those of a receiver that jumps are left out, a robot that is lost is placed again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.arrays import Array
+from kalmark.geometry.frames import compose
+from kalmark.report import Report
+
+RTK_M, STEP_S = 0.014, 0.2
+UNIT_S, RECEIVER_M = 0.01, 0.1
+JUMP = np.array([0.6, -0.63])
+
+
+def nees(slam: km.Slam, truth: Array) -> float:
+    error = slam.robots["r"].motion.space.minus(slam.mean("r"), truth)
+    return float(error @ np.linalg.solve(slam.covariance("r"), error))
+
+
+def rtk(jump: tuple[float, float], slip: float, seed: int, end_s: float = 80.0) -> tuple[list[float], list[Report]]:
+    """Drive a robot with a receiver, which jumps for some time; by the middle of that the robot slips sideways."""
+    rng, x = np.random.default_rng(seed), np.zeros(3)
+    gps = km.Mount(km.sensors.Gps2D(RTK_M), at=(0.3, 0.0, 0.0))
+    slam = km.Slam(km.Robot("r", km.motion.Unicycle(0.05, 0.03), sensors={"gps": gps}, cov=np.diag([1e-4] * 3)))
+    reports: list[Report] = []
+    found: list[float] = []
+    for k in range(int(end_s / STEP_S)):
+        t_s, u = k * STEP_S, np.array([0.5, 0.1 * np.sin(0.05 * k)])
+        slam.process(km.Control(t_s, "r", u + rng.normal(0.0, [0.05, 0.03])))
+        x = compose(x, np.array([u[0] * STEP_S, slip if k == 150 else 0.0, u[1] * STEP_S]))[0]
+        y = compose(x, np.array([0.3, 0.0, 0.0]))[0][:2] + rng.normal(0.0, RTK_M, 2)
+        y = y + JUMP * (jump[0] <= t_s < jump[1])
+        reports.append(slam.process(km.Scan(t_s + STEP_S, "r", "gps", [y])))
+        found.append(nees(slam, x))
+    return found, reports
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_receiver_that_jumps_for_eight_seconds_moves_no_robot(seed: int) -> None:
+    found, reports = rtk((20.0, 28.0), 0.0, seed)
+    assert not any(report.replaced for report in reports)
+    assert sum(o.outcome == "rejected" for report in reports for o in report.observations) >= 35
+    assert np.mean(found[100:]) < 5.0  # 3 is expected, of few independent values
+    assert found[-1] < 16.3  # .999 of chi-square of 3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_that_slipped_is_placed_by_readings_that_fit_for_half_a_minute(seed: int) -> None:
+    found, reports = rtk((0.0, 0.0), 15.0, seed)
+    moves = [k for k, report in enumerate(reports) if report.replaced]
+    assert len(moves) == 1
+    assert 30.0 <= moves[0] * STEP_S - 30.0 < 36.0
+    assert max(found[moves[0] :]) < 25.0
+
+
+class Unit:
+    """A car on a track with an inertial unit that stands still for a second, `fault_s`, and a receiver."""
+
+    def __init__(self, fault_s: float, seed: int) -> None:
+        self.rng, self.fault_s = np.random.default_rng(seed), fault_s
+        self.motion = km.motion.Inertial(2e-4, 1e-5, 5e-3, 1e-4)
+        self.x = np.zeros(self.motion.space.size)
+        self.x[[6, 7]] = 1.0, 5.0  # upright, and 5 m/s ahead
+        sigmas = [0.1] * 3 + [0.02] * 3 + [0.1] * 3 + [1e-3] * 3 + [0.02] * 3
+        start = self.motion.space.plus(self.x, self.rng.normal(0.0, sigmas))
+        gps = km.Mount(km.sensors.Gps3D(RECEIVER_M))
+        robot = km.Robot("r", self.motion, start=start, sensors={"gps": gps}, cov=np.diag(np.square(sigmas)))
+        self.slam = km.Slam(robot)
+        self.held = np.zeros(6)
+
+    def drive(self, from_s: float, to_s: float) -> tuple[list[float], list[float]]:
+        """Return state NEES after each reading of the receiver, and when, s, the robot was moved."""
+        found, moves = [], []
+        for k in range(round(from_s / UNIT_S), round(to_s / UNIT_S)):
+            t_s = k * UNIT_S
+            w = 0.6 * np.sin(0.5 * t_s)
+            u = np.array([0.0, 0.0, w, 0.5 * np.cos(0.3 * t_s), 5.0 * w, 9.80665])
+            noise = self.rng.normal(0.0, [2e-4 / UNIT_S**0.5] * 3 + [5e-3 / UNIT_S**0.5] * 3)
+            if not self.fault_s <= t_s < self.fault_s + 1.0:
+                self.held = u + noise
+            self.slam.process(km.Control(t_s, "r", self.held))
+            self.x = self.motion.move(self.x, u, UNIT_S)[0]
+            if k % 100 == 99:
+                y = self.x[:3] + self.rng.normal(0.0, RECEIVER_M, 3)
+                report = self.slam.process(km.Scan(t_s + UNIT_S, "r", "gps", [y]))
+                found.append(nees(self.slam, self.x))
+                moves += [t_s] if report.replaced else []
+        return found, moves
+
+
+def test_a_unit_that_stood_still_for_a_second_is_placed_again() -> None:
+    last = []
+    for seed in range(10):
+        unit = Unit(31.0, seed)
+        found, moves = unit.drive(0.0, 80.0)
+        assert max(found[:30]) < 45.0
+        assert len(moves) <= 1
+        assert all(38.0 < t_s < 60.0 for t_s in moves)
+        last.append(found[-1])
+    assert np.mean(last) < 20.2  # .99 of the mean of ten chi-squares of 15
+
+
+def test_an_alternative_is_kept_when_a_map_is_saved(tmp_path: Path) -> None:
+    whole, resumed = Unit(31.0, 0), Unit(31.0, 0)
+    for unit in (whole, resumed):
+        unit.drive(0.0, 37.0)
+    assert "r" in resumed.slam.state.alternatives
+    resumed.slam.save(tmp_path / "map.kmk")
+    resumed.slam = km.Slam.load(tmp_path / "map.kmk")
+    for unit in (whole, resumed):
+        assert len(unit.drive(37.0, 55.0)[1]) == 1
+    np.testing.assert_array_equal(resumed.slam.mean("r"), whole.slam.mean("r"))
+    np.testing.assert_array_equal(resumed.slam.covariance("r"), whole.slam.covariance("r"))
