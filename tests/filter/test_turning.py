@@ -10,8 +10,11 @@ import pytest
 from scipy.stats import chi2
 
 import kalmark as km
+from kalmark.filter import turning
 from kalmark.geometry.frames import compose
-from kalmark.geometry.rotations import matrix
+from kalmark.geometry.frames3d import compose as compose3
+from kalmark.geometry.rotations import exp, matrix
+from kalmark.geometry.spaces import SE2, SE3, Space, generator, generator_plane, mount_space, retract, retract_plane
 
 DT_S, REST_S = 0.02, 2.0
 UNIT = km.motion.Inertial(
@@ -169,3 +172,37 @@ def test_a_heading_is_found_with_a_lever_arm_that_is_not_known(beside: str) -> N
     low, high = chi2.ppf([0.0005, 0.9995], 5 * len(found))
     most = high if beside == "nothing" else 1.5 * high  # what is left: docs/invariant.md
     assert low < sum(found) < most, (sum(found) / len(found), found)
+
+
+@pytest.mark.parametrize("plane", [True, False], ids=["plane", "space"])
+def test_a_correction_along_what_a_robot_and_its_mount_leave_open_moves_no_sensor(plane: bool) -> None:
+    """Neither the mean nor, by differences, what the covariance says is open: however far the correction goes."""
+    pose, chain, t = (SE2, compose, 1) if plane else (SE3, compose3, 3)
+    rng, n, k = np.random.default_rng(5), pose.size, pose.dof
+    space = Space("robot and mount", (*pose.kinds, *mount_space(n).kinds))
+    q, q_s = (np.array([a]) if plane else exp(np.full(3, a) * [1, -2, 0.5]) for a in (0.7, 0.4))
+    x = np.array([*rng.normal(size=k - t), *q, *rng.normal(size=k - t), *q_s])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        """Return that of the sensor's pose in robot and mount, by differences."""
+        steps = 1e-6 * np.eye(2 * k)
+        ends = [[chain(*np.split(space.plus(x, s * step), [n]))[0] for s in (1, -1)] for step in steps]
+        return np.array([pose.minus(plus, minus) / 2e-6 for plus, minus in ends]).T
+
+    H = jacobian(x)
+    N = np.vstack([-np.linalg.solve(H[:, :k], H[:, k:]), np.eye(k)])
+    P = N @ np.diag(rng.uniform(0.01, 0.04, k)) @ N.T + 1e-10 * np.eye(2 * k)
+    d, after, moved = N @ rng.normal(0, 0.3, k), x.copy(), retract_plane if plane else retract
+    rows = turning.turning_rows(space.atoms, (n, 2 * n, t, 2 * k, 0, 0), H)
+    R, turn = turning.frame_of(x, 0, t), turning.gauge(x, d, rows, t)
+    L = turning.leaning(P[rows[0]], rows[0], space.atoms, rows, t, R)
+    E, W, d_lean = turning.turns_of(turn, d, rows, t)
+    moved(space.atoms, after, d, turn)
+    turning.carry(space.atoms, after, L, W, d_lean)
+    np.testing.assert_allclose(chain(*np.split(after, [n]))[0], chain(*np.split(x, [n]))[0], atol=1e-6)
+    then, now = ((generator_plane if plane else generator)(space.atoms, at, 2 * k, t, x[:3]) for at in (x, after))
+    A = np.eye(2 * k)
+    R_now = turning.frame_of(after, 0, t)
+    A[:, rows[0]] += turning.displaced(space.atoms, now, then, L, E, d_lean, rows, rows[0], R, R_now, 0)
+    np.testing.assert_allclose(jacobian(after) @ A @ N, 0.0, atol=1e-6)
+    assert np.abs(jacobian(after) @ N).max() > 0.1

@@ -7,7 +7,11 @@ import pytest
 from scipy.stats import chi2
 
 import kalmark as km
-from kalmark.geometry.rotations import exp
+from kalmark.geometry.frames import compose
+from kalmark.geometry.frames3d import compose as compose3
+from kalmark.geometry.rotations import exp, matrix
+from kalmark.geometry.spaces import SE2, SE3
+from kalmark.results.measures import pose_error
 
 M, RAD = 0.1, np.radians(20)  # of a mount of which little is known
 IN_PLANE = np.array([[3.0, 0.4], [4.0, -1.0], [2.0, 2.0], [7.0, 1.0]])
@@ -37,6 +41,73 @@ def test_a_robot_that_stands_still_learns_nothing_of_its_mount(rig: Any, estimat
         assert kept[-1] < 0.5, "the textbook filter claims to learn it"
     else:
         np.testing.assert_allclose(kept, 1.0, atol=1e-6)
+
+
+PLACES = np.array([[3.0, 4, 1], [-5, 2, -2], [2, -6, 2], [6, 1, -1], [-4, -5, 1]])
+
+
+def seen(kind: str, T: np.ndarray) -> np.ndarray:
+    """Return what a sensor at T (3,) or (7,) measures: its pose, or ranges and directions of the known landmarks."""
+    if kind == "pose":
+        return T[None]
+    if len(T) == 3:
+        return km.geometry.observe(T, PLACES[:, :2])[0]
+    p = (PLACES - T[:3]) @ matrix(T[3:])
+    return np.column_stack(
+        [np.linalg.norm(p, axis=1), np.arctan2(p[:, 1], p[:, 0]), np.arctan2(p[:, 2], np.hypot(*p.T[:2]))]
+    )
+
+
+def placed(kind: str, plane: bool, seed: int, estimator: Any = None) -> tuple[np.ndarray, float, float]:
+    """Return of a robot that stands at first, both its start and its mount off by some degrees, how sure it is.
+
+    Which is the sigmas of its mount after the last scan of the stand in parts of those after the first; and the NEES
+    of pose and mount in the end.
+    """
+    d, space, rng = (2, SE2, np.random.default_rng(seed)) if plane else (3, SE3, np.random.default_rng(seed))
+    start, at = (np.zeros(3), np.array([0.3, 0.1, 0.6])) if plane else (np.eye(7)[6], np.array([0.3, 0.1, 0.2, *Q]))
+    sigmas = np.repeat([0.1, np.radians(3)], (d, space.dof - d))
+    unsure = np.repeat([0.05, np.radians(2)], (d, space.dof - d))
+    odometry: Any = km.motion.Odometry2D(0.01, 0.01, 0.005) if plane else km.motion.Odometry3D()
+    if kind == "pose":
+        sensor: Any = (km.sensors.AbsolutePose2D if plane else km.sensors.AbsolutePose3D)(1e-3, 1e-3)
+        noise, ids = np.repeat(1e-3, space.dof), None
+    else:
+        sensor = km.sensors.RangeBearing(2e-3, 1e-3) if plane else km.sensors.RangeBearing3D(2e-3, 1e-3, 1e-3)
+        noise, ids = np.array([2e-3, *[1e-3] * (d - 1)]), range(len(PLACES))
+    mount = km.Mount(sensor, at=at, cov=np.diag(unsure**2))
+    robot = km.Robot("r", odometry, start, {"s": mount}, np.diag(sigmas**2))
+    slam = km.Slam([robot], estimator=estimator or km.estimators.Invariant())
+    for i, place in enumerate(PLACES[:, :d] if ids else ()):
+        slam.add_landmark(i, mean=place)
+    x, true, first = space.plus(start, rng.normal(0, sigmas)), space.plus(at, rng.normal(0, unsure)), None
+    for k in range(40):
+        if k >= 30:
+            u = np.array([0.1, *[0] * (d - 1), *[0.1] * (space.dof - d)])
+            slam.process(km.Control(0.1 * k, "r", u))
+            x = odometry.move(x, u + rng.normal(0, np.repeat([0.01, 0.005], (d, space.dof - d))), 0.1)[0]
+        y = seen(kind, (compose if plane else compose3)(x, true)[0])
+        y = space.plus(y[0], rng.normal(0, noise))[None] if kind == "pose" else y + rng.normal(0, noise, y.shape)
+        slam.process(km.Scan(0.1 * k, "r", "s", y, ids))
+        if k < 30:
+            last = np.sqrt(np.diag(slam.covariance("r.s")))
+            first = last if first is None else first
+    e, d_s = pose_error(slam.mean("r"), x, "log"), space.minus(true, slam.mean("r.s"))
+    nees = [float(v @ np.linalg.solve(slam.covariance(name), v)) for name, v in (("r", e), ("r.s", d_s))]
+    return last / first, nees[0], nees[1]
+
+
+@pytest.mark.parametrize("plane", [True, False], ids=["plane", "space"])
+@pytest.mark.parametrize("kind", ["pose", "known landmarks"])
+def test_what_a_robot_and_its_mount_leave_open_together_stays_open(kind: str, plane: bool) -> None:
+    """Where a sensor is determines the product of both: one learns how to divide it by turning."""
+    found = [placed(kind, plane, seed) for seed in range(12)]
+    for kept, _pose, _mount in found:
+        np.testing.assert_allclose(kept, 1.0, atol=0.01)
+    assert placed(kind, plane, 0, km.estimators.Ekf())[0].min() < 0.95, "the textbook filter claims to learn it"
+    low, high = chi2.ppf([0.0005, 0.9995], (3 if plane else 6) * len(found))
+    for i in (1, 2):
+        assert low < sum(each[i] for each in found) < high
 
 
 def test_a_sensor_that_sees_no_directions_learns_nothing_of_how_its_mount_turns() -> None:

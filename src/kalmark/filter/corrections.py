@@ -168,8 +168,9 @@ def iterate(
     turning = turning_rows(table, sizes, linear[1])
     theta = turning[0]
     correction, origin = np.zeros(len(P_ss)), mean[:3].copy()
-    L = leaning(rows_of(P_ss, theta, len(P_ss)), theta, table, turning, axes)
-    R_r, then = frame_of(mean, 0, axes), call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
+    R_r = frame_of(mean, 0, axes)
+    L = leaning(rows_of(P_ss, theta, len(P_ss)), theta, table, turning, axes, R_r)
+    then = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
     turn = np.zeros(axes)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
     depths = anchored(table if parallaxes else table[:0])
@@ -189,7 +190,7 @@ def iterate(
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            a = displaced(table, now, then, L, E, turning, theta, R_r, frame_of(x_j, 0, axes), level)
+            a = displaced(table, now, then, L, E, d, turning, theta, R_r, frame_of(x_j, 0, axes), level)
             transport_rows(H, v, a, theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, h + others)
         M, positive = cholesky_inverse(Z)
@@ -200,8 +201,8 @@ def iterate(
             break
         x_j = mean.copy()
         turn = gauge(mean, correction, turning, axes)
-        E, W, d = turns_of(turn, correction, turning, axes)
         step = heading_last(correction, turn, level, 3)
+        E, W, d = turns_of(turn, step, turning, axes)
         call_retract(ways[_RETRACT], (table, x_j, step, turn))
         carry(table, x_j, L, W, d)
         if len(depths):
@@ -304,8 +305,9 @@ def invariant(
     at, origin = blocks[robot, 0], mean[:3].copy()
     turning = turning_rows(table, sizes, linear[1])
     theta = picked(index, turning[0])
-    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes)
-    R_r, then = frame_of(x, at, axes), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    R_r = frame_of(x, at, axes)
+    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r)
+    then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     V, correction = gain(sparse_product(H, rows_of(P, index, n), h + sizes[4], count), M, v)
     depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
@@ -316,12 +318,12 @@ def invariant(
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
     own = taken(correction, index)
     turn = gauge(mean, own, turning, axes)
-    E, W, d_lean = turns_of(turn, own, turning, axes)
     step = heading_last(correction, turn, sizes[5], blocks[robot, 2] + 3)
+    E, W, d_lean = turns_of(turn, taken(step, index), turning, axes)
     call_retract(ways[_RETRACT], (atoms, x, step, turn))
     carry(atoms, x, L, W, d_lean)
     now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    a = displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, axes), sizes[5])
+    a = displaced(atoms, now, then, L, E, d_lean, turning, theta, R_r, frame_of(x, at, axes), sizes[5])
     downdate_and_transport(P, V, a, theta)
     if len(depths):
         observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
@@ -435,8 +437,9 @@ def averaged(
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
     at, origin, turning = blocks[robot, 0], mean[:3].copy(), turning_rows(table, sizes, H)
     theta, own = picked(index, turning[0]), correction[index]
-    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes)
-    R_r, then = frame_of(x, at, axes), call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
+    R_r = frame_of(x, at, axes)
+    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r)
+    then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     step, turn = correction, gauge(mean, own, turning, axes) if transports else np.zeros(0)
     if transports:
         step = heading_last(correction, turn, sizes[5], blocks[robot, 2] + 3)
@@ -444,10 +447,11 @@ def averaged(
     downdate(P, V)
     add_square(P, spread)
     if transports:
-        E, W, d_lean = turns_of(turn, own, turning, axes)
+        E, W, d_lean = turns_of(turn, taken(step, index), turning, axes)
         carry(atoms, x, L, W, d_lean)
         now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-        transport(P, displaced(atoms, now, then, L, E, turning, theta, R_r, frame_of(x, at, axes), sizes[5]), theta)
+        a = displaced(atoms, now, then, L, E, d_lean, turning, theta, R_r, frame_of(x, at, axes), sizes[5])
+        transport(P, a, theta)
     return d2, True
 
 

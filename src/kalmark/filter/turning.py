@@ -7,6 +7,7 @@ inertial unit, turns with that.  With the rotation errors of the observing robot
 
 of each vector of the world, by the covariance before the correction.  It becomes E d of the leaning part, E the turn
 of the robot that has the arm, or of r; a turn of the whole world changes no difference, so nothing is lost of it.
+Where the map turns with a sensor, the position of its robot leans on arm and rotation of the mount.
 """
 
 from __future__ import annotations
@@ -94,13 +95,13 @@ def turning_rows(table: Table, sizes: tuple[int, int, int, int, int, int], H: Ar
 
     The map turns with the sensor that observes it, so with its mount (1 or 3 rows, if it is in the map).  A second
     block that is no mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation
-    in H are zero.  Of such a mount the rows of its position (2 or 3) are here, its lever arm.
+    in H are zero.  The rows of the mount's position (2 or 3) follow, the lever arm.
     """
     pose, head, axes, behind, others, _ = sizes
     dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
-    first, arm = 2 * dof - turns, 0
+    first, arm = 2 * dof - turns, dof - turns
     if head <= pose or table[2, 0] != SCALAR or table[last, 0] != (ANGLE if pose == 3 else TURNED):
-        turns = 0
+        turns = arm = 0
     else:
         most = turning = 0.0
         for i in range(len(H)):
@@ -109,10 +110,12 @@ def turning_rows(table: Table, sizes: tuple[int, int, int, int, int, int], H: Ar
                 if first <= j < 2 * dof:
                     turning = max(turning, abs(H[i, j]))
         if turning <= BLIND * most:
-            first, turns, arm = dof, 0, dof - turns
-    rows, own = np.empty(axes + turns + arm + others, np.int64), turns + arm
-    for i in range(len(rows)):
-        rows[i] = dof - axes + i if i < axes else first + i - axes if i < axes + own else behind + i - axes - own
+            turns = 0
+    rows, k = np.empty(axes + turns + arm + others, np.int64), 0
+    for start, count in ((dof - axes, axes), (first, turns), (dof, arm), (behind, others)):
+        for i in range(count):
+            rows[k] = start + i
+            k += 1
     return rows, turns, arm
 
 
@@ -150,34 +153,41 @@ def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
 
 
 @compiled
-def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int) -> Array:
-    """Return L (n, m): how each vector of some atoms leans on the m rows of an arm and of other units' rotations.
+def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array) -> Array:
+    """Return L (n, m): how each vector of some atoms leans on the m rows of a mount and of other units' rotations.
 
-    `B` (k, n) are the rows of P, before the correction, of all rows that turn; `index` are these rows.  The rotation of
-    the observing robot explains its part, too.
+    `B` (k, n) are the rows of P, before the correction, of all rows that turn; `index` are these rows, R that of the
+    robot's rotation.  The rotation of the sensor explains its part, too.  On a mount that turns the map leans the
+    position of its own robot alone.
     """
-    first, t = axes + turning[1], 1 if axes == 1 else 3
-    m = len(index) - first
-    L = np.zeros((B.shape[1], m))
+    _rows, turns, arm = turning
+    m, (t, s) = len(index) - axes, (1, 2) if axes == 1 else (3, 3)
+    L, robot = np.zeros((B.shape[1], m)), index[axes - t]
     if m == 0:
         return L
-    used, S = np.empty(t + m, np.int64), np.empty((t + m, t + m))
-    for i in range(t + m):
-        used[i] = axes - t + i if i < t else first + i - t
-    for i in range(t + m):
-        for j in range(t + m):
-            S[i, j] = B[used[i], index[used[j]]]
-        S[i, i] += RAISED * max(S[i, i], 1.0)
-    M, positive = cholesky_inverse(S)
-    if not positive:
-        return L
-    W = product(transposed(M), M)  # S^-1
+    W = weights(B, index, axes - t)
+    for c in range(turns):  # what leans on the robot's rotation leans on the sensor's, d_theta + R_r d_theta_s
+        for a in range(t):
+            for b in range(t + m):
+                W[t + c, b] -= R[a, c] * W[a, b]
     for a in range(len(atoms)):
         for j in range(atoms[a, 2], atoms[a, 2] + vectors(atoms[a, 0])):
-            for c in range(m):
+            for c in range(0 if turns == 0 or robot - s <= j < robot else turns + arm, m):
                 for b in range(t + m):
-                    L[j, c] += W[t + c, b] * B[used[b], j]
+                    L[j, c] += W[t + c, b] * B[axes - t + b, j]
     return L
+
+
+@compiled
+def weights(B: Array, index: Index, first: int) -> Array:
+    """Return S^-1 of the covariance S of the rows B of P from `first` on, at `index`; 0 where S is singular."""
+    S = np.empty((len(index) - first, len(index) - first))
+    for i in range(len(S)):
+        for j in range(len(S)):
+            S[i, j] = B[first + i, index[first + j]]
+        S[i, i] += RAISED * max(S[i, i], 1.0)
+    M, positive = cholesky_inverse(S)
+    return product(transposed(M), M) if positive else np.zeros(S.shape)
 
 
 @compiled
@@ -204,29 +214,31 @@ def turns_of(turn: Array, correction: Array, turning: Turning, axes: int) -> tup
     """Return E - 1 and W - V (m, s, s) of the m rows that others lean on, and their errors (m,) by a correction.
 
     A leaning part becomes E of it, and moves the mean by W, where a vector moves by V otherwise: V of the gauge's
-    `turn`, E and W of the turn of the robot; that of another unit goes on from that of the gauge.
+    `turn`, E and W of the turn of the robot; that of another unit goes on from that of the gauge, and so does that of
+    the robot where the map turns with its sensor.
     """
     rows, turns, arm = turning
-    first, s = axes + turns, 2 if axes == 1 else 3
-    m = len(rows) - first
-    E, W, d, own = np.empty((m, s, s)), np.empty((m, s, s)), np.empty(m), np.zeros(3)
+    m, s = len(rows) - axes, 2 if axes == 1 else 3
+    E, W, d = np.empty((m, s, s)), np.empty((m, s, s)), np.empty(m)
     if m == 0:
         return E, W, d
-    V, E_r = rotation_of(turn)
-    E_c = W_c = E_r
+    t = 1 if axes == 1 else 3
+    V, E_turn = rotation_of(turn)
+    own, others = np.zeros(t), turns + arm
+    E_c, W_c = E_turn, E_turn
     for c in range(m):
-        d[c], axis = correction[rows[first + c]], (c - arm) % 3
-        if c >= arm and axis == 0:
-            for a in range(3):
-                own[a] = correction[rows[first + c + a]] - turn[axes - 3 + a]
+        axis = (c - others) % 3
+        if c == 0 or (c >= others and axis == 0):
+            at = axes - t if c < others else axes + c
+            for a in range(t):
+                own[a] = correction[rows[at + a]] - turn[axes - t + a]
             V_own, E_own = rotation_of(own)
-            E_c, W_c = product(E_r, E_own), product(E_r, V_own)
-        if c >= arm:
-            d[c] = own[axis]
+            E_c, W_c = product(E_turn, E_own), product(E_turn, V_own)
+        d[c] = own[axis] if c >= others else correction[rows[axes + c]]
         for a in range(s):
             for b in range(s):
                 E[c, a, b] = E_c[a, b] - (1.0 if a == b else 0.0)
-                W[c, a, b] = W_c[a, b] - V[a, b]
+                W[c, a, b] = (E_c[a, b] if turns <= c < others else W_c[a, b]) - V[a, b]
     return E, W, d
 
 
@@ -245,13 +257,14 @@ def carry(atoms: Table, x: Array, L: Array, W: Array, d: Array) -> None:
 
 @compiled
 def displaced(
-    atoms: Table, now: Array, then: Array, L: Array, E: Array, turning: Turning, index: Index, R: Array, R_now: Array,
-    level: int,
+    atoms: Table, now: Array, then: Array, L: Array, E: Array, d: Array, turning: Turning, index: Index, R: Array,
+    R_now: Array, level: int,
 ) -> Array:  # fmt: skip
     """Return the columns (n, rows that turn) by which errors change from a mean to a corrected one.
 
     `now` and `then` (n, axes) are the generators there, `index` the rows that turn, R and R_now those of the robot's
-    rotation, before and now.  The errors of tilt of a unit whose gravity is known, `level`, turn with its heading.
+    rotation, before and now, d (m,) what the rows were corrected by that others lean on.  The errors of tilt of a unit
+    whose gravity is known, `level`, turn with its heading.
     """
     _rows, turns, arm = turning
     n, axes = now.shape
@@ -260,6 +273,7 @@ def displaced(
     for i in range(n):
         for a in range(axes):
             out[i, a] = now[i, a] - then[i, a]
+    L = with_arm(out, L, d, axes, turns)
     lean(out, atoms, L, E, axes, first + arm, index)
     for i in range(n):  # other units turn by d_theta_r - d_theta
         for c in range(first + arm, len(index)):
@@ -278,8 +292,21 @@ def displaced(
 
 
 @compiled
+def with_arm(out: Array, L: Array, d: Array, axes: int, turns: int) -> Array:
+    """Return L of a mount's rotation with its arm as corrected, by d (m,): L_a x d_a more, which is added to `out`."""
+    L = L.copy() if turns else L
+    for i in range(len(L) if turns else 0):
+        for c in range(turns):
+            a, b = (turns, turns + 1) if turns == 1 else (turns + (c + 1) % 3, turns + (c + 2) % 3)
+            more = L[i, a] * d[b] - L[i, b] * d[a]
+            L[i, c] += more
+            out[i, axes + c] += more
+    return L
+
+
+@compiled
 def lean(out: Array, atoms: Table, L: Array, E: Array, axes: int, others: int, index: Index) -> None:
-    """Set the last columns of `out` (n, .), those of an arm and from `others` on of other units, to (E - 1) L.
+    """Set the last columns of `out` (n, .), those of a mount and from `others` on of other units, to (E - 1) L.
 
     A vector of a unit's own turns with it by its generator, in the first columns, whatever it leans on.
     """
