@@ -117,7 +117,8 @@ def refuse_bad_control(event: Control, motion: Motion) -> None:
     """Refuse a control that is not of a motion's components, a part of one that is no increment, and bad noise."""
     columns = motion.columns
     if event.share != 1.0 and (motion.held or coasts(motion)):
-        raise EventError(f"{when(event)}: share is {event.share:g}, expected 1: {', '.join(columns)}: no increment")
+        rates = f"expected 1: the controls {', '.join(columns)} are no increments of a pose, and only these have parts"
+        raise EventError(f"{when(event)}: share is {event.share:g}, {rates}")
     if event.u.shape != (len(columns),):
         raise EventError(f"{when(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
     if event.largest > SMALLEST_BOUND:
