@@ -109,7 +109,9 @@ def test_a_part_of_rates_is_refused_and_changes_nothing(motion: Any) -> None:
     u = np.full(len(motion.columns), 0.1)
     slam.process(Control(0.0, "rover", u))
     before = slam.mean("rover"), slam.covariance("rover")
-    with pytest.raises(EventError, match=r"t=1 s: share is 0.5, expected 1: the controls .+ are no increments of a pose, and only"):
+    with pytest.raises(
+        EventError, match=r"t=1 s: share is 0.5, expected 1: the controls .+ are no increments of a pose, and only"
+    ):
         slam.process(Control(1.0, "rover", u, share=0.5, uneven=np.ones(len(u))))
     assert_allclose(slam.mean("rover"), before[0], rtol=0)
     assert_allclose(slam.covariance("rover"), before[1], rtol=0)

@@ -282,6 +282,8 @@ def test_a_start_at_rest_is_refused_of_a_log_that_begins_with_a_motion() -> None
     with pytest.raises(KalmarkError) as refused:
         build_slam(scene.config(), simulate(scene, 1))
     assert "robots.drone.start: the unit begins with" in str(refused.value)
+    assert "Begin where it stands, by log.from_s; or state a start without at_rest" in str(refused.value)
     with pytest.raises(KalmarkError) as refused:
         build_slam(scene.config())
     assert "expected a log that begins at rest" in str(refused.value)
+    assert "state a start without at_rest" in str(refused.value)

@@ -28,6 +28,8 @@ from kalmark.models.protocols import coasts, state_columns
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 
+BY_SIGMAS = "state a start without at_rest, as uncertain as it is: sigma_rotation_deg, sigma_v_mps, sigma_bias_..."
+
 
 def build_slam(config: Config, log: Log | None = None) -> Slam:
     """Return the filter that a configuration describes, for the robots of a log and with what the log says of them.
@@ -142,10 +144,14 @@ def _at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any)
     """
     readings = [event for event in log or () if isinstance(event, Control) and event.robot == name]
     if not readings:
-        raise ModelError(f"{name} has no readings of its inertial unit yet, expected a log that begins at rest")
+        what = f"{name} has no readings of its inertial unit yet, expected a log that begins at rest"
+        raise ModelError(f"{what}. Events that arrive one by one have none: {BY_SIGMAS}; km.motion.at_rest finds them")
     t_ns = np.array([event.t_ns for event in readings])
     seconds, u = (t_ns - t_ns[0]) * 1e-9, np.array([event.u for event in readings])
-    found = at_rest(motion, seconds, u, np.array(start, dtype=np.float64), np.asarray(cov, dtype=np.float64))
+    try:
+        found = at_rest(motion, seconds, u, np.array(start, dtype=np.float64), np.asarray(cov, dtype=np.float64))
+    except ModelError as error:
+        raise ModelError(f"{error}. Begin where it stands, by log.from_s; or {BY_SIGMAS}") from None
     return found.start, found.cov, int(t_ns[0]) + round(found.until_s * 1e9)
 
 
