@@ -11,7 +11,11 @@ import pytest
 
 import kalmark as km
 from kalmark.cli.run import run_log
+from kalmark.config import build_slam
 from kalmark.filter.compressed.map import CompressedMap
+from kalmark.results.record import record
+from kalmark.simulate import load_world
+from kalmark.simulate.robots import simulation
 
 WORLD = np.random.default_rng(1).uniform(-8, 8, (60, 2))
 START = (5.0, 0.0, np.pi / 2)
@@ -201,6 +205,14 @@ def test_what_was_found_is_in_the_summary_of_a_run_and_of_one_that_is_read_again
     assert 0 < told["sigma_w_radps"] < PRIOR["sigma_w_bias_radps"]
     recorded.save(tmp_path)
     assert km.Run.load(tmp_path).evaluate()["biases"]["r"] == pytest.approx(told)
+
+
+def test_of_wheels_the_summary_has_radii_and_track_not_by_what_they_are_off() -> None:
+    simulated = simulation(load_world("differential_drive", ["steps=100"]), 1)
+    run = record(build_slam(load_world("differential_drive").config(), simulated.log), simulated.log, progress=False)
+    told, stated = run.evaluate()["biases"]["rover"], {"left_radius_m": 0.1, "right_radius_m": 0.1, "track_m": 0.5}
+    for (name, value), off in zip(stated.items(), simulated.constants["rover"], strict=True):
+        assert abs(told[name] - (value + off)) < 4.0 * told[f"sigma_{name}"] < 0.5 * value
 
 
 def test_a_bias_cannot_be_removed() -> None:

@@ -97,10 +97,13 @@ def mount_figures(mount: Mounted) -> dict[str, Any]:
     }
 
 
-def bias_figures(bias: Biased) -> dict[str, float]:
-    """Return what the filter believes is to be added to a robot's controls, and how far that is known."""
+def bias_figures(bias: Biased, motion: Mapping[str, Any]) -> dict[str, float]:
+    """Return what the filter believes is to be added to a robot's controls, and how far that is known.
+
+    Of a parameter of its `motion`, a radius or a track, it is the parameter itself: the configured one, corrected.
+    """
     sigmas = np.sqrt(np.maximum(np.diagonal(bias.covariance), 0.0)).tolist()
-    found = dict(zip(bias.columns, bias.mean.tolist(), strict=True))
+    found = {name: motion.get(name, 0.0) + off for name, off in zip(bias.columns, bias.mean.tolist(), strict=True)}
     return found | {f"sigma_{column}": sigma for column, sigma in zip(bias.columns, sigmas, strict=True)}
 
 

@@ -87,7 +87,7 @@ def evaluate(run: Recording) -> dict[str, Any]:
     if history.mounts:
         summary["mounts"] = {mount.name: mount_figures(mount) for mount in history.mounts}
     if history.biases:
-        summary["biases"] = {bias.robot: bias_figures(bias) for bias in history.biases}
+        summary["biases"] = {bias.robot: bias_figures(bias, run.motion(bias.robot)) for bias in history.biases}
     summary["gaps"], summary["repeats"] = gap_figures(run), repeat_figures(run)
     summary |= run.reference
     if run.truth.fixes and not np.isfinite(run.truth.poses).any():
