@@ -67,6 +67,17 @@ def test_a_laser_is_drawn_in_its_measurement_space(run: Run) -> None:
     assert names >= set(run.history.unmeasured_landmark[missed].tolist())
 
 
+def test_positions_of_a_receiver_are_drawn_as_in_the_map() -> None:
+    world = load_world("lever_arm", ["steps=10"])
+    log = simulate(world, 1)
+    run = km.record(build_slam(world.config(), log), log, progress=False)
+    step = int(run.history.step[run.history.of_own][-1])
+    axes = draw_sensor(run, "robot", "receiver", step).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel(), axes.xaxis_inverted()) == ("x (m)", "y (m)", False)
+    y = run.history.y[run.history.step == step][0, :2]
+    np.testing.assert_array_equal(np.column_stack(axes.lines[0].get_data())[0], y)
+
+
 def test_a_camera_shows_what_it_did_not_measure() -> None:
     world = space_world(robot={"sensors": {"lidar": {"type": "range_bearing_3d"}, "eye": CAMERA}}, steps=30)
     log = simulate(world, 2)

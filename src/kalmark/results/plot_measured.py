@@ -1,6 +1,7 @@
 """The picture of one scan by a sensor that is no camera, in its measurement space: ``sensor_<robot>_<sensor>.png``.
 
-Two of its numbers are drawn: bearing and range, or two coordinates.  Crosses are the measurements, ellipses of Z around
+Two of its numbers are drawn: bearing and range, or two coordinates, those of a sensor of its own robot as in the map.
+Crosses are the measurements, ellipses of Z around
 e are what the filter expected, of landmarks in view that were not measured, too.
 """
 
@@ -56,7 +57,10 @@ def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
     """Return the figure of a scan by a sensor that has `axes_of`."""
     found = axes_of(sensor)
     assert found is not None
-    rows, columns = np.flatnonzero(history.step == step), [axis.column for axis in found]
+    rows = np.flatnonzero(history.step == step)
+    in_map = bool(history.of_own[rows].any())  # of the robot's own position: x to the right, y upwards, as in the map
+    found = found[::-1] if in_map else found
+    columns = [axis.column for axis in found]
     scale = np.array([axis.scale for axis in found])
     figure = Figure(figsize=(9.5, 7.0), layout="constrained", facecolor="white")
     axes = figure.subplots()
@@ -73,7 +77,8 @@ def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
         axes.annotate(name, at, (5, 5), textcoords="offset points", fontsize=8, color=INK)
     axes.set_xlabel(found[0].label)
     axes.set_ylabel(found[1].label)
-    axes.invert_xaxis()  # what is on the left has positive bearings
+    if not in_map:
+        axes.invert_xaxis()  # what is on the left has positive bearings
     axes.grid(color="#eceef1")
     axes.margins(0.08)
     outcomes = Counter(history.outcome[rows].tolist()) | (Counter({IN_VIEW: len(missed)}) if len(missed) else Counter())
