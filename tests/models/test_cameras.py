@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import kalmark as km
 from differences import agree, derivative
-from kalmark.errors import ModelError
+from kalmark.errors import EventError, ModelError
 from kalmark.models import cameras
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
@@ -142,3 +143,10 @@ def test_a_pixel_is_in_the_image_with_its_borders_and_before_the_camera() -> Non
     assert cameras.in_image(e, v, SIZE).tolist() == [True, True, False, False, False]
     pair = np.array([[5.0, 5, -1, 5], [5, 5, 3, 5]])
     assert cameras.in_image(pair, v[:2], SIZE).tolist() == [False, True]
+
+
+def test_a_negative_disparity_is_refused_with_both_pixels() -> None:
+    robot = km.Robot("r", km.motion.Odometry3D(), sensors={"pair": km.Mount(km.sensors.Stereo())})
+    what = r"scan at t=1 s: r.pair, observation 1: ul_px 10 - ur_px 12.5 is a disparity of -2.5 px, expected 0 or more"
+    with pytest.raises(EventError, match=what):
+        km.Slam(robot).process(km.Scan(1.0, "r", "pair", [[20, 10, 15, 10], [10, 10, 12.5, 10]], [1, 2]))

@@ -227,7 +227,8 @@ class Stereo(_PinHole):
         """Refuse observations y (K, 4) of points behind the cameras, with a negative disparity."""
         for i, row in enumerate(y):
             if row[0] < row[2]:
-                raise EventError(f"observation {i}: ul_px {row[0]} is less than ur_px {row[2]}, expected at least it")
+                what = f"ul_px {row[0]:g} - ur_px {row[2]:g} is a disparity of {row[0] - row[2]:g} px"
+                raise EventError(f"observation {i}: {what}, expected 0 or more: are left and right exchanged?")
 
 
 @register("sensor", "segments")

@@ -157,7 +157,7 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
         try:
             check(event.y)
         except EventError as error:
-            raise EventError(f"{when(event)}: {error}") from None
+            raise EventError(f"{when(event)}: {event.robot}.{event.sensor}, {error}") from None
     if event.cov is None:
         return sensor.noise(event.y) if count else np.zeros((0, m, m))
     what, p = f"{when(event)}: cov", innovation_size(sensor)
