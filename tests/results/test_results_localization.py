@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.diagnosis.gross import MOST
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.results.evaluate import headline
 from kalmark.results.run import Run
@@ -84,4 +85,6 @@ def test_a_path_that_a_receiver_moved_to_and_fro_is_doubtful_and_says_so(tmp_pat
         assert any("of receiver that agree moved rover by 29, 28 m" in line for line in one.evaluate()["warnings"])
     verdict = diagnose(run)
     assert verdict.map == "doubtful"
-    assert any(c.evidence.startswith("readings of receiver that agree moved rover by 29, 28 m") for c in verdict.causes)
+    (cause,) = (c for c in verdict.causes if c.evidence.startswith("readings of receiver that agree moved rover by"))
+    left_out = np.sum(run.history.outcome == "rejected")
+    assert cause.score == 0.5 * MOST * 2 * left_out, "no reading counts more than 25 for each number"

@@ -26,13 +26,14 @@ from kalmark.geometry.gaussian import quantile
 from kalmark.logs.log import Log
 from kalmark.results.batch import filtered_map, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
+from kalmark.results.history import Placed
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict import INNOVATIONS, NO_LANDMARKS, NO_MAP
 from kalmark.results.warnings import CHANCE, NO_ID, TOO_SMALL, placements, window_warnings, words_of
 from kalmark.results.words import count, figure
-from kalmark.slam.replacing import NEEDED
+from kalmark.slam.replacing import KEPT, NEEDED
 from kalmark.slam.surveyed import ELSEWHERE
 from kalmark.tracks.surveys import MISFITS
 
@@ -304,7 +305,19 @@ def _placed_elsewhere(run: Run) -> Iterator[Cause]:
                 f"{of}, from t={first.t_ns * 1e-9:.1f} s on: it was lost, or they jumped, as those of receivers do"
             )
             cure = "leave their rows out where they jump, or state more noise for them"
-            yield Cause(MISFIT, first.t_ns * 1e-9, 0.5 * MOST_D2 * NEEDED, evidence, cure)
+            yield Cause(MISFIT, first.t_ns * 1e-9, _left_out_until(run, mine), evidence, cure)
+
+
+def _left_out_until(run: Run, placed: Sequence[Placed]) -> float:
+    """Return half of the chi-square of the readings that moved a robot: those left out in a row until it was moved."""
+    h, now, score = run.history, fit(run), 0.0
+    of = (h.robot[h.step] == placed[0].robot) & (h.sensor == placed[0].sensor)
+    for one in placed:
+        mine = np.flatnonzero(of & (h.t_ns[h.step] <= one.t_ns))
+        used = np.flatnonzero(h.outcome[mine] != "rejected")
+        rows = mine[used[-1] + 1 if len(used) else 0 :][-KEPT:]
+        score += 0.5 * float(np.minimum(h.d2[rows], MOST_D2 * now.dof[rows]).sum())
+    return score
 
 
 def misplaced_landmarks(run: Run) -> list[Cause]:
