@@ -14,7 +14,7 @@ from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
 
 REACH_M, S = 0.5, 10**9
-MATCHER = "robots.rover.sensing.matcher"
+MATCHER, KEEP = "robots.rover.sensing.matcher", "robots.rover.sensors.matcher.keep"
 
 
 def errors(log: Log) -> np.ndarray:
@@ -62,7 +62,16 @@ def test_a_campaign_with_loops_is_consistent_and_better_than_one_without() -> No
     assert 2.0 < both[0]["pose_anees"] < 4.0 and both[0]["position_rmse_m"] < 0.8 * both[1]["position_rmse_m"]
 
 
-@pytest.mark.parametrize("keep", [0, 1])
-def test_loops_of_a_matcher_that_keeps_no_poses_are_refused(keep: int) -> None:
-    with pytest.raises(ConfigError, match="loop_reach_m of an odometer that keeps 2 poses or more, not of 'matcher'"):
-        load_world("scan_matching", [f"robots.rover.sensors.matcher.keep={keep}"])
+def test_loops_of_a_matcher_that_keeps_no_earlier_poses_are_refused() -> None:
+    with pytest.raises(
+        ConfigError, match="loop_reach_m of an odometer whose keep is 0, or 2 or more, not of 'matcher'"
+    ):
+        load_world("scan_matching", [f"{KEEP}=1"])
+
+
+def test_a_filter_that_foresees_the_loops_of_a_campaign_keeps_no_other_poses_and_finds_the_same() -> None:
+    all_, needed = (
+        run_campaign(load_world("scan_matching", ["steps=600", f"{KEEP}={keep}"]), 2).summary() for keep in (100, 0)
+    )
+    both = [summary["estimators"]["invariant"] for summary in (all_, needed)]
+    assert both[1]["pose_anees"] == pytest.approx(both[0]["pose_anees"], rel=1e-6)

@@ -57,8 +57,8 @@ class _Underway(Section):
                 raise expected(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
             if self.sensing[name].images and robot.sensors[name].type not in IMAGING:
                 raise expected(f"images of {' or '.join(IMAGING)}, not of {name!r}, a {robot.sensors[name].type}")
-            if self.sensing[name].loop_reach_m is not None and getattr(robot.sensors[name], "keep", 1) < 2:
-                raise expected(f"loop_reach_m of an odometer that keeps 2 poses or more, not of {name!r}")
+            if self.sensing[name].loop_reach_m is not None and getattr(robot.sensors[name], "keep", 1) == 1:
+                raise expected(f"loop_reach_m of an odometer whose keep is 0, or 2 or more, not of {name!r}")
         return self
 
 
