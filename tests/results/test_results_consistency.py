@@ -11,6 +11,7 @@ from kalmark.results.measures import (
     anees_interval,
     diverged,
     left_jacobian_inverse,
+    most_nees,
     nees,
     nis,
     point_error,
@@ -82,3 +83,26 @@ def test_a_run_has_diverged_only_if_far_in_sigmas_and_in_metres() -> None:
     assert diverged(d, P, error, np.array([[0, 0], [20.0, 0]]))
     assert not diverged(d, P, error, np.array([[0, 0], [100.0, 0]]))
     assert not diverged(d, 100 * P, error, np.array([[0, 0], [20.0, 0]]))
+
+
+def test_the_most_of_a_mean_nees_is_that_of_one_value_for_an_error_that_lasts_and_less_for_one_that_does_not() -> None:
+    rng, N = np.random.default_rng(1), 300
+    d, P = rng.normal(size=3), np.tile(np.diag([0.01, 4.0, 1.0]), (N, 1, 1))
+    assert most_nees(np.tile(d, (N, 1)), P) == pytest.approx(chi2.ppf(0.9999, 3))
+    assert most_nees(rng.normal(size=(N, 3)) * [0.1, 2.0, 1.0], P) == pytest.approx(chi2.ppf(0.97, 3))
+    several = np.repeat(rng.normal(size=(4, 3)), 75, axis=0) * [0.1, 2.0, 1.0]
+    assert chi2.ppf(0.97, 3) < most_nees(several, P) < chi2.ppf(0.9999, 3) - 1.0
+    P[10:] = 0.0
+    assert np.isfinite(most_nees(np.tile(d, (N, 1)), P)) and np.isnan(most_nees(np.ones((2, 3)), P[-2:]))
+
+
+@pytest.mark.parametrize("rho", [0.9, 0.99, 0.999])
+def test_hardly_a_consistent_run_of_errors_that_last_has_a_mean_nees_above_what_it_may_be(rho: float) -> None:
+    rng, P, above = np.random.default_rng(3), np.tile(np.eye(3), (400, 1, 1)), 0
+    for _ in range(1000):
+        d, step = rng.normal(size=(400, 3)), np.sqrt(1.0 - rho**2)
+        for k in range(1, 400):
+            d[k] = rho * d[k - 1] + step * d[k]
+        above += float(np.mean(nees(d, P))) > most_nees(d, P)
+        assert float(np.mean(nees(10.0 * d, P))) > most_nees(10.0 * d, P) or rho == 0.999
+    assert above <= 2

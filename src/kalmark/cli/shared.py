@@ -17,6 +17,7 @@ from kalmark.results.words import (
     ROBOT,
     TOTALS,
     difference_rows,
+    figure,
     header,
     in_words,
 )
@@ -79,7 +80,6 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
     from kalmark.results.calibration import ESTIMATE_COLUMNS, MOUNT_COLUMNS, estimate_rows, mount_rows
     from kalmark.results.verdict import verdict_lines
-    from kalmark.results.warnings import POSE_NEES
 
     rows = [
         (label, number(summary[key], unit), unit)
@@ -97,9 +97,9 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         table = [(name, *(number(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
         print_table("", columns, table, align="<" + ">" * len(shown))
         if any(key == "pose_nees" for key, _, _ in shown):
-            dof = summary.get("pose_dof", 3)
-            several = f"{dof} averaged over many runs, up to {POSE_NEES[dof]:g} in a single one"
-            typer.echo(f"consistent pose NEES: {several}\n")
+            most = [figure(f["pose_nees_most"], 2) for f in robots.values() if f.get("pose_nees_most") is not None]
+            this = f", up to {', '.join(most)} in this one" if most else ""
+            typer.echo(f"consistent pose NEES: {summary.get('pose_dof', 3)} averaged over many runs{this}\n")
     mounts = mount_rows(summary)
     if mounts:
         print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")

@@ -8,6 +8,7 @@ an orientation is the rotation vector in the world's frame that turns the estima
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -21,6 +22,8 @@ from kalmark.geometry.rotations import from_matrix, multiply
 from kalmark.results.history import Ints
 
 SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix that still counts as regular
+TINY = 1e-300
+CONSISTENT, ALONE = 0.9999, 0.97  # of good runs, of single values: above them a NEES is worth a warning
 DIVERGED_SIGMAS = 10.0
 DIVERGED_PATH = 0.05
 
@@ -205,6 +208,31 @@ def nees(d: Array, P: Array) -> Array:
     scaled = np.where(regular[..., None], d / sigma, 0.0)
     value = np.einsum("...i,...i->...", scaled, np.linalg.solve(correlation, scaled[..., None])[..., 0])
     return np.where(regular, value, np.nan)
+
+
+def most_nees(d: Array, P: Array) -> float:
+    """Return what the mean NEES of errors d (N, n), covariances P (N, n, n), one after the other, may be in a good run.
+
+    They are worth N / (1 + 2 sum (1 - k / N) |C_k|^2 / n) independent ones, one at least: C_k (n, n) is the correlation
+    of errors in their sigmas over k steps, up to the first of which the trace is not positive.  The mean is below
+    in a share `CONSISTENT` of runs, and `most_nees` never below what one value is in a share `ALONE`, because the
+    correlation is that of this run, and changes along it.  NaN where every P is singular.
+    """
+    known = np.isfinite(nees(d, P))
+    d, P = d[known], P[known]
+    number, dof = d.shape
+    if not number:
+        return math.nan
+    sigma = np.sqrt(np.einsum("kii->ki", P))
+    L = np.linalg.cholesky(P / (sigma[:, :, None] * sigma[:, None, :]))
+    f = np.fft.rfft(np.linalg.solve(L, (d / sigma)[..., None])[..., 0], 2 * number, axis=0)
+    C = np.fft.irfft(f.conj()[:, :, None] * f[:, None, :], axis=0)[:number]
+    trace = np.einsum("kii->k", C)
+    first = int(np.argmax(trace <= 0.0)) if (trace <= 0.0).any() else number
+    left, scale = 1.0 - np.arange(1, first) / number, max(float(trace[0]) / dof, TINY)
+    squares = np.minimum(np.sum((C[1:first] / scale) ** 2, axis=(1, 2)) / left**2 / dof, dof)
+    independent = max(number / (1.0 + 2.0 * float(left @ squares)), 1.0)
+    return max(float(quantile(CONSISTENT, dof * independent)) / independent, float(quantile(ALONE, dof)))
 
 
 def nis(z: Array, Z: Array) -> tuple[Array, Ints]:
