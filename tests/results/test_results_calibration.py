@@ -73,7 +73,10 @@ def test_on_one_and_the_same_circle_a_turn_about_its_centre_is_not_observed_eith
 
 
 def test_what_was_not_observed_is_warned_of_and_stands_in_every_report(planar: Run, tmp_path: Path) -> None:
-    said = "mount r.eye: its z (z 1.00) was not observed: sigma 5 cm of 5 cm"
+    said = (
+        "mount r.eye: its z (z 1.00) was not observed: sigma 5 cm of 5 cm; with this route and noise it stays as "
+        "stated: measure it, or drive other turns and slopes"
+    )
     summary = planar.evaluate()
     assert [line for line in summary["warnings"] if line.startswith("mount")] == [said]
     assert summary["mounts"]["r.eye"]["directions"][0]["ratio"] == pytest.approx(1.0, abs=1e-6)
