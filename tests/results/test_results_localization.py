@@ -56,11 +56,21 @@ def test_a_path_without_landmarks_is_judged_as_a_path(tmp_path: Path) -> None:
     assert loaded.evaluate()["warnings"] == [] and loaded.history.localizes
 
 
-@pytest.mark.parametrize("keys", [{"sigma_m": 0.2}, {"bias_radps": 0.03}], ids=["noise", "bias"])
-def test_readings_that_are_off_make_a_path_doubtful(keys: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    ("keys", "name", "cure", "value"),
+    [
+        ({"sigma_m": 0.2}, "reading_sigma", "receiver.sigma_m", 0.5),
+        ({"bias_radps": 0.03}, "reading_offset", "gyro.bias_radps", 0.03),
+    ],
+    ids=["noise", "bias"],
+)
+def test_readings_that_are_off_make_a_path_doubtful_and_say_why(
+    keys: dict[str, float], name: str, cure: str, value: float
+) -> None:
     verdict = diagnose(run_of(**keys))
-    assert (verdict.map, verdict.causes[0].name) == ("doubtful", "misfit")
-    assert f"over {STEPS // 5} readings of receiver of rover" in verdict.causes[0].evidence
+    assert (verdict.map, verdict.causes[0].name) == ("doubtful", name)
+    key, found = verdict.causes[0].cure.removeprefix("--set robots.rover.sensors.").split("=")
+    assert key == cure and float(found) == pytest.approx(value, rel=0.2)
 
 
 def test_a_few_outliers_do_not_make_a_path_doubtful() -> None:

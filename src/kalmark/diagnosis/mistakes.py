@@ -97,7 +97,7 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
         cures = (corrected(config, "factors", (*where, column), factor) for where in sensors for column in which)
         by = np.array([factor if column in which else 1.0 for column in names])
         shrunk = dict.fromkeys(sensors, -math.log(float(np.abs(by).prod())))
-        return Mistake(name, evidence, " ".join(cures), config, _measured({*sensors}, lambda y: y * by), shrunk=shrunk)
+        return Mistake(name, evidence, " ".join(cures), config, measured({*sensors}, lambda y: y * by), shrunk=shrunk)
 
     if turned or names[:2] == ("x_m", "y_m"):
         evidence = f"directions of {of} fit only with their sign changed: clockwise, or upside down"
@@ -107,7 +107,7 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
     if names == ("range_m", "bearing_rad"):
         evidence = f"range and bearing of {of} are swapped"
         cure = "swap the columns range_m and bearing_rad"
-        yield Mistake("swapped_columns", evidence, cure, config, _measured({*sensors}, lambda y: y[:, ::-1]))
+        yield Mistake("swapped_columns", evidence, cure, config, measured({*sensors}, lambda y: y[:, ::-1]))
     for unit, factor in LENGTHS.items() if lengths else ():
         yield made("units", f"distances of {of} fit only if they are {unit}", lengths, factor)
 
@@ -212,7 +212,9 @@ def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> 
     return changed
 
 
-def _measured(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
+def measured(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
+    """Return what changes the measurements y (K, m) of some sensors."""
+
     def changed(e: Event) -> Event:
         if isinstance(e, Scan) and len(e.y) and (e.robot, e.sensor) in sensors:
             return at_time(e, e.t_ns, change(e.y))

@@ -12,17 +12,17 @@ from kalmark.arrays import Array
 from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
-from kalmark.diagnosis.gross import LOST, MOVED, fit, gross, started_at, until
+from kalmark.diagnosis.gross import FITS, LOST, MOVED, fit, gross, started_at, until
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.gross import MOST as MOST_D2
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.mounts import TURNED
+from kalmark.diagnosis.readings import NAMES, SIGMA, judged, reasons
 from kalmark.diagnosis.search import LEAST_GAIN, Search
 from kalmark.diagnosis.searched import MORE, WORST, Searched, misfits, searched
 from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError
-from kalmark.geometry.gaussian import quantile
 from kalmark.logs.log import Log
 from kalmark.results.batch import filtered_map, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
@@ -31,7 +31,7 @@ from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict import INNOVATIONS, NO_LANDMARKS, NO_MAP
-from kalmark.results.warnings import CHANCE, NO_ID, TOO_SMALL, placements, window_warnings, words_of
+from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, window_warnings, words_of
 from kalmark.results.words import count, figure
 from kalmark.slam.replacing import KEPT, NEEDED
 from kalmark.slam.surveyed import ELSEWHERE
@@ -103,12 +103,13 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     if not run.summary:
         run.evaluate()
     summary = run.summary
-    mistake = gross(run, log)
+    off, explained = readings_off(run, log)
+    mistake = None if explained else gross(run, log)
     if mistake is not None and mistake.share > FEW:
-        others = (cause for cause in _structural(run, log) if cause.name != MISFIT)
+        others = (cause for cause in _structural(run, log, off) if cause.name != MISFIT)
         verdict = Verdict("wrong", (_of_mistake(mistake), *others), "the log filtered again without the mistake")
     else:
-        verdict = _judged(run, log, most, progress)
+        verdict = _judged(run, log, off, most, progress)
         if mistake is not None:
             of_it = (mistake.name, "kidnapped") if mistake.name in (LATE, MOVED) else ()
             rest = [c for c in verdict.causes if c.name not in of_it]
@@ -128,9 +129,9 @@ def _of_mistake(mistake: Mistake) -> Cause:
     return Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
 
 
-def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
+def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first, limit = _structural(run, log), max(MOST, MORE * most)
+    first, limit = _structural(run, log, off), max(MOST, MORE * most)
     if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
         most = max(most, MOST)  # its reason may show in all of the log only
     try:
@@ -164,7 +165,7 @@ def _judged(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     causes = [*first, *(c for c in causes if c not in first)]
     causes.sort(key=lambda c: c.harmless)
     wrong = any(misplaced(run, f) for f in found.search.found) or any(map(stayed_lost, run.summary.get("gaps", ())))
-    wrong |= any(c.name in ("misplaced_landmark", "split_landmarks", MISFIT) and not c.harmless for c in first)
+    wrong |= any(c.name in ("misplaced_landmark", "split_landmarks", MISFIT, *NAMES) and not c.harmless for c in first)
     if any(c.name in JUMPS and not c.harmless for c in first):
         effect = replace(effect, status="wrong")
     elif effect.status == "ok" and wrong:
@@ -265,7 +266,7 @@ def misplaced(run: Run, finding: Finding) -> bool:
     return bool(np.linalg.norm(off) > SIGMAS * np.hypot(finding.sigma, np.sqrt(np.trace(P))))
 
 
-def _structural(run: Run, log: Log) -> list[Cause]:
+def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
     return [
         *carried_away(run, log),
@@ -274,7 +275,7 @@ def _structural(run: Run, log: Log) -> list[Cause]:
         *split_landmarks(run),
         *misplaced_landmarks(run),
         *fits_nothing(run),
-        *readings_off(run),
+        *off,
         *given_up(run),
         *_started_elsewhere(run),
         *_placed_elsewhere(run),
@@ -358,19 +359,26 @@ def fits_nothing(run: Run) -> Iterator[Cause]:
         yield Cause(MISFIT, begin_s(run), 0.5 * LOST * float(mine.sum()), f"only {evidence}", cure)
 
 
-def readings_off(run: Run) -> Iterator[Cause]:
-    """Yield the sensors of the state whose readings are further off than their noise and that of the pose allow."""
-    h, now = run.history, fit(run)
-    robots, d2 = h.robot[h.step], np.nan_to_num(h.d2)
-    for robot, sensor in sorted({*zip(robots[h.of_own].tolist(), h.sensor[h.of_own].tolist(), strict=True)}):
-        mine = h.of_own & (robots == robot) & (h.sensor == sensor)
-        dof, number = int(now.dof[mine].sum()), int(mine.sum())
-        mean = float(np.minimum(d2[mine], MOST_D2 * now.dof[mine]).sum()) / dof
-        if mean > max(MISFITS_ALL, float(quantile(1.0 - CHANCE, dof)) / dof):
-            score, of = 0.5 * dof * (mean - 1.0 - float(np.log(mean))), f"{number} readings of {sensor} of {robot}"
-            evidence = f"d2 per degree of freedom is {figure(mean, 2)} over {of}, where 1 is expected"
-            cure = "state more noise for it, or look for what lasts: a bias, a delay, its mount, a wrong start"
-            yield Cause(MISFIT, begin_s(run), score, evidence, cure)
+def readings_off(run: Run, log: Log) -> tuple[list[Cause], bool]:
+    """Return what is wrong with sensors of the state, and which do not fit all the same; whether that explains the run.
+
+    They are further off than their noise and that of the pose allow.  More noise explains nothing for sure.
+    """
+    now = judged(run)
+    if not now.off() and (not now.sensors() or len(run.landmarks) or fit(run).mean < MISFITS_ALL):
+        return [], False
+    found, after = reasons(run, log)
+    causes = [replace(_of_mistake(cause), since_s=begin_s(run)) for cause in found]
+    left = {*after.off()} if found and after is not None else {*now.off()}
+    for robot, sensor in (of for of in now.off() if of in left):
+        mine = now.of((robot, sensor))
+        dof, mean = int(now.dof[mine].sum()), now.mean((robot, sensor))
+        score, of = 0.5 * dof * (mean - 1.0 - float(np.log(mean))), f"{len(mine)} readings of {sensor} of {robot}"
+        evidence = f"d2 per degree of freedom is {figure(mean, 2)} over {of}, where 1 is expected"
+        cure = "state more noise for it, or look for what lasts: a bias, a delay, its mount, a wrong start"
+        causes.append(Cause(MISFIT, begin_s(run), score, evidence, cure))
+    fits = after is not None and not left and fit(after.run).mean < FITS
+    return causes, bool(found) and found[0].name != SIGMA and fits
 
 
 def _copied(run: Run, log: Log) -> list[Cause]:
