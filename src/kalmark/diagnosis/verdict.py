@@ -16,6 +16,7 @@ from kalmark.diagnosis.gross import FITS, LOST, MOVED, fit, gross, started_at, u
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.gross import MOST as MOST_D2
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
+from kalmark.diagnosis.lost import lost
 from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.mounts import TURNED
 from kalmark.diagnosis.readings import NAMES, SIGMA, judged, reasons
@@ -33,7 +34,7 @@ from kalmark.results.run import Run
 from kalmark.results.verdict import INNOVATIONS, NO_LANDMARKS, NO_MAP
 from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, window_warnings, words_of
 from kalmark.results.words import count, figure
-from kalmark.slam.replacing import KEPT, NEEDED
+from kalmark.slam.replacing import NEEDED
 from kalmark.slam.surveyed import ELSEWHERE
 from kalmark.tracks.surveys import MISFITS
 
@@ -116,7 +117,7 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
             verdict = replace(verdict, causes=(_of_mistake(mistake), *rest))
             if of_it and verdict.map == "ok":  # of late scans nothing is of a landmark in turns: they vanish, too
                 verdict = replace(verdict, map="doubtful")
-        if run.stopped or summary.get("diverged") or repeats(summary):
+        if run.stopped or summary.get("diverged") or repeats(summary) or any(_lost(run)):
             verdict = replace(verdict, map="wrong")
     summary["verdict"] = verdict.as_dict()
     first = next((cause.name for cause in verdict.causes if not cause.harmless), "noise")
@@ -279,6 +280,7 @@ def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
         *given_up(run),
         *_started_elsewhere(run),
         *_placed_elsewhere(run),
+        *_lost(run),
         *_copied(run, log),
     ]
 
@@ -309,6 +311,15 @@ def _placed_elsewhere(run: Run) -> Iterator[Cause]:
             yield Cause(MISFIT, first.t_ns * 1e-9, _left_out_until(run, mine), evidence, cure)
 
 
+def _lost(run: Run) -> Iterator[Cause]:
+    """Yield the robots that nothing places any more at the end of the run."""
+    for one in lost(run):
+        evidence = f"the last {one.number} {one.of} of {one.robot}, from t={one.since_s:.1f} s on, were left out: "
+        evidence += "it is not where the path says, or they are wrong"
+        cure = "look at what its controls and these say from then on, or state more noise"
+        yield Cause("lost", one.since_s, 0.5 * MOST_D2 * one.number, evidence, cure)
+
+
 def _left_out_until(run: Run, placed: Sequence[Placed]) -> float:
     """Return half of the chi-square of the readings that moved a robot: those left out in a row until it was moved."""
     h, now, score = run.history, fit(run), 0.0
@@ -316,7 +327,7 @@ def _left_out_until(run: Run, placed: Sequence[Placed]) -> float:
     for one in placed:
         mine = np.flatnonzero(of & (h.t_ns[h.step] <= one.t_ns))
         used = np.flatnonzero(h.outcome[mine] != "rejected")
-        rows = mine[used[-1] + 1 if len(used) else 0 :][-KEPT:]
+        rows = mine[used[-1] + 1 if len(used) else 0 :]
         score += 0.5 * float(np.minimum(h.d2[rows], MOST_D2 * now.dof[rows]).sum())
     return score
 
