@@ -32,7 +32,7 @@ from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.words import figure
 
-SCANS, OBSERVATIONS = 400, 3000  # of the log are filtered again
+SCANS, OBSERVATIONS, EVENTS = 400, 3000, 10_000  # of the log are filtered again, whatever comes first
 DETECTED = 7  # observations in a raw scan, or so
 FEW_SCANS = 80  # of them at first: a log that does not fit shows it soon
 FEW_SKIPPED = 0.02  # of the events may be refused in a log that fits
@@ -496,7 +496,7 @@ def _from(run: Run, log: Log, row: int) -> tuple[int, str, list[Event]]:
 
 
 def beginning(run: Run, events: Log | list[Event], most: int = SCANS) -> list[Event]:
-    """Return the first events with so many scans and observations; in a raw scan are few, however many its beams."""
+    """Return the first events, with so many scans and observations; in a raw scan are few, however many its beams."""
     robots = run.final_slam().robots.values()
     detected = {(r.name, name) for r in robots for name, m in r.sensors.items() if m.detector is not None}
     scans = observations = 0
@@ -504,7 +504,7 @@ def beginning(run: Run, events: Log | list[Event], most: int = SCANS) -> list[Ev
         if isinstance(event, Scan):
             number = DETECTED if (event.robot, event.sensor) in detected else len(event.y)
             scans, observations = scans + 1, observations + number
-            if scans >= most or observations >= OBSERVATIONS:
+            if scans >= most or observations >= OBSERVATIONS or n >= EVENTS:
                 return list(events)[: n + 1]
     return list(events)
 

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from kalmark.arrays import Array
-from kalmark.diagnosis.gross import ALIKE, FITS, MISFIT, MOST, filtered
+from kalmark.diagnosis.gross import ALIKE, FITS, MISFIT, MOST, beginning, filtered
 from kalmark.diagnosis.mistakes import Mistake, Where, measured, section_of, stated, with_value
 from kalmark.diagnosis.search import LEAST_GAIN
 from kalmark.diagnosis.words import corrected
-from kalmark.events import Event, Scan
+from kalmark.events import Event
 from kalmark.geometry.gaussian import quantile
 from kalmark.logs.log import Log
 from kalmark.models.protocols import POSE
@@ -265,7 +265,7 @@ def reasons(run: Run, log: Log) -> tuple[list[Mistake], Filtered | None]:
     """
     if not run.config.get("robots") or run.stopped:
         return [], None
-    config, events, found = dict(run.config), beginning(log), list[Mistake]()
+    config, events, found = dict(run.config), beginning(run, log, SCANS), list[Mistake]()
     now = filtered_with(config, log, events)
     while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
         of = [_Sensor(now, config, log, events, where) for where in now.tried()]
@@ -279,13 +279,3 @@ def reasons(run: Run, log: Log) -> tuple[list[Mistake], Filtered | None]:
         config, events = dict(first.config), [*map(first.change, events)] if first.change else events
         now = filtered_with(config, log, events)
     return found, now
-
-
-def beginning(log: Log) -> list[Event]:
-    """Return the first events of a log, with `SCANS` scans."""
-    scans = 0
-    for n, event in enumerate(log.events):
-        scans += isinstance(event, Scan)
-        if scans >= SCANS:
-            return list(log.events[: n + 1])
-    return list(log.events)
