@@ -90,7 +90,7 @@ def causes(world: str, sensor: str, fault: Fault, seed: int, more: list[str]) ->
 
 
 def main() -> None:
-    """Print a row for each fault."""
+    """Print a row for each fault, and the sum of each world."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("worlds", nargs="*", default=[*FAULTS])
     parser.add_argument("--seeds", type=int, default=3)
@@ -99,6 +99,7 @@ def main() -> None:
     parser.add_argument("--told", action="store_true")
     given = parser.parse_args()
     for world in given.worlds:
+        planted = of_all = of_named = good = accused = 0
         for sensor, faults in {"": [NONE], **FAULTS[world]}.items():
             for fault in faults:
                 alarmed = named = other = 0
@@ -111,11 +112,18 @@ def main() -> None:
                     right = [f for f in mine if f.startswith(f"{fault.name}:") and f"{robot}.{sensor} " in f]
                     alarmed, named = alarmed + bool(mine), named + bool(right)
                     other += bool([f for f in found if f not in right])
+                if sensor:
+                    planted, of_all, of_named = planted + number, of_all + alarmed, of_named + named
+                else:
+                    good, accused = number, other
                 what = f"{sensor}: {fault.what}" if sensor else "good"
                 print(
                     f"{world:18s} {what:40s} alarmed {alarmed}, named {named}, others {other} of {number}",
                     flush=True,
                 )
+        print(
+            f"sum of {world}: {of_all} alarmed, {of_named} named of {planted} planted; {accused} of {good} good accused"
+        )
 
 
 if __name__ == "__main__":

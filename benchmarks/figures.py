@@ -454,6 +454,10 @@ def diagnosis() -> Iterator[Figure]:
                  "85 %, 97 %", command, read)  # fmt: skip
     yield Figure(section, "clean simulated logs that are accused of anything (200)", "1 % at most", command,
                  row("clean:", "{0} of {2}"))  # fmt: skip
+    for world in ("lever_arm", "wheels_and_gyro", "compass_and_gyro", "stop_and_go"):
+        yield Figure(section, f"faults of sensors of the state, `{world}`: alarmed / named, of planted; good runs accused", "",
+                     f"python benchmarks/diagnosis_readings.py {world} --seeds 2 --clean 10",
+                     row(f"sum of {world}:", "{0} / {2} of {5}; {7} of {9}"))  # fmt: skip
     further = "python benchmarks/diagnosis_worlds.py"
     yield Figure(section, "planted faults, further worlds: first / among three", "85 %, 97 %", further, read)
     yield Figure(section, "planted faults, further worlds: clean logs that are accused of anything", "1 % at most", further,

@@ -116,3 +116,31 @@ def test_an_alternative_is_kept_when_a_map_is_saved(tmp_path: Path) -> None:
         assert len(unit.drive(37.0, 55.0)[1]) == 1
     np.testing.assert_array_equal(resumed.slam.mean("r"), whole.slam.mean("r"))
     np.testing.assert_array_equal(resumed.slam.covariance("r"), whole.slam.covariance("r"))
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+def test_of_two_robots_only_the_one_that_was_carried_away_is_moved(map_: str) -> None:
+    rng, truth = np.random.default_rng(0), {"a": np.zeros(3), "b": np.array([0.0, 5.0, 0.0])}
+    places = rng.uniform(-20.0, 20.0, (30, 2))
+    sensors = {"lidar": km.Mount(km.sensors.RangeBearing(0.1, 0.02)), "gps": km.Mount(km.sensors.Gps2D(0.5))}
+    start = np.diag([0.01, 0.01, 0.001])
+    robots = [km.Robot(name, km.motion.Odometry2D(), x, sensors=sensors, cov=start) for name, x in truth.items()]
+    slam, moves = km.Slam(robots, map=map_), []
+    for k in range(1, 161):
+        for name, before in truth.items():
+            u = np.array([0.5, 0.0, 0.05])
+            x = compose(before, u)[0]
+            if name == "b" and k == 60:
+                x = compose(np.array([400.0, -30.0, 1.0]), x)[0]
+            truth[name] = x
+            slam.process(km.Control(0.5 * k, name, u + rng.normal(0.0, [0.01, 0.0, 0.01])))
+            y = km.geometry.observe(x, places)[0]
+            ids = np.flatnonzero(y[:, 0] < 12.0).tolist()
+            noise = rng.normal(size=(len(ids), 2)) * (0.1, 0.02)
+            slam.process(km.Scan(0.5 * k, name, "lidar", y[ids] + noise, ids))
+            report = slam.process(km.Scan(0.5 * k, name, "gps", [x[:2] + rng.normal(0.0, 0.5, 2)]))
+            moves += [(0.5 * k, name)] if report.replaced else []
+    assert moves == [(60.0, "b")]
+    for name, x in truth.items():
+        error = slam.robots[name].motion.space.minus(slam.mean(name), x)
+        assert error @ np.linalg.solve(slam.covariance(name), error) < 16.3
