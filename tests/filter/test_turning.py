@@ -195,7 +195,7 @@ def test_a_correction_along_what_a_robot_and_its_mount_leave_open_moves_no_senso
     d, after, moved = N @ rng.normal(0, 0.3, k), x.copy(), retract_plane if plane else retract
     rows = turning.turning_rows(space.atoms, (n, 2 * n, t, 2 * k, 0, 0), H)
     R, turn = turning.frame_of(x, 0, t), turning.gauge(x, d, rows, t)
-    L = turning.leaning(P[rows[0]], rows[0], space.atoms, rows, t, R)
+    L = turning.leaning(P[rows[0]], rows[0], space.atoms, rows, t, R, False)
     E, W, d_lean = turning.turns_of(turn, d, rows, t)
     moved(space.atoms, after, d, turn)
     turning.carry(space.atoms, after, L, W, d_lean)

@@ -119,7 +119,9 @@ def test_a_path_whose_scale_nothing_tells_has_no_nees_and_diverges_by_its_shape_
     truth = np.column_stack([np.cumsum(rng.normal(size=(60, 3)), axis=0), np.tile([0.0, 0.0, 0.0, 1.0], (60, 1))])
     P = np.tile(1e-4 * np.eye(6), (60, 1, 1))
     small = np.column_stack([0.3 * truth[:, :3], truth[:, 3:]])
-    assert of_a_free_scale(small, P, truth) == {"pose_nees": None, "pose_nees_world": None, "diverged": False}
+    assert of_a_free_scale(small, P, truth) == {
+        "pose_nees": None, "pose_nees_most": None, "pose_nees_world": None, "diverged": False,
+    }  # fmt: skip
     lost = small + np.r_[np.zeros(40), np.full(20, 15.0)][:, None] * np.r_[1.0, np.zeros(6)]
     assert of_a_free_scale(lost, P, truth)["diverged"]
 

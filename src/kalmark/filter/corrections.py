@@ -169,7 +169,7 @@ def iterate(
     theta = turning[0]
     correction, origin = np.zeros(len(P_ss)), mean[:3].copy()
     R_r = frame_of(mean, 0, axes)
-    L = leaning(rows_of(P_ss, theta, len(P_ss)), theta, table, turning, axes, R_r)
+    L = leaning(rows_of(P_ss, theta, len(P_ss)), theta, table, turning, axes, R_r, ways[_SPREAD] != 0)
     then = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
     turn = np.zeros(axes)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
@@ -306,7 +306,7 @@ def invariant(
     turning = turning_rows(table, sizes, linear[1])
     theta = picked(index, turning[0])
     R_r = frame_of(x, at, axes)
-    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r)
+    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
     then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     V, correction = gain(sparse_product(H, rows_of(P, index, n), h + sizes[4], count), M, v)
     depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
@@ -438,7 +438,7 @@ def averaged(
     at, origin, turning = blocks[robot, 0], mean[:3].copy(), turning_rows(table, sizes, H)
     theta, own = picked(index, turning[0]), correction[index]
     R_r = frame_of(x, at, axes)
-    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r)
+    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
     then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     step, turn = correction, gauge(mean, own, turning, axes) if transports else np.zeros(0)
     if transports:

@@ -153,12 +153,12 @@ def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
 
 
 @compiled
-def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array) -> Array:
+def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array, rays: bool) -> Array:
     """Return L (n, m): how each vector of some atoms leans on the m rows of a mount and of other units' rotations.
 
     `B` (k, n) are the rows of P, before the correction, of all rows that turn; `index` are these rows, R that of the
     robot's rotation.  The rotation of the sensor explains its part, too.  On a mount that turns the map leans the
-    position of its own robot alone.
+    position of its own robot alone, and with `rays` in the map nothing: their parallaxes count from that position.
     """
     _rows, turns, arm = turning
     m, (t, s) = len(index) - axes, (1, 2) if axes == 1 else (3, 3)
@@ -172,7 +172,7 @@ def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R
                 W[t + c, b] -= R[a, c] * W[a, b]
     for a in range(len(atoms)):
         for j in range(atoms[a, 2], atoms[a, 2] + vectors(atoms[a, 0])):
-            for c in range(0 if turns == 0 or robot - s <= j < robot else turns + arm, m):
+            for c in range(0 if turns == 0 or (robot - s <= j < robot and not rays) else turns + arm, m):
                 for b in range(t + m):
                     L[j, c] += W[t + c, b] * B[axes - t + b, j]
     return L
