@@ -24,6 +24,7 @@ from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Fix, Scan, order
 from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
+from kalmark.logs.progress import track
 from kalmark.report import ALONE
 from kalmark.results.gaps import while_lost
 from kalmark.results.history import Start
@@ -112,7 +113,7 @@ def explained(before: Fit, after: Fit) -> float:
     return 0.5 * ((before.chi2 if len(before.values) else refused) - after.chi2)
 
 
-def gross(run: Run, log: Log) -> Mistake | None:
+def gross(run: Run, log: Log, progress: bool = False) -> Mistake | None:
     """Return the mistake that explains why a run does not fit, None if it does fit or if none explains it."""
     if not run.config.get("robots"):
         return None
@@ -124,19 +125,21 @@ def gross(run: Run, log: Log) -> Mistake | None:
     if now.mean < MISFIT and not run.stopped:
         found = exchanged(run, log, now)
     else:
-        found = likeliest(run, log, beginning(run, log), run.config) or exchanged(run, log, now)
+        found = likeliest(run, log, beginning(run, log), run.config, progress) or exchanged(run, log, now)
         found = found or (None if first is None else kidnapped(run, log, now, first))
     return found or (None if first is None else later(run, log, first))
 
 
-def likeliest(run: Run, log: Log, events: list[Event], config: Mapping[str, Any]) -> Mistake | None:
+def likeliest(
+    run: Run, log: Log, events: list[Event], config: Mapping[str, Any], progress: bool = False
+) -> Mistake | None:
     """Return the mistake without which events fit best, None if they fit as they are or without none."""
     as_it_is = fit_of(config, log, events)
     if as_it_is.mean < MISFIT:
         return None
     few, made = beginning(run, events, FEW_SCANS), []
     few_as_they_are = fit_of(config, log, few)
-    for mistake in mistakes(config, run):
+    for mistake in track([*mistakes(config, run)], "mistakes, one after the other", show=progress):
         if not fit_without(mistake, log, few).fits(MISFIT, few_as_they_are):
             continue
         after = fit_without(mistake, log, events)

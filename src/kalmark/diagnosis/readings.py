@@ -22,6 +22,7 @@ from kalmark.diagnosis.words import corrected
 from kalmark.events import Event
 from kalmark.geometry.gaussian import quantile
 from kalmark.logs.log import Log
+from kalmark.logs.progress import track
 from kalmark.models.protocols import POSE
 from kalmark.models.state_sensors import StateSensor
 from kalmark.results.calibration import mount_figures
@@ -124,11 +125,12 @@ class _Sensor:
         self.path = ("robots", section_of(config, of[0]), "sensors", of[1])
         self.size = float(np.sqrt(np.nanmax(np.mean(run.history.z[as_it_is.of(of)] ** 2, axis=0))))
 
-    def trials(self) -> Iterator[Mistake]:
-        """Yield all without which the log is likelier, and its readings fit."""
-        for found in (self.noise(), *self.constants(), *self.signs(), self.scale()):
-            if found is not None:
-                yield found
+    def trials(self) -> Iterator[Mistake | None]:
+        """Yield of each what it was, None where the log is not likelier without it, or its readings do not fit."""
+        yield self.noise()
+        yield from self.constants()
+        yield from self.signs()
+        yield self.scale()
 
     def key(self, name: str) -> str:
         return f"robots.{self.where[0]}.sensors.{self.where[1]}.{name}"
@@ -258,7 +260,7 @@ def _same(told: tuple[str, str], _: Filtered) -> tuple[str, str]:
     return told
 
 
-def reasons(run: Run, log: Log) -> tuple[list[Mistake], Filtered | None]:
+def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], Filtered | None]:
     """Return what is wrong with sensors of the state of a run that does not fit, and how the log fits without it.
 
     Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.
@@ -269,7 +271,8 @@ def reasons(run: Run, log: Log) -> tuple[list[Mistake], Filtered | None]:
     now = filtered_with(config, log, events)
     while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
         of = [_Sensor(now, config, log, events, where) for where in now.tried()]
-        tried = sorted((m for sensor in of for m in sensor.trials()), key=lambda m: -m.gain)
+        trials = track((m for sensor in of for m in sensor.trials()), "sensors of the state, tried", show=progress)
+        tried = sorted((m for m in trials if m is not None), key=lambda m: -m.gain)
         if not tried:
             break
         first, *others = tried

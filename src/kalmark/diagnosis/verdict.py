@@ -104,8 +104,8 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     if not run.summary:
         run.evaluate()
     summary = run.summary
-    off, explained = readings_off(run, log)
-    mistake = None if explained else gross(run, log)
+    off, explained = readings_off(run, log, progress)
+    mistake = None if explained else gross(run, log, progress)
     if mistake is not None and mistake.share > FEW:
         others = (cause for cause in _structural(run, log, off) if cause.name != MISFIT)
         verdict = Verdict("wrong", (_of_mistake(mistake), *others), "the log filtered again without the mistake")
@@ -370,7 +370,7 @@ def fits_nothing(run: Run) -> Iterator[Cause]:
         yield Cause(MISFIT, begin_s(run), 0.5 * LOST * float(mine.sum()), f"only {evidence}", cure)
 
 
-def readings_off(run: Run, log: Log) -> tuple[list[Cause], bool]:
+def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]:
     """Return what is wrong with sensors of the state, and which do not fit all the same; whether that explains the run.
 
     They are further off than their noise and that of the pose allow.  More noise explains nothing for sure.
@@ -378,7 +378,7 @@ def readings_off(run: Run, log: Log) -> tuple[list[Cause], bool]:
     now = judged(run)
     if not now.off() and (not now.sensors() or len(run.landmarks) or fit(run).mean < MISFITS_ALL):
         return [], False
-    found, after = reasons(run, log)
+    found, after = reasons(run, log, progress)
     causes = [replace(_of_mistake(cause), since_s=begin_s(run)) for cause in found]
     left = {*after.off()} if found and after is not None else {*now.off()}
     for robot, sensor in (of for of in now.off() if of in left):
