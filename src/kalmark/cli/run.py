@@ -91,7 +91,7 @@ def judge(result: Run) -> None:
     """Put a short verdict into the summary of a run."""
     from kalmark.diagnosis.verdict import SHORT, diagnose
 
-    diagnose(result, SHORT)
+    diagnose(result, SHORT, progress=True)
 
 
 def finish(result: Run, out: Path, title: str) -> None:
