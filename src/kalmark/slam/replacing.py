@@ -4,8 +4,9 @@ Fixes are positions of the robot, or those of an antenna on it, which a sensor o
 
 A fix outside its gate is left out.  A filter that has lost its robot would leave out all of them.  So the last fixes
 that were left out, one after the other, are compared with where the filter believed the robot to be: if a shift and a
-turn about the vertical axis lead from there to all of them, within their noise, the robot is moved by it.  What that
-does not determine, and all correlation of the robot with the map, is given up.
+turn about the vertical axis lead from there to all of them, within their noise, the robot is moved by it, or,
+where fixes have fitted before, an `alternative` begins there.  What that does not determine, and all correlation of the
+robot with the map, is given up.
 
 If nothing has said yet where the map is in the world, no survey and fewer fixes that fitted than must agree, it was the
 start that was wrong: then the whole map is moved with the robot.  Its covariance gets that of the shift and of the
