@@ -10,6 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.config import Config, build_slam, config_dict, load_config, open_config_log, slam_from_config
+from kalmark.config.opening import open_run
 from kalmark.config.sections import section_of
 from kalmark.declare import classes, parameters
 from kalmark.errors import ConfigError
@@ -72,7 +73,7 @@ def test_without_truth_a_robot_starts_at_the_origin(tmp_path: Path) -> None:
     assert build_slam(config_of("map: {type: auto}", tmp_path), log).mean("a") == pytest.approx([0, 0, 0])
 
 
-def test_a_named_robot_has_its_own_models_and_each_serves_the_rest(tmp_path: Path) -> None:
+def test_a_named_robot_has_its_own_models_beside_those_of_each(tmp_path: Path) -> None:
     text = """\
 robots:
   each: {sensors: {lidar: {type: range_bearing}}}
@@ -84,7 +85,7 @@ robots:
 """
     slam = build_slam(config_of(text, tmp_path), log_of("a", "b"))
     a, b = slam.robots["a"], slam.robots["b"]
-    assert (list(a.sensors), list(b.sensors)) == (["lidar"], ["sonar", "tags"])
+    assert (list(a.sensors), list(b.sensors)) == (["lidar"], ["lidar", "sonar", "tags"])
     assert a.motion == km.motion.Unicycle()
     assert b.motion == km.motion.Unicycle(sigma_v_mps=7)
     assert b.sensors["sonar"].sensor == km.sensors.Range(sigma_range_rel=0.5)
@@ -140,3 +141,28 @@ def test_a_log_of_a_format_with_options_is_opened_with_them(data: object, tmp_pa
     near = open_config_log(load_config("lost_in_the_woods", ["log.to_s=30", "log.r_max=2.0"]))
     assert max(e.y[:, 0].max() for e in far if isinstance(e, km.Scan)) > 2.0
     assert max(e.y[:, 0].max() for e in near if isinstance(e, km.Scan)) <= 2.0
+
+
+def test_each_lies_below_named_robots_and_sensors_of_a_file_and_of_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log/controls.csv").write_text("t_s,robot,v_mps,w_radps\n0,a,1,0\n0,b,1,0\n")
+    (tmp_path / "log/scans.csv").write_text(
+        "t_s,robot,sensor,id,range_m,bearing_rad\n.1,a,left,1,2,.1\n.1,a,right,1,2,.1\n.1,b,left,1,2,.1\n"
+    )
+    path = tmp_path / "mine.yaml"
+    path.write_text("""log: {path: log}
+robots:
+  each: {motion: {type: unicycle, sigma_v_mps: 0.3}, sensors: {each: {type: range_bearing, sigma_range_m: 0.2}}}
+  a: {motion: {sigma_w_radps: 0.4}, sensors: {left: {sigma_bearing_rad: 0.5}}}
+""")
+    overrides = ["robots.each.sensors.each.sigma_range_rel=0.1", "robots.b.sensors.left.sigma_range_m=0.7"]
+    config, log = open_run(path, None, overrides)
+    slam = build_slam(config, log)
+    motion = slam.robots["a"].motion
+    assert (motion.sigma_v_mps, motion.sigma_w_radps) == (0.3, 0.4)
+    left, right, other = (slam.robots[r].sensors[s].sensor for r, s in (("a", "left"), ("a", "right"), ("b", "left")))
+    assert (left.sigma_range_m, left.sigma_bearing_rad, left.sigma_range_rel) == (0.2, 0.5, 0.1)
+    assert (right.sigma_range_m, right.sigma_range_rel, other.sigma_range_m) == (0.2, 0.1, 0.7)
+    assert list(slam.robots["b"].sensors) == ["left"]
+    with pytest.raises(ConfigError, match=r"mine.yaml:3:.*robots.a.sensors.each: got each without a log, expected the"):
+        build_slam(load_config(path))

@@ -161,8 +161,7 @@ association: {gate: off}
 """
     slam = build_slam(*opened(text, log_of("a", "b")))
     a, b = slam.robots["a"], slam.robots["b"]
-    assert a.motion == km.motion.Odometry3D(sigma_x_m=0.5, sigma_y_m=0.6)
-    assert b.motion == km.motion.Odometry3D(sigma_x_m=0.5, sigma_y_m=0.7)
+    assert a.motion == b.motion == km.motion.Odometry3D(sigma_x_m=0.5, sigma_y_m=0.7)
     assert slam.mean("a")[:3] == pytest.approx([1, 0, 4])
     assert a.sensors["radar"].sensor == km.sensors.RangeBearing3D(sigma_range_m=0.3, sigma_azimuth_rad=0.5)
     assert a.sensors["eye"].sensor == km.sensors.Position3D()

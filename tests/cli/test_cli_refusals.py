@@ -248,10 +248,6 @@ NAMED = "robots: {rover: {motion: {type: unicycle}, sensors: {lidar: {type: rang
     ("setting", "message"),
     [
         (
-            "robots.each.sensors.lidar.sigma_range_m=.3",
-            "robots.each: no robot takes it, as each one is named, expected robots.",
-        ),
-        (
             "robots.rovre.motion.sigma_v_mps=.3",
             "robots.rovre: got a robot that is not in this log or run, expected one of rov",
         ),
@@ -268,8 +264,7 @@ def test_what_is_set_and_nothing_takes_is_refused(
     for more in ((), ("--set", "log.robots=[rover]")):
         said = refused(kalmark("run", tmp_path / "named.yaml", "--log", log, "--set", setting, *more))
         assert said.startswith(f"--set {setting}: {message}")
-        if "each" not in setting:
-            assert said.endswith("; did you mean rover?" if "rovre" in setting else "; did you mean the sensor lidar?")
+        assert said.endswith("; did you mean rover?" if "rovre" in setting else "; did you mean the sensor lidar?")
 
 
 def test_a_robot_that_is_set_alone_leaves_no_warning_of_each(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
@@ -279,11 +274,10 @@ def test_a_robot_that_is_set_alone_leaves_no_warning_of_each(kalmark: Kalmark, l
 
 
 def test_what_is_configured_and_serves_nothing_is_said_in_one_line(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:
-    (tmp_path / "named.yaml").write_text("robots: {each: {}, " + NAMED.removeprefix("robots: {"))
+    (tmp_path / "named.yaml").write_text(NAMED)
     run = ("run", tmp_path / "named.yaml", "--log", log)
     lines = kalmark(*run, "--set", "robots.rover.sensors.lidra.type=range").out.splitlines()
     assert [line for line in lines if line.startswith("warning")] == [
-        "warning: robots.each of the configuration stands for no robot of the log: each one is named",
         "warning: no observation is by the sensor lidra of rover, which is configured; did you mean lidar?",
     ]
 

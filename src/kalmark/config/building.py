@@ -15,6 +15,7 @@ from kalmark.config.opening import described, known_path, open_run
 from kalmark.config.reading import did_you_mean, load_config
 from kalmark.config.schema import TRUTH, Config, SpaceStartConfig, covariance_of, pose_of, state_of
 from kalmark.config.sections import model_of
+from kalmark.config.tree import EACH
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
@@ -95,11 +96,13 @@ def _plain(value: Any) -> Any:
 
 def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     """Return one robot with its sensors, started where the configuration says, or else the log's truth."""
-    key = name if name in config.robots else "each"
+    key = name if name in config.robots else EACH
     if key not in config.robots:
         near = did_you_mean(name, [*config.robots])
         raise config.error(("robots",), f"got {', '.join(config.robots)}, expected {name!r} of the log, or each{near}")
     robot, path = config.robots[key], ("robots", key)
+    if EACH in robot.sensors:
+        raise config.error((*path, "sensors", EACH), "got each without a log, expected the sensors by their names")
     moves = _made(config, (*path, "motion"), model_of, robot.motion)
     if log is not None:
         refuse_controls(config, key, name, moves.columns, log)
@@ -117,7 +120,7 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
 
 
 def _names(config: Config, log: Log | None) -> list[str]:
-    named = [name for name in config.robots if name != "each"]
+    named = [name for name in config.robots if name != EACH]
     if log is None:
         return named or ["robot"]
     for name in named if config.log.robots is None else ():

@@ -48,8 +48,10 @@ estimator: {{type: invariant}}
 
 A log may describe its own rig: a recording its camera, a data set its calibration and the noise of its sensors.  Then
 a key that is left out, in any section here, has the log's value, and a section may hold single keys without its `type`;
-another `type` than the log's drops what the log says of that section, but for a mount.  `each` here stands for the
-robots that have no entry of their own; `--set` of a robot without one is laid over `each`.
+another `type` than the log's drops what the log says of that section, but for a mount.
+
+`robots.each` holds for every robot, `sensors.each` for every sensor of the log.  An entry with a name beside it is laid
+over it, key by key; so is `--set` of a name that has no entry, and `--set` of `each` is set for all of them.
 
 Lengths are metres, angles radians (degrees in keys that end in `_deg`), times seconds.  Robots move in the plane or in
 space, as their `motion` says, all robots of a log in the same; mounts and starts have other keys in each.  A control's

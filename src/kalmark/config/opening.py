@@ -10,13 +10,12 @@ from typing import Any
 from kalmark.config.images import complete, with_images
 from kalmark.config.reading import ENDINGS, config_of, did_you_mean, resolve_config, shipped_configs
 from kalmark.config.schema import COMMON, TRUTH, Config
-from kalmark.config.tree import OVERRIDE, Tree, read_tree, tree_of
+from kalmark.config.tree import EACH, OVERRIDE, Tree, merged, read_tree, tree_of, with_each
 from kalmark.errors import ConfigError, LogError
+from kalmark.events import Frame, Scan
 from kalmark.logs import FORMATS, find_data, open_log
 from kalmark.logs.formats import recognise
 from kalmark.logs.log import Log
-
-EACH = "each"
 
 
 def open_run(
@@ -37,7 +36,7 @@ def open_run(
     alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
     log = open_config_log(alone, progress=progress)
     refuse_idle(tree, log)
-    for_each(tree, log)
+    resolve_each(tree, log)
     whole = laid_over(tree, log)
     complete(whole)
     config = config_of(whole, path)
@@ -149,16 +148,6 @@ def check_format(config: Config, path: Path) -> None:
             raise config.error(("log", key), message)
 
 
-def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Return `below` with `above` laid over it, key by key; another `type` replaces its section, but for a mount."""
-    other = "type" in above and above["type"] != below.get("type", above["type"])
-    result = {key: value for key, value in below.items() if not other or key == "mount"}
-    for key, value in above.items():
-        old = result.get(key)
-        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-    return result
-
-
 def laid_over(tree: Tree, log: Log) -> Tree:
     """Return a configuration laid over what its log describes: what the user wrote wins, key by key.
 
@@ -173,36 +162,23 @@ def laid_over(tree: Tree, log: Log) -> Tree:
     below["robots"] = {name: merged(theirs.get(EACH, {}), theirs.get(name, {})) for name in log.robots}
     if isinstance(mine, dict):
         for name in log.robots:
-            if name not in mine:
-                mine[name] = deepcopy(mine.get(EACH, {}))
-                for table in (out.keys, out.places):  # it was written there
-                    table |= {("robots", name, *p[2:]): at for p, at in table.items() if p[:2] == ("robots", EACH)}
+            if name not in mine and EACH in mine:
+                out.share(mine, ("robots",), name)
         above["robots"] = {name: value for name, value in mine.items() if name != EACH}
     out.values = merged(below, above)
     _place(out, out.values, (), str(log.path or log.name))
     return out
 
 
-def for_each(tree: Tree, log: Log) -> None:
-    """Lay what the command line sets for a robot that the file does not name over the file's `each`, in place.
-
-    If `each` then stands for no robot, it is left out: the file is not to blame for that.
-    """
-    robots: Any = tree.values.get("robots")
-    each: Any = robots.get(EACH) if isinstance(robots, dict) else None
-    laid = False
-    for name in log.robots if isinstance(each, dict) else ():
-        places = [at for path, at in tree.places.items() if path[:2] == ("robots", name)]
-        if isinstance(robots.get(name), dict) and all(at.startswith(OVERRIDE) for at in places):
-            robots[name], laid = merged(deepcopy(each), robots[name]), True
-            for table in (tree.keys, tree.places):
-                table |= {
-                    ("robots", name, *path[2:]): at
-                    for path, at in table.items()
-                    if path[:2] == ("robots", EACH) and ("robots", name, *path[2:]) not in table
-                }
-    if laid and all(name in robots for name in log.robots):
-        del robots[EACH]
+def resolve_each(tree: Tree, log: Log) -> None:
+    """Let ``sensors.each`` stand for the log's sensors; leave ``robots.each`` out where all robots have entries."""
+    for node, path in with_each(tree.values):
+        if path[-1] == "sensors":
+            scans = (e for e in log.events if isinstance(e, Scan | Frame) and path[1] in (e.robot, EACH))
+            for sensor in sorted({scan.sensor for scan in scans} - node.keys()):
+                tree.share(node, path, sensor)
+        if path[-1] == "sensors" or all(name in node for name in log.robots):
+            del node[EACH]
 
 
 def _place(tree: Tree, values: dict[str, Any], path: tuple[str, ...], log: str) -> None:
@@ -219,14 +195,8 @@ def refuse_idle(tree: Tree, log: Log) -> None:
     """Refuse what was set on the command line for robots of which the log has none."""
     named: Any = tree.values.get("robots")
     for path, place in tree.places.items() if isinstance(named, dict) else ():
-        if path[:1] != ("robots",) or len(path) < 2 or path[1] in log.robots or not place.startswith(OVERRIDE):
+        if path[:1] != ("robots",) or len(path) < 2 or path[1] in (*log.robots, EACH) or not place.startswith(OVERRIDE):
             continue
-        if path[1] != EACH:
-            near = did_you_mean(path[1], log.robots)
-            wanted = f"one of {', '.join(log.robots)}{near}"
-            raise ConfigError(
-                f"{place}: robots.{path[1]}: got a robot that is not in this log or run, expected {wanted}"
-            )
-        if all(name in named for name in log.robots):
-            names = " or ".join(f"robots.{name}" for name in log.robots)
-            raise ConfigError(f"{place}: robots.each: no robot takes it, as each one is named, expected {names}")
+        near = did_you_mean(path[1], log.robots)
+        wanted = f"one of {', '.join(log.robots)}{near}"
+        raise ConfigError(f"{place}: robots.{path[1]}: got a robot that is not in this log or run, expected {wanted}")

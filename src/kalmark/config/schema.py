@@ -420,7 +420,7 @@ class RobotConfig(_AnyRobot):
     start: StartConfig | None = None
     """Start; if absent, the log's truth, or else the origin."""
     sensors: dict[str, PlaneSensor] = Field(default_factory=dict)
-    """Sensors by the log's name of each."""
+    """Sensors by the log's names; `each` holds for all of them."""
 
 
 class SpaceRobotConfig(_AnyRobot):
@@ -429,7 +429,7 @@ class SpaceRobotConfig(_AnyRobot):
     start: SpaceStartConfig | None = None
     """Start; if absent, the log's truth, or else the origin."""
     sensors: dict[str, SpaceSensor] = Field(default_factory=dict)
-    """Sensors by the log's name of each."""
+    """Sensors by the log's names; `each` holds for all of them."""
 
 
 def robot_world(robot: Any) -> str:
@@ -503,7 +503,7 @@ class Config(OfFile):
     log: LogConfig = LogConfig()
     """The log."""
     robots: dict[str, AnyRobot] = Field(default_factory=_each)
-    """Robots by name; `each` stands for every robot not named."""
+    """Robots by name; `each` holds for all of them."""
     landmarks: Landmark | None = None
     """Landmark type; what fits each sensor if absent."""
     association: Association = section_of("association", "identity")()

@@ -1,9 +1,14 @@
-"""A YAML file as plain values, each remembering where it stood; and `--set` overrides laid over it."""
+"""YAML files as plain values with their places, and `--set` overrides laid over them.
+
+What a file says of ``robots.each`` or ``sensors.each`` lies below the entries named beside it, key by key.  An override
+of `each` is one of all entries; one of a name that the file does not have begins with what `each` is.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +21,8 @@ from ruamel.yaml.reader import ReaderError
 
 from kalmark.errors import ConfigError
 
+EACH = "each"
+SHARED = ("robots", "sensors")  # the mappings whose entry `each` stands for all
 OVERRIDE = "--set "  # how the place begins of what was set on the command line
 _MOST = 100_000  # aliases can repeat a few lines more often than memory holds
 _DEEPEST = 12  # a configuration is 5 levels deep; an alias to its own parent has no end
@@ -47,6 +54,34 @@ class Tree:
             return self.keys[path]
         return next((self.places[path[:n]] for n in range(len(path), -1, -1) if path[:n] in self.places), "")
 
+    def share(self, node: dict[str, Any], path: tuple[str, ...], name: str) -> None:
+        """Lay the entry `name` of the mapping `node`, at `path`, over its `each`, which then was written there, too."""
+        each, own = deepcopy(node[EACH]), node.get(name)
+        node[name] = each if own is None else merged(each, own) if isinstance(own, dict) else own
+        for table in (self.keys, self.places):
+            for p in [p for p in table if p[: len(path) + 1] == (*path, EACH)]:
+                table.setdefault((*path, name, *p[len(path) + 1 :]), table[p])
+
+
+def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Return `below` with `above` laid over it, key by key; another `type` replaces its section, but for a mount."""
+    other = "type" in above and above["type"] != below.get("type", above["type"])
+    result = {key: value for key, value in below.items() if not other or key == "mount"}
+    for key, value in above.items():
+        old = result.get(key)
+        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return result
+
+
+def with_each(values: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[dict[str, Any], tuple[str, ...]]]:
+    """Yield the mappings of robots and of their sensors that have an `each`, robots first, with their paths."""
+    for key in SHARED if isinstance(values, dict) else ():
+        node = values.get(key)
+        if isinstance(node, dict) and isinstance(node.get(EACH), dict):
+            yield node, (*path, key)
+        for name in list(node) if isinstance(node, dict) else ():
+            yield from with_each(node[name], (*path, key, name))
+
 
 def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
     """Return the YAML 1.2 file at `path` with the overrides applied.
@@ -66,6 +101,9 @@ def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
     tree = Tree()
     tree.values = _plain(content, (), tree, str(path))
     tree.places[()] = f"{path}:1:1"
+    for node, where in with_each(tree.values):
+        for name in [name for name in node if name != EACH]:
+            tree.share(node, where, name)
     for override in overrides:
         _override(tree, override)
     return tree
@@ -157,15 +195,28 @@ def _override(tree: Tree, override: str) -> None:
     path = tuple(part.strip() for part in dotted.split("."))
     if not equals or not all(path):
         raise ConfigError(f"{where}: got no key and value, expected key.path=value")
-    node = tree.values
-    for depth, part in enumerate(path[:-1], 1):
-        if node.get(part) is None:
-            node[part] = {}
-            tree.keys[path[:depth]] = tree.places[path[:depth]] = where
-        node = node[part]
-        if not isinstance(node, dict):
-            raise ConfigError(f"{where}: {'.'.join(path[:depth])}: got {show(node)}, expected a mapping of keys")
-    value = parse_value(text, where)
+    _set(tree, tree.values, path, 0, parse_value(text, where), where)
+
+
+def _set(tree: Tree, node: dict[str, Any], path: tuple[str, ...], depth: int, value: Any, where: str) -> None:
+    """Set the value at `path` below `node`, which is `depth` keys deep."""
+    if depth == len(path) - 1:
+        _replace(tree, node, path, value, where)
+        return
+    part, among = path[depth], depth > 0 and path[depth - 1] in SHARED
+    if among and part not in node and isinstance(node.get(EACH), dict):
+        tree.share(node, path[:depth], part)
+    for name in [*node] if among and part == EACH and node else [part]:
+        here = (*path[:depth], name)
+        if node.get(name) is None:
+            node[name] = {}
+            tree.keys[here] = tree.places[here] = where
+        if not isinstance(node[name], dict):
+            raise ConfigError(f"{where}: {'.'.join(here)}: got {show(node[name])}, expected a mapping of keys")
+        _set(tree, node[name], (*here, *path[depth + 1 :]), depth + 1, deepcopy(value), where)
+
+
+def _replace(tree: Tree, node: dict[str, Any], path: tuple[str, ...], value: Any, where: str) -> None:
     if path[-1] == "type" and node.get("type", value) != value:  # another type has other keys; a mount stays
         for key in [key for key in node if key != "mount"]:
             del node[key]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.config.opening import EACH
+from kalmark.config.tree import EACH
 from kalmark.diagnosis.columns import Column
 from kalmark.diagnosis.components import Noise
 from kalmark.results.run import Run

@@ -330,14 +330,12 @@ def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _sensors(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
-    """Tell of what is configured and served nothing: sensors that no observation was by, `each` without a robot."""
+    """Yield the configured sensors that no observation was by."""
     robots: Mapping[str, Any] = run.config.get("robots") or {}
     rows = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
     seen = set(rows)
     for key, given in robots.items() if seen and not run.stopped else ():
         mine = [name for name in run.log.robots if name == key or (key == "each" and name not in robots)]
-        if key == "each" and run.log.robots and not mine:
-            yield "robots.each of the configuration stands for no robot of the log: each one is named"
         used = sorted({sensor for robot, sensor in seen if robot in mine})
         configured: Mapping[str, Any] = (given or {}).get("sensors") or {}
         for name, section in configured.items() if mine else ():

@@ -13,7 +13,6 @@ from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 from ruamel.yaml import YAML
 
 from kalmark.config.data_sheets import take_data_sheets
-from kalmark.config.opening import merged
 from kalmark.config.reading import resolve_name, run_plugins, shipped_configs, validate
 from kalmark.config.schema import (
     TRUTH,
@@ -27,14 +26,13 @@ from kalmark.config.schema import (
     robot_world,
 )  # fmt: skip
 from kalmark.config.sections import Positive, Section, expected, model_of
-from kalmark.config.tree import Tree, read_tree
+from kalmark.config.tree import Tree, merged, read_tree
 from kalmark.simulate.layouts import Layout, TexturedPlanes, TexturedRoom
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import Sensing
 
 Count = Annotated[int, Field(ge=1)]
 IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types of sensors whose images can be rendered
-EACH = "robots.each."  # how an override begins that is meant for all robots of a world
 
 
 class _Underway(Section):
@@ -195,23 +193,10 @@ def load_world(path_or_name: str | Path, overrides: Sequence[str] = ()) -> World
     Raises ConfigError: ``file:line:column: key.path: got value, expected what``.
     """
     path = resolve_name(path_or_name, shipped_worlds(), "world")
-    tree = read_tree(path, _of_each(path, overrides))
+    tree = read_tree(path, overrides)
     run_plugins(tree, path)
     take_data_sheets(tree, path)
     world = validate(tree, World)
     world._file, world._tree = path, tree
     world.config()  # a mistake in `filter` shows now, not after the simulation
     return world
-
-
-def _of_each(path: Path, overrides: Sequence[str]) -> list[str]:
-    """Return the overrides with those of ``robots.each`` said of each robot of the world by its name."""
-    if not any(override.startswith(EACH) for override in overrides):
-        return [*overrides]
-    robots = read_tree(path).values.get("robots")
-    names = [*robots] if isinstance(robots, dict) else []
-    result = []
-    for override in overrides:
-        of_each = override.startswith(EACH) and names
-        result += [f"robots.{name}.{override.removeprefix(EACH)}" for name in names] if of_each else [override]
-    return result
