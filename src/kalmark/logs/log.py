@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +149,10 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.events)
+
+    def without_truth(self) -> Log:
+        """Return the log without all that only scores a run: true poses, landmarks and ids, `gps`, `reference`."""
+        return replace(self, truth={}, landmarks={}, gps={}, reference={}, true_ids={})
 
 
 def begins_at(events: Iterable[Event], robot: str, held: bool) -> int | None:
