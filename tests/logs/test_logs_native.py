@@ -174,7 +174,7 @@ def test_any_controls_and_scans_come_back(
     events: list[Event] = [Control(t_ns=t, robot="r", u=(a, b)) for t, a, b in rows]
     for t in {t for t, _, _ in rows}:
         ids = data.draw(st.lists(st.one_of(st.integers(), st.sampled_from(["u1", "robot2"])), unique=True, max_size=4))
-        y = data.draw(st.lists(st.tuples(finite.map(abs), finite), min_size=len(ids), max_size=len(ids)))
+        y = data.draw(st.lists(st.tuples(finite.map(abs), st.floats(-6.0, 6.0)), min_size=len(ids), max_size=len(ids)))
         events.append(Scan(t_ns=t, robot="r", sensor="s", y=y, ids=ids))
     log = Log(
         name="any",

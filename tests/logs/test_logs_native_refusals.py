@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import kalmark as km
 from kalmark.errors import LogError
 from kalmark.events import Scan
 from kalmark.logs import open_log
@@ -227,14 +228,13 @@ def test_a_file_cut_anywhere_inside_a_row_is_refused(tmp_path: Path) -> None:
             open_log(tmp_path)
 
 
-def test_with_skip_a_bad_row_takes_its_scan_along_and_is_listed(tmp_path: Path) -> None:
-    text = f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,nan,0.3\n0.2,rover,lidar,8,4,0.3\n0.3,rover,lidar,8,4,0.3\n"
+def test_with_skip_a_bad_row_is_left_out_of_its_scan_and_listed(tmp_path: Path) -> None:
+    text = f"{HEAD}\n{GOOD}\n0.2,rover,lidar,7,nan,0.3\n0.2,rover,lidar,8,4,0.3\n0.3,rover,lidar,8,-4,0.3\n"
     log = open_log(native(tmp_path, scans=text), on_error="skip")
     scans = [event for event in log if isinstance(event, Scan)]
-    assert [scan.t_ns for scan in scans] == [100_000_000, 300_000_000]
-    assert len(log.skipped) == 2
+    assert [(scan.t_ns, scan.ids) for scan in scans] == [(100_000_000, (7,)), (200_000_000, (8,))]
     assert "scans.csv:3: range_m is 'nan'" in log.skipped[0]
-    assert "t=0.200000000 s" in log.skipped[1]
+    assert "scans.csv:5: range_m is -4, expected a range of at least 0" in log.skipped[1]
     assert [records_of(line) for line in log.skipped] == [1, 1]
 
 
@@ -269,3 +269,43 @@ def test_a_table_that_is_no_file_is_refused_with_one_line(kind: str, tmp_path: P
         scans.symlink_to(scans)
     with pytest.raises(LogError, match=r"scans.csv: not a file, expected a table"):
         open_log(scans.parent)
+
+
+@pytest.mark.parametrize(
+    ("column", "angles", "message"),
+    [
+        (
+            "bearing_rad",
+            "90 -45 10 3",
+            "bearing_rad: 3 of 4 numbers are beyond 2 pi, expected radians; degrees are the col",
+        ),
+        (
+            "bearing_deg",
+            "3.14 -3.13 1 0",
+            "bearing_deg: all 4 numbers are within pi and reach it, expected degrees; radia",
+        ),
+    ],
+)
+def test_directions_that_contradict_the_unit_of_their_column_are_refused(
+    column: str, angles: str, message: str, tmp_path: Path
+) -> None:
+    rows = [f"0.{n},rover,lidar,{n},4,{angle}\n" for n, angle in enumerate(angles.split())]
+    text = f"t_s,robot,sensor,id,range_m,{column}\n{''.join(rows)}"
+    with pytest.raises(LogError, match=rf"scans\.csv:1: {message}"):
+        open_log(native(tmp_path, scans=text))
+    assert len(open_log(native(tmp_path, scans=text.replace("90", "0.9").replace("3.1", "31").replace("-45", "1"))))
+
+
+def test_a_column_of_a_user_s_sensor_may_begin_like_one_of_kalmark(tmp_path: Path) -> None:
+    text = "t_s,robot,sensor,id,bearing_px\n0.1,rover,line,7,320\n"
+    with pytest.raises(LogError, match="column 'bearing_px' is unknown, expected bearing_rad"):
+        open_log(native(tmp_path, scans=text))
+
+    @km.register("sensor", "line_camera_of_a_test")
+    class LineCamera:
+        """A line camera."""
+
+        columns = ("bearing_px",)
+
+    log = open_log(native(tmp_path, scans=text))
+    assert log.sensor_columns[("rover", "line")] == LineCamera.columns

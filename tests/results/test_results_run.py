@@ -15,7 +15,7 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, load_config
 from kalmark.errors import DivergedError, EventError, LogError, RunError
-from kalmark.events import Control, Fix, Scan
+from kalmark.events import Control, Fix, Scan, order
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
 from kalmark.logs import open_log, write_native
@@ -371,3 +371,18 @@ def test_a_run_without_pictures_is_the_same_but_for_what_these_show() -> None:
     np.testing.assert_array_equal(whole.landmarks.positions()[0], bare.landmarks.positions()[0])
     assert len(whole.history.maps) > len(bare.history.maps) == 1
     assert len(whole.history.unmeasured_step) > len(bare.history.unmeasured_step) == 0
+
+
+def test_stamps_of_scans_in_another_unit_of_time_are_refused_before_anything_is_filtered() -> None:
+    def events(unit: float) -> list[km.Control | km.Scan]:
+        controls = [km.Control(t_s=0.1 * k, robot="a", u=(1.0, 0.0)) for k in range(20)]
+        scans = [km.Scan(t_s=0.1 * k * unit, robot="a", sensor="lidar", y=[[4.0, 0.1]], ids=[1]) for k in range(20)]
+        return sorted([*controls, *scans], key=order)
+
+    def slam() -> km.Slam:
+        return km.Slam(km.Robot("a", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())}))
+
+    for unit in (1e-3, 1e3, 1e6):
+        with pytest.raises(LogError, match=r"controls of a span 1.9 s, its scans .* s, expected one unit of time: t_s"):
+            km.record(slam(), events(unit), progress=False)
+    assert len(km.record(slam(), events(3.0), progress=False).history.t_ns) == 20

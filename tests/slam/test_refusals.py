@@ -9,7 +9,7 @@ import pytest
 from state_digest import digest
 
 import kalmark as km
-from kalmark.errors import DivergedError, EventError, MapError
+from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.report import INDEFINITE
 from kalmark.slam.starting import SINGULAR
 
@@ -194,3 +194,22 @@ def test_a_large_variance_hides_no_negative_one() -> None:
     cov[0] = 0.0
     slam.process(km.Control(t_s=0.0, robot="r", u=np.ones(6), cov=cov))
     assert np.linalg.eigvalsh(slam.covariance("r"))[0] > -1e-9 * np.abs(slam.covariance("r")).max()
+
+
+def test_a_user_s_noise_of_another_shape_is_refused_and_changes_nothing() -> None:
+    class OneNumber(km.sensors.RangeBearing):
+        def noise(self, y: np.ndarray) -> np.ndarray:
+            return np.eye(2)
+
+    class Wheels(km.motion.Unicycle):
+        def control_noise(self, u: np.ndarray) -> np.ndarray:
+            return np.eye(3)
+
+    slam = km.Slam(km.Robot("a", km.motion.Unicycle(), sensors={"lidar": km.Mount(OneNumber())}))
+    before = digest(slam)
+    wanted = r"a.lidar, OneNumber: noise of 3 measurements has shape \(2, 2\), expected \(3, 2, 2\)"
+    with pytest.raises(EventError, match=wanted):
+        slam.process(km.Scan(t_s=1.0, robot="a", sensor="lidar", y=np.ones((3, 2)), ids=[1, 2, 3]))
+    assert digest(slam) == before
+    with pytest.raises(ModelError, match=r"'a': motion: control_noise has shape \(3, 3\), expected \(2, 2\)"):
+        km.Robot("a", Wheels())

@@ -50,5 +50,7 @@ FACTORS = {
     "dps": ("radps", math.pi / 180), "g": ("mps2", 9.80665), "mg": ("mps2", 9.80665e-3),
 }  # fmt: skip
 """Units of columns that are taken, too: each the unit that it becomes, and by what it is multiplied."""
+DIRECTIONS = ("bearing_rad", "azimuth_rad", "elevation_rad", "normal_rad")
+"""The columns of directions, which are within a turn."""
 GLOBE = {"lat_deg": "x_m", "lon_deg": "y_m", "height_m": "z_m"}
 """Columns of positions on the globe, and those of the tangent plane whose place in a row they take."""

@@ -35,9 +35,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.declare import classes, is_own
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, in_order, order, shown
-from kalmark.logs.columns import CONTROL, GPS, OBSERVATION, POSE2, POSE3, POSITION, READING
+from kalmark.logs.columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
 from kalmark.logs.geodesy import Globe, origin_of
 from kalmark.logs.images.pictures import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
@@ -133,14 +134,13 @@ def read_rig(path: Path) -> dict[str, Any]:
 
 @dataclass
 class _Rows:
-    """Gather the observations of one scan; a bad row refuses the whole scan, an empty one says it saw nothing."""
+    """Gather the observations of one scan; a bad row is left out, an empty one says that the scan saw nothing."""
 
     t_ns: int
     y: list[list[float]] = field(default_factory=list)
     ids: list[Id | None] = field(default_factory=list)
     covs: list[Array | None] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
-    bad: bool = False
     empty: bool = False
 
 
@@ -178,7 +178,7 @@ class _Reader:
             cov = row.own_noise(self.columns[row.key], definite=False)
             return Control(t_ns=row.t_ns, robot=row.robot, u=u, cov=cov)
 
-        return read_table(path, ("t_s", "robot"), known=CONTROL).made(self.request, make)
+        return read_table(path, ("t_s", "robot"), known=known_columns(CONTROL)).made(self.request, make)
 
     def scans(self, path: Path | Sheet) -> Iterator[Event]:
         """Yield the scans of `scans.csv`: one a robot, sensor and time."""
@@ -194,25 +194,20 @@ class _Reader:
             try:
                 self.add(rows, row)
             except Refused as refused:
-                rows.bad = True
                 self.request.refuse(f"{path}{row.table.content.word}{row.line}: {refused}")
             return done
 
-        table = read_table(
-            path, ("t_s", "robot", "sensor", "id"), known=(*CONTROL, *OBSERVATION, *READING), globe=self.globe
-        )
+        table = read_table(path, ("t_s", "robot", "sensor", "id"), known=known_columns(), globe=self.globe)
         for done in table.made(self.request, make, by_sensor=True):
             yield from done
         for key, rows in scans.items():
             yield from self.closed(path, key, rows)
 
     def closed(self, path: Path | Sheet, key: tuple[str, str], rows: _Rows) -> Iterator[Event]:
-        """Yield the event of the rows of a scan, which has no more; none if one of them is bad."""
-        robot, sensor = key
-        if rows.bad:
-            line = f"{path}: scan of {robot} by {sensor} at t={seconds(rows.t_ns)} s, all of it"
-            self.request.leave_out(len(rows.lines), line)
+        """Yield the event of the rows of a scan, which has no more; none if all of them are bad."""
+        if not rows.y and not rows.empty:
             return
+        robot, sensor = key
         covs = [cov for cov in rows.covs if cov is not None]
         cov = np.array(covs) if covs else None
         yield Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov)
@@ -246,7 +241,7 @@ class _Reader:
             cov = row.own_noise(self.columns[row.key], definite=True)
             return Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov)
 
-        table = read_table(path, ("t_s", "robot", "sensor"), known=(*CONTROL, *OBSERVATION, *READING), globe=self.globe)
+        table = read_table(path, ("t_s", "robot", "sensor"), known=known_columns(), globe=self.globe)
         return table.made(self.request, make, by_sensor=True)
 
     def frames(self, path: Path | Sheet) -> Iterator[Event]:
@@ -336,6 +331,13 @@ class _Reader:
         for robot, (times, rows) in tracks.items():
             track = np.array(rows)
             self.gps[robot] = PositionTrack(np.array(times), track[:, :2], track[0, 2:])
+
+
+def known_columns(own: tuple[str, ...] = CANONICAL) -> tuple[str, ...]:
+    """Return these columns and those of the motions and sensors that users have registered."""
+    models = [model for role in ("motion", "sensor") for of in classes(role).values() for model in of]
+    columns = [name for model in models if not is_own(model) for name in getattr(model, "columns", ())]
+    return (*own, *columns)
 
 
 def stream(path: Path, request: Request) -> Iterator[Event]:

@@ -10,8 +10,9 @@ import csv
 import io
 import math
 import re
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from sys import intern
@@ -23,7 +24,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import MOST, Id, bound, most, shown
 from kalmark.logs import geodesy
-from kalmark.logs.columns import CANONICAL, FACTORS, GLOBE, NAMES, NOT_NEGATIVE, OTHER_UNITS, UNITS
+from kalmark.logs.columns import CANONICAL, DIRECTIONS, FACTORS, GLOBE, NAMES, NOT_NEGATIVE, OTHER_UNITS, UNITS
 from kalmark.logs.geodesy import Globe
 from kalmark.logs.progress import track
 from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
@@ -32,6 +33,7 @@ T = TypeVar("T")
 TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
 CSV, PARQUET = ".csv", ".parquet"
 ONE_IN_A_FILE = "expected one of them in a file: scans.csv and measurements.csv may have one each"
+NEAR_PI = 0.99  # of pi: directions all around that are within pi come nearer to it
 BATCH = 65_536  # rows of Parquet at a time
 SEPARATORS = {"\t": "tabs", "|": "'|'", " ": "blanks"}
 
@@ -81,6 +83,7 @@ class Table:
     given: dict[str, tuple[str, float]]
     unit_ns: int = TIMES["t_s"]
     globe: Globe | None = None
+    directions: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
 
     def name(self, column: str) -> str:
         """Return a column's name as the source has it."""
@@ -125,6 +128,20 @@ class Table:
                 yield found
         if row is None:
             raise LogError(f"{content.where}: no rows after the header, expected at least one")
+        self.refuse_other_angles()
+
+    def refuse_other_angles(self) -> None:
+        """Refuse directions whose numbers contradict the unit of their column.  Raises LogError."""
+        for column, values in self.directions.items():
+            size, name = np.abs(values) / self.given.get(column, (column, 1.0))[1], self.name(column)
+            stem, _, unit = name.rpartition("_")
+            beyond, told = int((size > 2 * np.pi).sum()), f"{self.content.where}: {name}: "
+            if unit == "rad" and 2 * beyond > len(size):
+                wanted = f"radians; degrees are the column {stem}_deg"
+                raise LogError(f"{told}{beyond} of {len(size)} numbers are beyond 2 pi, expected {wanted}")
+            if unit == "deg" and NEAR_PI * np.pi < size.max() <= np.pi:
+                wanted = f"degrees; radians are the column {stem}_rad"
+                raise LogError(f"{told}all {len(size)} numbers are within pi and reach it, expected {wanted}")
 
 
 def opened(source: Path | Sheet) -> Content:
@@ -395,6 +412,8 @@ class Row:
                 raise Refused(f"{name(column)} is {shown(self.text(column))}, expected {wanted}")
             if values[-1] < 0 and column in NOT_NEGATIVE:
                 raise Refused(f"{name(column)} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
+            if column in DIRECTIONS:
+                self.table.directions[column].append(values[-1])
         return values if self.table.globe is None else self._placed(self.table.globe, columns, values)
 
     def _placed(self, globe: Globe, columns: tuple[str, ...], values: list[float]) -> list[float]:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 SNAPSHOTS = 60
 LATEST = 30  # images whose rate the bar shows
+OF_TWO = math.log10(2.0) / 3.0  # a factor of two, as a power of 1000
 SMALL = 5000  # landmarks in all snapshots, up to which the map is kept whenever it grows, too
 
 
@@ -66,12 +67,13 @@ def record(
     that diverges so far that it refuses to go on ends the run in either case: `run.stopped` says why and the summary
     has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's models.
     Without `pictures` what only these show is left out, which is faster: the map on the way, and what was in view.
-    Raises LogError if the log has other columns than the filter's motions and sensors.
+    Raises LogError if the log has other columns than the filter's motions and sensors, or two units of time.
     """
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
     log = log if isinstance(log, Log) else Log("", tuple(slam.robots), list(log), format="")
     refuse_other_columns(slam, log)
+    refuse_other_times(log)
     slam.foresee(log.events)
     recorder = _Recorder(slam, log, pictures)
     begin = time.perf_counter()
@@ -355,3 +357,22 @@ def refuse_other_columns(slam: Slam, log: Log) -> None:
             where = f"{place[0]}:1" if place is not None else log.path or "log"
             wanted = f"{', '.join(columns)} of its {type(model).__name__}"
             raise LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}{hint}")
+
+
+def refuse_other_times(log: Log) -> None:
+    """Refuse a log whose controls and scans are in other units of time.  Raises LogError.
+
+    Then the times that they span, and their usual intervals, have a ratio of 1000 or a power of it, to a factor of two.
+    """
+    for robot in log.robots:
+        times = [
+            np.unique([event.t_ns for event in log.events if event.robot == robot and isinstance(event, kind)])
+            for kind in (Control, Scan)
+        ]
+        if min(map(len, times)) < 2:
+            continue
+        spans, usual = (np.array([of(np.diff(t)) for t in times]) * 1e-9 for of in (np.sum, np.median))
+        powers = np.log10([spans[1] / spans[0], usual[1] / usual[0]]) / 3.0
+        if round(powers[0]) and (np.abs(powers - round(powers[0])) < OF_TWO).all():
+            told = f"controls of {robot} span {spans[0]:.4g} s, its scans {spans[1]:.4g} s"
+            raise LogError(f"{log.path or log.name}: {told}, expected one unit of time: t_s, t_ms, t_us or t_ns")

@@ -158,9 +158,15 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
             check(event.y)
         except EventError as error:
             raise EventError(f"{when(event)}: {event.robot}.{event.sensor}, {error}") from None
-    if event.cov is None:
-        return sensor.noise(event.y) if count else np.zeros((0, m, m))
+    if event.cov is None and not count:
+        return np.zeros((0, m, m))
     what, p = f"{when(event)}: cov", innovation_size(sensor)
+    if event.cov is None:
+        R = sensor.noise(event.y)
+        if np.shape(R) != (count, p, p):
+            wrong = f"noise of {count} measurements has shape {np.shape(R)}, expected ({count}, {p}, {p})"
+            raise EventError(f"{when(event)}: {event.robot}.{event.sensor}, {type(sensor).__name__}: {wrong}")
+        return R
     if event.cov.shape not in ((p, p), (count, p, p)):
         raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
     _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)

@@ -161,6 +161,10 @@ class Robot:
             instance(self.rests_until_ns, int, f"{what}: rests_until_ns", "a whole number, or None")
         instance(self.motion, Motion, f"{what}: motion", "a motion model")
         refuse_misspelt(self.motion, f"{what}: motion")
+        k = len(self.motion.columns)
+        noise = np.shape(self.motion.control_noise(np.zeros(k)))
+        if noise != (k, k):
+            raise ModelError(f"{what}: motion: control_noise has shape {noise}, expected ({k}, {k})")
         space = self.motion.space
         pose = 3 if space.kinds[:2] == SE2.kinds else 7 if space.kinds[:2] == SE3.kinds else 0
         if not pose:
