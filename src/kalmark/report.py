@@ -64,7 +64,7 @@ class Compared(NamedTuple):
 class Judged(NamedTuple):
     """The observations `rows` of a scan that were compared with landmarks, and what came of it; `ids` of all the scan.
 
-    d2 is NaN where they could not be compared.
+    d2 is NaN where the covariance of the innovation is not positive definite, infinite where nothing can be expected.
     """
 
     rows: Sequence[int]
@@ -87,8 +87,9 @@ def outcomes_of(judged: Judged) -> list[Observation]:
 
 def _rejected(seen: Observation, gate: float, Z: Array) -> Observation:
     if seen.d2 is None or math.isnan(seen.d2):
-        why = INDEFINITE if np.isfinite(Z).all() else "nothing can be expected of it from here"
-        return seen._replace(outcome="rejected", d2=None, reason=why)
+        return seen._replace(outcome="rejected", d2=None, reason=INDEFINITE)
+    if not np.isfinite(Z).all():
+        return seen._replace(outcome="rejected", reason="nothing can be expected of it from here")
     far = "so far from what is expected that d2 is no number" if gate == math.inf else f"outside the gate of {gate:.2f}"
     return seen._replace(outcome="rejected", reason=far)
 

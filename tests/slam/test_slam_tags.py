@@ -108,6 +108,33 @@ def test_tags_far_from_where_they_are_expected_bring_the_robot_back() -> None:
     assert max(nees) < 30 and 4 < np.mean(nees) < 8  # six degrees of freedom
 
 
+@pytest.mark.parametrize("cov", [None, np.diag(np.full(6, 1e-12))])
+def test_two_surveyed_tags_that_are_expected_behind_the_camera_bring_a_carried_robot_back_at_once(cov: Any) -> None:
+    rng, slam, l = np.random.default_rng(1), slam_of(), tags(*NEAR, tilt=(0.6, 0.5, 0.2))
+    for i in range(2):
+        slam.add_landmark(i, l[i], cov, TAG)
+    away = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0])  # turned about, the tags behind it
+    slam.process(km.Control(0, "r", np.zeros(6)))
+    slam.process(sight(0, np.eye(7)[6], l, rng))
+    slam.state.map.set_predicted(slam.state.moving["r"].slot, away)
+    report = slam.process(sight(1, np.eye(7)[6], l, rng))
+    assert [(o.outcome, o.d2) for o in report.observations] == [("associated", np.inf)] * 2
+    d = SE3.minus(slam.mean("r"), np.eye(7)[6])
+    assert np.linalg.norm(d[:3]) < 0.02 and np.linalg.norm(d[3:]) < 0.02
+
+
+def test_one_surveyed_tag_that_is_expected_behind_the_camera_is_left_out_as_a_misfit() -> None:
+    rng, slam, l = np.random.default_rng(1), slam_of(), tags(*NEAR, tilt=(0.6, 0.5, 0.2))
+    for i, place in enumerate([l[0], l[1] - [6.0, 0, 0, 0, 0, 0, 0]]):
+        slam.add_landmark(i, place, None, TAG)
+    for t in range(5):
+        report = slam.process(sight(t, np.eye(7)[6], l, rng))
+        fits, out = report.observations
+        assert fits.outcome == "associated"
+        assert (out.outcome, out.d2, out.reason) == ("rejected", np.inf, "nothing can be expected of it from here")
+    assert slam.state.surveys.misfits == {1: (5, frozenset([0]))}  # of one other landmark: it may be either
+
+
 def test_doubts_are_saved_and_resume_bit_for_bit(tmp_path: Path) -> None:
     rng, slam, l = np.random.default_rng(3), slam_of(), tags((4.0, 0.3, 0.8))
     pose = np.array([0.0, 0, 0, 0, 0, 0, 1])

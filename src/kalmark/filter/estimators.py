@@ -60,8 +60,8 @@ class Movement(NamedTuple):
 class Correction(NamedTuple):
     """Of K observations: expectation, innovation and its covariance, squared distance, and which were fused.
 
-    Where the correction is not `valid`, some could not be fused, because nothing can be expected of them or because
-    their covariance is not positive definite: their d2 is NaN.
+    Where the correction is not `valid`, some could not be fused: d2 is infinite of those of which nothing can be
+    expected, NaN of those whose covariance is not positive definite.
     """
 
     e: Array
@@ -191,7 +191,7 @@ class _Estimator:
         """Fuse those of a scan one after the other that could not be fused together."""
         robot, mount, slots, d, y, R, gate = scan
         d2, fused = together.d2.copy(), together.fused.copy()
-        for k in np.flatnonzero(d2 <= gate).tolist():
+        for k in np.flatnonzero((d2 <= gate) & (d2 < np.inf)).tolist():
             one = slice(k, k + 1)
             done = self._fused(model, m, (robot, mount, slots[one], d, y[one], R[one], gate), parallax)
             fused[k] = done.fused[0]

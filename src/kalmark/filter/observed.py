@@ -106,16 +106,17 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
 def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
     """Return d2 = z' Z^-1 z (K,) of innovations z (K, p) with their covariances Z (K, p, p).
 
-    d2 is NaN where nothing can be expected (a landmark at the sensor) and where Z is not positive definite; the last
-    answer is False if that is so of any.
+    d2 is infinite where nothing can be expected (a landmark behind the camera), for what is seen there is beyond any
+    gate.  It is NaN where Z is not positive definite.  The last answer is False if either is so of any.
     """
     k, p = z.shape
     d2, valid = np.zeros(k), True
     L, w = np.empty((p, p)), np.empty(p)
     for i in range(k):
-        positive = True
+        positive, expected = True, True
         for a in range(p):  # Z = L L', w = L^-1 z, row by row
             w[a] = z[i, a]
+            expected = expected and not np.isnan(z[i, a])
             for b in range(a + 1):
                 s = Z[i, a, b]
                 for c in range(b):
@@ -129,7 +130,7 @@ def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
             w[a] /= L[a, a]
             d2[i] += w[a] * w[a]
         if not positive:
-            d2[i], valid = np.nan, False
+            d2[i], valid = np.nan if expected else np.inf, False
     return d2, valid
 
 

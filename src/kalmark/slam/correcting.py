@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array, Index
 from kalmark.association.averaging import average, outcomes
 from kalmark.association.protocol import Decision, Mixture
 from kalmark.filter.estimators import Averaging
@@ -43,13 +45,13 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         on_trial = surveyed.is_tried(state, scan.event.robot, names)
         least = surveyed.gate_of(state, scan, policy) if on_trial else math.inf
         slots = state.tracks.slots_of(names)
-        if scan.channel.far is not None and (near := tags.approach(scan, model, slots, rows)) is not None:
-            state.estimator.correct(state.map, near._replace(gate=min(near.gate, least)))
-        if scan.channel.depths and (near := depths.approach(scan, model, slots, rows)) is not None:
-            state.estimator.correct(state.map, near._replace(gate=min(near.gate, least)))
+        approach = partial(_approach, state, scan, model, slots, rows, None)
+        approach(range(len(rows)), least)
         update = scan.update(model, slots, rows)
         done = (
-            surveyed.corrected(state, scan, names, update, least) if on_trial else state.corrected(update, scan.event)
+            surveyed.corrected(state, scan, names, update, least, state.estimator, approach)
+            if on_trial
+            else state.corrected(update, scan.event)
         )
         report.fill(rows, done)
         state.tracks.count(names, done.fused.tolist())
@@ -71,16 +73,35 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
     for model, rows in groups:
         names: list[Any] = [decisions[k][0] for k in rows]
         l, estimator = known.means(names), state.estimator.for_fixes()
-        if scan.channel.far is not None:
-            slots = np.full(len(rows), scan.robot)
-            if (near := tags.approach(scan, model.exactly, slots, rows, l)) is not None:
-                estimator.correct(state.map, near._replace(gate=min(near.gate, least)))
-        done = surveyed.corrected(state, scan, names, scan.known_update(model, l, rows), least, estimator)
+        approach = partial(_approach, state, scan, model.exactly, np.full(len(rows), scan.robot), rows, l)
+        approach(range(len(rows)), least)
+        done = surveyed.corrected(state, scan, names, scan.known_update(model, l, rows), least, estimator, approach)
         done = done._replace(e=done.e[:, :m])
         report.fill(rows, done)
         known.count(names, done.fused.tolist())
         judged.append(Judged(rows, scan.ids, names, done, min(scan.channel.gate, least)))
     return judged
+
+
+def _approach(
+    state: State, scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int], known: Array | None,
+    some: Sequence[int], least: float,
+) -> bool:  # fmt: skip
+    """Correct by those of `some` observations that are far from what is expected, if any are: `tags`, `depths`.
+
+    `slots` (K,) and `rows` are of all of them, as are the numbers (K, n) of landmarks `known` exactly; `some` are the
+    numbers of those that are meant, `least` is the gate.
+    """
+    at = list(some)
+    mine, of, exactly = [rows[i] for i in at], slots[at], None if known is None else known[at]
+    found = [tags.approach(scan, model, of, mine, exactly)] if scan.channel.far is not None else []
+    found += [depths.approach(scan, model, of, mine)] if scan.channel.depths and known is None else []
+    estimator, used = state.estimator if known is None else state.estimator.for_fixes(), False
+    for near in found:
+        used |= near is not None and bool(
+            estimator.correct(state.map, near._replace(gate=min(near.gate, least))).fused.any()
+        )
+    return used
 
 
 def _average(state: State, scan: ScanContext, decisions: Sequence[Decision]) -> list[Observation]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from kalmark.tracks.scan import ScanContext
 SURVEYED = 0.9999  # of right sightings are within the gate
 ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped anew"
 WIDER = 2.0  # times what a robot that was elsewhere has moved by
+DOUBLED = 20  # times at most that a robot is moved by one scan, each time farther
 SURE_RAD = 0.3  # a sigma of the heading above which nothing can be expected
 
 
@@ -40,11 +41,12 @@ def is_tried(state: State, robot: str, names: Sequence[Any]) -> bool:
 
 def corrected(
     state: State, scan: ScanContext, names: Sequence[Any], update: Update, least: float,
-    estimator: Estimator | None = None,
+    estimator: Estimator, approach: Callable[[Sequence[int], float], bool],
 ) -> Correction:  # fmt: skip
     """Correct by sightings of which some are of surveys; of these the ones beyond `least` are left out.
 
     They are taken all the same if it is the robot that is elsewhere, unless they are outside the association's gate.
+    `approach` corrects beforehand by those of some that are far from what is expected, within a gate, if there are any.
     """
     if least == math.inf:
         return state.corrected(update, scan.event, estimator)
@@ -57,22 +59,28 @@ def corrected(
     out = np.array([k for k in beyond if (lost or not tried[k]) and done.d2[k] <= update.gate], dtype=np.int64)
     if not len(out):
         return done
-    pose = state.map.mean(scan.robot)[: len(scan.channel.at)]
+    before = state.map.mean(scan.robot)
+    for _ in range(DOUBLED if lost else 1):
+        if not approach(out.tolist(), math.inf):
+            break
+        if lost:
+            _widen(state, scan, before)
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
     again, fused = state.corrected(rest, scan.event, estimator), done.fused.copy()
     fused[out] = again.fused
     if lost:
-        _widen(state, scan, pose)
+        _widen(state, scan, before)
     return done._replace(fused=fused)
 
 
 def _widen(state: State, scan: ScanContext, before: Array) -> None:
-    """Let the pose of a robot that was elsewhere be as uncertain as it has moved now: it was believed too much.
+    """Let the state of a robot that was elsewhere be as uncertain as it has changed now: it was believed too much.
 
-    What its covariance lets it move by is too little at first, but doubles from scan to scan.
+    What its covariance lets it move by is too little at first, but doubles from time to time.
     """
-    after, d, dof = state.map.mean(scan.robot)[: len(before)], scan.dimensions, scan.channel.pose_dof
-    turn = after[2] - before[2] if d == 2 else 2.0 * math.acos(min(1.0, abs(float(after[3:] @ before[3:]))))
+    after, d, dof = state.map.mean(scan.robot), scan.dimensions, scan.channel.pose_dof
+    turn = after[2] - before[2] if d == 2 else 2.0 * math.acos(min(1.0, abs(float(after[3:7] @ before[3:7]))))
     sigmas = np.repeat([np.linalg.norm(after[:d] - before[:d]), abs(wrap(float(turn)))], [d, dof - d])
-    index = state.map.index(scan.robot)[:dof]
-    state.map.predict(index, np.eye(dof), np.diag((WIDER * sigmas) ** 2))
+    pose = len(scan.channel.at)
+    sigmas = np.append(sigmas, np.abs(after[pose:] - before[pose:]))  # of a velocity, which a jump is none of
+    state.map.predict(state.map.index(scan.robot), np.eye(len(sigmas)), np.diag((WIDER * sigmas) ** 2))
