@@ -26,6 +26,7 @@ LATEST_NS = 2**63  # times are int64: about 292 years either side of 0
 LONGEST_PAUSE_NS = 366 * 86_400_000_000_000  # between two events: what comes later has a wrong stamp
 LONGEST = 80  # characters of a value in a message
 LONGEST_ID = 200  # characters or digits of a landmark's id
+ROUNDED = 1e-3  # a quaternion is of length 1, and a matrix a rotation, up to this: files have few digits
 _SHORT = 2**63  # ids that need no second look
 
 MOST = {"m": 1e9, "mps": 1e6, "rad": 1e6, "radps": 1e6, "px": 1e9}
@@ -111,6 +112,14 @@ def _nanoseconds(t_s: Any, t_ns: Any) -> int:
 def finite(value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkError] = EventError) -> Array:
     """Return a copy of `value` as a float array (..., n); raise `error` if it is not finite or larger than `limit`."""
     return measured(value, what, limit, error)[0]
+
+
+def unit_quaternion(q: Array, error: type[Exception] = EventError) -> Array:
+    """Return a quaternion (4,) normalised; raise `error` if its length is not 1 up to `ROUNDED`, as of few digits."""
+    norm = float(np.linalg.norm(q))
+    if not abs(norm - 1) <= ROUNDED:
+        raise error(f"quaternion has length {norm:.6g}, expected 1 up to {ROUNDED:g}")
+    return np.asarray(q / norm)
 
 
 def measured(

@@ -10,8 +10,9 @@ import pytest
 
 from command_line import Kalmark
 from kalmark.config import build_slam, load_config, open_run
+from kalmark.config.opening import open_config_log
 from kalmark.errors import LogError
-from kalmark.events import Control
+from kalmark.events import Control, Scan
 from kalmark.logs import open_log
 from kalmark.logs.bag.first_config import first_config
 from kalmark.logs.bag.survey import survey
@@ -110,6 +111,23 @@ def test_a_robot_that_hardly_moves_starts_with_the_heading_of_its_compass(tmp_pa
     )
     assert wanted in text
     assert "declination_rad: 0, sigma_declination_rad: 0.2}  # GUESS: its north is true north, or nearly" in text
+
+
+@pytest.mark.parametrize(("roll", "up"), [(90.0, (0.0, 1.0, 0.0)), (180.0, (0.0, 0.0, -1.0)), (0.0, (0.0, 0.0, 1.0))])
+def test_gravity_says_how_an_inertial_unit_lies_that_tf_does_not_have(
+    roll: float, up: tuple[float, ...], tmp_path: Path
+) -> None:
+    """The robot drives round: its rate about the vertical is on the axis that points up; one second it rests."""
+    rows, u = [odometry(T0 + k * 10**8, pose(0.1 * k, 0, 0.02 * k)) for k in range(40)], np.array(up)
+    for k in range(400):
+        turns = 0.0 if k < 100 else 0.2
+        across = np.array([0.0, 0.0, 3.0]) if roll == 90 else np.array([0.0, 3.0, 0.0])  # inward, as it turns
+        rows.append(imu(T0 + k * 10**7, turns * u, a=9.8 * u + (across if turns else 0.0)))
+    text = config_of(tmp_path, sorted(rows, key=lambda m: m.t_ns))
+    assert (f"mount: {{roll_deg: {roll:g}, pitch_deg: 0}}" in text) == (roll != 0)
+    log = open_config_log(load_config(tmp_path / "config.yaml"))
+    rates = [e.y[0, 0] for e in log.events if isinstance(e, Scan) and e.sensor == "gyro"]
+    np.testing.assert_allclose(rates[-1], 0.2, atol=1e-6)
 
 
 def test_an_orientation_without_a_covariance_is_not_taken(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def test_a_cut_bag_gets_one_line(kind: str, share: float, bags: dict[str, Path],
     cut = tmp_path / source.name
     content = source.read_bytes()
     cut.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(LogError, match=r"not a bag that can be read|no message|no topic") as error:
+    with pytest.raises(LogError, match=r"not a bag that can be read|no message|no topic|index") as error:
         open_log(cut, topics=TOPICS)
     assert "\n" not in str(error.value) and str(cut) in str(error.value)
 
@@ -54,6 +54,24 @@ def test_damaged_bags_get_one_line(bags: dict[str, Path], tmp_path: Path) -> Non
                 open_log(tmp_path / source.name, topics=TOPICS, on_error="skip")
             except KalmarkError as error:
                 assert "\n" not in str(error)
+
+
+def field_at(content: bytes, name: bytes) -> int:
+    return content.index(name + b"=") + len(name) + 1
+
+
+def test_bags_that_can_be_mended_say_how(tmp_path: Path) -> None:
+    whole = bag_of(tmp_path, [odometry(T0 + k, pose(k, 0, 0)) for k in range(3)], "ros1.bag").read_bytes()
+    index, connections = field_at(whole, b"index_pos"), field_at(whole, b"conn_count")
+    for said, content in {
+        "an old version .*expected #ROSBAG V2.0: `rosbag fix": whole.replace(b"V2.0", b"V1.2", 1),
+        "without an index, .*`rosbag reindex": whole[:index] + bytes(8) + whole[index + 8 :],
+        "index of the bag is damaged, .*`rosbag reindex": whole[:connections] + bytes(4) + whole[connections + 4 :],
+    }.items():
+        (tmp_path / "odd.bag").write_bytes(content)
+        with pytest.raises(LogError, match=said) as error:
+            open_log(tmp_path / "odd.bag", topics=TOPICS)
+        assert "\n" not in str(error.value)
 
 
 def test_two_clocks_get_one_line(tmp_path: Path) -> None:

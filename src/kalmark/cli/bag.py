@@ -21,6 +21,10 @@ def bag(
     out: Annotated[
         Path | None, typer.Option(metavar="CONFIG", help="Write a first configuration that maps its topics.")
     ] = None,
+    definition: Annotated[
+        list[str] | None,
+        typer.Option(metavar="TYPE=FILE", help="The .msg file of a type that the bag does not define."),
+    ] = None,
 ) -> None:
     """List the topics of a ROS bag, their rates, gaps and frames; write a first configuration that maps them."""
     from kalmark.logs import find_data
@@ -33,7 +37,12 @@ def bag(
     path = find_bag(find_data(file))
     if path is None:
         raise LogError(f"{file}: not a bag, {EXPECTED}")
-    found = survey(path)
+    given = dict(each.partition("=")[::2] for each in definition or ())
+    if not all(name.endswith(".msg") for name in given.values()):
+        raise LogError(
+            f"--definition {' '.join(definition or ())}: expected TYPE=FILE, such as uwb_msgs/Range=Range.msg"
+        )
+    found = survey(path, {kind: str(Path(name).resolve()) for kind, name in given.items()})
     columns = ("topic", "type", "messages", "rate (Hz)", "gaps", "longest (s)", "at (s)", "frames", "read as")
     rows = [_row(topic) for topic in found.topics]
     print_table(f"{path.name}: {found.length_s:.1f} s", columns, rows, align="<<>>>>><<")

@@ -89,6 +89,7 @@ def described(config: Config, log: Log) -> Config:
 def in_force(config: Config, log_path: str | Path | None = None) -> Config:
     """Return the configuration with its log's path found, or replaced by `log_path`.  Raises ConfigError, LogError."""
     named: dict[str, Any] = {name: beside(config, getattr(config.log, name)) for name in ("truth", "fixes")}
+    named["definitions"] = definitions(config)
     log = config.log.model_copy(update=named | {"path": str(find_log(config, log_path))})
     return config.model_copy(update={"log": log})
 
@@ -99,10 +100,17 @@ def open_config_log(config: Config, log_path: str | Path | None = None, *, progr
     check_format(config, path)
     common = log.model_dump(include={*COMMON})
     common |= {name: beside(config, common[name]) for name in ("truth", "fixes")}
-    found = open_log(path, log.format, **common, **log.options(), progress=progress)
+    options = log.options() | ({"definitions": definitions(config)} if log.definitions else {})
+    found = open_log(path, log.format, **common, **options, progress=progress)
     if not found.events:
         raise LogError(f"{path}: true poses alone, expected a log with events; as `log.truth` it scores one")
     return found
+
+
+def definitions(config: Config) -> dict[str, str] | None:
+    """Return the definitions of types of messages of a configuration, with the files found.  Raises LogError."""
+    given = config.log.definitions or {}
+    return {kind: str(beside(config, d)) if d.endswith(".msg") else d for kind, d in given.items()} or None
 
 
 def beside(config: Config, path: Any) -> Any:

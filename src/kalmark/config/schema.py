@@ -389,6 +389,8 @@ class LogConfig(Section):
     """kitti_odometry: take the images of the right camera (auto if absent)."""
     topics: dict[str, Topic] | None = None
     """bag: topics by name, and what each of them is in the log, see below."""
+    definitions: dict[str, str] | None = None
+    """bag: types of messages that it does not define, each with its .msg file, or the text of one."""
 
     def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""

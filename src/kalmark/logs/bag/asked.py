@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from kalmark.errors import LogError
+from kalmark.logs.bag.fields import leaves, offers
 from kalmark.logs.bag.messages import MESSAGES, Message, Seen
-from kalmark.logs.bag.reading import Bag, Received
+from kalmark.logs.bag.reading import UNDEFINED, Bag, Received
 from kalmark.logs.bag.topics import Carried, Compass, Imu, Posed, Topic
 
 beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].seen
@@ -14,11 +15,16 @@ beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].see
 
 def offered(bag: Bag, name: str, topic: Topic) -> Message:
     """Return what the messages of a topic offer.  Raises LogError if that is not what the topic is to be."""
-    kind, known = bag.topics[name].type, MESSAGES.get(bag.topics[name].type)
+    kind = bag.topics[name].type
+    known = offers(kind, bag.definitions, f"log option topics: {name}", topic)
     if known is None or not any(getattr(known, want) for want in topic.wants):
+        if known is None and kind not in bag.definitions:
+            raise LogError(f"{bag.path}: topic {name} has messages of the type {short(kind)}, {UNDEFINED}")
         types = ", ".join(sorted({short(k) for k, m in MESSAGES.items() if any(getattr(m, w) for w in topic.wants)}))
         what = short(kind) if known is None else f"{short(kind)} ({known.what})"
-        raise LogError(f"{bag.path}: topic {name} has messages of the type {what}, expected one of {types}")
+        own = ", ".join(path for path, _ in leaves(kind, bag.definitions)) if known is None else ""
+        own = f", or `fields` of {own}" if own else ""
+        raise LogError(f"{bag.path}: topic {name} has messages of the type {what}, expected one of {types}{own}")
     if known.transforms is not None and not (isinstance(topic, Posed) and topic.frame and topic.child_frame):
         raise LogError(f"{bag.path}: topic {name} has many frames, expected `frame` and `child_frame`: two of them")
     return known

@@ -64,6 +64,8 @@ def first_config(found: Survey, file: Path | None = None) -> str:
         head.append("  # kalmark wrote this bag: it holds a whole log, and no topics are needed")
         head.append("# robots and sensors are in its configuration: kalmark run CONFIG --log FILE --set log.format=bag")
         return "\n".join([*head, ""])
+    if found.definitions:
+        head += ["  definitions:", *(f"    {quoted(kind)}: {quoted(d)}" for kind, d in found.definitions.items())]
     writer = _Writer(found)
     lines = writer.lines()
     out = [*head, *lines.log, "  topics:", *(f"    {line}" for line in lines.topics)]
@@ -202,7 +204,9 @@ class _Writer:
                 used[topic.name] = entry_and_why
         for topic in scans:
             entry = entry_of(topic, space)
-            used[topic.name] = entry, told(topic) + (f"; {GUESS} the edge of the tags" if "size_m" in entry else "")
+            why = f"; {GUESS} the edge of the tags" if "size_m" in entry else ""
+            why += f"; {GUESS} these fields, in m and rad, by their names" if topic.stated else ""
+            used[topic.name] = entry, f"{told(topic)}{why}"
         return used
 
     # -------------------------------------------------------------- controls

@@ -16,14 +16,32 @@ from kalmark.logs.bag.first_start import Start
 from kalmark.logs.bag.first_words import GUESS, mapping, quoted, told
 from kalmark.logs.bag.inertial import heading_of, heading_of_field
 from kalmark.logs.bag.messages import Measured
+from kalmark.logs.bag.mounts import LEVEL
 from kalmark.logs.bag.survey import Survey, TopicSummary
 from kalmark.logs.bag.topics import Scans
+from kalmark.logs.source import placed
 
 HEADING_S, HEADING_RAD = 1.0, 0.02
 """Headings are taken so often, and are not believed to be better: errors of a compass last."""
 NORTH_RAD, START_RAD, FIELD_RAD = 0.2, 0.1, 0.1
 """Sigmas: of where north is, of a declination by the first heading, of a heading by a magnetic field."""
+STANDARD_GRAVITY, NOT_GRAVITY = 9.80665, 0.2  # m/s^2; a mean force farther off by this share is something else
 GYRO_RADPS, BIAS = 0.005, {"sigma_bias_radps": 0.01, "sigma_bias_radps_per_sqrt_s": 0.0001}
+
+
+def upward(topic: TopicSummary) -> Array | None:
+    """Return the direction up (3,) in the frame of an inertial unit: that of its mean force where it turned least.
+
+    By the quarter of the seconds of least rates: a robot that rests or goes straight on, whose mean acceleration is
+    gravity's.  None if the mean is not of gravity's size.
+    """
+    sums = np.array([row for row in topic.each_second.values() if np.isfinite(row).all()]).reshape(-1, 8)
+    if not len(sums):
+        return None
+    slow = sums[np.argsort(sums[:, 6] / sums[:, 7], kind="stable")[: max(1, len(sums) // 4)]]
+    mean = slow[:, :3].sum(axis=0) / slow[:, 7].sum()
+    size = float(np.linalg.norm(mean))
+    return mean / size if abs(size / STANDARD_GRAVITY - 1) < NOT_GRAVITY else None
 
 
 class Readings:
@@ -35,16 +53,36 @@ class Readings:
         self.sensors: list[str] = []
         self.taken: set[str] = set()
         self.heading: float | None = None  # the first that was measured, and taken
+        self.tilted: dict[str, Array] = {}  # mounts by frame that gravity shows, of units that are not level
 
     def entries(self, topics: Sequence[TopicSummary]) -> dict[str, tuple[dict[str, Any], str]]:
         """Return the entries of the topics that are used, each with the reason."""
         used = {}
         for topic in sorted(topics, key=lambda each: each.offers.rates is None):  # compasses last
             if {"rates", "attitude"} & topic.first.keys() and (entry := self.unit(topic)) is not None:
-                used[topic.name] = (entry, told(topic))
+                used[topic.name] = (entry | self.tilt(topic), told(topic))
             elif "field" in topic.first and not self.space and self.heading is None:
-                used[topic.name] = (self.compass(topic), told(topic))
+                used[topic.name] = (self.compass(topic) | self.tilt(topic), told(topic))
         return used
+
+    def mount(self, topic: TopicSummary) -> Array | None:
+        """Return where a unit is in its robot: by tf, or turned (7,) as gravity shows; None if neither says so."""
+        known = mount_of(self.found, topic, self.control)
+        if known is not None or topic.frame in self.tilted:
+            return known if known is not None else self.tilted[topic.frame]
+        up = upward(topic)
+        if up is None or up[2] > LEVEL:
+            return None
+        turn, _ = rotations.from_euler(np.array([math.atan2(up[1], up[2]), math.asin(-up[0]), 0.0]))
+        self.tilted[topic.frame] = np.append(np.zeros(3), turn)
+        return self.tilted[topic.frame]
+
+    def tilt(self, topic: TopicSummary) -> dict[str, Any]:
+        """Return what an entry says of a mount that gravity shows."""
+        if mount_of(self.found, topic, self.control) is not None or (mount := self.mount(topic)) is None:
+            return {}
+        turned = placed(mount)
+        return {"mount": {key: round(turned[key], 2) for key in ("roll_deg", "pitch_deg")}}
 
     def unused(self, topic: TopicSummary) -> str:
         """Return why a topic of an inertial unit or a compass is not used, "" if it is no such."""
@@ -98,7 +136,7 @@ class Readings:
 
     def compass_line(self, name: str, topic: TopicSummary, v: Array, sigma: float) -> None:
         """Note a sensor of headings, its declination such that its first heading is that of the start."""
-        mount = mount_of(self.found, topic, self.control)
+        mount = self.mount(topic)
         R = np.eye(3) if mount is None else rotations.matrix(np.array(mount[3:]))
         heading = heading_of(v, np.eye(3) if self.space else R) if len(v) == 4 else heading_of_field(R @ v)
         self.heading = heading if self.heading is None else self.heading
@@ -133,6 +171,8 @@ class Readings:
         """Note the line of a sensor; a mount that tf does not have is to be given where it counts."""
         if mount_of(self.found, topic, self.control) is not None:
             why = f"{why}; its mount is that of tf"
+        elif self.mount(topic) is not None:
+            why = f"{why}; {GUESS} its yaw in the robot, its roll and pitch are by gravity"
         else:
             why = f"{why}; {GUESS} its axes are those of the robot"
         self.sensors.append(f"{quoted(name)}: {mapping(section)}  # {why}")

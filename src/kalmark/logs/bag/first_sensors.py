@@ -32,7 +32,9 @@ def entry_of(topic: TopicSummary, space: bool) -> dict[str, Any]:
             entry[key] = name
     if topic.columns == CORNERS:
         entry["size_m"] = 0.16
-    if topic.columns == ("range_m",):
+    if topic.stated:
+        entry["fields"] = topic.stated
+    elif topic.columns == ("range_m",):
         entry["landmark"] = sensor_name(topic.name, Scans())
     if topic.columns == POSE3 and not is_tag(topic):
         entry["take"] = [*POSITION] if space else [*POSITION[:2]]
@@ -62,16 +64,19 @@ def mount_of(found: Survey, topic: TopicSummary, control: Any) -> Array | None:
 def model(found: Survey, topic: TopicSummary, space: bool) -> tuple[dict[str, Any], str]:
     """Return a sensor's section, and why."""
     columns = topic.columns
-    if columns[:2] == BEAM:
+    if columns[:2] == BEAM and not topic.stated:
         detector = {"type": "trunks"}
         section = {"type": "range_bearing", "detector": detector, "association": {"type": "auto"}}
         return section, f"{GUESS} posts and trunks are its landmarks; or corners, reflectors"
     if columns == ("range_m",):
         section = {"type": "range"} if space else {"type": "range", "initialization": {"type": "trilateration"}}
-        return section, f"{GUESS} `landmark` of its topic is what it measures"
+        return section, "" if topic.stated else f"{GUESS} `landmark` of its topic is what it measures"
     if columns == CORNERS or columns[:1] == ("u_px",):
         numbers, why = camera(found, topic)
         return {"type": "tag_corners" if columns == CORNERS else "pinhole"} | numbers, why
+    if topic.stated and columns[0] in BEAM:
+        kind = "_".join(column.rpartition("_")[0] for column in columns if column in BEAM)
+        return {"type": kind if columns[-1] != "elevation_rad" else "range_bearing_3d"}, ""
     kind = ("tag_pose" if is_tag(topic) else "position_3d") if space else "position"
     named = {} if topic.named or {*topic.fields} & {*IDS} else {"association": {"type": "auto"}}
     return {"type": kind} | named, ""

@@ -56,12 +56,16 @@ DAY_NS = 86_400_000_000_000
 _AXES2, _AXES3 = [0, 1], [0, 1, 2]
 
 
-def read(path: Path, request: Request, topics: Mapping[str, Any] | None = None) -> Log:
+def read(
+    path: Path, request: Request, topics: Mapping[str, Any] | None = None, definitions: Mapping[str, str] | None = None
+) -> Log:
     """Return the log that these topics of a bag are; of a bag that kalmark wrote, the log itself.
+
+    `definitions` are those of types that the bag does not define: texts, or .msg files.
 
     Raises LogError: a topic that is not there, messages that do not offer what the topic is to be.
     """
-    with Bag(path) as bag:
+    with Bag(path, definitions) as bag:
         if topics is None and tables.holds_log(bag):
             return tables.read(bag, request)
         if not topics:
@@ -411,4 +415,4 @@ def increment(a: Array, b: Array) -> Array:
 
 
 BAG = Format("bag", "a ROS bag (.bag, .mcap, .db3, the folder of a ROS 2 bag), with log.topics", find_bag, read,
-             options=("topics",))  # fmt: skip
+             options=("topics", "definitions"))  # fmt: skip

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.events import unit_quaternion
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.calibration import lens
 from kalmark.logs.columns import BEAM, CORNERS, POSE3, POSITION
 from kalmark.logs.table import Refused
 
-LENGTH = 1e-3  # a quaternion is of length 1 up to this
 NO_FIX = 0  # of NavSatStatus: what is below has no fix
 UNKNOWN_COVARIANCE = 0
 NOT_MEASURED = -1  # the first number of a covariance in an Imu that does not measure this
@@ -127,11 +127,7 @@ def frame_of(position: Any, rotation: Any) -> Array:
 
 def unit(rotation: Any) -> Array:
     """Return a geometry_msgs/Quaternion (4,), normalised.  Raises Refused."""
-    q = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-    norm = float(np.linalg.norm(q))
-    if not abs(norm - 1) <= LENGTH:
-        raise Refused(f"quaternion has length {norm:.6g}, expected 1")
-    return np.asarray(q / norm)
+    return unit_quaternion(np.array([rotation.x, rotation.y, rotation.z, rotation.w]), Refused)
 
 
 def pose_frame(pose: Any) -> Array:
@@ -325,7 +321,7 @@ def cloud(m: Any, scan: Scans) -> Seen:
     return seen
 
 
-def _named(scan: Scans, *names: Any) -> Any:
+def named(scan: Scans, *names: Any) -> Any:
     """Return the first id that there is, as a number where it is one; None if the configuration wants none."""
     text = next((str(name) for name in names if str(name)), "") if scan.ids != "none" else ""
     digits = text.removeprefix("-")
@@ -342,7 +338,7 @@ def _of_class(results: Any) -> str:
 def detection_id(each: Any, scan: Scans) -> Any:
     """Return the id of a vision_msgs detection: its own, or else its likeliest class; `ids: class` takes the class."""
     own = getattr(each, "id", getattr(each, "tracking_id", ""))
-    return _named(scan, "" if scan.ids == "class" else own, _of_class(each.results))
+    return named(scan, "" if scan.ids == "class" else own, _of_class(each.results))
 
 
 def boxes(m: Any, scan: Scans) -> Seen:
@@ -371,7 +367,7 @@ def markers(listed: Iterable[Any], scan: Scans) -> Seen:
         if each.action >= DELETED:
             seen.left_out["markers that are deleted"] += 1
             continue
-        seen.add(pose_frame(each.pose).tolist(), _named(scan, f"{each.ns}/{each.id}" if several else each.id))
+        seen.add(pose_frame(each.pose).tolist(), named(scan, f"{each.ns}/{each.id}" if several else each.id))
     return seen
 
 

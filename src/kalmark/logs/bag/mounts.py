@@ -13,7 +13,7 @@ from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.messages import MESSAGES
 from kalmark.logs.bag.reading import frame_id
 from kalmark.logs.bag.topics import Carried, InertialTopic, Posed, Topic
-from kalmark.logs.source import Request, placed
+from kalmark.logs.source import Request, frame_of, placed
 
 LEVEL = math.cos(math.radians(5))  # a sensor tilted by less is taken as level
 
@@ -59,7 +59,8 @@ class Mounts:
         assert isinstance(scan, Carried)
         frame = self.of_sensor.get(name, "")
         base = self.frames.base((scan.base_frame, self.base.get(scan.robot)), frame)
-        mount = None if base is None else self.frames.fixed(base, frame)
+        given = scan.mounted()
+        mount = frame_of(given) if given else None if base is None else self.frames.fixed(base, frame)
         if mount is None:
             return
         keys = [(scan.robot, sensor) for sensor in scan.sensors(name)]

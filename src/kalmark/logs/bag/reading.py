@@ -8,9 +8,9 @@ from __future__ import annotations
 import bz2
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
 from kalmark.errors import LogError
@@ -21,6 +21,17 @@ from kalmark.logs.table import Refused
 ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
 METADATA = "metadata.yaml"  # of a ROS 2 bag, which is a folder
 EXPECTED = "expected a whole bag: .bag, .bag.bz2, .mcap, .db3 or the folder of a ROS 2 bag"
+REINDEX, RECOVER = "`rosbag reindex FILE` of ROS 1 writes it", "`mcap recover FILE -o NEW.mcap` writes it"
+CURES = {
+    "Bag version": "an old version of bags, expected #ROSBAG V2.0: `rosbag fix OLD.bag NEW.bag` of ROS 1 writes one",
+    "is not indexed": f"a bag without an index, as of a recording that broke off, expected one: {REINDEX}",
+    "index looks damaged": f"the index of the bag is damaged, expected a whole one: {REINDEX}",
+    "encryption": "an encrypted bag, expected a plain one: `rosbag decrypt FILE` of ROS 1 writes it",
+    "File end magic is invalid": f"the file ends early and has no index, expected one: {RECOVER}",
+    "Unindexed MCAP messages": f"messages out of order and without an index, expected one: {RECOVER}",
+}
+"""What is said of a bag that can be mended, by what rosbags says of it."""
+UNDEFINED = "which the bag does not define, expected its .msg file, or the text of it, in log.definitions"
 SECOND_NS = 1_000_000_000
 
 
@@ -53,8 +64,8 @@ def find_bag(path: Path) -> Path | None:
 class Bag:
     """An open bag: `topics` by name, and their messages.  To be used in a `with` statement; raises LogError."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, definitions: Mapping[str, str] | None = None) -> None:
+        self.path, self._given = path, definitions or {}
         self.topics: dict[str, Messages] = {}
         self._open = ExitStack()
         self._reader: Any = None
@@ -76,11 +87,40 @@ class Bag:
                 connections = list(self._reader.connections)
             except Exception as error:  # rosbags has no common error for damaged files
                 raise self._damaged(error) from None
+            self._define()
             for each in connections:
                 count = self.topics[each.topic].number if each.topic in self.topics else 0
                 self.topics[each.topic] = Messages(each.msgtype, count + each.msgcount)
             self._open = stack.pop_all()
         return self
+
+    @property
+    def definitions(self) -> Mapping[str, Any]:
+        """The fields of types of messages, as the bag or the caller defines them."""
+        return self._reader.typestore.fielddefs
+
+    def _define(self) -> None:
+        """Add the definitions that the caller gives of types which the bag does not define.  Raises LogError."""
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        known = self._reader.typestore
+        for kind, given in self._given.items():
+            path = PurePosixPath(kind)
+            name = str(path if path.parent.name == "msg" else path.parent / "msg" / path.name)
+            try:
+                text = Path(given).read_text(encoding="utf-8") if given.strip().endswith(".msg") else given
+                if "/" not in kind:
+                    raise ValueError("expected a name PACKAGE/TYPE")
+                made = get_types_from_msg(text, name)
+            except Exception as error:  # rosbags has no common error of texts that are no definitions
+                reason = " ".join(str(error).split())[:120]
+                raise LogError(
+                    f"log option definitions: {kind} is {shown(given)}, expected a .msg file or its text ({reason})"
+                ) from None
+            known.register({each: fields for each, fields in made.items() if each not in known.fielddefs})
+        if self._given:  # what these are made of
+            usual = get_typestore(Stores.LATEST).fielddefs
+            known.register({each: fields for each, fields in usual.items() if each not in known.fielddefs})
 
     def __exit__(self, *_: object) -> None:
         """Close the bag."""
@@ -100,6 +140,8 @@ class Bag:
 
     def _damaged(self, error: Exception) -> LogError:
         reason = " ".join(str(error).split()) or type(error).__name__
+        if cure := next((cure for said, cure in CURES.items() if said in reason), ""):
+            return LogError(f"{self.path}: {cure}")
         return LogError(f"{self.path}: not a bag that can be read ({reason[:160].rstrip('.')}), {EXPECTED}")
 
     def find(self, name: str) -> str:
@@ -122,7 +164,7 @@ class Bag:
                 message = self._reader.deserialize(raw, connection.msgtype)
             except Exception as error:
                 if connection.msgtype not in self._reader.typestore.fielddefs:
-                    what = f"messages of the type {connection.msgtype}, which the bag does not define"
+                    what = f"messages of the type {connection.msgtype}, {UNDEFINED}"
                     raise LogError(f"{self.path}: topic {connection.topic} has {what}") from None
                 reason = " ".join(str(error).split())[:120] or type(error).__name__
                 at = f"the message of {connection.topic} recorded at {recorded_ns} ns"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry import rotations
+from kalmark.logs.bag.fields import offers, recognised
 from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.messages import MESSAGES, Measured, Message, Pose
-from kalmark.logs.bag.reading import Bag, declared, frame_id, has_header, stamp
+from kalmark.logs.bag.reading import UNDEFINED, Bag, declared, frame_id, has_header, stamp
 from kalmark.logs.bag.tables import holds_log
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.table import Refused
@@ -60,13 +62,15 @@ class TopicSummary:
 
     `gaps` counts the intervals of more than five usual ones.  `header` says whether its messages have a time of their
     own, which is `offset_s` behind that of the recorder in the first of them, and runs backwards by `back_s` at most;
-    `unset`: that it has a place for one, and zeros in it.  `turns` says whether a velocity in them is not 0.
+    `unset`: that it has a place for one, and zeros in it.  `offers` is what can be read from its messages, by their
+    type or by the fields `stated`, which their definition shows.  `turns` says whether a velocity in them is not 0.
     """
 
     name: str
     type: str
     count: int
     what: str = ""
+    offers: Message = field(default_factory=lambda: Message(""))
     rate_hz: float = float("nan")
     gaps: int = 0
     longest_s: float = float("nan")
@@ -80,6 +84,7 @@ class TopicSummary:
     poses: Poses = field(default_factory=Poses)
     columns: tuple[str, ...] = ()
     fields: tuple[str, ...] = ()
+    stated: dict[str, str] = field(default_factory=dict)
     named: bool = False
     unset: bool = False
     turns: bool = False
@@ -88,11 +93,8 @@ class TopicSummary:
     camera: dict[str, Any] | None = None
     first: dict[str, Measured] = field(default_factory=dict)
     """Of an inertial unit or a compass the first rates, attitude, force and field."""
-
-    @property
-    def offers(self) -> Message:
-        """What can be read from its messages, nothing of a type that is not known."""
-        return MESSAGES.get(self.type, Message(""))
+    each_second: dict[int, Array] = field(default_factory=dict)
+    """Of an inertial unit the sums (8,) over each second of its force, its rates, their magnitude, and their number."""
 
     @property
     def frames(self) -> str:
@@ -111,19 +113,20 @@ class Survey:
     frames: Frames
     pairs: dict[tuple[str, str], Poses]
     holds_log: bool
+    definitions: Mapping[str, str] = field(default_factory=dict)
 
     def named(self, name: str) -> TopicSummary:
         """Return the topic of a name."""
         return next(topic for topic in self.topics if topic.name == name)
 
 
-def survey(path: Path) -> Survey:
-    """Return what is in a bag.  Raises LogError if it cannot be read."""
-    with Bag(path) as bag:
-        summaries = {name: _summary(name, told.type, told.number) for name, told in sorted(bag.topics.items())}
+def survey(path: Path, definitions: Mapping[str, str] | None = None) -> Survey:
+    """Return what is in a bag; `definitions` are those of types that it does not define.  Raises LogError."""
+    with Bag(path, definitions) as bag:
+        summaries = {name: _summary(bag, name) for name in sorted(bag.topics)}
         begin, end = _rates(bag, summaries)
         frames, pairs = Frames(), dict[tuple[str, str], Poses]()
-        known = {name for name, summary in summaries.items() if summary.type in MESSAGES}
+        known = {name for name, summary in summaries.items() if summary.what}
         for received in bag.messages(known):
             summary, m = summaries[received.topic], received.message
             own = has_header(m)
@@ -148,12 +151,18 @@ def survey(path: Path) -> Survey:
             except Refused as refused:
                 summary.error = summary.error or str(refused)
         moving = {pair: poses for pair, poses in pairs.items() if pair in frames.moving}
-        return Survey(path, begin, end - begin, [*summaries.values()], frames, moving, holds_log(bag))
+        return Survey(
+            path, begin, end - begin, [*summaries.values()], frames, moving, holds_log(bag), definitions or {}
+        )
 
 
-def _summary(name: str, kind: str, count: int) -> TopicSummary:
-    known = MESSAGES.get(kind)
-    return TopicSummary(name, kind, count, known.what if known else "")
+def _summary(bag: Bag, name: str) -> TopicSummary:
+    kind, count = bag.topics[name]
+    known = offers(kind, bag.definitions) or Message("")
+    if kind not in bag.definitions:
+        return TopicSummary(name, kind, count, error=f"of a type {UNDEFINED}")
+    stated = {} if kind in MESSAGES else recognised(kind, bag.definitions)
+    return TopicSummary(name, kind, count, known.what, known, stated=stated)
 
 
 def _rates(bag: Bag, summaries: dict[str, TopicSummary]) -> tuple[float, float]:
@@ -196,6 +205,10 @@ def _look(summary: TopicSummary, m: Any, t_ns: int) -> None:
         told = None if read is None or name in summary.first else read(m)
         if told is not None and np.isfinite(told.v).all():
             summary.first[name] = told
+    force, rates = (None if read is None else read(m) for read in (offers.force, offers.rates))
+    if force is not None and rates is not None:
+        row = np.array([*force.v, *rates.v, np.linalg.norm(rates.v), 1.0])
+        summary.each_second[t_ns // 10**9] = summary.each_second.get(t_ns // 10**9, np.zeros(8)) + row
     if hasattr(m, "fields"):
         summary.fields = tuple(each.name for each in m.fields)
     elif offers.seen is not None and not (summary.columns and summary.named):

@@ -6,6 +6,7 @@ those of the control that comes of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
@@ -14,7 +15,7 @@ from kalmark.declare import Number, Within, class_of, classes, declared, paramet
 from kalmark.errors import LogError, ModelError
 from kalmark.events import Id, is_number, shown
 from kalmark.logs.columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
-from kalmark.logs.source import landmark_id, nanoseconds, nearest
+from kalmark.logs.source import POSE_KEYS, landmark_id, nanoseconds, nearest
 
 
 @declared
@@ -34,6 +35,11 @@ class Topic:
         "Time of a message: in its header, or when it was recorded; auto: the header's, if it has one.",
     ] = "auto"
     shift_s: Annotated[Number, "Added to the time of every message."] = 0.0
+    fields: Annotated[
+        Any,
+        "Columns, and the fields of the messages that have them, of a type that kalmark does not know: "
+        "`{id: tags[].id, range_m: tags[].distance}`; `[]`: of each element.",
+    ] = None
 
 
 @declared
@@ -123,6 +129,17 @@ class Carried(Topic):
     base_frame: Annotated[
         str | None, "The robot's frame in tf, for the sensor's mount; if absent that of its odometry, or base_link."
     ] = None
+    mount: Annotated[
+        Any, "Its pose in the robot, where tf does not have it: x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg, or some."
+    ] = None
+
+    def mounted(self) -> dict[str, float] | None:
+        """Return its pose in the robot as given, None if it is not.  Raises ModelError."""
+        given = self.mount
+        numbers = isinstance(given, Mapping) and all(is_number(v) and math.isfinite(v) for v in given.values())
+        if given is not None and not (numbers and {*given} <= {*POSE_KEYS}):
+            raise refuse(self, "mount", f"a mapping of numbers with keys among {', '.join(POSE_KEYS)}")
+        return None if given is None else dict(given)
 
     def sensors(self, topic: str) -> tuple[str, ...]:
         """Return the names of the sensors that a topic of this name has readings of."""
@@ -310,6 +327,8 @@ def topic_of(name: str, section: Any) -> Topic:
             )
     try:
         topic: Topic = model(**given)
+        if isinstance(topic, Carried):
+            topic.mounted()
     except ModelError as error:
         raise LogError(f"{where}: {error}") from None
     return topic
