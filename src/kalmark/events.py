@@ -23,7 +23,7 @@ Id = int | str
 
 FLOAT = np.dtype(np.float64)
 LATEST_NS = 2**63  # times are int64: about 292 years either side of 0
-LONGEST_PAUSE_NS = 366 * 86_400_000_000_000  # between two events: what comes later has a wrong stamp
+LONGEST_PAUSE_S = 12 * 3600.0  # between two events: what comes later has a wrong stamp
 LONGEST = 80  # characters of a value in a message
 LONGEST_ID = 200  # characters or digits of a landmark's id
 ROUNDED = 1e-3  # a quaternion is of length 1, and a matrix a rotation, up to this: files have few digits
@@ -420,6 +420,11 @@ _RANK: dict[type, int] = {Control: 0, Scan: 1, Frame: 1, Fix: 2}
 def when(event: Event) -> str:
     """Return what kind of event it is and its time, for an error's line."""
     return f"{type(event).__name__.lower()} at t={seconds(event.t_ns)} s"
+
+
+def kind_of(event: Event) -> tuple[str, str, str]:
+    """Return the kind of an event, its robot and its sensor ("" of what has none)."""
+    return type(event).__name__, event.robot, event.sensor if isinstance(event, Scan | Frame) else ""
 
 
 def order(event: Event) -> tuple[int, int, str, str]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import signal
 import socket
 import struct
 import subprocess
@@ -19,9 +21,9 @@ import pytest
 
 import kalmark as km
 from command_line import Kalmark
-from kalmark.cli.live import serve
+from kalmark.cli.live import Checkpoints, Signals, serve
 from kalmark.logs.lines import KEYS, LONGEST_LINE, event_of, line_of, mapping_of
-from kalmark.results.live import Live, converse
+from kalmark.results.live import Incoming, Live, converse
 
 CONFIG = """robots:
   rover:
@@ -200,6 +202,102 @@ def test_one_program_waits_for_the_other_and_none_that_is_gone_stops_the_next(tm
     last.sendall(control(100.0))
     assert answers(last, 2)[1]["t_s"] == 100.0
     last.close()
+
+
+def test_a_silent_program_and_one_of_another_protocol_are_told_so_and_left(tmp_path: Path) -> None:
+    live, port = a_live(tmp_path), free_port()
+    threading.Thread(target=serve, args=(live, port, 1.0), daemon=True).start()
+
+    def said(*pieces: bytes) -> list[dict[str, Any]]:
+        for _ in range(200):
+            with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=60) as connection:
+                for piece in pieces:
+                    connection.sendall(piece)
+                    time.sleep(0.01)
+                with connection.makefile() as lines:
+                    return [json.loads(line) for line in lines]
+            time.sleep(0.05)
+        raise AssertionError("nobody listens")
+
+    whole = json.dumps(CONTROL).encode() + b"\n"
+    ready, refused = said(b"GET / HTTP/1.1\r\n")
+    assert ready["ready"]
+    assert refused == {"error": "'GET / HTTP/1.1' is no object of JSON, expected events as docs/live.md has them"}
+    assert "is no object of JSON" in said(b"\x16\x03\x01")[1]["error"]
+    silent = "no line for 1 s, expected one sooner; the map is kept: connect again"
+    assert said()[1] == {"error": silent}
+    taken, left = said(whole, b'{"type"')[1:]
+    assert (taken["t_s"], left) == (1.0, {"error": silent})
+    assert said(b"\n \n", json.dumps(SCAN).encode()[:9], json.dumps(SCAN).encode()[9:], b"\n[1]\n")[1]["t_s"] == 2.0
+
+
+def test_an_event_that_is_sent_again_after_a_restart_is_not_taken_twice(tmp_path: Path) -> None:
+    live = a_live(tmp_path)
+    talk(live, CONTROL, SCAN)
+    live.slam.save(tmp_path / "map.kmk")
+    again = Live(km.Slam.load(tmp_path / "map.kmk"))
+    twice, late, new = talk(again, SCAN, CONTROL, FIX)[1:]
+    assert twice["error"] == "scan at t=2 s: a second one of 'rover' by 'lidar' at this time, expected each event once"
+    assert late["error"] == "control at t=1 s comes after one at t=2 s"
+    talk(live, FIX)
+    assert new["mean"] == live.slam.mean("rover").tolist()
+
+
+def test_lines_come_out_of_pieces_whole_and_long_ones_cut(tmp_path: Path) -> None:
+    here, there = os.pipe()
+    incoming = Incoming(here)
+    os.write(there, b"one\ntw")
+    assert incoming.readline(10) == "one\n"
+    os.write(there, b"o\n" + b"x" * 25 + b"\n\xff")
+    os.close(there)
+    read = [incoming.readline(10) for _ in range(6)]
+    assert read == ["two\n", "x" * 10, "x" * 10, "xxxxx\n", "\N{REPLACEMENT CHARACTER}", ""]
+    os.close(here)
+
+
+def test_the_map_is_saved_while_events_come_and_only_then(tmp_path: Path) -> None:
+    live, out = a_live(tmp_path), tmp_path / "map.kmk"
+    kept = Checkpoints(live.slam, out, 1e-9, Signals())
+    kept.look()
+    assert not out.exists()
+    talk(live, CONTROL)
+    kept.look()
+    assert km.Slam.load(out).state.t_ns == 10**9
+    out.unlink()
+    kept.due = 0.0
+    kept.look()
+    assert not out.exists()
+    talk(live, SCAN)
+    kept.out = tmp_path / "nowhere" / "map.kmk"
+    kept.look()  # a warning
+    assert kept.failed
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="of POSIX")
+def test_signals_end_it_between_events_and_the_map_is_saved(
+    kalmark: Kalmark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rover.yaml").write_text(CONFIG)
+    taken = Live.process
+    monkeypatch.setattr(km.Slam, "warm_up", lambda slam: None)
+    for number, status in ((signal.SIGTERM, 0), (signal.SIGHUP, 0), (signal.SIGINT, 130)):
+
+        def signalled(live: Live, event: Any, number: signal.Signals = number) -> Any:
+            if live.number == 2:
+                os.kill(os.getpid(), number)
+                os.kill(os.getpid(), number)
+            return taken(live, event)
+
+        text = "\n".join(json.dumps(line) for line in (CONTROL, SCAN, FIX))
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
+        monkeypatch.setattr(Live, "process", signalled)
+        before = signal.getsignal(number)
+        done = kalmark("live", "rover.yaml", "--out", "map.kmk")
+        assert done.status == status
+        assert km.Slam.load(tmp_path / "map.kmk").state.t_ns == 2 * 10**9
+        assert len(done.out.splitlines()) == 2  # ready, and the answer to the first event
+        assert signal.getsignal(number) is before
+        (tmp_path / "map.kmk").unlink()
 
 
 def test_events_come_back_from_their_lines() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +14,12 @@ import kalmark as km
 from kalmark.config import build_slam, load_config
 from kalmark.errors import DivergedError, EventError, LogError, RunError
 from kalmark.events import Control, Fix, Scan, order
+from kalmark.files import replace_file
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
 from kalmark.logs import open_log, write_native
 from kalmark.results.record import record
-from kalmark.results.recording import file_name, replace_file
+from kalmark.results.recording import file_name
 from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 from results_world import STEP_NS, circle, slam_for
@@ -226,22 +225,22 @@ def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
         Run.load(tmp_path)
 
 
-def test_an_interrupted_save_leaves_no_summary_and_no_temporary_file(
+def test_an_interrupted_save_leaves_the_old_run_and_no_temporary_file(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run.save(tmp_path)
+    out = run.save(tmp_path / "out")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
 
     def interrupt(_: object) -> str:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("kalmark.results.recording.associations_csv", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        run.save(tmp_path)
-    assert not (tmp_path / "summary.json").exists()
+        run.save(out)
     with pytest.raises(OSError, match="full"):
-        replace_file(tmp_path / "map.png", _half_written)
-    assert len((tmp_path / "map.png").read_bytes()) > 1000
-    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+        replace_file(out / "map.png", _half_written)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def _half_written(path: Path) -> None:
@@ -337,27 +336,6 @@ def test_the_name_of_a_robot_may_be_longer_than_that_of_a_file() -> None:
     assert file_name("rover-1.b") == "rover-1.b"
     assert len({file_name(name) for name in ("a/b", "a_b", "a b", "x" * 300, "x" * 301)}) == 5
     assert len(file_name("\u6f22" * 300).encode()) <= 100
-
-
-def test_of_two_programs_that_save_into_one_folder_the_second_one_waits(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    inside: list[str] = []
-
-    def slowly(self: Run, folder: Path) -> None:
-        inside.append("begins")
-        time.sleep(0.2)
-        inside.append("ends")
-
-    run.evaluate()
-    monkeypatch.setattr(Run, "save_files", slowly)
-    monkeypatch.setattr(Run, "report", lambda self, folder: [])
-    threads = [threading.Thread(target=run.save, args=(tmp_path,)) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert inside == ["begins", "ends"] * 3
 
 
 def test_a_run_without_pictures_is_the_same_but_for_what_these_show() -> None:

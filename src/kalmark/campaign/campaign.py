@@ -17,9 +17,9 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.campaign.scoring import NEES, Scores
+from kalmark.files import replace_folder, write
 from kalmark.geometry.gaussian import quantile
 from kalmark.results.evaluate import none_for_nan
-from kalmark.results.recording import write
 from kalmark.results.scene import COLOURS, grouped
 
 POINTS = 400  # of a curve, at most
@@ -37,6 +37,11 @@ FIGURES = (
     ("mount_deg", "mount at the end, deg"),
     ("mount_sure", "mounts within 3 sigma at the end"),
 )
+FILES = (
+    *("summary.json", "world.yaml", "config.yaml", "anees.csv", "anees.png", "sweep.png"),
+    *("runs.parquet", "report.html", "cells"),
+)
+"""Names that the results of a campaign have in its folder."""
 _WORDS = {"joint": "joint state, a dimension", "state": "pose and velocity"}
 _WITH_WORLD = ("pose", "landmarks", "joint")
 
@@ -246,10 +251,13 @@ class Campaign:
 
     def save(self, folder: str | Path) -> Path:
         """Write ``summary.json``, ``anees.csv`` (a row an estimator, robot and step), ``anees.png``, description."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        replace_folder(Path(folder), self.write, FILES, "summary.json")
+        return Path(folder)
+
+    def write(self, folder: Path) -> None:
+        """Write the files of `save` into a new folder."""
         write(folder / "summary.json", json.dumps(self.summary(), indent=2) + "\n")
-        (folder / f"{self.kind}.yaml").write_text(self.description, encoding="utf-8")
+        write(folder / f"{self.kind}.yaml", self.description)
         self._write_steps(folder / "anees.csv")
         title = f"{self.world}: average NEES of {self.runs} runs, seed {self.seed}"
         t_s = np.array(self.t_s) - (self.t_s[0] if self.kind == "config" else 0.0)  # logs have clocks
@@ -259,7 +267,6 @@ class Campaign:
             if any(np.isfinite(score.series[n]).any() for scores in self.scores.values() for score in scores)
         ]  # of a map without landmarks none has a NEES
         draw(folder / "anees.png", title, t_s, panels)
-        return folder
 
     def _names(self) -> list[str]:
         return kinds([score for scores in self.scores.values() for score in scores])

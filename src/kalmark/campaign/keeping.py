@@ -22,7 +22,7 @@ from kalmark.campaign.replay import Look, Replay
 from kalmark.campaign.scoring import SERIES, Scores
 from kalmark.config.schema import Config
 from kalmark.errors import KalmarkError
-from kalmark.results.recording import replace_file, write
+from kalmark.files import replace_file, write
 from kalmark.simulate.worlds import World
 
 NUMBERS = ("landmark_rmse_m", "landmark_rmse_raw_m", "landmarks", "nis", "nis_dof", "diverged")
@@ -74,8 +74,6 @@ class Kept:
             )
         folder.mkdir(parents=True, exist_ok=True)
         write(file, json.dumps(head | {"cells": old["cells"] | cells}, indent=2) + "\n")
-        for cell in cells.values():
-            (self.folder / cell).mkdir(parents=True, exist_ok=True)
 
     def path(self, cell: str, number: int) -> Path:
         """Return the file of one run."""
@@ -106,4 +104,5 @@ class Kept:
             "estimators": np.array([*result]),
             "stopped": np.array([s.stopped for s in scores]),
         }
+        self.path(cell, number).parent.mkdir(parents=True, exist_ok=True)
         replace_file(self.path(cell, number), lambda temporary: np.savez_compressed(temporary, **arrays))

@@ -16,10 +16,11 @@ from scipy.special import stdtrit
 
 from kalmark.arrays import Array
 from kalmark.campaign.campaign import FIGURES, Campaign, kinds, last_value, mean, rms
+from kalmark.campaign.campaign import FILES as RESULTS
 from kalmark.campaign.cells import Cell, shown
 from kalmark.campaign.scoring import Scores
 from kalmark.events import is_number
-from kalmark.results.recording import replace_file, write
+from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.report import show
 from kalmark.results.scene import COLOURS
 
@@ -115,16 +116,20 @@ class Sweep:
 
         With a sweep, each cell has that in a folder of its own, ``cells/NUMBER``, and ``sweep.png`` compares them.
         """
-        folder = Path(folder)
+        replace_folder(Path(folder), self._write, RESULTS, "summary.json")
+        return Path(folder)
+
+    def _write(self, folder: Path) -> None:
         for i, campaign in enumerate(self.campaigns):
-            campaign.save(folder / f"cells/{i + 1:03d}" if self.keys else folder)
+            of_cell = folder / f"cells/{i + 1:03d}" if self.keys else folder
+            of_cell.mkdir(parents=True, exist_ok=True)
+            campaign.write(of_cell)
         pictures = [folder / "sweep.png" if self.keys else folder / "anees.png"]
         if self.keys:
             write(folder / "summary.json", json.dumps(self.summary(), indent=2) + "\n")
             self.draw(pictures[0])
         self.write_runs(folder / "runs.parquet")
         write(folder / "report.html", self.page(pictures[0]))
-        return folder
 
     def write_runs(self, path: Path) -> None:
         """Write the rows of `runs` to a Parquet file; a swept key whose values are of several kinds as text."""

@@ -27,6 +27,7 @@ def bag(
     ] = None,
 ) -> None:
     """List the topics of a ROS bag, their rates, gaps and frames; write a first configuration that maps them."""
+    from kalmark.files import write
     from kalmark.logs import find_data
     from kalmark.logs.bag.first_config import first_config
     from kalmark.logs.bag.reading import EXPECTED, find_bag
@@ -52,7 +53,7 @@ def bag(
         if pairs:
             typer.echo(f"{what}: {', '.join(pairs)}")
     if out is not None:
-        out.write_text(first_config(found, out), encoding="utf-8")
+        write(out, first_config(found, out))
         typer.echo(f"{out}: look at the lines with GUESS, then kalmark run {shlex.quote(str(out))}")
 
 

@@ -83,12 +83,13 @@ def _write_path(out: Path, log: Log | None, run: Run | None, robot: str | None) 
 def _write_graph(out: Path, source: Path, log: Log | None, run: Run | None) -> None:
     """Write a run as a graph.  Raises KalmarkError."""
     from kalmark.config import build_slam, open_run
+    from kalmark.files import write
     from kalmark.results.graph import g2o_text
 
     if log is None or run is None:
         raise KalmarkError(f"{source}: not the folder of a run, expected one: a graph needs estimates and noise")
     slam = build_slam(open_run(source / "config.yaml")[0], log)
-    out.write_text(g2o_text(run, log, slam.robots), encoding="utf-8")
+    write(out, g2o_text(run, log, slam.robots))
 
 
 def _read(source: Path, log_format: str | None) -> tuple[Log | None, Run | None]:

@@ -21,8 +21,8 @@ def diagnose(
     from kalmark.diagnosis.breakdown import breakdown, nees_parts
     from kalmark.diagnosis.picture import draw_diagnosis
     from kalmark.diagnosis.verdict import diagnose as diagnosed
+    from kalmark.files import write
     from kalmark.results.plot import save_figure
-    from kalmark.results.recording import write
     from kalmark.results.run import Run
     from kalmark.results.verdict import verdict_lines
 

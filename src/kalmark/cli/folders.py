@@ -24,8 +24,8 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print all figures as JSON.")] = False,
 ) -> None:
     """Print the figures of a run."""
+    from kalmark.files import write
     from kalmark.logs import open_log
-    from kalmark.results.recording import write
     from kalmark.results.run import Run
 
     with computing():

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
@@ -13,8 +18,83 @@ from kalmark.errors import DivergedError, KalmarkError
 
 if TYPE_CHECKING:
     from kalmark.results.live import Live
+    from kalmark.slam.slam import Slam
 
 HERE = "127.0.0.1"
+ENDS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+BUSY = 0.05  # of the time may be spent on saving
+
+
+class SignalledError(Exception):
+    """The program was told to end by a signal."""
+
+
+class Signals:
+    """Signals that end the program: at once, or at the end of the context if one came inside.
+
+    Within it the map changes, or is saved.
+    """
+
+    def __init__(self) -> None:
+        self.inside, self.came, self.before = False, 0, {}  # type: ignore[var-annotated]
+
+    def listen(self) -> None:
+        """Take the signals from now on, in the main thread."""
+        if threading.current_thread() is threading.main_thread():
+            self.before = {number: signal.signal(number, self._take) for number in ENDS}
+
+    def leave(self) -> None:
+        """Take no signal any more."""
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
+
+    def _take(self, number: int, _: FrameType | None) -> None:
+        again, self.came = self.came, self.came or number
+        if not again:
+            self._end()
+
+    def _end(self) -> None:
+        if self.came and not self.inside:
+            raise SignalledError(signal.Signals(self.came).name)
+
+    def __enter__(self) -> Self:
+        self.inside = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.inside = False
+        self._end()
+
+
+class Checkpoints:
+    """A map that is saved every so often while it changes, for a twentieth of the time at most."""
+
+    def __init__(self, slam: Slam, out: Path | None, every_s: float, signals: Signals) -> None:
+        self.slam, self.out, self.every_s, self.signals = slam, out, every_s, signals
+        self.due, self.saved, self.failed = time.monotonic() + every_s, slam.state.t_ns, False
+
+    def look(self) -> None:
+        """Save the map if it is time; that it cannot be saved is said once, and the conversation goes on."""
+        if self.out is None or not self.every_s or time.monotonic() < self.due or self.saved == self.slam.state.t_ns:
+            return
+        begin = time.monotonic()
+        with self.signals:
+            try:
+                self.slam.save(self.out)
+                self.saved = self.slam.state.t_ns
+            except KalmarkError as error:
+                if not self.failed:
+                    typer.echo(f"kalmark: warning: {error}", err=True)
+                self.failed = True
+        now = time.monotonic()
+        self.due = now + max(self.every_s, (now - begin) / BUSY)
+
+    def end(self, told: Live) -> None:
+        """Save the map at the end, once, unless the filter is lost; no signal interrupts it."""
+        self.signals.inside = True
+        out, self.out = self.out, None
+        if out is not None and not told.lost:
+            self.slam.save(out)
 
 
 def live(
@@ -24,11 +104,19 @@ def live(
     listen: Annotated[
         int | None, typer.Option(metavar="PORT", min=0, max=65535, help="Answer on this port of this machine instead.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="MAP", help="Save the map here at the end, .kmk.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="MAP", help="Save the map here at the end and at signals, .kmk.")
+    ] = None,
+    checkpoint_every: Annotated[
+        float, typer.Option(metavar="S", min=0, help="Save it every so many seconds, too; 0: only at the end.")
+    ] = 60.0,
+    timeout: Annotated[
+        float, typer.Option(metavar="S", min=0, help="With --listen: leave a program silent for so long; 0: never.")
+    ] = 60.0,
     overrides: Overrides = None,
 ) -> None:
     """Take events as lines of JSON on standard input or a socket; answer each with the estimate after it."""
-    from kalmark.results.live import Live, converse
+    from kalmark.results.live import Incoming, Live, converse
     from kalmark.slam.slam import Slam
 
     if out is not None:
@@ -41,23 +129,53 @@ def live(
         else:
             slam = slam_of(config, overrides or ())
         slam.warm_up()
-        told = Live(slam)
+        signals = Signals()
+        told, kept = Live(slam, signals), Checkpoints(slam, out, checkpoint_every, signals)
         try:
-            if listen is None:
-                incoming, outgoing = (typer.get_text_stream(n, "utf-8", "replace") for n in ("stdin", "stdout"))
-                converse(told, incoming, outgoing)
-            else:
-                serve(told, listen)
+            try:
+                signals.listen()
+                idle_s = checkpoint_every or None
+                if listen is None:
+                    incoming, outgoing = (typer.get_text_stream(n, "utf-8", "replace") for n in ("stdin", "stdout"))
+                    handle = _descriptor(incoming)
+                    source = incoming if handle is None else Incoming(handle, kept.look, idle_s)
+                    converse(told, source, outgoing, kept.look)
+                else:
+                    serve(told, listen, timeout, kept.look, idle_s)
+            finally:
+                kept.end(told)
+        except SignalledError as error:
+            kept.end(told)
+            if signals.came == signal.SIGINT:
+                raise KeyboardInterrupt from None
+            typer.echo(f"kalmark: ended by {error}", err=True)
         finally:
-            if out is not None and not told.lost:
-                slam.save(out)
+            signals.leave()
     if told.lost:
         raise DivergedError(told.lost)
 
 
-def serve(told: Live, port: int) -> None:
-    """Answer one program after the other on a port of this machine, until the filter is lost."""
-    from kalmark.results.live import converse
+def _descriptor(stream: Any) -> int | None:
+    """Return the descriptor of a stream, None of one that has none."""
+    try:
+        return int(stream.fileno())
+    except (OSError, AttributeError):
+        return None
+
+
+def serve(
+    told: Live,
+    port: int,
+    silent_s: float = 60.0,
+    look: Callable[[], object] = lambda: None,
+    idle_s: float | None = None,
+) -> None:
+    """Answer one program after the other on a port of this machine, until the filter is lost.
+
+    One that is silent for `silent_s` (0: for ever), reads no answers for as long, or speaks another protocol is left.
+    `look` is called after each answer, and whenever there was none for `idle_s`.
+    """
+    from kalmark.results.live import Incoming, converse
 
     try:
         server = socket.create_server((HERE, port))
@@ -65,14 +183,17 @@ def serve(told: Live, port: int) -> None:
         raise KalmarkError(f"--listen {port}: {error.strerror}, expected a free port") from None
     with server:
         typer.echo(f"listening on {HERE}:{server.getsockname()[1]}", err=True)
+        server.settimeout(idle_s)
         while not told.lost:
-            connection, _ = server.accept()
             try:
-                with (
-                    connection,
-                    connection.makefile("r", encoding="utf-8", errors="replace", newline="\n") as incoming,
-                    connection.makefile("w", encoding="utf-8", newline="\n") as outgoing,
-                ):
-                    converse(told, incoming, outgoing)
+                connection, _ = server.accept()
+            except TimeoutError:
+                look()
+                continue
+            try:
+                connection.settimeout(silent_s or None)
+                with connection, connection.makefile("w", encoding="utf-8", newline="\n") as outgoing:
+                    incoming = Incoming(connection, look, idle_s, silent_s or None, stranger=True)
+                    converse(told, incoming, outgoing, look)
             except OSError:  # the program is gone; the map stays for the next one
                 continue

@@ -24,13 +24,14 @@ def simulate(
 ) -> None:
     """Simulate a world and write a native log with its truth, and the configuration of the filter that fits it."""
     from kalmark import simulate as sim
+    from kalmark.files import write
     from kalmark.logs import write_native
 
     writable(out)
     loaded = sim.load_world(world, overrides or ())
     log = sim.simulate(loaded, seed)
     write_native(log, out)
-    (out / "config.yaml").write_text(fitting_config(loaded, seed), encoding="utf-8")
+    write(out / "config.yaml", fitting_config(loaded, seed))
     typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}; map them with")
     typer.echo(f"kalmark run {shlex.quote(str(out / 'config.yaml'))}")
 

@@ -39,8 +39,8 @@ def tune(
     from kalmark.diagnosis.tune import tune as tuned
     from kalmark.diagnosis.tune_picture import draw_tuning
     from kalmark.diagnosis.tuned_file import new_config
+    from kalmark.files import write
     from kalmark.results.plot import save_figure
-    from kalmark.results.recording import write
 
     out = out or Path("out") / f"{Path(config).stem}_tuned.yaml"
     if out.suffix not in (".yaml", ".yml"):

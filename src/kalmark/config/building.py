@@ -46,6 +46,7 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
         "landmarks": _made(config, ("landmarks",), model_of, config.landmarks, robots[0].motion.space.world),
     }
     kept_map = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
+    kept_map["longest_pause_s"] = config.longest_pause_s
     slam: Slam = _made(config, ("robots",), Slam, robots, **types, **kept_map, upkeep=kept)
     for landmark in _known(config, log):
         try:

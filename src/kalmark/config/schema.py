@@ -28,6 +28,7 @@ from kalmark.config.sections import (
 from kalmark.config.tree import OVERRIDE, name_of
 from kalmark.declare import classes, register, registered_name
 from kalmark.errors import ConfigError
+from kalmark.events import LONGEST_PAUSE_S
 from kalmark.geometry.rotations import from_euler
 from kalmark.models.protocols import state_columns
 
@@ -516,6 +517,8 @@ class Config(OfFile):
     """Filter."""
     map: MapConfig = MapConfig()
     """Covariance storage."""
+    longest_pause_s: Positive = LONGEST_PAUSE_S
+    """An event that comes later after the one before it has a wrong stamp and is refused; 10 such in a row are not."""
 
     _where: dict[tuple[str, ...], str] = PrivateAttr(default_factory=dict)
 

@@ -28,6 +28,7 @@ from urllib.parse import quote, urlsplit
 import platformdirs
 
 from kalmark.errors import DataError, LogError
+from kalmark.files import locked
 from kalmark.logs.source import nearest
 
 ORIGIN = "https://raw.githubusercontent.com/{repo}/{commit}/{path}"
@@ -140,9 +141,12 @@ def fetch_one(dataset: Dataset, progress: Progress | None) -> Path:
             check(Path(provided) / file.file, file)
         return Path(provided)
     root = cache_folder()
-    there = ((root / file.file, file.sha256) for file in dataset.files)
-    if not all(path.is_file() and sha256(path) == wanted for path, wanted in there):
-        download(dataset, root, progress)
+    with suppress(OSError):  # `download` says so
+        root.mkdir(parents=True, exist_ok=True)
+    with locked(root):  # of two programs one downloads
+        there = ((root / file.file, file.sha256) for file in dataset.files)
+        if not all(path.is_file() and sha256(path) == wanted for path, wanted in there):
+            download(dataset, root, progress)
     return root
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
+from kalmark.files import write
 from kalmark.geometry.rotations import matrix
 from kalmark.logs.columns import POSE3
 from kalmark.logs.log import Log, Times, Trajectory
@@ -134,14 +135,14 @@ def write_path(out: Path, t_ns: Times, poses: Array) -> list[Path]:
     """Write a path as TUM, or as KITTI with its times beside it, by the file's ending; return the files."""
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".tum":
-        out.write_text(tum_text(t_ns, poses), encoding="utf-8")
+        write(out, tum_text(t_ns, poses))
         return [out]
     lines = []
     for pose in in_space(poses):
         M = np.column_stack([matrix(np.ascontiguousarray(pose[3:])), pose[:3]])
         lines.append(" ".join(f"{value:.12g}" for value in M.ravel()))
-    out.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    times_beside(out).write_text("".join(f"{seconds(int(t))}\n" for t in t_ns), encoding="utf-8")
+    write(times_beside(out), "".join(f"{seconds(int(t))}\n" for t in t_ns))
+    write(out, "\n".join(lines) + "\n")
     return [out, times_beside(out)]
 
 

@@ -13,6 +13,7 @@ from ruamel.yaml import YAML
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan
+from kalmark.files import replace_folder
 from kalmark.logs.columns import CANONICAL, GPS, POSE2, POSE3, POSITION
 from kalmark.logs.images.pictures import write_depth, write_image
 from kalmark.logs.log import Log
@@ -35,26 +36,26 @@ def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path
     unnamed column, two scans of one sensor at one time, an id that would be read as another).
     """
     folder = Path(folder)
-    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log), EMPTY, frames(log, folder))
-    folder.mkdir(parents=True, exist_ok=True)
+    own = [*FILES, RIG, *(str(Path(name).with_suffix(PARQUET)) for name in FILES)]
+    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log), EMPTY)
+    replace_folder(folder, lambda made: _fill(made, log, (*tables, frames(log, made)), parquet), own, FILES[0])
+    return folder
+
+
+def _fill(folder: Path, log: Log, tables: Sequence[Table], parquet: bool) -> None:
     for file_name, (header, rows) in zip(FILES, tables, strict=True):
-        other = (folder / file_name).with_suffix(PARQUET)
-        for old in (folder / file_name, other):
-            old.unlink(missing_ok=True)
         if not rows:
             continue
         if parquet and file_name != FRAMES:
-            write_parquet(other, header, rows)
+            write_parquet((folder / file_name).with_suffix(PARQUET), header, rows)
             continue
         with (folder / file_name).open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, header, lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
-    (folder / RIG).unlink(missing_ok=True)
     if log.describes:
         with (folder / RIG).open("w", encoding="utf-8") as file:
             YAML(typ="safe", pure=True).dump(log.describes, file)
-    return folder
 
 
 def write_parquet(path: Path, header: list[str], rows: list[dict[str, str]]) -> None:

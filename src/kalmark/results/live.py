@@ -6,21 +6,37 @@ The answer to a line that is refused is an error, and the map is what it was.
 from __future__ import annotations
 
 import json
-from typing import Any, TextIO
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from typing import Any, Protocol, TextIO
 
 from kalmark.errors import DivergedError, EventError, KalmarkError
-from kalmark.events import Event, Scan, seconds, shown, when
+from kalmark.events import Event, kind_of, seconds, shown, when
 from kalmark.logs.lines import LONGEST_LINE, event_of, mapping_of
 from kalmark.report import Report
 from kalmark.slam.slam import Slam
 
+PIECE = 1 << 16  # bytes that are read at once
+
+
+class EndedError(Exception):
+    """The other side of a conversation is silent, or speaks another protocol: what it says is said to it."""
+
 
 class Live:
-    """Takes lines, gives answers: objects for JSON.  `lost` says why the filter has ended, "" while it goes on."""
+    """Takes lines, gives answers: objects for JSON.  `lost` says why the filter has ended, "" while it goes on.
 
-    def __init__(self, slam: Slam) -> None:
+    The map is whole but within the context `changing`.
+    """
+
+    def __init__(self, slam: Slam, changing: AbstractContextManager[Any] | None = None) -> None:
         self.slam, self.number, self.lost = slam, 0, ""
-        self.latest: dict[tuple[type[Event], str, str], int] = {}
+        self.changing = nullcontext() if changing is None else changing
 
     def ready(self) -> dict[str, Any]:
         """Return what is said before the first line: the robots, and the columns of their controls and sensors."""
@@ -42,7 +58,8 @@ class Live:
             if given == {"type": "map"}:
                 return head | {"landmarks": self.landmarks()}
             event = event_of(given)
-            return head | self.estimate(event, self.process(event))
+            with self.changing:
+                return head | self.estimate(event, self.process(event))
         except KalmarkError as error:
             said = " ".join(str(error).split())
             self.lost = said if isinstance(error, DivergedError) else ""
@@ -53,13 +70,10 @@ class Live:
 
         Raises EventError or DivergedError.
         """
-        key = type(event), event.robot, event.sensor if isinstance(event, Scan) else ""
-        if self.latest.get(key) == event.t_ns:
-            whose = " by ".join(shown(name) for name in key[1:] if name)
+        if self.slam.has_taken(event):
+            whose = " by ".join(shown(name) for name in kind_of(event)[1:] if name)
             raise EventError(f"{when(event)}: a second one of {whose} at this time, expected each event once")
-        report = self.slam.process(event)
-        self.latest[key] = event.t_ns
-        return report
+        return self.slam.process(event)
 
     def estimate(self, event: Event, report: Report) -> dict[str, Any]:
         """Return the robot's mean and covariance after an event, and what became of its observations."""
@@ -85,18 +99,91 @@ class Live:
         return [row | {"mean": row["mean"].tolist(), "covariance": row["covariance"].tolist()} for row in rows]
 
 
-def converse(live: Live, incoming: TextIO, outgoing: TextIO) -> None:
-    """Answer each line until there are no more, or the filter is lost; blank lines have no answer."""
+class Lines(Protocol):
+    """A source of lines of text."""
+
+    def readline(self, most: int, /) -> str:
+        """Return the next line, or `most` characters of it; "" at the end."""
+
+
+class Incoming:
+    """The lines that a program writes to a pipe (its descriptor) or to a socket.
+
+    `idle` is called whenever nothing has come for `idle_s`.  Of a `stranger`, the first character has to be that of an
+    object of JSON, and a line has to be whole `silent_s` after the one before it: else EndedError.
+    """
+
+    def __init__(
+        self,
+        source: socket.socket | int,
+        idle: Callable[[], object] = lambda: None,
+        idle_s: float | None = None,
+        silent_s: float | None = None,
+        stranger: bool = False,
+    ) -> None:
+        self.source, self.idle, self.idle_s, self.silent_s = source, idle, idle_s, silent_s
+        self.read: Callable[[int], bytes] = partial(os.read, source) if isinstance(source, int) else source.recv
+        self.stranger, self.came = stranger, bytearray()
+
+    def readline(self, most: int) -> str:
+        """Return the next line, or `most` bytes of it; "" at the end."""
+        until = None if self.silent_s is None else time.monotonic() + self.silent_s
+        seen = 0
+        while (end := self.came.find(b"\n", seen)) < 0 and len(self.came) < most:
+            seen = len(self.came)
+            if not self._ready(until):
+                raise EndedError(
+                    f"no line for {self.silent_s:g} s, expected one sooner; the map is kept: connect again"
+                )
+            piece = self.read(PIECE)
+            self.came += piece
+            if self.stranger and (first := self.came.lstrip()[:1]):
+                if first != b"{":
+                    said = shown(self.came.decode("utf-8", "replace").splitlines()[0])
+                    raise EndedError(f"{said} is no object of JSON, expected events as docs/live.md has them")
+                self.stranger = False
+            if not piece:
+                end = len(self.came) - 1
+                break
+        length = min(most, end + 1 if end >= 0 else most)
+        line = self.came[:length].decode("utf-8", "replace")
+        del self.came[:length]
+        return line
+
+    def _ready(self, until: float | None) -> bool:
+        """Wait until something can be read; return False if nothing came until then."""
+        while True:
+            left = None if until is None else max(0.0, until - time.monotonic())
+            waits = min((s for s in (left, self.idle_s) if s is not None), default=None)
+            try:
+                if select.select([self.source], [], [], waits)[0]:
+                    return True
+            except OSError:  # Windows, where only a socket can be waited for
+                return True
+            self.idle()
+            if left is not None and until is not None and time.monotonic() >= until:
+                return False
+
+
+def converse(live: Live, incoming: Lines, outgoing: TextIO, after: Callable[[], object] = lambda: None) -> None:
+    """Answer each line until there are no more, or the filter is lost; blank lines have no answer.
+
+    `after` is called after each answer.
+    """
 
     def say(told: dict[str, Any]) -> None:
         outgoing.write(json.dumps(told, allow_nan=False) + "\n")
         outgoing.flush()
 
     say(live.ready())
-    while not live.lost and (line := incoming.readline(LONGEST_LINE + 1)):
-        while len(line) > LONGEST_LINE and not line.endswith("\n"):  # the rest of a line that is too long
-            rest = incoming.readline(LONGEST_LINE + 1)
-            if len(rest) <= LONGEST_LINE or rest.endswith("\n"):
-                break
-        if line.strip():
-            say(live.answer(line))
+    try:
+        while not live.lost and (line := incoming.readline(LONGEST_LINE + 1)):
+            while len(line) > LONGEST_LINE and not line.endswith("\n"):  # the rest of a line that is too long
+                rest = incoming.readline(LONGEST_LINE + 1)
+                if len(rest) <= LONGEST_LINE or rest.endswith("\n"):
+                    break
+            if line.strip():
+                say(live.answer(line))
+                after()
+    except EndedError as error:
+        say({"error": str(error)})

@@ -20,9 +20,10 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
 from kalmark.arrays import Array
+from kalmark.files import replace_file
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.landmarks import LINES, TAG
-from kalmark.results.recording import Recording, replace_file
+from kalmark.results.recording import Recording
 from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares
 from kalmark.results.verdict import alarm
 

@@ -71,6 +71,7 @@ def describe(slam: Any, log: Any = None) -> dict[str, Any]:
     out["upkeep"] = _keys(settings.upkeep)
     out["estimator"] = model(slam.estimator)
     reparametrize = "off" if settings.reparametrize is None else float(settings.reparametrize)
+    out["longest_pause_s"] = settings.longest_pause_s
     out["map"] = {"type": settings.map, "numbers": settings.numbers, "reparametrize": reparametrize}
     return out
 

@@ -10,13 +10,11 @@ import hashlib
 import io
 import json
 import math
-import os
 import shutil
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -28,6 +26,7 @@ from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
+from kalmark.files import locked, replace_file, write
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of, seconds
 from kalmark.results.history import History
@@ -135,38 +134,6 @@ def file_name(robot: str) -> str:
     return f"{name[: LONGEST_NAME // 4]}_{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
 
 
-@contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
-    """Wait until no other program saves into a folder, where the system has such locks."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
-
-
-def write(path: Path, text: str) -> None:
-    """Write a text file so that it is there completely or not at all."""
-    replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-
-
-def replace_file(path: Path, writer: Callable[[Path], Any]) -> None:
-    """Let `writer` write a temporary file beside `path`, then put it in its place."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        writer(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 @dataclass(frozen=True)
 class LogReference:
     """Which log a run was made from; a plain list of events has no name."""
@@ -259,45 +226,45 @@ class Recording:
             if not (folder / name).is_file():
                 raise RunError(f"{folder / name}: no such file, expected the folder of a complete run")
         try:
-            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-            with np.load(folder / "history.npz", allow_pickle=False) as arrays:
-                named = {key: arrays[key] for key in arrays.files}
-            log = summary["log"]
-            return cls(
-                history=History.from_arrays(named),
-                config=read_yaml(folder / "config.yaml"),
-                landmarks=MapLandmarks.read(folder / "landmarks.csv"),
-                truth=Truth.from_arrays(named),
-                log=LogReference(log["name"], log["format"], log["path"], tuple(log["robots"])),
-                coordinates=summary["coordinates"],
-                wall_s=summary["wall_s"],
-                skipped=[
-                    line if n == 1 else LeftOut(line, n)
-                    for line, n in zip(named["skipped"].tolist(), named["skipped_records"].tolist(), strict=True)
-                ],
-                stopped=summary.get("stopped", ""),
-                folder=folder,
-                summary=summary,
-                reference={name: summary[name] for name in named["reference"].tolist()},
-            )
+            with locked(folder, shared=True):  # no other program replaces it meanwhile
+                summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+                with np.load(folder / "history.npz", allow_pickle=False) as arrays:
+                    named = {key: arrays[key] for key in arrays.files}
+                log = summary["log"]
+                return cls(
+                    history=History.from_arrays(named),
+                    config=read_yaml(folder / "config.yaml"),
+                    landmarks=MapLandmarks.read(folder / "landmarks.csv"),
+                    truth=Truth.from_arrays(named),
+                    log=LogReference(log["name"], log["format"], log["path"], tuple(log["robots"])),
+                    coordinates=summary["coordinates"],
+                    wall_s=summary["wall_s"],
+                    skipped=[
+                        line if n == 1 else LeftOut(line, n)
+                        for line, n in zip(named["skipped"].tolist(), named["skipped_records"].tolist(), strict=True)
+                    ],
+                    stopped=summary.get("stopped", ""),
+                    folder=folder,
+                    summary=summary,
+                    reference={name: summary[name] for name in named["reference"].tolist()},
+                )
         except (KeyError, ValueError, OSError) as error:
             raise RunError(f"{folder}: not a run that this version reads: {error}") from None
 
     def save_files(self, folder: Path) -> None:
-        """Write all files of the run into a folder but its figures, its pictures and its page."""
+        """Write all files of the run into a new folder but its figures, its pictures and its page."""
         for robot in self.history.robots:
             write(folder / f"trajectory_{file_name(robot)}.tum", tum(self.history, robot))
         write(folder / "config.yaml", config_yaml(self.config))
         write(folder / "landmarks.csv", self.landmarks.to_csv())
         write(folder / "associations.csv", associations_csv(self.history))
-        (folder / "changes.csv").unlink(missing_ok=True)
         if self.history.changes:
             write(folder / "changes.csv", changes_csv(self.history))
         replace_file(folder / "history.npz", self._save_arrays)
         saved = None if self.folder is None else self.folder / "map.kmk"
         if self.slam is not None:
             replace_file(folder / "map.kmk", self.slam.save)
-        elif saved is not None and saved.is_file() and saved.parent.resolve() != folder.resolve():
+        elif saved is not None and saved.is_file():
             replace_file(folder / "map.kmk", partial(shutil.copyfile, saved))
 
     def _save_arrays(self, path: Path) -> None:

@@ -7,10 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from kalmark.files import replace_folder, write
 from kalmark.results.evaluate import evaluate
 from kalmark.results.history import Camera, Measuring
-from kalmark.results.recording import Recording, file_name, only_writer, write
+from kalmark.results.recording import Recording, file_name
 from kalmark.results.scene import steps_of
+
+FILES = (
+    *("summary.json", "config.yaml", "landmarks.csv", "associations.csv", "changes.csv", "history.npz", "map.kmk"),
+    *("map.png", "report.html", "trajectory_*.tum", "sensor_*.png"),
+)
+"""Patterns of the files of a run folder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +41,16 @@ class Run(Recording):
     def save(self, folder: str | Path) -> Path:
         """Write the run folder of the contract; files of an earlier run in it are replaced, all others stay.
 
-        ``summary.json`` goes first and comes last: a folder that has one is complete.  Of two programs that save into
-        one folder the second one waits, so that all files are of one run.
+        The folder has all files of the earlier run or all of this one, whatever happens meanwhile: `replace_folder`.
         """
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        summary = self.summary or self.evaluate()
-        with only_writer(folder):
-            (folder / "summary.json").unlink(missing_ok=True)
-            self.save_files(folder)
-            self.report(folder)
-            write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+        folder, summary = Path(folder), self.summary or self.evaluate()
+
+        def fill(made: Path) -> None:
+            self.save_files(made)
+            self.report(made)
+            write(made / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+
+        replace_folder(folder, fill, FILES, "summary.json")
         return folder
 
     def report(self, folder: str | Path) -> list[Path]:

@@ -15,12 +15,13 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from kalmark.errors import RunError
+from kalmark.files import replace_file
 from kalmark.logs.progress import track
 from kalmark.results.evaluate import headline
 from kalmark.results.pictures import Pictures
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_scan import draw_image
-from kalmark.results.recording import Recording, replace_file
+from kalmark.results.recording import Recording
 from kalmark.results.scene import INK, Scene, images, steps_of
 
 INCHES, DPI = (12.8, 7.2), 80

@@ -9,7 +9,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError, ModelError
-from kalmark.events import MOST, Control, Fix, Scan, finite, refuse_huge, shown, when
+from kalmark.events import MOST, Control, Fix, Scan, finite, is_number, refuse_huge, shown, when
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, Motion, OwnNoise, Sensor, coasts, innovation_size
 
@@ -49,7 +49,9 @@ def refuse_odd_association(value: Any, what: str) -> None:
     able(value, ("threshold", "associate"), what, expected)
 
 
-def refuse_odd_parts(association: Any, estimator: Any, landmarks: Any, upkeep: Any, reparametrize: Any) -> None:
+def refuse_odd_parts(
+    association: Any, estimator: Any, landmarks: Any, upkeep: Any, reparametrize: Any, longest_pause_s: Any
+) -> None:
     """Refuse what a Slam cannot be made of."""
     refuse_odd_association(association, "association")
     like = "an object like km.estimators.Ekf(), with predict, correct, for_fixes and pose_jacobian"
@@ -59,6 +61,8 @@ def refuse_odd_parts(association: Any, estimator: Any, landmarks: Any, upkeep: A
     instance(upkeep, Upkeep, "upkeep", "an Upkeep")
     if reparametrize is not None and not (isinstance(reparametrize, int | float) and reparametrize >= 0):
         raise ModelError(f"reparametrize is {shown(reparametrize)}, expected a number of at least 0, or None: never")
+    if not is_number(longest_pause_s) or not longest_pause_s > 0:
+        raise ModelError(f"longest_pause_s is {shown(longest_pause_s)}, expected a number of seconds above 0")
 
 
 def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[KalmarkError] = EventError) -> None:

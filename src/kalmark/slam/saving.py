@@ -10,7 +10,6 @@ import hashlib
 import io
 import json
 import math
-import os
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -34,7 +33,8 @@ from kalmark.arrays import Array
 from kalmark.association import Association
 from kalmark.declare import by_class_name, registered_name
 from kalmark.errors import KalmarkError, MapError
-from kalmark.events import Id
+from kalmark.events import LONGEST_PAUSE_S, Id
+from kalmark.files import replace_file
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.maps import restored as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
@@ -83,16 +83,15 @@ def save(path: Path, state: State) -> None:
     members = {DESCRIPTION: json.dumps(description, default=_plain, allow_nan=False).encode()}
     members |= {f"{name}.npy": _npy(array) for name, array in _arrays(state)}
     sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in members.items()).encode()
-    temporary = path.with_name(path.name + ".part")
+
+    def pack(file: Path) -> None:
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, data in (members | {SUMS: sums}).items():  # without the clock: equal maps are equal files
+                small = len(data) < LARGE
+                archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED if small else zipfile.ZIP_STORED)
+
     try:
-        try:
-            with zipfile.ZipFile(temporary, "w") as archive:
-                for name, data in (members | {SUMS: sums}).items():  # without the clock: equal maps are equal files
-                    small = len(data) < LARGE
-                    archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED if small else zipfile.ZIP_STORED)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        replace_file(path, pack)
     except OSError as error:
         raise MapError(f"{path}: {error.strerror}, expected a file that can be written") from error
 
@@ -103,6 +102,7 @@ def _state(state: State) -> Description:
     blocks = {name: slot for name, slot in tracks.slots.items() if name not in tracks.confirmed}
     return {
         "t_ns": state.t_ns,
+        "taken": sorted(map(list, state.taken)),
         "placed": state.placed,
         "map": state.map.state(),
         "blocks": [[_id(name), slot] for name, slot in blocks.items()],
@@ -235,6 +235,7 @@ class Saved:
         robots, tracks, clones = state.robots, Tracks(state.robots), Clones()
         state.t_ns, state.map, state.tracks, state.clones = _time(s["t_ns"]), map_, tracks, clones
         state.placed = _count(s["placed"], "placed")
+        state.taken = {(str(kind), str(robot), str(sensor)) for kind, robot, sensor in s.get("taken", ())}
         for name, slot in s["blocks"]:
             tracks.enter_block(name, slot, robot=name in robots)
         for record in s["tracks"]:
@@ -339,6 +340,7 @@ def load(
                 "numbers": s["numbers"],
                 "reparametrize": _optional(s["reparametrize"], "reparametrize", "a number", int, float),
                 "upkeep": restored("upkeep", s["upkeep"], "upkeep", "upkeep"),
+                "longest_pause_s": s.get("longest_pause_s", LONGEST_PAUSE_S),
             }
         )
         made = robots_restored(s["robots"], None if robots is None else list(robots))

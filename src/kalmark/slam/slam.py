@@ -28,7 +28,7 @@ from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
-from kalmark.events import LONGEST_PAUSE_NS, Control, Event, Fix, Frame, Id, Scan, checked_id, seconds, when
+from kalmark.events import LONGEST_PAUSE_S, Control, Event, Fix, Frame, Id, Scan, checked_id, kind_of, seconds, when
 from kalmark.filter.estimators import Compiling, Estimator, Invariant
 from kalmark.geometry.spaces import RHO
 from kalmark.management import reparametrize as points
@@ -51,6 +51,7 @@ from kalmark.tracks.front_ends import FrameDetector, FrontEnd, SearchingDetector
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track
 
+IN_A_ROW = 10  # events that are all far ahead of the map: then it was a pause
 LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
@@ -62,7 +63,8 @@ class Slam(Estimate):
     `reparametrize` (None: never).  `map` is "dense", "postponed" (the compressed map, docs/compressed.md), or "auto":
     dense while small; `numbers` ("float64", "float32") are those in which a compressed one keeps what is inactive.
     `upkeep` says when an observation without an id becomes a landmark (docs/association.md).  Events must come in the
-    order of their times.
+    order of their times, none more than `longest_pause_s` after the one before it: its stamp is wrong.  After 10 such
+    events in a row, none of them that far after the one before it, it was a pause.
     """
 
     def __init__(
@@ -75,18 +77,20 @@ class Slam(Estimate):
         reparametrize: float | None = LINEAR,
         numbers: str = "float64",
         upkeep: Upkeep = CAREFUL,
+        longest_pause_s: float = LONGEST_PAUSE_S,
     ) -> None:
         association = ByIdentity() if association is None else association
         estimator = Invariant() if estimator is None else estimator
-        refuse_odd_parts(association, estimator, landmarks, upkeep, reparametrize)
+        refuse_odd_parts(association, estimator, landmarks, upkeep, reparametrize, longest_pause_s)
         by_name: dict[str, Robot] = {}
         for robot in robots_given(robots):
             if robot.name in by_name:
                 raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
             by_name[robot.name] = robot
-        settings = Settings(association, estimator, landmarks, map, reparametrize, numbers, upkeep)
+        settings = Settings(association, estimator, landmarks, map, reparametrize, numbers, upkeep, longest_pause_s)
         super().__init__(State(by_name, settings))
         self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may ask `expect`
+        self._ahead: list[int] = []  # times of the events in a row that came too far ahead
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Frame: self._frame, Fix: self._fix}
         if isinstance(estimator, Compiling):
             kinds = [kind for channel in self.state.channels.values() for kind in channel.landmark.space.kinds]
@@ -105,19 +109,21 @@ class Slam(Estimate):
         before = state.t_ns
         if before is not None and event.t_ns < before:
             raise EventError(f"{when(event)} comes after one at t={seconds(before)} s")
-        if before is not None and event.t_ns - before > LONGEST_PAUSE_NS:
-            raise EventError(
-                f"{when(event)} comes more than a year after one at t={seconds(before)} s, expected it sooner"
-            )
         if event.robot not in state.robots:
             names = sorted(state.robots)
             raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
+        if before is not None and event.t_ns - before > self.state.settings.longest_pause_s * 1e9:
+            self._refuse_ahead(event, before)
         try:
             report: Report = take(event)
             if not isinstance(event, Frame):
                 state.settle()
             if event.robot in state.standing:
                 report.standing = own_readings.stood(state, event)
+            if event.t_ns != before:
+                self.state.taken.clear()
+                self._ahead = []
+            self.state.taken.add(kind_of(event))
             return report
         except EventError:
             state.t_ns = before
@@ -126,6 +132,22 @@ class Slam(Estimate):
             state.refuse_lost(event)
             why = " ".join(str(error).split())
             raise DivergedError(f"{when(event)}: {why}; {CURE}") from error
+
+    def _refuse_ahead(self, event: Event, before: int) -> None:
+        """Refuse an event that comes longer after the last one than any pause lasts, but not the tenth in a row."""
+        longest_s = self.state.settings.longest_pause_s
+        if self._ahead and not 0 <= event.t_ns - self._ahead[-1] <= longest_s * 1e9:
+            self._ahead = []
+        self._ahead.append(event.t_ns)
+        if len(self._ahead) < IN_A_ROW:
+            raise EventError(
+                f"{when(event)} comes {(event.t_ns - before) * 1e-9:.6g} s after one at t={seconds(before)} s, "
+                f"expected at most {longest_s:g} s (longest_pause_s), or {IN_A_ROW} such events in a row"
+            )
+
+    def has_taken(self, event: Event) -> bool:
+        """Return whether an event of this kind, robot and sensor is in the map that is of the time of the map."""
+        return event.t_ns == self.state.t_ns and kind_of(event) in self.state.taken
 
     def _control(self, event: Control) -> Report:
         state = self.state

@@ -45,6 +45,7 @@ class Settings:
     reparametrize: float | None
     numbers: str
     upkeep: Upkeep
+    longest_pause_s: float
 
 
 class State:
@@ -52,13 +53,15 @@ class State:
 
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
     `standing` are, of robots that are noticed to stand, the names of the sensors that do; `alternatives` are, of robots
-    whose readings do not fit, the other explanations of these.
+    whose readings do not fit, the other explanations of these; `taken` are the events of this very time: the kind, the
+    robot and the sensor of each.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
     def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
         self.settings, self.robots = settings, robots
         self.t_ns: int | None = None
+        self.taken: set[tuple[str, str, str]] = set()
         self.map: Map = new_map(settings.map, settings.numbers)
         self.tracks, self.clones, self.surveys = Tracks(robots), Clones(), Surveys()
         self.placed = 0  # fixes that have told where the map is in the world; a survey counts as many

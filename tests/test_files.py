@@ -1,0 +1,189 @@
+"""Files and folders of results: old or new, whole, after errors, kills and with two writers."""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from kalmark import files
+from kalmark.errors import RunError
+from kalmark.files import locked, refuse_bomb, replace_file, replace_folder, write
+
+OWN = ("summary.json", "map_*.csv", "cells")
+
+
+def fill(text: str, *names: str) -> Callable[[Path], None]:
+    """Return a writer of files of one content, the summary first."""
+
+    def filled(folder: Path) -> None:
+        for name in ("summary.json", *names):
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text)
+
+    return filled
+
+
+def content(folder: Path) -> dict[str, str]:
+    """Return the text of each file of a folder."""
+    return {str(p.relative_to(folder)): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def save(folder: Path, text: str, *names: str) -> None:
+    """Write a result into a folder."""
+    replace_folder(folder, fill(text, *names), OWN, "summary.json")
+
+
+NO_EXCHANGE: list[str] = ["exchanged", "one by one"]
+
+
+@pytest.fixture(params=NO_EXCHANGE)
+def _way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have folders exchanged, or their files put in place one by one."""
+
+    def refused(*_: object) -> None:
+        raise OSError("this system cannot exchange folders")
+
+    if request.param != NO_EXCHANGE[0]:
+        monkeypatch.setattr(files, "_exchange", refused)
+
+
+@pytest.mark.usefixtures("_way")
+def test_a_folder_is_replaced_with_all_that_was_its_own_and_nothing_else(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    save(out, "old", "map_a.csv", "map_b.csv", "cells/1", "cells/2")
+    (out / "notes").mkdir()
+    (out / "notes" / "mine.txt").write_text("mine")
+    (out / "scan.png").write_text("mine")
+    (out / "link").symlink_to("notes")
+    save(out, "new", "map_a.csv", "cells/1")
+    told = {"summary.json": "new", "map_a.csv": "new", "cells/1": "new", "scan.png": "mine", "notes/mine.txt": "mine"}
+    assert content(out) == told
+    assert (out / "link").readlink() == Path("notes")
+    assert os.listdir(tmp_path) == ["out"]
+
+
+@pytest.mark.usefixtures("_way")
+def test_a_writer_that_fails_changes_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def fails(folder: Path) -> None:
+        fill("half")(folder)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        replace_folder(out, fails, OWN, "summary.json")
+    assert not out.exists()
+    save(out, "old", "map_a.csv")
+    with pytest.raises(KeyboardInterrupt):
+        replace_folder(out, fails, OWN, "summary.json")
+    assert content(out) == {"summary.json": "old", "map_a.csv": "old"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_the_working_folder_stays_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    save(Path(), "old", "map_a.csv")
+    before = tmp_path.stat().st_ino
+    save(Path(), "new")
+    assert content(Path()) == {"summary.json": "new"}
+    assert tmp_path.stat().st_ino == before
+    assert os.listdir() == ["summary.json"]
+
+
+def test_a_link_to_a_file_or_a_folder_stays_one(tmp_path: Path) -> None:
+    save(tmp_path / "real", "old")
+    (tmp_path / "link").symlink_to("real")
+    save(tmp_path / "link", "new")
+    write(tmp_path / "link" / "b.txt", "b")
+    (tmp_path / "c.txt").symlink_to("real/b.txt")
+    write(tmp_path / "c.txt", "c")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "c.txt").is_symlink()
+    assert content(tmp_path / "real") == {"summary.json": "new", "b.txt": "c"}
+
+
+def _dies(folder: Path) -> None:
+    """Write half of a result and end as a killed program does, without a word."""
+    fill("half")(folder)
+    os._exit(9)
+
+
+def _dies_in_a_file(path: Path) -> None:
+    path.write_text("half")
+    os._exit(9)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="programs are forked")
+def test_a_killed_program_leaves_the_old_result_and_a_later_one_clears_up(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    save(out, "old")
+    for target, writer in ((out, _dies), (out / "summary.json", _dies_in_a_file)):
+        how = (out, writer, OWN, "summary.json") if target == out else (target, writer)
+        child = mp.get_context("fork").Process(target=replace_folder if target == out else replace_file, args=how)
+        child.start()
+        child.join()
+        assert child.exitcode == 9
+    assert (out / "summary.json").read_text() == "old"
+    left = [path for path in (*tmp_path.iterdir(), *out.iterdir()) if path.name.startswith(".")]
+    assert len(left) == 2
+    save(out, "new")
+    assert left[0].exists()  # another program may still be at work there
+    for path in left:
+        if path.exists():
+            os.utime(path, (0, 0))
+    save(out, "newer")
+    write(out / "summary.json", "newest")
+    assert content(tmp_path) == {"out/summary.json": "newest"}
+
+
+def _many(folder: Path, text: str) -> None:
+    for _ in range(30):
+        save(folder, text, *(f"map_{k}.csv" for k in range(5)))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="programs are forked")
+@pytest.mark.usefixtures("_way")
+def test_of_two_writers_a_reader_finds_one_result_whole(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    save(out, "a", *(f"map_{k}.csv" for k in range(5)))
+    fork = mp.get_context("fork")
+    writers = [fork.Process(target=_many, args=(out, text)) for text in "ab"]
+    for writer in writers:
+        writer.start()
+    reads = 0
+    while any(writer.is_alive() for writer in writers) or not reads:
+        with locked(out, shared=True) as got:
+            found = content(out)
+        assert got
+        assert len(found) == 6
+        assert len(set(found.values())) == 1
+        reads += 1
+    for writer in writers:
+        writer.join()
+        assert writer.exitcode == 0
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_lock_that_another_has_is_waited_for_only_so_long(tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    with locked(tmp_path / "a.lock") as first, locked(tmp_path / "a.lock", wait_s=0.0) as second:
+        assert first
+        assert not second
+    with locked(tmp_path / "a.lock", wait_s=0.0) as again:
+        assert again
+    with locked(tmp_path / "nowhere" / "a.lock") as without:
+        assert not without
+
+
+def test_an_archive_that_says_that_it_unpacks_to_far_more_is_refused_before_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for k in range(100):
+            archive.writestr(str(k), bytes(1_000_000))
+    with zipfile.ZipFile(path) as archive, pytest.raises(RunError, match=r"100000000 bytes in a file of \d+, expected"):
+        refuse_bomb(archive, path, RunError)
