@@ -296,10 +296,6 @@ class Moving:
         shared, (slots, B, u) = self.error is not None, self.added(map_, part)
         return Movement(self.model, self.slot, slots, shared, B, u, part.N, NO_NOISE if D is None else D, part.dt_s)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return all but the compiled model, whose address means nothing to another process."""
-        return {name: value for name, value in self.__dict__.items() if name != "model"}
-
 
 def bias_name(robot: str) -> str:
     """Return the name of the constants of a robot's controls in the map."""

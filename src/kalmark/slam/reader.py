@@ -189,7 +189,3 @@ class Reader:
             self.mean = Mean(np.array(rate, dtype=np.float64).reshape(size), max(int(number), 1))
             self.sigma = np.array(sigma, dtype=np.float64).reshape(size)
         self.until = None if until is None else {int(from_ns): int(t_ns) for from_ns, t_ns in until}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return all but the compiled view, whose addresses mean nothing to another process."""
-        return self.__dict__ | {"_view": None}

@@ -79,9 +79,7 @@ def save(path: Path, state: State) -> None:
 
     Raises MapError if the file cannot be written, or an id is neither an integer nor a text.
     """
-    description = {"kalmark": VERSION, "settings": _settings(state), "state": _state(state)}
-    members = {DESCRIPTION: json.dumps(description, default=_plain, allow_nan=False).encode()}
-    members |= {f"{name}.npy": _npy(array) for name, array in _arrays(state)}
+    members = members_of(state, {"kalmark": VERSION, "settings": _settings(state)})
     sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in members.items()).encode()
 
     def pack(file: Path) -> None:
@@ -94,6 +92,19 @@ def save(path: Path, state: State) -> None:
         replace_file(path, pack)
     except OSError as error:
         raise MapError(f"{path}: {error.strerror}, expected a file that can be written") from error
+
+
+def members_of(state: State, head: Description) -> dict[str, bytes]:
+    """Return what events have made of a Slam, as the files of an archive; `head` stands before it."""
+    said = json.dumps(head | {"state": _state(state)}, default=_plain, allow_nan=False)
+    return {DESCRIPTION: said.encode()} | {f"{name}.npy": _npy(array) for name, array in _arrays(state)}
+
+
+def fill(state: State, members: dict[str, bytes]) -> None:
+    """Fill a state as it is after construction with what `members_of` returned."""
+    own = state.settings.landmarks
+    said = json.loads(members[DESCRIPTION])["state"]
+    Saved(Path(), [*state.robots.values()], state.settings, said, members, own).fill(state)
 
 
 def _state(state: State) -> Description:

@@ -445,7 +445,22 @@ class Slam(Estimate):
             saved.fill(slam.state)
         return slam
 
+    def __reduce__(self) -> tuple[Callable[..., Slam], tuple[Any, ...]]:
+        """Return how a copy is made, by `copy` or `pickle`: made anew, with the state that `save` writes."""
+        from kalmark.slam import saving
+
+        return _copied, ([*self.robots.values()], self.state.settings, saving.members_of(self.state, {}))
+
     @staticmethod
     def from_config(path: str | Path) -> Slam:
         """Build the Slam that a configuration (a path or a shipped name) describes."""
         return import_module("kalmark.config").slam_from_config(path)  # by name: configuration stands above
+
+
+def _copied(robots: list[Robot], settings: Settings, members: dict[str, bytes]) -> Slam:
+    """Make the copy that `Slam.__reduce__` describes."""
+    from kalmark.slam import saving
+
+    slam = Slam(robots, **vars(settings))
+    saving.fill(slam.state, members)
+    return slam
