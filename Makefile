@@ -3,13 +3,17 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench bench-peers bench-growth fuzz clean
+.PHONY: demo test lowest lint bench bench-peers bench-growth fuzz clean
 
 demo: $(VENV)/base.stamp
 	$(BIN)/kalmark demo
 
 test: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -n 2
+
+# the oldest versions that pyproject.toml allows
+lowest: $(VENV)-lowest/stamp
+	$(VENV)-lowest/bin/python -m pytest -q tests/test_config.py tests/slam/test_slam.py tests/logs/test_logs_tables.py tests/logs/test_logs_bags_files.py tests/cli/test_cli.py
 
 lint: $(VENV)/test.stamp
 	$(BIN)/ruff check .
@@ -50,5 +54,11 @@ $(VENV)/fuzz.stamp: $(VENV)/base.stamp
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[fuzz]'
 	touch $@
 
+$(VENV)-lowest/stamp: pyproject.toml
+	$(PYTHON) -m venv --clear $(VENV)-lowest
+	$(VENV)-lowest/bin/python -m pip install --quiet uv
+	VIRTUAL_ENV=$(VENV)-lowest $(VENV)-lowest/bin/uv pip install --quiet --resolution lowest-direct -e '.[test]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) $(VENV)-lowest out
