@@ -36,6 +36,7 @@ from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, window_warnin
 from kalmark.results.words import count, figure
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.surveyed import ELSEWHERE
+from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 from kalmark.tracks.surveys import MISFITS
 
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
@@ -49,6 +50,7 @@ SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to as
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped anew because of it
 MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
 JUMP = "odometry_jump"  # the cause that controls say a motion that was none
+MISPLACED = "misplaced_landmark"  # the cause that a landmark is not where its sightings have it
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause that innovations look wrong, and nothing says why
 LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that says something
@@ -275,6 +277,7 @@ def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
         *repeats(run.summary),
         *split_landmarks(run),
         *misplaced_landmarks(run),
+        *_begun_again(run),
         *fits_nothing(run),
         *off,
         *given_up(run),
@@ -356,7 +359,19 @@ def misplaced_landmarks(run: Run) -> list[Cause]:
     evidence = f"{some}: {more}. An outlier at first sight, or an id that means another place"
     cure = "leave out their first sightings, or use robust: huber instead of a gate"
     few = len(names) <= FEW * len(mapped) or len(rows) <= FEW * len(h.id)
-    return [Cause("misplaced_landmark", since_s, score, evidence, cure, few)]
+    return [Cause(MISPLACED, since_s, score, evidence, cure, few)]
+
+
+def _begun_again(run: Run) -> Iterator[Cause]:
+    """Yield the landmarks whose first sightings the filter found to be outliers, which does no harm."""
+    h = run.history
+    for change in (c for c in h.changes if c.reason == BEGUN_AGAIN):
+        rows = np.flatnonzero((h.id == change.landmark) & (h.outcome == "new"))
+        since_s = float(h.t_ns[h.step[rows[0]] if len(rows) else change.step]) * 1e-9
+        evidence = f"landmark {change.landmark} was begun by an outlier: from later sightings it was begun again"
+        yield Cause(
+            MISPLACED, since_s, 0.5 * MOST_D2, evidence, f"leave out its first sighting, at t={since_s:.1f} s", True
+        )
 
 
 def fits_nothing(run: Run) -> Iterator[Cause]:

@@ -51,7 +51,8 @@ def matched(
 
     `lost` (K,) are observations of a robot that does not know its place.
     """
-    names = [name for name, track in scan.tracks.tentative.items() if track.model.kind in scan.channel.models]
+    kinds, tentative = scan.channel.models, scan.tracks.tentative.items()
+    names = [name for name, track in tentative if track.model.kind in kinds and track.of is None]
     if not rows or not names:
         return [], []
     d2 = _distances(scan, rows, names, lost)

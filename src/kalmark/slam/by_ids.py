@@ -8,15 +8,18 @@ from __future__ import annotations
 import math
 from typing import cast
 
+import numpy as np
+
 from kalmark.events import Id, Scan
 from kalmark.filter.estimators import Update
 from kalmark.report import Judged, Report
-from kalmark.slam import moves
+from kalmark.slam import moves, tentative
 from kalmark.slam.checks import measurements
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.slam.surveyed import is_tried
 from kalmark.tracks.channel import Channel
+from kalmark.tracks.scan import ScanContext
 
 
 def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Report | None:
@@ -40,6 +43,12 @@ def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Re
     report.e, report.z, report.Z, _, fused, _ = done
     for track, used in zip(seen, fused.tolist(), strict=True):
         track.observations += used
+    if policy.contests and not fused.all():
+        scan = ScanContext(
+            state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report
+        )  # fmt: skip
+        group = Judged(range(len(ids)), ids, ids, done, channel.gate)
+        tentative.contest(state, scan, model, group, ~fused & ~np.isnan(done.d2), policy.upkeep.odds)
     if report.gaps and fused.any():
         moving.held.located(event.t_ns)
     report.judged = (Judged(range(len(ids)), ids, ids, done, channel.gate),)

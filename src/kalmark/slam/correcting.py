@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array, Index
+from kalmark.arrays import Array, Flags, Index
 from kalmark.association.averaging import average, outcomes
 from kalmark.association.protocol import Decision, Mixture
-from kalmark.filter.estimators import Averaging
+from kalmark.filter.estimators import Averaging, Correction, Update
+from kalmark.geometry.gaussian import gate
 from kalmark.management import depths, tags
 from kalmark.management.attention import chosen
 from kalmark.report import INDEFINITE, Judged, Observation
-from kalmark.slam import surveyed
+from kalmark.slam import surveyed, tentative
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import ObservationModel
@@ -54,8 +55,11 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
             else state.corrected(update, scan.event)
         )
         report.fill(rows, done)
-        state.tracks.count(names, done.fused.tolist())
         judged.append(Judged(rows, scan.ids, names, done, min(scan.channel.gate, least)))
+        if policy.contests:
+            misfits = _misfits(scan, model, slots, rows, update, done)
+            tentative.contest(state, scan, model, judged[-1], misfits, policy.upkeep.odds)
+        state.tracks.count(names, done.fused.tolist())
     return judged, found + _average(state, scan, decisions) if policy.averages else found
 
 
@@ -81,6 +85,19 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
         known.count(names, done.fused.tolist())
         judged.append(Judged(rows, scan.ids, names, done, min(scan.channel.gate, least)))
     return judged
+
+
+def _misfits(
+    scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int], update: Update, done: Correction
+) -> Flags:  # fmt: skip
+    """Return which observations (K,) do not fit: beyond the gate or, where outliers count less, by their own noise."""
+    if scan.channel.robust is None:
+        return np.asarray(~done.fused & ~np.isnan(done.d2))
+    Z = done.Z - update.R + scan.noise(model, slots, rows)
+    regular: Flags = np.asarray(np.isfinite(Z).all(axis=(1, 2)), dtype=np.bool_)
+    z, Z = np.where(regular[:, None], done.z, 0.0), np.where(regular[:, None, None], Z, np.eye(Z.shape[1]))
+    d2 = np.sum(z * np.linalg.solve(Z, z[..., None])[..., 0], axis=1)
+    return np.asarray(~regular | (d2 > gate(surveyed.SURVEYED, scan.channel.dof)))
 
 
 def _approach(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -42,7 +43,9 @@ class Policy:
     may answer with mixtures; `holds_back`: its pairs are tested against chance; `reviews`: landmarks may change after a
     scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the
     last `keep_poses` clones are kept for tentative landmarks.  `restarts`: rays may have to be started again
-    (`baselines.py`).  `by_ids`: nothing is to be decided of a scan whose ids are of landmarks of one type in the map.
+    (`baselines.py`).  `contests`: where a landmark with an id was begun is weighed against sightings that do not fit
+    (`tentative.py`), which are left out or count less.
+    `by_ids`: nothing is to be decided of a scan whose ids are of landmarks of one type in the map.
     """
 
     association: Association
@@ -58,6 +61,7 @@ class Policy:
     linear: float
     keep_poses: int
     restarts: bool
+    contests: bool
     by_ids: bool
 
 
@@ -84,6 +88,8 @@ def policy_of(
         0.0 if channel.joins else linear or 0.0,
         upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
         not channel.finds_depth and channel.mount >= 0 and any(isinstance(kind, AnchoredHomogeneous) for kind in seen),
+        (channel.robust is not None or association.threshold(channel.dof, math.inf) < math.inf)
+        and delayed is None and (_deferred(mount) is None or channel.is_ambiguous) and channel.starts_landmarks,
         type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
         and not (reviews or varies or looks_back or approaches),
     )  # fmt: skip

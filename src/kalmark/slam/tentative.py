@@ -1,22 +1,37 @@
-"""Tentative landmarks: compared with what no landmark explains, confirmed with what was kept of them, or dropped."""
+"""Tentative landmarks: compared with what no landmark explains, confirmed with what was kept of them, or dropped.
+
+A tentative landmark may also be the other place of a landmark with an id: a sighting that does not fit begins it, as a
+wrong first sighting is followed by right ones.  Each further sighting fits one place or the other, and the one that
+it does not fit has to have it as an outlier.  Once the other place is beyond doubt, it is the landmark's.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from contextlib import suppress
+from itertools import islice
 
 import numpy as np
 
+from kalmark.arrays import Flags
 from kalmark.association.protocol import REMAP, Decision
 from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.estimators import Update
-from kalmark.management import confirm, merge, walls
-from kalmark.report import Observation
+from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.management import confirm, merge, tags, walls
+from kalmark.report import Judged, Observation
 from kalmark.slam.policy import Policy
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import State
+from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
-from kalmark.tracks.track import Late, Track
+from kalmark.tracks.track import Late, Status, Track
+
+OUTLIER = math.log(0.95 / 0.05)  # the log odds that one sighting with an id is right
+WITHIN = 0.9999  # of right sightings fit
+ELSEWHERE = "its first sightings are outliers: it is where the later ones have it"
 
 
 def compare(state: State, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision],
@@ -96,10 +111,80 @@ def _keep(state: State, scan: ScanContext, most: int, waiting: dict[int, Track])
         track.measurements.append(scan.measurement(k, clone))
 
 
+def contest(state: State, scan: ScanContext, model: ObservationModel, group: Judged, misfits: Flags, odds: float
+) -> None:  # fmt: skip
+    """Weigh where the `misfits` (K,) of a group of observations with ids have their landmarks against where these are.
+
+    A landmark is begun again there if that is `odds` times likelier, and if no fewer landmarks that were in the map
+    before fit meanwhile than do not: else the robot may be elsewhere.
+    """
+    tracks, rivals = state.tracks, {t.of: t for t in state.tracks.tentative.values() if t.of is not None}
+    if not rivals and not misfits.any():
+        return
+    mine = [i for i, name in enumerate(group.names) if name in tracks.confirmed and name not in state.surveys.trial]
+    fitting = {group.names[i] for i in mine if not misfits[i]}
+    for i in mine:
+        name, k = group.names[i], group.rows[i]
+        rival = rivals.get(name)
+        if not misfits[i] and rival is not None:
+            rival.log_odds = (rival.log_odds or 0.0) - OUTLIER
+            if rival.hits == 1 or rival.log_odds < -math.log(odds):
+                _forget(state, rival)
+        elif misfits[i] and scan.ids[k] is not None:
+            if rival is None or not _agrees(scan, model, rival, k):
+                _begin(state, scan, name, k, rival)
+                continue
+            rival.hits, rival.log_odds = rival.hits + 1, (rival.log_odds or 0.0) + OUTLIER
+    rivals = {t.of: t for t in tracks.tentative.values() if t.of is not None}
+    contested = sum(rival.hits > 1 for rival in rivals.values())
+    for name, rival in rivals.items():
+        older = set(islice(tracks.confirmed, rival.searched)) - {name}
+        rival.covisible |= fitting & older
+        if (rival.log_odds or 0.0) >= math.log(odds) and len(rival.covisible) >= contested and name in tracks.confirmed:
+            state.remove(name)
+            del tracks.tentative[rival.id]
+            rival.id, rival.of, rival.log_odds, rival.covisible = name, None, None, set()
+            tracks.confirm(rival)
+            scan.report.removed += ((name, ELSEWHERE),)
+
+
+def _agrees(scan: ScanContext, model: ObservationModel, rival: Track, k: int) -> bool:
+    """Return whether the k-th observation fits a tentative landmark."""
+    model = scan.channel.models.get(rival.model.kind, model)
+    d2 = scan.predict(model, np.array([rival.slot]), [k])[1]
+    return bool(d2[0] <= chi2_gate(WITHIN, scan.channel.dof))
+
+
+def _begin(state: State, scan: ScanContext, name: Id, k: int, before: Track | None) -> None:
+    """Begin the other place of a landmark at the k-th observation, in the place of one `before` that was seen once."""
+    if (before is not None and before.hits > 1) or (scan.channel.is_ambiguous and not tags.is_clear(scan, k)):
+        return
+    with suppress(np.linalg.LinAlgError, MapError):  # it is full
+        start = scan.start_of(k)
+        if not start.is_finite:
+            return
+        track = Track(state.tracks.new_name(), scan.channel.landmark, state.add(start), size_m=scan.size_of(k))
+        against, track.searched = state.tracks.confirmed[name].observations - 1, len(state.tracks.confirmed)
+        track.status, track.of, track.log_odds = Status.TENTATIVE, name, -OUTLIER * against
+        if before is not None:
+            track.log_odds, track.covisible = before.log_odds, before.covisible
+            _forget(state, before)
+        state.tracks.tentative[track.id] = track
+
+
+def _forget(state: State, track: Track) -> None:
+    """Remove a tentative landmark."""
+    state.map.remove(track.slot)
+    del state.tracks.tentative[track.id]
+
+
 def drop(state: State, scan: ScanContext, policy: Policy) -> None:
     """Count the tentative landmarks in view that this scan did not show; drop those that cannot be confirmed."""
     tentative, u = state.tracks.tentative, policy.upkeep
-    mine = [name for name, track in tentative.items() if track.model.kind in scan.channel.models]
+    for track in [t for t in tentative.values() if t.of is not None and t.of not in state.tracks.confirmed]:
+        _forget(state, track)
+    kinds = scan.channel.models
+    mine = [name for name, track in tentative.items() if track.model.kind in kinds and track.of is None]
     for name in mine:
         tentative[name].unseen += 1
     missed = [name for name in mine if tentative[name].unseen]
@@ -110,5 +195,4 @@ def drop(state: State, scan: ScanContext, policy: Policy) -> None:
         if u.hopeless(track.hits, track.chances) or track.unseen > confirm.OUT_OF_VIEW * u.within:
             why = f"tentative: seen in {track.hits} of {track.chances} scans"
             scan.report.removed += ((name, why),)
-            state.map.remove(track.slot)
-            del tentative[name]
+            _forget(state, track)

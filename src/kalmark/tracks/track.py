@@ -69,6 +69,8 @@ class Track:
     (2,) are the abscissas of the segment observed of a line, `size_m` is the measured size of a tag.  `first` is the
     observation that started it, and
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
+    A tentative one may be where sightings `of` a landmark have it that do not fit that: then `log_odds` are those that
+    it is right, and `covisible` are those of the first `searched` landmarks that fitted meanwhile.
     """
 
     id: Id
@@ -90,6 +92,7 @@ class Track:
     first: Late | None = None
     pending: Pending | None = None
     measurements: list[Measurement] = field(default_factory=list)
+    of: Id | None = None
 
 
 def _looks_invented(name: Id) -> bool:
