@@ -11,8 +11,8 @@ import pytest
 
 from command_line import Kalmark, write_log
 from kalmark.config import build_slam, open_run
-from kalmark.events import Control, Fix, Scan
-from kalmark.logs import Log, PositionTrack, Trajectory, open_log
+from kalmark.events import Control, Fix, Scan, order
+from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
 from kalmark.logs.bag.write import Types
 from kalmark.results.mcap import export
 from kalmark.results.record import record
@@ -105,6 +105,24 @@ def test_a_log_comes_back_with_the_same_map(kalmark: Kalmark, tmp_path: Path) ->
     maps = {(tmp_path / f"run_{log}" / "landmarks.csv").read_bytes() for log in ("native", "there.mcap", "back")}
     assert len(maps) == 1
     assert kalmark("convert", "native", "there.mcap").status == 2
+
+
+@pytest.mark.parametrize("options", [(), ("--parquet",)])
+def test_increments_that_scans_cut_are_written_whole(
+    options: tuple[str, ...], kalmark: Kalmark, tmp_path: Path
+) -> None:
+    events = [Control(0.5 * k, "cart", (0.2, 0.0, 0.1)) for k in range(1, 5)]
+    seen = [Scan(0.3 * k, "cart", "eye", [[3.0, 1.0]], ids=[7]) for k in range(5)]
+    columns = {
+        "control_columns": {"cart": ("dx_m", "dy_m", "dtheta_rad")},
+        "sensor_columns": {("cart", "eye"): ("x_m", "y_m")},
+    }
+    write_native(Log("cart", ("cart",), sorted([*events, *seen], key=order), **columns), tmp_path / "log")
+    robot = "{motion: {type: odometry_2d}, sensors: {eye: {type: position}}}"
+    (tmp_path / "cart.yaml").write_text(f"log: {{path: log}}\nrobots: {{cart: {robot}}}\n")
+    assert len(open_run(tmp_path / "cart.yaml")[1].events) > 9
+    assert kalmark("convert", "cart.yaml", "out", *options).status == 0
+    assert same_logs(open_log(tmp_path / "out"), open_log(tmp_path / "log"))
 
 
 def test_another_library_reads_the_messages_of_a_run(kalmark: Kalmark, tmp_path: Path) -> None:

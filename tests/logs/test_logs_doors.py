@@ -59,9 +59,29 @@ def test_poses_of_the_plane_are_at_height_0() -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "text", "t_ns"),
+    [
+        ("a.tum", "timestamp tx ty tz qx qy qz qw\n1.5 1 2 3 0 0 0.7071 0.7071\n", 1_500_000_000),
+        ("a.csv", "time,x,y,z,q_w,q_x,q_y,q_z\n1.5, 1, 2, 3, 0.7071, 0, 0, 0.7071\n", 1_500_000_000),
+        ("a.txt", "# t x y z qx qy qz qw\n1 nan nan nan nan nan nan nan\n1.5;1;2;3;0;0;0.7071;0.7071\n", 1_500_000_000),
+        ("a.tum", "1500000000000000001 1 2 3 0 0 0.7071 0.7071\n", 1_500_000_000_000_000_001),
+        ("a.tum", "1500000000000000 1 2 3 0 0 0.7071 0.7071\n", 1_500_000_000 * 10**9),
+    ],
+)
+def test_poses_of_tum_are_read_as_programs_write_them(name: str, text: str, t_ns: int, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    skipped: list[str] = []
+    path = read_path(tmp_path / name, Request(None, raising, skipped))
+    assert path.t_ns.tolist() == [t_ns]
+    np.testing.assert_allclose(path.poses, [[1, 2, 3, 0, 0, 0.5**0.5, 0.5**0.5]], atol=1e-12)
+    assert skipped == ([f"{tmp_path / name}: 1 positions of NaN, which are none"] if "nan" in text else [])
+
+
+@pytest.mark.parametrize(
     ("name", "text", "said"),
     [
         ("a.tum", "1 0 0 0 0 0 0 2\n", "a.tum:1: quaternion has length 2, expected 1"),
+        ("a.csv", "t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n2,0,0,0,0,0,0,1.1\n", "a.csv:3: quaternion has length 1.1"),
         ("a.tum", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "a.tum:2: time 1.000000000 s twice"),
         ("a.tum", "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "a.tum:2: time 1 s after 2 s"),
         ("a.tum", "1 0 0 0 0 0 0 1\n2 0 0 nan 0 0 0 1\n", "a.tum:2: z_m is 'nan'"),
@@ -218,6 +238,25 @@ def test_a_bad_line_of_a_graph_is_named(line: str, said: str, tmp_path: Path) ->
     assert "\n" not in str(error.value) and len(str(error.value)) < 700
 
 
+def test_a_graph_of_toro_has_its_information_in_another_order(tmp_path: Path) -> None:
+    """As xx, xy, yy, tt, xt, yt."""
+    lines = "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0 10 1 20 30 2 3\n"
+    (tmp_path / "a.graph").write_text(lines)
+    log = open_log(tmp_path / "a.graph", vertices="truth")
+    np.testing.assert_allclose(np.linalg.inv(log.events[0].cov), [[10, 1, 2], [1, 20, 3], [2, 3, 30]], atol=1e-9)
+    assert log.truth["robot"].poses.tolist() == [[0, 0, 0], [1, 0, 0]]
+
+
+def test_a_graph_with_bearings_has_a_sensor_of_bearings(tmp_path: Path) -> None:
+    lines = "EDGE_BEARING_SE2_XY 0 7 0.5 100\nEDGE_SE2_XY 0 7 1 2 4 0 4\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
+    (tmp_path / "a.g2o").write_text(lines)
+    log = open_log(tmp_path / "a.g2o")
+    seen = {event.sensor: event for event in log if isinstance(event, Scan)}
+    assert seen["bearings"].y.tolist() == [[0.5]] and seen["bearings"].ids == (7,)
+    assert seen["bearings"].cov.tolist() == [[[0.01]]] and seen["sensor"].y.tolist() == [[1, 2]]
+    assert log.describes["robots"]["robot"]["sensors"]["bearings"]["type"] == "bearing"
+
+
 # ------------------------------------------------------------------ CARMEN
 LASER = "FLASER 3 1.0 2.0 81.9 0.3 0 0 0.2 0 0 10.5 host 0.5\n"
 CARMEN = f"""# a comment
@@ -242,12 +281,23 @@ def test_a_log_of_carmen_has_increments_and_beams(tmp_path: Path) -> None:
     assert [line.split(": ", 1)[1] for line in log.skipped] == ["1 SYNC messages, which are not read"]
 
 
+def test_messages_of_carmen_without_times_are_a_second_apart(tmp_path: Path) -> None:
+    lines = "ODOM 0 0 0 0.1 0 0\nFLASER 2 1 2 0 0 0 1 0 0\nODOM 3 0 0 0.1 0 0\n"
+    (tmp_path / "a.log").write_text(lines)
+    log = open_log(tmp_path / "a.log")
+    assert [(type(e).__name__, e.t_ns // 10**9) for e in log] == [("Control", 2), ("Scan", 2), ("Control", 3)]
+    (tmp_path / "a.log").write_text(lines + "ODOM 4 0 0 0.1 0 0 17.0 host 1\n")
+    with pytest.raises(LogError, match=r"a\.log:4: ODOM: a message with a time, expected all or none to have one"):
+        open_log(tmp_path / "a.log")
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [
         ("FLASER 5 1.0 2.0", "a.log:9: FLASER: .* cells and 5 ranges"),
         ("FLASER x 1.0 2.0", "a.log:9: FLASER: invalid literal"),
         ("ODOM 0 0", "a.log:9: ODOM: too few cells"),
+        ("ODOM 0 0 0 0.1 0 0", "a.log:9: ODOM: a message without a time"),
         ("ODOM 0 0 inf 0.1 0 0 14.0 host 0.0", "a.log:9: ODOM: inf"),
         ("FLASER 2 -1.0 1.0 0.3 0 0 0.2 0 0 13 host 0.5", "range -1.0, expected ranges of at least 0"),
         (LASER.strip(), "a second scan at this time"),

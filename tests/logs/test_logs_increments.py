@@ -20,6 +20,7 @@ from kalmark.events import Event
 from kalmark.geometry import frames, frames3d
 from kalmark.logs.increments import CUT, cut, part_of, unevenness
 from kalmark.logs.log import Log, begins_at
+from kalmark.logs.overflow import overflows
 from kalmark.models.observe import step, step_of
 from kalmark.slam.motion import noise_of
 
@@ -214,3 +215,28 @@ def test_halves_are_no_copies() -> None:
 
 def test_a_robot_without_controls_has_none_that_is_far_larger_than_the_others() -> None:
     assert Controls(log_of([]), PLANE, "rover").odd(1.0) is None
+
+
+@pytest.mark.parametrize(("bits", "way", "digits"), [(16, -1, 6), (16, 1, 15), (32, -1, 15)])
+def test_a_counter_of_a_wheel_that_ran_over_is_named_with_what_to_add(
+    bits: int, way: int, digits: int, tmp_path: Path
+) -> None:
+    counts, step = np.random.default_rng(3).integers(280, 321, 60), 2 * np.pi / 2 ** (10 if bits == 16 else 16)
+    left = np.round(np.where(np.arange(60) == 40, counts + way * 2.0**bits, counts) * step, digits)
+    rows = [f"{k},r,{a:.15g},{b:.15g}" for k, (a, b) in enumerate(zip(left, counts * step, strict=True))]
+    (tmp_path / "controls.csv").write_text("\n".join(["t_s,robot,left_rad,right_rad", *rows, ""]))
+    said = f"left_rad of r at t=40.* s is .*: a counter of {bits} bits, whose steps are {step:.6g} rad, ran over"
+    with pytest.raises(km.errors.LogError, match=said) as error:
+        km.open_log(tmp_path)
+    (tmp_path / "controls.csv").write_text(f"t_s,robot,left_rad,right_rad\n1,r,1,{2.0**32 * 0.006}\n")
+    with pytest.raises(km.errors.LogError, match=r"expected at most 1e\+06 rad: did the counter of the wheel run over"):
+        km.open_log(tmp_path)
+    assert float(str(error.value).rpartition("add ")[2]) == pytest.approx(-way * 2.0**bits * step, rel=1e-5)
+
+
+def test_a_wheel_that_jumps_by_something_else_is_not_taken_for_a_counter(tmp_path: Path) -> None:
+    counts, step = np.random.default_rng(3).integers(280, 321, 60), 2 * np.pi / 1024
+    smooth = np.random.default_rng(4).normal(1.8, 0.05, 60)
+    for values in (np.where(np.arange(60) == 40, 50_000, counts) * step, np.where(np.arange(60) == 40, 402.0, smooth)):
+        assert overflows(values) == []
+    assert overflows(np.zeros(9)) == overflows(counts * step) == []

@@ -97,7 +97,7 @@ def test_poses_in_space_and_landmarks_in_space_come_back(tmp_path: Path) -> None
         robots=("r",),
         events=[Fix(t_ns=1, robot="r", y=(1, 2, 3), cov=np.eye(3) / 3)],
         truth={"r": Trajectory(np.array([1]), np.array([pose]))},
-        landmarks={"a": np.array([1.0, 2.0, 3.0]), 2: np.arange(6.0) / 7, "tag": np.array(pose) / 7},
+        landmarks={"a": np.array([1.0, 2.0, 3.0]), 2: np.arange(6.0) / 7, "tag": np.array([1 / 7, *pose[1:]])},
         describes={
             "robots": {"r": {"motion": {"type": "odometry_3d", "sigma_x_m": 1e-5}}},
             "landmarks": {"type": "tag"},
@@ -135,6 +135,8 @@ def test_robots_and_sensors_of_space_come_back_side_by_side(tmp_path: Path) -> N
     ]
     for k, sensor in enumerate(sensors):
         y = random.random((2, len(SPACE[sensor])))
+        if SPACE[sensor][-1] == "qw":
+            y[:, -4:] /= np.linalg.norm(y[:, -4:], axis=1, keepdims=True)
         events.append(Scan(t_ns=k, robot="odometry", sensor=sensor, y=y, ids=[k, f"l{k}"]))
     log = Log(
         name="many",
@@ -316,4 +318,22 @@ def test_a_sensor_with_other_columns_in_another_file_is_refused_with_its_line(tm
     with pytest.raises(
         LogError, match=r"measurements.csv:2: no column range_m, expected range_m, bearing_rad as r laser"
     ):
+        open_log(tmp_path)
+
+
+def test_quaternions_of_few_digits_are_poses_and_normalised(tmp_path: Path) -> None:
+    """Of truth, of readings, of landmarks; farther from 1 than rounding they are refused, with file and line."""
+    pose, heads = "1,2,0,0.0000,0.0000,0.7071,0.7072", "x_m,y_m,z_m,qx,qy,qz,qw"
+    for file, head, begin in (
+        ("truth", "t_s,robot", "1,r"),
+        ("scans", "t_s,robot,sensor,id", "1,r,s,4"),
+        ("landmarks", "id", "4"),
+    ):
+        (tmp_path / f"{file}.csv").write_text(f"{head},{heads}\n{begin},{pose}\n")
+    log = open_log(tmp_path)
+    q = np.array([0, 0, 0.7071, 0.7072]) / np.hypot(0.7071, 0.7072)
+    for found in (log.truth["r"].poses[0], log.events[0].y[0], log.landmarks[4]):
+        np.testing.assert_allclose(found[3:], q, atol=1e-15)
+    (tmp_path / "scans.csv").write_text(f"t_s,robot,sensor,id,{heads}\n1,r,s,4,{pose}\n2,r,s,4,0,0,0,0,0,0,0.99\n")
+    with pytest.raises(LogError, match=r"scans\.csv:3: quaternion has length 0\.99, expected 1 up to 0\.001"):
         open_log(tmp_path)

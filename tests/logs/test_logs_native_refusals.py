@@ -200,7 +200,11 @@ OTHER_FILES = {
     "truth.csv": ("t_s,robot,x_m,y_m,theta_rad\n0.1,r,1,2,x\n", 2, "theta_rad is 'x'"),
     "truth.csv with a time twice": ("t_s,robot,x_m,y_m,theta_rad\n1,r,1,2,0\n1,r,1,2,0\n", 3, "increasing times"),
     "truth.csv with half a pose": ("t_s,robot,x_m,y_m\n1,r,1,2\n", 1, "theta_rad"),
-    "truth.csv with a bad quaternion": ("t_s,robot,x_m,y_m,z_m,qx,qy,qz,qw\n1,r,0,0,0,0,0,0,2\n", 2, "norm 2"),
+    "truth.csv with a bad quaternion": (
+        "t_s,robot,x_m,y_m,z_m,qx,qy,qz,qw\n1,r,0,0,0,0,0,0,2\n",
+        2,
+        "quaternion has length 2",
+    ),
     "landmarks.csv": ("id,x_m,y_m\n1,2,3\n1,4,5\n", 3, "already"),
     "landmarks.csv without id": ("id,x_m,y_m\n,2,3\n", 2, "id is empty"),
     "landmarks.csv with a typo": ("id,x_m,y_n\n1,2,3\n", 1, "did you mean 'y_m'"),

@@ -17,7 +17,7 @@ from kalmark.events import Control, Fix, Scan, order
 from kalmark.files import replace_file
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
-from kalmark.logs import open_log, write_native
+from kalmark.logs import Trajectory, open_log, write_native
 from kalmark.results.record import record
 from kalmark.results.recording import file_name
 from kalmark.results.run import Run
@@ -104,6 +104,14 @@ def test_a_run_that_starts_in_a_frame_of_its_own_has_the_same_errors(run: Run) -
     for key in ("ate_m", "ate_raw_m", "heading_rmse_deg", "pose_nees", "pose_nees_world"):
         assert there["robots"]["rover"][key] == pytest.approx(here["robots"]["rover"][key], rel=1e-6)
     assert there["landmark_rmse_raw_m"] == pytest.approx(here["landmark_rmse_raw_m"], rel=1e-6)
+
+
+def test_a_run_in_a_frame_of_its_own_whose_truth_begins_later_is_scored_there() -> None:
+    log = circle(steps=40)
+    truth = {name: Trajectory(path.t_ns[15:], path.poses[15:]) for name, path in log.truth.items()}
+    summary = record(slam_for(log, start=(7.0, -3.0, 1.2)), replace(log, truth=truth), progress=False).evaluate()
+    assert summary["frame"] == "start" and not summary["diverged"]
+    assert summary["robots"]["rover"]["ate_raw_m"] < 0.3
 
 
 def test_a_wrong_start_with_known_landmarks_is_an_error_and_not_another_frame() -> None:

@@ -41,7 +41,7 @@ def convert(
         writable(out.parent)
     else:
         writable(out)
-    log, run = _read(source, log_format)
+    log, run = _read(source, log_format, whole=out.suffix != G2O)
     if out.suffix in POSES:
         _write_path(out, log, run, robot)
         return
@@ -92,17 +92,18 @@ def _write_graph(out: Path, source: Path, log: Log | None, run: Run | None) -> N
     write(out, g2o_text(run, log, slam.robots))
 
 
-def _read(source: Path, log_format: str | None) -> tuple[Log | None, Run | None]:
-    """Return the log, and the run if `source` is the folder of one."""
+def _read(source: Path, log_format: str | None, whole: bool) -> tuple[Log | None, Run | None]:
+    """Return the log, with `whole` increments as it has them, and the run if `source` is the folder of one."""
     from kalmark.logs import open_log
 
+    overrides = ("log.increments=recorded",) if whole else ()
     if (source / "summary.json").is_file() and (source / "config.yaml").is_file():
         from kalmark.config import open_run
         from kalmark.results.run import Run
 
-        return open_run(source / "config.yaml")[1], Run.load(source)
+        return open_run(source / "config.yaml", overrides=overrides)[1], Run.load(source)
     if source.suffix in (".yaml", ".yml"):
         from kalmark.config import open_run
 
-        return open_run(source, progress=True)[1], None
+        return open_run(source, overrides=overrides, progress=True)[1], None
     return open_log(source, log_format, progress=True), None

@@ -16,16 +16,17 @@ from kalmark.config.reading import did_you_mean, load_config
 from kalmark.config.schema import TRUTH, Config, SpaceStartConfig, covariance_of, pose_of, state_of
 from kalmark.config.sections import model_of
 from kalmark.config.tree import EACH
+from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Frame, Scan
 from kalmark.logs.images.pictures import size_of
 from kalmark.logs.known_map import KnownLandmark, read_known
-from kalmark.logs.log import Log, true_start
+from kalmark.logs.log import Log
 from kalmark.models.inertial import Inertial, at_rest
 from kalmark.models.protocols import Motion as MotionModel
-from kalmark.models.protocols import coasts, state_columns
+from kalmark.models.protocols import state_columns
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 
@@ -132,13 +133,12 @@ def _names(config: Config, log: Log | None) -> list[str]:
 
 
 def _start(section: Any, name: str, log: Log | None, moves: MotionModel) -> tuple[Any, Any]:
-    """Return the start and its covariance: as configured, else the truth before the first motion, else the origin."""
+    """Return the start and its covariance: as configured, else by the truth, else the origin."""
     space = moves.space
     if section is not None:
         behind = state_columns(moves)
         return [*pose_of(section), *state_of(section, behind)], covariance_of(section, space.dof, behind)
-    true = None if log is None else true_start(log, name, moves.held or coasts(moves))
-    return (true if true is not None and (len(true) == 3) == (space.world == "plane") else None), None
+    return (None, None) if log is None else true_start(log, name, moves)
 
 
 def _at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any) -> tuple[Array, Array, int]:

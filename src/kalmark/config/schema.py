@@ -421,7 +421,7 @@ class RobotConfig(_AnyRobot):
     """One robot: how it moves, where it starts, what it carries.  Its motion decides: in the plane or in space."""
 
     start: StartConfig | None = None
-    """Start; if absent, the log's truth, or else the origin."""
+    """Start; if absent, by the log's truth (the first true pose, moved back by the controls), or else the origin."""
     sensors: dict[str, PlaneSensor] = Field(default_factory=dict)
     """Sensors by the log's names; `each` holds for all of them."""
 
@@ -430,7 +430,7 @@ class SpaceRobotConfig(_AnyRobot):
     """One robot of space."""
 
     start: SpaceStartConfig | None = None
-    """Start; if absent, the log's truth, or else the origin."""
+    """Start; if absent, by the log's truth (the first true pose, moved back by the controls), or else the origin."""
     sensors: dict[str, SpaceSensor] = Field(default_factory=dict)
     """Sensors by the log's names; `each` holds for all of them."""
 

@@ -12,7 +12,7 @@ line                                       numbers
 
 The odometry is that of the wheels, as a path; the log has the increments from each pose to the next.  The beams of
 `FLASER` and `RLASER` go from right to left over 180 degrees; scans of 181 or 361 beams include both ends, of others
-the left end is left out.
+the left end is left out.  Messages without a time, as older logs have them, are one second apart.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from kalmark.events import Control, Event, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.logs.columns import BEAM, INCREMENT2
 from kalmark.logs.log import Log
-from kalmark.logs.source import Format, Request, nanoseconds, number, one_robot, rows
+from kalmark.logs.source import STEP_NS, Format, Request, nanoseconds, number, one_robot, rows
 
 ROBOT = "robot"
 LASERS = {"FLASER": "front_laser", "RLASER": "rear_laser", "ROBOTLASER1": "front_laser", "ROBOTLASER2": "rear_laser"}
@@ -47,21 +47,25 @@ class _Reader:
         self.scans: dict[tuple[str, int], Array] = {}
         self.offsets: dict[str, float] = {}
         self.unread: dict[str, int] = {}
+        self.steps = self.timed = 0
 
     def take(self, cells: list[str]) -> None:
         """Take one line.  Raises ValueError, IndexError."""
         tag = cells[0]
         if tag == "ODOM":
-            self.pose(nanoseconds(cells[7]), cells[1:4])
+            if len(cells) < 7:
+                raise IndexError
+            self.pose(self.time(cells[7:]), cells[1:4])
         elif tag in ("FLASER", "RLASER"):
             n = int(cells[1])
             rest = cells[2 + n :]
-            if n < 2 or len(rest) < 7:
+            if n < 2 or len(rest) < 6:
                 raise ValueError(f"{len(cells)} cells and {n} ranges, expected them, two poses and a time")
+            t_ns = self.time(rest[6:])
             both = n % 2 == 1
             step = math.pi / (n - 1 if both else n)
-            self.scan(tag, nanoseconds(rest[6]), cells[2 : 2 + n], -math.pi / 2, step, MOST_M)
-            self.pose(nanoseconds(rest[6]), rest[3:6])
+            self.scan(tag, t_ns, cells[2 : 2 + n], -math.pi / 2, step, MOST_M)
+            self.pose(t_ns, rest[3:6])
         elif tag in LASERS:
             first, _, step, most = (number(cell) for cell in cells[2:6])
             n = int(cells[8])
@@ -73,6 +77,16 @@ class _Reader:
             self.offsets[OFFSETS[cells[1]]] = number(cells[2])
         elif tag != "PARAM":
             self.unread[tag] = self.unread.get(tag, 0) + 1
+
+    def time(self, cells: list[str]) -> int:
+        """Return the time (ns) that a message ends in; the next step of a log without any.  Raises ValueError."""
+        if self.steps if cells else self.timed:
+            raise ValueError(f"a message {'with' if cells else 'without'} a time, expected all or none to have one")
+        if cells:
+            self.timed += 1
+            return nanoseconds(cells[0])
+        self.steps += 1
+        return self.steps * STEP_NS
 
     def pose(self, t_ns: int, cells: list[str]) -> None:
         """Take a pose of the odometry."""

@@ -10,6 +10,7 @@ INCREMENT2, INCREMENT3 = ("dx_m", "dy_m", "dtheta_rad"), ("dx_m", "dy_m", "dz_m"
 TWIST3 = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
 INERTIAL = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
 BEAM = ("range_m", "bearing_rad")
+WHEELS = ("left_rad", "right_rad")
 CORNERS = ("u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m")
 GPS = ("x_m", "y_m", "antenna_x_m", "antenna_y_m")
 

@@ -27,6 +27,7 @@ from kalmark.logs.log import Log
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
 from kalmark.logs.native import NATIVE, stream
+from kalmark.logs.overflow import refuse_overflow
 from kalmark.logs.plaza import PLAZA
 from kalmark.logs.poses import KITTI, TUM, read_path
 from kalmark.logs.slamtb import SLAMTB
@@ -82,6 +83,7 @@ def open_log(
             raise LogError(f"log option {name!r} is unknown to {entry.name}, expected {wanted}")
     request = requested(robot_names(robots, entry.robot_prefix), on_error, progress)
     log = corrected(entry.read(found, request, **options), factors, shift_s)
+    refuse_overflow(log)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m, sigma_fixes_z_m)
     log = selected(log, request, from_s, to_s, ids)
     return cut(log) if choice(increments, "increments", ("recorded", "cut")) == "cut" else log

@@ -11,11 +11,15 @@ line                    numbers                                                i
 `EDGE_SE3:QUAT`         i j x y z qx qy qz qw, 21 of information               the same in space
 `EDGE_SE2_XY`           i l x y, 3 of information                              an observation, x and y in pose i
 `EDGE_SE3_TRACKXYZ`     i l p x y z, 6 of information                          the same in space, sensor offset p
+`EDGE_BEARING_SE2_XY`   i l bearing, 1 of information                          a bearing in pose i
 `PARAMS_SE3OFFSET`      p x y z qx qy qz qw                                    the mount of the sensor
 ======================  =====================================================  =====================================
 
 Poses have no times: in the order of their ids they are one second apart.  An edge between poses that do not follow each
 other, a loop that something else has closed, is a reading of an `odometer` at the later one, of the way from the other.
+
+TORO's `VERTEX2` and `EDGE2` (.graph, .toro) are those of the plane with the information in another order: xx, xy, yy,
+tt, xt, yt.
 
 Information matrices are upper triangles.  g2o's errors of an edge are in the frame where it ends, and those of a turn
 in space the vector part of a quaternion, half an angle (`EdgeSE3::computeError`).  So the covariance of an increment u
@@ -34,10 +38,10 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, shown
+from kalmark.events import Control, Event, Id, Scan, shown, unit_quaternion
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew
-from kalmark.logs.columns import INCREMENT2, INCREMENT3, POSITION
+from kalmark.logs.columns import BEAM, INCREMENT2, INCREMENT3, POSITION
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     STEP_NS,
@@ -53,11 +57,13 @@ from kalmark.logs.source import (
 
 SECOND_NS = 10**9
 ROBOT, SENSOR, LOOPS = "robot", "sensor", "loops"
-LENGTH = 1e-3
+BEARINGS, BEARING = "bearings", "EDGE_BEARING_SE2_XY"
+TORO = {"VERTEX2": "VERTEX_SE2", "EDGE2": "EDGE_SE2"}
+TORO_ORDER = (0, 1, 4, 2, 5, 3)  # where TORO has xx, xy, xt, yy, yt, tt
 POSES = {"VERTEX_SE2": 3, "VERTEX_SE3:QUAT": 7}
 PLACES = {"VERTEX_XY": 2, "VERTEX_TRACKXYZ": 3}
 EDGES = {"EDGE_SE2": (3, 3), "EDGE_SE3:QUAT": (7, 6)}  # numbers, and the size of their information
-SIGHTS = {"EDGE_SE2_XY": 2, "EDGE_SE3_TRACKXYZ": 3}
+SIGHTS = {"EDGE_SE2_XY": 2, "EDGE_SE3_TRACKXYZ": 3, BEARING: 1}
 OFFSET = "PARAMS_SE3OFFSET"
 IGNORED = ("FIX",)
 TAGS = (*POSES, *PLACES, *EDGES, *SIGHTS, OFFSET, *IGNORED)
@@ -70,7 +76,7 @@ class Graph:
     poses: dict[int, Array] = field(default_factory=dict)
     places: dict[Id, Array] = field(default_factory=dict)
     moves: dict[tuple[int, int], tuple[Array, Array]] = field(default_factory=dict)
-    sights: dict[int, list[tuple[Id, Array, Array]]] = field(default_factory=dict)
+    sights: dict[tuple[str, int], list[tuple[Id, Array, Array]]] = field(default_factory=dict)
     offset: Array | None = None
     left_out: Counter[str] = field(default_factory=Counter)
 
@@ -93,10 +99,7 @@ def pose(cells: list[str], size: int) -> Array:
         raise ValueError(f"{len(cells)} numbers of a pose, expected {size}")
     values = np.array([number(cell) for cell in cells])
     if len(values) == 7:
-        norm = float(np.linalg.norm(values[3:]))
-        if abs(norm - 1) > LENGTH:
-            raise ValueError(f"quaternion has length {norm:.6g}, expected 1")
-        values[3:] /= norm
+        values[3:] = unit_quaternion(values[3:], ValueError)
     return values
 
 
@@ -135,6 +138,9 @@ def turned_round(step: Array, C: Array) -> tuple[Array, Array]:
 
 def take(graph: Graph, tag: str, cells: list[str]) -> None:
     """Take one line.  Raises ValueError."""
+    if tag == "EDGE2" and len(cells) == 11:
+        cells = [*cells[:5], *(cells[5 + k] for k in TORO_ORDER)]
+    tag = TORO.get(tag, tag)
     if tag in POSES or tag in PLACES:
         size = POSES.get(tag) or PLACES[tag]
         if len(cells) != size + 1:
@@ -146,12 +152,13 @@ def take(graph: Graph, tag: str, cells: list[str]) -> None:
     elif tag in EDGES:
         _take_edge(graph, tag, cells)
     elif tag in SIGHTS:
-        size, first = SIGHTS[tag], 2 if tag == "EDGE_SE2_XY" else 3
+        size, first = SIGHTS[tag], 3 if tag == "EDGE_SE3_TRACKXYZ" else 2
         y = np.array([number(cell) for cell in cells[first : first + size]])
         C = information(cells[first + size :], size)
         if len(y) != size:
-            raise ValueError(f"{len(cells)} cells, expected {first} ids, a position and its information")
-        graph.sights.setdefault(pose_id(cells[0]), []).append((landmark_id(cells[1]), y, C))
+            raise ValueError(f"{len(cells)} cells, expected {first} ids, {size} numbers and their information")
+        key = BEARINGS if tag == BEARING else SENSOR, pose_id(cells[0])
+        graph.sights.setdefault(key, []).append((landmark_id(cells[1]), y, C))
     elif tag == OFFSET:
         offset = pose(cells[1:], 7)
         if graph.offset is not None and not np.array_equal(graph.offset, offset):
@@ -183,7 +190,7 @@ def read(path: Path, request: Request, vertices: Any = None) -> Log:
             take(graph, tag, cells)
         except (ValueError, IndexError) as error:
             request.refuse(f"{path}:{line}: {tag}: {' '.join(str(error).split())}, expected {WHAT}")
-    ids = sorted({*graph.poses, *graph.sights, *(one for pair in graph.moves for one in pair)})
+    ids = sorted({*graph.poses, *(at for _, at in graph.sights), *(one for pair in graph.moves for one in pair)})
     for reason, count in sorted(graph.left_out.items()):
         request.leave_out(count, f"{path}: {count} {reason}")
     return _log(path, request, graph, ids, choice(vertices or "none", "vertices", ("none", "truth")) == "truth")
@@ -206,27 +213,34 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
     if any(e.width not in (0, size) for e in loops):
         raise LogError(f"{path}: edges of the plane and of space, expected one kind")
     events += loops
-    for at, seen in graph.sights.items():
+    for (name, at), seen in graph.sights.items():
+        numbers = 1 if name == BEARINGS and not space else d
         first = {one: (y, C) for one, y, C in reversed(seen)}
         if len(first) < len(seen):
             twice = len(seen) - len(first)
             request.leave_out(twice, f"{path}: {twice} observations of a landmark that pose {at} has already")
-        if any(len(y) != d for y, _ in first.values()):
-            raise LogError(f"{path}: pose {at} has observations of another world, expected positions of {d} numbers")
+        if any(len(y) != numbers for y, _ in first.values()):
+            world = "space" if space else "the plane"
+            raise LogError(f"{path}: pose {at} has observations of another world, expected those of {world}")
         y, cov = [y for y, _ in first.values()], [C for _, C in first.values()]
-        events.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=SENSOR, y=y, ids=[*first], cov=cov))
+        events.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=name, y=y, ids=[*first], cov=cov))
     sensor: dict[str, Any] = {"type": "position_3d" if space else "position"}
     if graph.offset is not None:
         sensor["mount"] = placed(graph.offset)
     told: dict[str, Any] = {"motion": {"type": "odometry_3d" if space else "odometry_2d"}}
-    told["sensors"] = {SENSOR: sensor} if graph.sights else {}
+    there = {name for name, _ in graph.sights}
+    told["sensors"] = {SENSOR: sensor} if SENSOR in there else {}
+    told["sensors"] |= (
+        {BEARINGS: {"type": "bearing", "initialization": {"type": "delayed"}}} if BEARINGS in there else {}
+    )
     told["sensors"] |= {LOOPS: {"type": "odometer", "keep": 0}} if loops else {}
     rest: dict[str, Any] = {"describes": {"robots": {ROBOT: told}}, "name": path.stem}
     if true and graph.poses:
         path_ = Trajectory.of({t_ns[one]: graph.poses[one] for one in sorted(graph.poses)})
         rest |= {"truth": {ROBOT: path_}, "landmarks": graph.places}
     steps = INCREMENT3 if space else INCREMENT2
-    columns = ({SENSOR: POSITION[:d]} if graph.sights else {}) | ({LOOPS: steps} if loops else {})
+    columns = {SENSOR: POSITION[:d]} if SENSOR in there else {}
+    columns |= ({BEARINGS: BEAM[1:]} if BEARINGS in there else {}) | ({LOOPS: steps} if loops else {})
     return one_robot("g2o", path, request, ROBOT, events, steps, columns, **rest)
 
 
@@ -244,9 +258,16 @@ def _loops(graph: Graph, ids: list[int], t_ns: dict[int, int]) -> list[Scan]:
 
 
 def find(path: Path) -> Path | None:
-    """Return the file if it is one of g2o: by its ending."""
-    return path if path.is_file() and path.suffix == ".g2o" else None
+    """Return the file if it is one of g2o or TORO: by its ending."""
+    return path if path.is_file() and path.suffix in (".g2o", ".graph", ".toro") else None
 
 
 WHAT = "a line of g2o with poses, landmarks or edges between them, information matrices positive definite"
-G2O = Format("g2o", "a graph of poses and landmarks, .g2o", find, read, options=("vertices",), describes_all=True)
+G2O = Format(
+    "g2o",
+    "a graph of poses and landmarks, .g2o; of TORO .graph, .toro",
+    find,
+    read,
+    options=("vertices",),
+    describes_all=True,
+)

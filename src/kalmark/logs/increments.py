@@ -19,11 +19,10 @@ from kalmark.arrays import Array
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.angles import V, V_inverse
 from kalmark.geometry.rotations import left_jacobian, left_jacobian_inverse
-from kalmark.logs.columns import INCREMENT2, INCREMENT3
+from kalmark.logs.columns import INCREMENT2, INCREMENT3, WHEELS
 from kalmark.logs.log import Log
 
 LONG = 5  # usual intervals: a longer one may be of a gap, of which the increment is only the end
-WHEELS = ("left_rad", "right_rad")
 CUT = INCREMENT2, INCREMENT3, WHEELS  # columns of increments that can be cut
 
 

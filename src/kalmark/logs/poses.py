@@ -1,12 +1,15 @@
 """Poses as TUM and KITTI have them: read as a path, written from one.
 
-TUM: rows ``t x y z qx qy qz qw`` (s, m).  KITTI: rows of twelve numbers, [R | t] row by row, without times, which are
+TUM: rows ``t x y z qx qy qz qw`` (s, m), also with commas, a header that may name another order, times in ns, us or
+ms, which no clock has in seconds, and positions of NaN where nothing was measured.
+KITTI: rows of twelve numbers, [R | t] row by row, without times, which are
 one a line in ``NAME_times.txt`` or ``times.txt`` beside the poses.  Poses of the plane are at z = 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +17,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
+from kalmark.events import ROUNDED, unit_quaternion
 from kalmark.files import write
 from kalmark.geometry.rotations import matrix
 from kalmark.logs.columns import POSE3
@@ -33,8 +37,9 @@ from kalmark.logs.source import (
 
 ROBOT = "robot"
 TUM_CELLS, KITTI_CELLS = 8, 12
-ENDINGS = (".tum", ".kitti", ".txt")
-LENGTH = 1e-3  # a quaternion is of length 1, and a matrix a rotation, up to this: the files are rounded
+ENDINGS = (".tum", ".kitti", ".txt", ".csv")
+TUM_NAMES = ("x", "y", "z", "w")  # ends of the names in a header
+LATEST_S = 2**63 // 10**9
 
 
 def find(path: Path, cells: int) -> Path | None:
@@ -43,8 +48,55 @@ def find(path: Path, cells: int) -> Path | None:
         return None
     with path.open("rb") as stream:
         begin = stream.read(8192).decode("utf-8", "replace").splitlines()
-    first = next((line.split() for line in begin if line.strip() and not line.lstrip().startswith("#")), [])
-    return path if len(first) == cells and all(map(is_number, first)) else None
+    told = [split(line) for line in begin if line.strip() and not line.lstrip().startswith("#")]
+    if cells == TUM_CELLS and told[1:] and not any(map(is_float, told[0])):
+        told = told[1:]
+    return path if told and len(told[0]) == cells and all(map(is_float, told[0])) else None
+
+
+def split(line: str) -> list[str]:
+    """Return the cells of a line: between blanks, commas or semicolons."""
+    return line.replace(",", " ").replace(";", " ").split()
+
+
+def is_float(text: str) -> bool:
+    """Return whether a text is a number, NaN among them."""
+    return is_number(text) or text.lower().lstrip("+-") == "nan"
+
+
+def plain(path: Path, request: Request) -> str:
+    """Return the text of a file of TUM with blanks, seconds and the usual order, line by line.  Raises LogError."""
+    out, order, gone, unit, begun = list[str](), [*range(TUM_CELLS)], 0, 0, False
+    for text in read_text(path).split("\n"):
+        line, cells = text, split(text.replace("#", " "))
+        if not begun and (line.lstrip().startswith("#") or not any(map(is_float, cells))):
+            order = order_in(cells) or order
+            out.append("")
+            continue
+        begun = begun or bool(cells)
+        if len(cells) == TUM_CELLS and not line.lstrip().startswith("#"):
+            cells = [cells[k] for k in order]
+            unmeasured = all(is_float(cell) and not is_number(cell) for cell in cells[1:4])
+            if not unit and is_number(cells[0]):
+                unit = next((n for n in (1, 10**3, 10**6, 10**9) if abs(float(cells[0])) < n * LATEST_S), 1)
+            if unit > 1 and is_number(cells[0]):
+                cells[0] = f"{Decimal(cells[0]) / unit:f}"
+            gone += unmeasured
+            line = "" if unmeasured else " ".join(cells)
+        out.append(line)
+    if gone:
+        request.leave_out(gone, f"{path}: {gone} positions of NaN, which are none")
+    return "\n".join(out)
+
+
+def order_in(header: list[str]) -> list[int] | None:
+    """Return where a header of eight names has t, x, y, z, qx, qy, qz, qw; None if it does not name the quaternion."""
+    names = [name.lower().replace("_", "") for name in header]
+    q = [[k for k, name in enumerate(names) if name.endswith(f"q{axis}")] for axis in TUM_NAMES]
+    if len(names) != TUM_CELLS or any(len(at) != 1 for at in q):
+        return None
+    turn = [at[0] for at in q]
+    return [*(k for k in range(TUM_CELLS) if k not in turn), *turn]
 
 
 def read_path(path: Path, request: Request) -> Trajectory:
@@ -61,15 +113,17 @@ def read_path(path: Path, request: Request) -> Trajectory:
 def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
     """Yield times (ns), which increase, and poses (7,)."""
     last_ns = None
-    for line, t_ns, values in timed_rows(path, POSE3, request.refuse):
-        norm = float(np.linalg.norm(values[3:]))
-        if abs(norm - 1) > LENGTH:
-            request.refuse(f"{path}:{line}: quaternion has length {norm:.6g}, expected 1")
-        elif t_ns == last_ns:
+    for line, t_ns, values in timed_rows(path, POSE3, request.refuse, plain(path, request)):
+        try:
+            q = unit_quaternion(np.array(values[3:]), ValueError)
+        except ValueError as error:
+            request.refuse(f"{path}:{line}: {error}")
+            continue
+        if t_ns == last_ns:
             request.refuse(f"{path}:{line}: time {seconds(t_ns)} s twice, expected increasing times")
         else:
             last_ns = t_ns
-            yield t_ns, np.append(values[:3], np.array(values[3:]) / norm)
+            yield t_ns, np.append(values[:3], q)
 
 
 def kitti_rows(path: Path, request: Request, t_ns: Times | None = None) -> Iterator[tuple[int, Array]]:
@@ -86,7 +140,7 @@ def kitti_rows(path: Path, request: Request, t_ns: Times | None = None) -> Itera
             continue
         R = M[:, :3]
         off = float(np.abs(R @ R.T - np.eye(3)).max())
-        if off > LENGTH or np.linalg.det(R) < 0:
+        if off > ROUNDED or np.linalg.det(R) < 0:
             request.refuse(f"{path}:{line}: the first three columns are no rotation (off by {off:.2g}), expected one")
         elif k and t_ns[k] <= t_ns[k - 1]:
             request.refuse(f"{path}:{line}: its time is not after the one before, expected increasing times")

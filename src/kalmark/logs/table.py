@@ -22,9 +22,20 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import MOST, Id, bound, most, shown
+from kalmark.events import MOST, Id, bound, most, shown, unit_quaternion
 from kalmark.logs import geodesy
-from kalmark.logs.columns import CANONICAL, DIRECTIONS, FACTORS, GLOBE, NAMES, NOT_NEGATIVE, OTHER_UNITS, UNITS
+from kalmark.logs.columns import (
+    CANONICAL,
+    DIRECTIONS,
+    FACTORS,
+    GLOBE,
+    NAMES,
+    NOT_NEGATIVE,
+    OTHER_UNITS,
+    POSE3,
+    UNITS,
+    WHEELS,
+)
 from kalmark.logs.geodesy import Globe
 from kalmark.logs.progress import track
 from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
@@ -36,6 +47,8 @@ ONE_IN_A_FILE = "expected one of them in a file: scans.csv and measurements.csv 
 NEAR_PI = 0.99  # of pi: directions all around that are within pi come nearer to it
 BATCH = 65_536  # rows of Parquet at a time
 SEPARATORS = {"\t": "tabs", "|": "'|'", " ": "blanks"}
+
+QUATERNION = POSE3[3:]
 
 _RANK = {name: rank for rank, name in enumerate(CANONICAL)}
 _COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
@@ -409,11 +422,14 @@ class Row:
                 raise Refused(f"{name(column)} is {shown(self.text(column))}, expected a finite number") from None
             if abs(values[-1]) > (MOST["m"] ** 2 if column.startswith("cov_") else most(column)[0]):
                 wanted = f"at most {MOST['m'] ** 2:.0e}" if column.startswith("cov_") else bound(column)
+                wanted += ": did the counter of the wheel run over (2^32 steps)?" if column in WHEELS else ""
                 raise Refused(f"{name(column)} is {shown(self.text(column))}, expected {wanted}")
             if values[-1] < 0 and column in NOT_NEGATIVE:
                 raise Refused(f"{name(column)} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
             if column in DIRECTIONS:
                 self.table.directions[column].append(values[-1])
+        if columns[-1:] == QUATERNION[-1:] and columns[-4:] == QUATERNION:
+            values[-4:] = unit_quaternion(np.array(values[-4:]), Refused).tolist()
         return values if self.table.globe is None else self._placed(self.table.globe, columns, values)
 
     def _placed(self, globe: Globe, columns: tuple[str, ...], values: list[float]) -> list[float]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, order
+from kalmark.events import Control, Event, Id, Scan, order, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag.reading import Bag, stamp
 from kalmark.logs.calibration import lens
@@ -182,8 +182,8 @@ def messages(path: Path) -> list[tuple[str, Any]]:
 
 def pose_of(position: Any, rotation: Any) -> Array:
     """Return the frame (7,) of a position and a quaternion, which is normalised."""
-    q = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
-    return np.append([position.x, position.y, position.z], q / np.linalg.norm(q))
+    q = unit_quaternion(np.array([rotation.x, rotation.y, rotation.z, rotation.w]), LogError)
+    return np.append([position.x, position.y, position.z], q)
 
 
 # ------------------------------------------------------------------ TagSLAM's own result

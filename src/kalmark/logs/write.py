@@ -79,7 +79,7 @@ def controls(log: Log) -> Table:
     events = [event for event in log if isinstance(event, Control)]
     columns = union(checked(log.control_columns, c.robot, len(c.u)) for c in events)
     if part := next((c for c in events if c.share < 1), None):
-        raise LogError(f"the control at {seconds(part.t_ns)} s is a part of an increment, expected whole ones")
+        raise LogError(f"the control at {seconds(part.t_ns)} s is a part, expected whole increments: those 'recorded'")
     noise = cov_columns(max((len(c.cov) for c in events if c.cov is not None), default=0))
     rows = [
         start(c) | cells(columns, log.control_columns[c.robot], c.u) | upper(c.cov, f"control at {c.t_s} s")

@@ -11,6 +11,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.declare import Limit, NotNegative, Positive, declared, register
 from kalmark.errors import EventError
+from kalmark.events import unit_quaternion
 from kalmark.geometry.directions import inv_spherical_many
 from kalmark.models import seen, walls
 from kalmark.models.seen import Spatial, refuse_negative_ranges
@@ -134,15 +135,18 @@ class TagPose(Spatial):
     sees_kinds: ClassVar[tuple[str, ...]] = ("tag",)
 
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return the poses themselves and the identity (K, 6, 6)."""
-        return y.copy(), np.tile(np.eye(6), (len(y), 1, 1))
+        """Return the poses themselves, their quaternions normalised, and the identity (K, 6, 6)."""
+        L = np.hstack([y[:, :3], y[:, 3:] / np.linalg.norm(y[:, 3:], axis=1, keepdims=True)])
+        return L, np.tile(np.eye(6), (len(y), 1, 1))
 
     def sees(self, v: Array) -> Flags:
         """Return (K,) that all tags are in view."""
         return np.ones(len(v), dtype=np.bool_)
 
     def check(self, y: Array) -> None:
-        """Refuse poses y (K, 7) whose quaternion is not of norm 1."""
+        """Refuse poses y (K, 7) whose quaternion is not of length 1."""
         for i, row in enumerate(y):
-            if abs(np.linalg.norm(row[3:]) - 1) > 1e-6:
-                raise EventError(f"observation {i}: the quaternion is {row[3:].tolist()}, expected one of length 1")
+            try:
+                unit_quaternion(row[3:])
+            except EventError as error:
+                raise EventError(f"observation {i}: {error}") from None

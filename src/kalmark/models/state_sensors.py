@@ -17,7 +17,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import NotNegative, Number, Positive, Probability, Within, declared, refuse, register
-from kalmark.errors import EventError
+from kalmark.events import unit_quaternion
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
 from kalmark.models import seen
 from kalmark.models.protocols import CHANGE, POSE, TWIST
@@ -375,9 +375,7 @@ class AbsolutePose3D(StateSensor):
 
     def check(self, y: Array) -> None:
         """Refuse a quaternion that is none."""
-        norm = float(np.linalg.norm(y[0, 3:]))
-        if abs(norm - 1) > 1e-6:
-            raise EventError(f"the quaternion has the norm {norm:.9g}, expected 1")
+        unit_quaternion(y[0, 3:])
 
 
 @register("sensor", "height")

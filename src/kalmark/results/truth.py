@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,7 +28,8 @@ class Truth:
     `landmarks` are true places: positions (2,) or (3,), endpoints of a line (6,), the pose of a tag (7,). `offset`
     is the pose of the truth's frame in the map's. It is the origin when the robots started at the truth (or the map
     is `anchored`: tied to the world otherwise, by known landmarks or fixes); else it is what brings the first
-    robot's true start to its start. `fixes` are used only for scoring, `robots` are those whose truth the log has.
+    robot's true start to its start, or, where the truth begins later, its first true pose to the estimate at that step.
+    `fixes` are used only for scoring, `robots` are those whose truth the log has.
     """
 
     poses: Array
@@ -47,7 +48,7 @@ class Truth:
             mine = history.robot == robot
             if mine.any():
                 poses[mine] = fitted(trajectory.at(history.t_ns[mine]), size)
-        offset = ORIGIN[size] if anchored else _offset(log.truth, history.starts, size)
+        offset = ORIGIN[size] if anchored else _offset(log.truth, _known(history, poses), size)
         landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in log.landmarks.items()}
         if size == 7:
             landmarks = {i: np.append(l, 0.0) if len(l) == 2 else l for i, l in landmarks.items()}
@@ -138,7 +139,20 @@ def moved(rigid: Rigid, landmarks: Mapping[Id, Array]) -> dict[Id, Array]:
     return out
 
 
-def _offset(trajectories: Mapping[str, Any], starts: tuple[Start, ...], size: int) -> Array:
+def _known(history: History, poses: Array) -> list[Start]:
+    """Return the starts of robots; of those whose truth (S, 3 or 7) begins later, also their first step that has it."""
+    there, first = np.isfinite(poses).all(axis=1), list[Start]()
+    for start in history.starts:
+        steps = np.flatnonzero(there & (history.robot == start.robot))
+        first.append(start)
+        if len(steps):
+            k = int(steps[0])
+            at, P = history.poses[k], history.pose_covariances[k]
+            first.append(Start(start.robot, at, P, int(history.t_ns[k])))
+    return first
+
+
+def _offset(trajectories: Mapping[str, Any], starts: Sequence[Start], size: int) -> Array:
     """Return the pose of the truth's frame in the map's: the origin if the first robot with truth started there."""
     for start in starts:
         if start.robot not in trajectories:

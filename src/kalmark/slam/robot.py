@@ -12,7 +12,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.association.protocol import Association
 from kalmark.errors import ModelError
-from kalmark.events import MOST, Scan, finite, shown
+from kalmark.events import MOST, ROUNDED, Scan, finite, shown, unit_quaternion
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
@@ -47,11 +47,11 @@ def _pose(value: Any, what: str, sizes: tuple[int, ...]) -> Array:
         pose = finite(value, what, INFINITE, ModelError)
     except ModelError:
         pose = np.empty(0)
-    unit = pose.shape == (7,) and abs(np.linalg.norm(pose[3:]) - 1) < 1e-6
+    unit = pose.shape == (7,) and abs(np.linalg.norm(pose[3:]) - 1) <= ROUNDED
     if pose.ndim != 1 or len(pose) not in sizes or (len(pose) == 7 and not unit):
         raise ModelError(f"{what} is {shown(value)}, expected {' or '.join(WANTED[n] for n in sizes)}")
     if unit:
-        pose[3:] /= np.linalg.norm(pose[3:])
+        pose[3:] = unit_quaternion(pose[3:])
     pose = finite(pose, what, error=ModelError)
     pose.flags.writeable = False
     return pose
