@@ -718,8 +718,10 @@ def test_scans_that_come_twice_are_named_and_count_once() -> None:
     log = replace(log, events=sorted([*log.events, *again], key=order))
     verdict = km.diagnose(recorded(log))
     assert [cause.name for cause in verdict.causes] == ["copies"]
-    assert "199 of 398" in verdict.causes[0].evidence or "200 of 400" in verdict.causes[0].evidence
-    assert 1.04 < (verdict.sigma_factor or 0.0) < np.sqrt(2)
+    number, _, of, *_ = verdict.causes[0].evidence.split()
+    assert 190 <= int(number) <= 200 and of == "400"  # the first ones tell how fine the numbers are
+    assert (verdict.map, verdict.causes[0].harmless) == ("ok", True)
+    assert 0.9 < (verdict.sigma_factor or 0.0) < 1.1
 
 
 def test_segments_of_a_long_log_have_scans_enough_of_each_robot() -> None:

@@ -21,13 +21,17 @@ LEAST = 10  # copies
 
 
 class Copies(NamedTuple):
-    """The copies in what a robot, or a `sensor` of it, wrote: how many of how many, and since when, s of the log."""
+    """The copies in what a robot, or a `sensor` of it, wrote: how many of how many, and since when, s of the log.
+
+    `sensor` is "" of its controls and its fixes.  `noticed`: the filter has left them out, as it does all of its fixes.
+    """
 
     robot: str
     sensor: str
     number: int
     of: int
     since_s: float
+    noticed: bool = False
 
 
 def copied(values: Array, first: Index) -> Flags:
@@ -61,14 +65,18 @@ def of_scans(run: Run) -> Flags:
 
 def copies(run: Run, log: Log) -> list[Copies]:
     """Return the streams of a log with copies: scans of sensors, and controls."""
-    h, found = run.history, []
+    h, slam = run.history, run.final_slam()
+    given = {key: one for key, one in slam.state.given.items() if one.repeats >= max(LEAST, SHARE * one.number)}
+    found = [Copies(*key, one.repeats, one.number, one.since_ns * 1e-9, True) for key, one in given.items()]
     same, robot = of_scans(run), run.history.robot[run.history.step]
     for key in sorted({*zip(robot[same].tolist(), h.sensor[same].tolist(), strict=True)}):
+        if key in given:
+            continue
         mine = (robot == key[0]) & (h.sensor == key[1])
         steps = np.unique(h.step[mine & same])
         since_s = float(h.t_ns[steps[0]]) * 1e-9
         found.append(Copies(*key, len(steps), len(np.unique(h.step[mine])), since_s))
-    for name in run.final_slam().robots:
+    for name in slam.robots:
         mine_ = [e for e in log.events if isinstance(e, Control) and e.robot == name and e.share == 1.0]
         twice = np.flatnonzero(copied(np.array([e.u for e in mine_]), np.arange(len(mine_))))
         if len(twice):

@@ -32,6 +32,7 @@ from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_ro
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.words import figure
+from kalmark.slam.held_readings import AGAIN
 
 SCANS, OBSERVATIONS, EVENTS = 400, 3000, 10_000  # of the log are filtered again, whatever comes first
 DETECTED = 7  # observations in a raw scan, or so
@@ -95,7 +96,7 @@ def fit(run: Run) -> Fit:
 
     What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
     time, and clutter fits none either.  What is deferred after a gap, until the robot is known again, contradicts
-    nothing, nor does what is of a landmark that no sensor has started.
+    nothing, nor does what is of a landmark that no sensor has started, nor what was given before.
     """
     history = run.history
     dof = np.maximum(np.isfinite(history.z).sum(axis=1), 1)
@@ -104,6 +105,7 @@ def fit(run: Run) -> Fit:
     d2 = np.where((history.id == "") & (history.outcome != "associated"), LOST, d2)
     early = np.char.find(history.reason, ALONE) >= 0
     early |= (history.outcome == "deferred") & while_lost(history)[history.step]
+    early |= history.reason == AGAIN
     return Fit(np.where(early, 1.0, d2), dof)
 
 

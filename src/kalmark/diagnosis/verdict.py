@@ -410,9 +410,14 @@ def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]
 def _copied(run: Run, log: Log) -> list[Cause]:
     """Return the streams of the log that come twice."""
     found = []
-    for robot, sensor, number, of, since_s in copies.copies(run, log):
-        what = f"scans of {robot}.{sensor}" if sensor else f"controls of {robot}"
-        evidence = f"{number} of {of} {what} repeat the one before to the last bit: the log has them twice"
+    for robot, sensor, number, of, since_s, noticed in copies.copies(run, log):
+        what = f"scans of {robot}.{sensor}" if sensor else f"fixes of {robot}" if noticed else f"controls of {robot}"
+        evidence = f"{number} of {of} {what} repeat the one before to the last bit: "
+        if noticed:
+            evidence += "they are no new measurements, and were left out"
+            found.append(Cause(COPIES, since_s, float(number), evidence, "give each measurement once", True))
+            continue
+        evidence += "the log has them twice"
         harmless = not sensor and run.final_slam().robots[robot].motion.held  # the same velocity goes on
         found.append(Cause(COPIES, since_s, float(number), evidence, "leave out every second of them", harmless))
     return found

@@ -184,7 +184,7 @@ class _Recorder:
             number, first_ns, _ = self.controls.get(event.robot, (0, event.t_ns, 0))
             self.controls[event.robot] = Controlled(number + event.share, first_ns, event.t_ns)
             self.reckoned[event.robot].take(event)
-        elif type(event) is Fix:
+        elif type(event) is Fix and not any(o.outcome == "ignored" for o in report.observations):
             used = all(o.outcome == "associated" for o in report.observations)
             self.fixes.append(
                 UsedFix(event.t_ns, event.robot, used, event.y, report.z[0], report.Z[0], report.replaced)

@@ -15,6 +15,7 @@ from kalmark.filter.estimators import Update
 from kalmark.report import Judged, Report
 from kalmark.slam import moves, tentative
 from kalmark.slam.checks import measurements
+from kalmark.slam.held_readings import again
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.slam.surveyed import is_tried
@@ -36,6 +37,8 @@ def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Re
     R, report = measurements(event, channel.sensor, channel.check), Report(event, event.y)
     state.t_ns = event.t_ns
     report.gaps, slots = moves.advance(state, name), tracks.slots_of(ids)
+    if state.repeats((name, event.sensor), event.t_ns, event.y, event.ids):
+        return again(report, ids, channel.dof)
     parallax = not channel.finds_depth
     done = state.corrected(
         Update(model.model, moving.slot, channel.mount, slots, model.d, event.y, R, channel.gate, parallax), event

@@ -60,6 +60,9 @@ def move(state: State, name: str, part: Part) -> None:
             moving.error = state.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
     if not state.estimator.predict(state.map, moving.movement(state.map, part)):
         raise _nowhere(state, name, part)
+    for key, given in state.given.items():
+        if key[0] == name:
+            given.moved(part)
     if name in state.alternatives and not state.alternatives[name].move(state.estimator, part):
         del state.alternatives[name]
     state.clones.moved(name)

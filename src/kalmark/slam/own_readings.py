@@ -16,6 +16,7 @@ from kalmark.report import Judged, Observation, Report, outcomes_of
 from kalmark.slam import moves, replacing
 from kalmark.slam.alternative import Alternative, put
 from kalmark.slam.checks import refuse_bad_fix
+from kalmark.slam.held_readings import again
 from kalmark.slam.reader import Reader
 from kalmark.slam.state import State
 
@@ -31,6 +32,8 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
     report.gaps = moves.advance(state, event.robot)
     if not len(event.y) and reader.keep == 1:
         return report
+    if not reader.counts and state.repeats(key, event.t_ns, event.y):
+        return again(report, [None] * len(event.y), R.shape[1], event.robot)
     other = state.alternatives.get(event.robot)
     reader.drift(event.t_ns, state.map, *([] if other is None else [other.map]))
     clones = {state.clones.clones[number].t_ns: number for number in state.clones.of(key)}
@@ -89,6 +92,8 @@ def fix(state: State, event: Fix) -> Report:
     gaps = moves.advance(state, event.robot)
     slot, report = state.moving[event.robot].slot, Report(event, event.y.reshape(1, size))
     report.gaps = gaps
+    if state.repeats((event.robot, ""), event.t_ns, report.y):
+        return again(report, [event.robot], size, event.robot)
     gate, R = state.settings.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
     update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
     estimator, other = state.estimator.for_fixes(), state.alternatives.get(event.robot)

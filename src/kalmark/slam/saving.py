@@ -41,6 +41,7 @@ from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
 from kalmark.slam.alternative import Alternative, alone
+from kalmark.slam.held_readings import Given
 from kalmark.slam.motion import Mean, Moving, bias_block, bias_name
 from kalmark.slam.reader import Reader
 from kalmark.slam.replacing import LeftOut
@@ -125,6 +126,7 @@ def _state(state: State) -> Description:
         ],
         "reserved": sorted(map(_id, tracks.reserved)),
         **{name: getattr(tracks, name) for name in OF_TRACKS},
+        "given": [[*key, given.saved()] for key, given in state.given.items()],
         "alternatives": [
             [name, other.since_ns, other.misses, other.map.state()] for name, other in state.alternatives.items()
         ],
@@ -270,6 +272,7 @@ class Saved:
             own = restored_map(of, lambda key, *shape, i=i: _array(self._members, f"alternative{i}.{key}", *shape))
             moving = alone(state.moving[name])
             state.alternatives[name] = Alternative(own, moving, int(since_ns), _count(misses, "misses"))
+        state.given = {(str(r), str(sensor)): Given.restored(*saved) for r, sensor, saved in s.get("given", ())}
         judged = s.get("surveys", {"trial": (), "misfits": (), "strangers": ()})
         state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
         state.surveys.misfits = {name: (int(out), frozenset(fit)) for name, out, fit in judged["misfits"]}

@@ -42,6 +42,7 @@ from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_c
 from kalmark.slam.checks import numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
+from kalmark.slam.held_readings import again
 from kalmark.slam.policy import Policy, refuse_other_world
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.robot import Robot, robots_given
@@ -260,6 +261,8 @@ class Slam(Estimate):
         scan = ScanContext(
             state.map, state.tracks, state.clones, state.estimator, channel, robot, event, ids, R, report
         )  # fmt: skip
+        if len(event.y) and state.repeats(key, event.t_ns, event.y, event.ids):
+            return again(report, ids, channel.dof)
         why = state.look_back(key) if channel.sees_velocity else ""
         if self.before_scan is not None and not why:
             self.before_scan(event.robot, event.sensor)

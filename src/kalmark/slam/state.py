@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kalmark.arrays import Index
+from kalmark.arrays import Array, Index
 from kalmark.association import Association
 from kalmark.errors import DivergedError, MapError, ModelError
 from kalmark.events import Event, Id, when
@@ -19,6 +19,7 @@ from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
 from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
+from kalmark.slam.held_readings import SELDOM, Given
 from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
 from kalmark.slam.reader import LEAST_S, Reader
@@ -54,7 +55,7 @@ class State:
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
     `standing` are, of robots that are noticed to stand, the names of the sensors that do; `alternatives` are, of robots
     whose readings do not fit, the other explanations of these; `taken` are the events of this very time: the kind, the
-    robot and the sensor of each.
+    robot and the sensor of each; `given` is what each sensor gave last.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
@@ -64,6 +65,7 @@ class State:
         self.taken: set[tuple[str, str, str]] = set()
         self.map: Map = new_map(settings.map, settings.numbers)
         self.tracks, self.clones, self.surveys = Tracks(robots), Clones(), Surveys()
+        self.given: dict[ChannelKey, Given] = {}
         self.placed = 0  # fixes that have told where the map is in the world; a survey counts as many
         self.alternatives: dict[str, Alternative] = {}
         self.moving: dict[str, Moving] = {}
@@ -184,6 +186,23 @@ class State:
             used.update(self.clones.of(key)[-1:])
         for slot in self.clones.refer(key, used):
             self.map.remove(slot)
+
+    def repeats(self, key: ChannelKey, t_ns: int, y: Array, ids: tuple[Id | None, ...] | None = None) -> bool:
+        """Take note of what a sensor measured, y (K, m); return whether it is what it gave before (`held_readings`)."""
+        given = self.given.get(key)
+        if given is None or given.y.shape[1] != y.shape[1]:
+            self.given[key] = Given.of(y, ids)
+            return False
+        if not given.take(y, ids) or given.chance >= SELDOM:
+            return False
+        moving = self.moving[key[0]]
+        pose, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
+        v = self.map.mean(moving.slot)[pose : pose + dof]
+        d = min(len(v), 3)
+        if not given.has_moved(v[:d], self.map.covariance([moving.slot])[dof : dof + d, dof : dof + d]):
+            return False
+        given.repeats, given.since_ns = given.repeats + 1, given.since_ns if given.repeats else t_ns
+        return True
 
     def settle(self) -> None:
         """Let front ends know that something else than their frames changes the map."""

@@ -163,7 +163,7 @@ def _begin(state: State, scan: ScanContext, name: Id, k: int, before: Track | No
         start = scan.start_of(k)
         if not start.is_finite:
             return
-        track = Track(state.tracks.new_name(), scan.channel.landmark, state.add(start), size_m=scan.size_of(k))
+        track = Track(f"other place of {name}", scan.channel.landmark, state.add(start), size_m=scan.size_of(k))
         against, track.searched = state.tracks.confirmed[name].observations - 1, len(state.tracks.confirmed)
         track.status, track.of, track.log_odds = Status.TENTATIVE, name, -OUTLIER * against
         if before is not None:

@@ -1,0 +1,116 @@
+"""Measurements that a sensor gives again, as a receiver does that repeats its last one until it has a new one.
+
+A measurement that has the numbers of the one before to the last bit, though its robot has moved by its controls since,
+is that one: noise forbids it, unless the numbers are so coarse that they repeat by chance.  How likely that is, the
+sensor tells by its own measurements: the least difference q of successive ones is a step of their numbers, and noise of
+which differences have the geometric mean g repeats a number with the probability CHANCE q / g.  Numbers that repeat
+alone, while others of the same measurement change, do so by chance as often as they did.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.events import Id
+from kalmark.geometry.gaussian import gate
+from kalmark.report import Observation, Report
+from kalmark.slam.motion import Part
+
+AGAIN = "it repeats the one before to the last bit, though the robot has moved: it is no new measurement"
+SELDOM = 0.01  # of new measurements may be taken for old ones
+MOVED = 0.99  # sure is it that a robot has moved
+CHANCE = math.exp(-0.5 * (np.euler_gamma + math.log(2.0))) / math.sqrt(2.0 * math.pi)  # of Gaussian noise: g is known
+SAME = 1e-9  # differences are rounding below it, as a share of a number
+
+
+def again(report: Report, ids: Sequence[Id | None], p: int, of: Id | None = None) -> Report:
+    """Enter into a report that all of a measurement, with innovations of p numbers, was given before."""
+    report.blank(p)
+    report.observations = [Observation(k, id_, "ignored", of, None, AGAIN) for k, id_ in enumerate(ids)]
+    return report
+
+
+@dataclass
+class Given:
+    """What a sensor gave last, y (K, m) with its ids, and what its measurements have told of their numbers.
+
+    Of each column: the `least` difference of successive measurements (0 of none), the sum of the logarithms of
+    differences, and how many `differ` and are `equal`.  `went` and `doubt` (c,) are the controls since it was given and
+    their variances.  `repeats` of `number` measurements were left out, since `since_ns`.
+    """
+
+    y: Array
+    ids: tuple[Id | None, ...] | None
+    least: Array
+    logs: Array
+    differ: Array
+    equal: Array
+    went: Array = field(default_factory=lambda: np.zeros(0))
+    doubt: Array = field(default_factory=lambda: np.zeros(0))
+    repeats: int = 0
+    number: int = 1
+    since_ns: int = 0
+
+    @classmethod
+    def of(cls, y: Array, ids: tuple[Id | None, ...] | None) -> Given:
+        """Return what a first measurement tells."""
+        m = y.shape[1]
+        return cls(y, ids, *np.zeros((4, m)))
+
+    def moved(self, part: Part) -> None:
+        """Take a part of a control of the robot."""
+        u, N = (part.u * part.dt_s, part.N * part.dt_s**2) if part.dt_s > 0.0 else (part.u, part.N)
+        if len(self.went) != len(u):
+            self.went, self.doubt = np.zeros(len(u)), np.zeros(len(u))
+        self.went, self.doubt = self.went + u, self.doubt + np.diagonal(N)
+
+    @property
+    def chance(self) -> float:
+        """The probability that a new measurement has the same numbers, of the columns independently; 1 if unknown."""
+        if not self.differ.any():
+            return 1.0
+        some = self.differ > 0
+        g = np.exp(self.logs[some] / self.differ[some])
+        by_noise, alone = np.ones(len(some)), self.equal / np.maximum(self.equal + self.differ, 1.0)
+        by_noise[some] = np.minimum(CHANCE * self.least[some] / g, 1.0)
+        return float(np.prod(np.maximum(by_noise, alone)))
+
+    def has_moved(self, velocity: Array, P: Array) -> bool:
+        """Return whether the robot has moved since: by its controls or, if it has one, its velocity (v,), P (v, v)."""
+        x, variances = (velocity, np.diagonal(P)) if len(velocity) else (self.went, self.doubt)
+        return bool(np.sum(x**2 / np.maximum(variances, 1e-30)) > gate(MOVED, max(len(x), 1)))
+
+    def take(self, y: Array, ids: tuple[Id | None, ...] | None) -> bool:
+        """Take a measurement; return whether it has the numbers of the one before."""
+        self.number += 1
+        if y.shape == self.y.shape and ids == self.ids:
+            d = np.abs(y - self.y)
+            if not d.any():
+                return True
+            new = d > SAME * np.abs(y)
+            least = np.where(new, d, np.inf).min(axis=0)
+            least = np.where(self.differ > 0, np.minimum(self.least, least), least)
+            self.least = np.where(new.any(axis=0), least, self.least)
+            self.logs += np.where(new, np.log(np.where(new, d, 1.0)), 0.0).sum(axis=0)
+            self.differ, self.equal = self.differ + new.sum(axis=0), self.equal + (~new).sum(axis=0)
+        self.y, self.ids, self.went, self.doubt = y, ids, np.zeros(0), np.zeros(0)
+        return False
+
+    def saved(self) -> list[Any]:
+        """Return all of it as lists and numbers."""
+        return [value.tolist() if isinstance(value, np.ndarray) else value for value in vars(self).values()]
+
+    @classmethod
+    def restored(cls, y: list[Any], ids: Sequence[Id | None] | None, *rest: Any) -> Given:
+        """Return what was `saved`."""
+        least, logs, differ, equal, went, doubt = (np.array(a, dtype=np.float64) for a in rest[:6])
+        repeats, number, since_ns = map(int, rest[6:])
+        shaped = np.array(y, dtype=np.float64).reshape(-1, len(least))
+        ids = None if ids is None else tuple(ids)
+        return cls(shaped, ids, least, logs, differ, equal, went, doubt, repeats, number, since_ns)
