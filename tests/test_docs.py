@@ -114,3 +114,64 @@ def test_the_program_of_a_figure_exists(command: str) -> None:
     else:
         shipped = {path.stem for path in (ROOT / "src" / "kalmark" / "configs").rglob("*.yaml")}
         assert words[0] == "kalmark" and words[1] in ("campaign", "run") and words[2] in shipped
+
+
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+PROSE = [
+    *PAGES,
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    *SOURCES,
+    *TESTS,
+    *sorted((ROOT / "benchmarks").glob("*.py")),
+]
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    plain = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", head) for head in re.findall(r"^#+ (.*?)\s*$", text, re.M)]
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in plain}
+
+
+def test_every_section_that_a_page_points_to_exists() -> None:
+    missing = [
+        f"{page.name}: {target}#{anchor}"
+        for page in [*PAGES, ROOT / "CONTRIBUTING.md"]
+        for target, anchor in re.findall(r"\]\(([^)#:\s]*)#([^)\s]+)\)", page.read_text())
+        if anchor not in anchors((page.parent / target) if target else page)
+    ]
+    assert missing == []
+
+
+def test_every_page_program_and_test_that_prose_names_exists() -> None:
+    tests = "\n".join(path.name + "\n" + path.read_text() for path in TESTS)
+    for path in PROSE:
+        text = path.read_text()
+        for name in re.findall(
+            r"(?<![\w/.])(?:docs|tests|benchmarks|examples|src/kalmark)/[\w/]+\.(?:md|py|json)", text
+        ):
+            assert (ROOT / name).exists(), f"{path.name}: {name}"
+        if path.suffix == ".md":
+            for word in re.findall(r"pytest [^`\n|]*?-k '?(\w+)", text):
+                assert re.search(rf"def test_\w*{word}|^\w*{word}\w*\.py", tests, re.M), f"{path.name}: -k {word}"
+
+
+def test_every_module_and_name_that_prose_puts_into_backticks_exists() -> None:
+    package, sources = ROOT / "src" / "kalmark", [path.read_text() for path in SOURCES]
+    for path in PROSE:
+        text = path.read_text()
+        for name, told in re.findall(r"`(?:src/kalmark/)?((?:[a-z_]+/)+[a-z_0-9]+\.py)(?:: ([\w., ]+))?`", text):
+            file = next((base / name for base in (package, ROOT, ROOT / "src") if (base / name).exists()), None)
+            assert file is not None, f"{path.name}: {name}"
+            for one in re.split(r", ?", told) if told else ():
+                assert re.search(rf"\b{one.rpartition('.')[2]}\b", file.read_text()), f"{path.name}: {name}: {one}"
+        for dotted in re.findall(r"`(kalmark(?:\.[a-z_]\w*)+)(?:\.[A-Z]\w*)?`", text):
+            parts = dotted.split(".")[1:]
+            above = package.joinpath(*parts[:-1])
+            known = [any(f'"{dotted}"' in source for source in sources)]  # a group of entry points
+            known += [package.joinpath(*parts).with_suffix(".py").exists(), package.joinpath(*parts).is_dir()]
+            files = [above.with_suffix(".py"), above / "__init__.py"]
+            known += [bool(re.search(rf"\b{parts[-1]}\b", file.read_text())) for file in files if file.exists()]
+            assert any(known), f"{path.name}: {dotted}"

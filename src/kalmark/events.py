@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from itertools import groupby
 from numbers import Real
@@ -62,6 +62,13 @@ def seconds(t_ns: int) -> str:
     """Return integer nanoseconds as text in seconds, exactly, without trailing zeros."""
     whole, rest = divmod(abs(t_ns), 1_000_000_000)
     return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}".rstrip("0").rstrip(".")
+
+
+def listed(names: Iterable[object], most: int = 3) -> str:
+    """Return names as a line shows them: the first ones, and how many more there are."""
+    texts = [shown(name) for name in names]
+    more = [f"{len(texts) - most} more"] if len(texts) > most else []
+    return ", ".join([*texts[:most], *more]) or "none"
 
 
 def shown(value: object) -> str:

@@ -20,6 +20,11 @@ from typing import Any
 from kalmark.models.inertial import Inertial
 from kalmark.models.sensors import Bearing, Gps2D, Gps3D, Gyro2D, Range, RangeBearing, Speed
 
+__all__ = [
+    "ALL", "ARVA", "CAMERA", "DEVICES", "INERTIAL_UNIT", "LASER", "LASER_SCANNER", "MEMS_IMU", "MOTIONS", "RFID",
+    "RGBD", "RTK_RECEIVER", "SONAR", "TABLE_2", "WHEEL_ENCODER", "Preset",
+]  # fmt: skip
+
 HOKUYO = "Hokuyo, Communication Protocol Specification for SCIP2.0, C-42-03320B"
 WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat, a laser that sees cylinders"
 FAQ = "Devantech, Ultrasonic Rangers FAQ, robot-electronics.co.uk/htm/sonar_faq.htm"

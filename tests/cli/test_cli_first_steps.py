@@ -14,7 +14,7 @@ from command_line import Kalmark, write_log
 from kalmark.compiled import COMPILING, say_compiling
 from kalmark.config import load_config, shipped_configs
 from kalmark.logs import list_data
-from kalmark.simulate import load_world
+from kalmark.simulate import load_world, shipped_worlds
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -86,6 +86,12 @@ def test_config_prints_a_shipped_configuration_to_start_from(kalmark: Kalmark, t
     (tmp_path / "mine.yaml").write_text(done.out)
     assert load_config(tmp_path / "mine.yaml").model_dump() == load_config("native").model_dump()
     assert done.out == shipped_configs()["native"].read_text()
+    assert kalmark("worlds", "cloister").out == shipped_worlds()["cloister"].read_text()
+    for verb, shipped in (("config", shipped_configs()), ("worlds", shipped_worlds())):
+        listed = kalmark(verb)
+        assert (listed.status, listed.err) == (0, "")
+        rows = [line.split(maxsplit=1) for line in listed.out.splitlines()]
+        assert {*shipped} <= {row[0] for row in rows if len(row) == 2}
     refused = kalmark("config", "nativ")
     assert (refused.status, refused.out) == (2, "")
     assert refused.err.endswith("did you mean native?\n")

@@ -20,6 +20,7 @@ from kalmark.results.explain import explain
 from kalmark.results.plot_scan import draw_scan
 from kalmark.results.report import change_rows, report_html, series
 from kalmark.results.run import Run
+from kalmark.results.scene import Scene
 from kalmark.results.warnings import window_warnings
 from kalmark.results.words import figure
 
@@ -214,7 +215,7 @@ def test_looking_is_the_same_with_and_without_a_record() -> None:
 
 def test_the_page_draws_the_ambiguous_scans_and_lists_what_was_merged(tmp_path: Path) -> None:
     run = lost_run(tmp_path)
-    shown = series(run)["association"]
+    shown = series(run, Scene.of(run))["association"]
     assert shown["changes"]["merged"]
     scan = next(s for s in shown["scans"] if s["t"] == 7.0)
     assert [seen["outcome"] for seen in scan["seen"]] == ["deferred"] * 6

@@ -64,7 +64,7 @@ def test_the_map_is_a_png_with_labelled_axes_in_metres(run: Run, tmp_path: Path)
     assert axes.get_ylabel() == "y (m)"
     assert axes.get_aspect() == 1.0
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels[:3] == ["estimated path", "true path", "true landmarks"]
+    assert labels[:3] == ["estimated path", "true path, aligned", "true landmarks, aligned"]
     (rings,) = [line for line in axes.lines if line.get_color() == LANDMARK_COLOUR and line.get_linestyle() == "-"]
     assert np.isnan(rings.get_xdata()).sum() == len(run.landmarks)
 
@@ -171,7 +171,7 @@ def test_text_from_a_log_cannot_break_out_of_the_page() -> None:
 
 def test_long_logs_are_thinned_but_keep_their_end() -> None:
     run = recorded(circle(steps=2 * POINTS + 10, landmarks=3))
-    data = series(run)
+    data = series(run, Scene.of(run))
     (robot,) = data["robots"]
     assert POINTS / 2 < len(robot["t"]) <= POINTS + 1
     assert len(robot["error"]) == len(robot["sigma"]) == 3
@@ -182,7 +182,7 @@ def test_long_logs_are_thinned_but_keep_their_end() -> None:
 
 
 def test_the_nis_curve_averages_to_the_figure_of_the_summary(run: Run) -> None:
-    nis = series(run)["nis"]
+    nis = series(run, Scene.of(run))["nis"]
     assert nis["window"] == 1
     assert np.mean(nis["value"]) == pytest.approx(run.evaluate()["nis_per_dof"], rel=0.2)
     assert all(low < 1 < high for low, high in zip(nis["low"], nis["high"], strict=True))
@@ -208,12 +208,12 @@ def test_the_headline_names_the_key_figures(run: Run) -> None:
 def test_the_map_shows_whole_ellipses_but_a_huge_one_does_not_blow_it_up(run: Run) -> None:
     means, covariances = run.landmarks.positions()
     rings = contours(means, covariances).reshape(-1, 2)
-    (axes,) = draw_map(run).axes
+    (axes,) = draw_map(run, world=True).axes
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     assert left < rings[:, 0].min() < rings[:, 0].max() < right
     assert bottom < rings[:, 1].min() < rings[:, 1].max() < top
     huge = replace(run.landmarks, covariances=[1e6 * np.eye(2), *run.landmarks.covariances[1:]])
-    (axes,) = draw_map(replace(run, landmarks=huge)).axes
+    (axes,) = draw_map(replace(run, landmarks=huge), world=True).axes
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 2 * (right - left)
 
 

@@ -98,3 +98,17 @@ def test_a_camera_shows_what_it_did_not_measure() -> None:
         assert np.isfinite(sighting.expected).all()
         assert np.isfinite(sighting.Z).all()
     assert "predicted only" in str([t.get_text() for t in draw_sensor(run, "r", "eye", step).legends[0].get_texts()])
+
+
+def test_an_expectation_across_180_degrees_is_drawn_beside_its_measurement() -> None:
+    robot = km.Robot("robot", km.motion.Unicycle(), sensors={"laser": km.Mount(km.sensors.RangeBearing())})
+    bearings = np.pi - 0.01, -np.pi + 0.01
+    scans = [
+        km.Scan(t_ns=k * 10**8, robot="robot", sensor="laser", y=[[2.0, bearing]], ids=[1])
+        for k, bearing in enumerate(bearings)
+    ]
+    run = km.record(km.Slam([robot]), km.Log("behind", ("robot",), scans), progress=False)
+    axes = draw_sensor(run, "robot", "laser", 1).axes[0]
+    measured, expected = (float(np.asarray(line.get_xdata())[0]) for line in axes.lines[:2])
+    assert measured == pytest.approx(np.degrees(bearings[1]))
+    assert expected == pytest.approx(measured - np.degrees(0.02), abs=0.1)

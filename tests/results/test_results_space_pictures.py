@@ -74,12 +74,12 @@ def test_the_map_of_a_run_in_space_has_a_view_and_a_plan(run: Run, tmp_path: Pat
     assert space.get_aspect() == plan.get_aspect() == 1.0
     assert (plan.get_xlabel(), plan.get_ylabel()) == ("x (m)", "y (m)")
     labels = [text.get_text() for text in draw_map(run).legends[0].get_texts()]
-    ends = ["start", "end", "3σ of the end"]
+    ends = ["start", "end", "end, 3σ of the shape"]
     assert labels == [
         "estimated path",
-        "true path",
-        "true landmarks",
-        "Euclidean landmarks, 3σ",
+        "true path, aligned",
+        "true landmarks, aligned",
+        "Euclidean landmarks, 3σ of the shape",
         *ends,
         "dead reckoning",
     ]
@@ -105,7 +105,7 @@ def test_a_point_at_great_depth_does_not_shrink_the_picture(run: Run) -> None:
         means=[np.array([9e3, 0, 0]), *run.landmarks.means[1:]],
         covariances=[1e8 * np.eye(3), *run.landmarks.covariances[1:]],
     )
-    a, b = Scene.of(run), Scene.of(replace(run, landmarks=far))
+    a, b = Scene.of(run, world=True), Scene.of(replace(run, landmarks=far), world=True)
     assert b.size < 1.2 * a.size
     assert (b.shapes.group == OTHERS).sum() == 1
     assert np.isnan(b.inside(b.shapes.means[:1])).all()

@@ -96,7 +96,7 @@ def test_a_room_is_mapped_from_raw_scans_drawn_saved_and_read_again(tmp_path: Pa
         np.testing.assert_array_equal(one, other)
     assert run.evaluate()["landmarks_compared"] == 5
     labels = [text.get_text() for text in draw_map(again).legends[0].get_texts()]
-    assert {"true walls", "walls, 3σ of their ends"} <= {*labels}
+    assert {"true walls, aligned", "walls, 3σ of their ends of the shape"} <= {*labels}
     assert '"trueLines"' in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert isinstance(MapLandmarks.read(tmp_path / "run" / "landmarks.csv"), MapLandmarks)
 

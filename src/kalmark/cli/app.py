@@ -18,7 +18,7 @@ from kalmark.cli.convert import convert
 from kalmark.cli.diagnose import diagnose
 from kalmark.cli.folders import compare, evaluate, explain, report, view
 from kalmark.cli.live import live
-from kalmark.cli.logs import config, data, simulate
+from kalmark.cli.logs import config, data, simulate, worlds
 from kalmark.cli.run import demo, run, warm_up
 from kalmark.cli.tune import tune
 from kalmark.errors import KalmarkError
@@ -50,6 +50,7 @@ for verb in (
     explain,
     campaign,
     config,
+    worlds,
     bag,
     convert,
     check,

@@ -51,17 +51,21 @@ def report(
         bool, typer.Option("--video", help="Also write video.mp4 (video.gif where ffmpeg is not installed).")
     ] = False,
     fps: Annotated[float, typer.Option(help="Frames a second of the video.")] = 10.0,
+    world: Annotated[
+        bool,
+        typer.Option("--world", help="Draw the ellipses in the world, with the start's uncertainty, not of the shape."),
+    ] = False,
 ) -> None:
     """Write map.png, report.html and a figure of each camera's last scan again."""
     from kalmark.results.run import Run
 
     loaded = Run.load(run)
-    for path in loaded.report(run):
+    for path in loaded.report(run, world):
         typer.echo(str(path))
     if video:
         from kalmark.results.video import write_video
 
-        typer.echo(str(write_video(loaded, run / "video.mp4", fps)))
+        typer.echo(str(write_video(loaded, run / "video.mp4", fps, world=world)))
 
 
 def view(

@@ -1,8 +1,10 @@
-"""What makes logs, `kalmark simulate` and `data`, and configurations to start from, `kalmark config`."""
+"""What makes logs, `kalmark simulate` and `data`, and files to start from, `kalmark config` and `worlds`."""
 
 from __future__ import annotations
 
+import re
 import shlex
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -83,9 +85,41 @@ def fetch(name: Annotated[str, typer.Argument(help="A dataset, or a group like m
 
 
 def config(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A shipped configuration, like native.")],
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="A shipped configuration, like native. (default: list them)")
+    ] = None,
 ) -> None:
     """Print a shipped configuration, to start your own: kalmark config native > mine.yaml."""
-    from kalmark.config import resolve_config
+    from kalmark.config import resolve_config, shipped_configs
 
-    typer.echo(resolve_config(name).read_text(encoding="utf-8"), nl=False)
+    if name is None:
+        _list(shipped_configs())
+    else:
+        typer.echo(resolve_config(name).read_text(encoding="utf-8"), nl=False)
+
+
+def worlds(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="A shipped world, like cloister. (default: list them)")
+    ] = None,
+) -> None:
+    """Print a shipped world, to start your own: kalmark worlds cloister > mine.yaml."""
+    from kalmark.config.reading import resolve_name
+    from kalmark.simulate import shipped_worlds
+
+    if name is None:
+        _list(shipped_worlds())
+    else:
+        typer.echo(resolve_name(name, shipped_worlds(), "world").read_text(encoding="utf-8"), nl=False)
+
+
+def _list(shipped: dict[str, Path]) -> None:
+    """Print the names of files and what their first comment says they are."""
+    print_table("", ("name", "what"), [(name, _headline(path)) for name, path in shipped.items()], align="<<")
+
+
+def _headline(path: Path) -> str:
+    """Return the first sentence of a file's first comment."""
+    lines = takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
+    text = " ".join(line.lstrip("# ").rstrip() for line in lines if not line.startswith("#   "))
+    return re.split(r"(?<=[a-z0-9)])\.(?:\s|$)", text, maxsplit=1)[0]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.causes import JUMPS, Finding
@@ -16,6 +16,7 @@ from kalmark.diagnosis.gross import FITS, LOST, MOVED, fit, gross, started_at, u
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.gross import MOST as MOST_D2
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
+from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.lost import lost
 from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.mounts import TURNED
@@ -27,6 +28,7 @@ from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.results.batch import filtered_map, log_of, of_the_filter_alone
 from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
+from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import Placed
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
@@ -77,8 +79,9 @@ class Verdict:
     """What is to be thought of a map: `map` is ok, doubtful or wrong, the `causes` are why, best first.
 
     `sigma_factor` is what the filter's sigmas are to be multiplied by, `accuracy_m` the sigma of a landmark's position
-    after it, both the median over landmarks; `shift_m` is by how much the shape of the map changes without the causes.
-    `checked` says of what all this was made, `search` is how.
+    after it in the world and `shape_accuracy_m` that without the motion of the world that the start leaves open
+    (`kalmark.results.gauge`), all the median over landmarks; `shift_m` is by how much the shape of the map changes
+    without the causes.  `checked` says of what all this was made, `search` is how.
     """
 
     map: str
@@ -86,12 +89,14 @@ class Verdict:
     checked: str
     sigma_factor: float | None = None
     accuracy_m: float | None = None
+    shape_accuracy_m: float | None = None
     shift_m: float | None = None
     search: Search | None = field(default=None, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict as it is in ``summary.json``."""
-        figures = {key: getattr(self, key) for key in ("map", "sigma_factor", "accuracy_m", "shift_m", "checked")}
+        keys = "map", "sigma_factor", "accuracy_m", "shape_accuracy_m", "shift_m", "checked"
+        figures = {key: getattr(self, key) for key in keys}
         return figures | {"causes": [vars(cause) for cause in self.causes]}
 
 
@@ -174,7 +179,7 @@ def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> 
     elif effect.status == "ok" and wrong:
         effect = replace(effect, status="doubtful")
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
-    figures = effect.sigma_factor, effect.accuracy_m, effect.shift_m
+    figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
     return Verdict(effect.status, tuple(causes), checked, *figures, found.search)
 
 
@@ -544,6 +549,7 @@ class Effect:
     status: str = "ok"
     sigma_factor: float | None = None
     accuracy_m: float | None = None
+    shape_accuracy_m: float | None = None
     shift_m: float | None = None
     claimed: float | None = None
     dof: int = 0
@@ -565,8 +571,9 @@ def effect_of(run: Run, found: Searched) -> Effect:
     angle = np.where(lines, found.batch.state.groups[LANDMARKS][its, -1], np.nan)
     off, extent = _off(places, moved, angle), rmse(moved - moved.mean(axis=0))
     by_steady = rmse(_off(places, steady, angle))  # of causes that are sure: no noise explains it
-    filtered = _sigma(np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine]))
-    stated, honest = (_sigma(linear.reduced.covariances()[its, :d, :d]) for linear in (first, cured))
+    P = np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine])
+    (stated, bare_stated), (honest, bare_honest) = (_sigmas(each, places, its, ~lines) for each in (first, cured))
+    filtered = _sigma(P)
     shift_m = float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0)))
     share, free = shift_m / max(extent, TINY_M), (filtered > 0) & (stated > 0)
     if not free.any():
@@ -582,7 +589,14 @@ def effect_of(run: Run, found: Searched) -> Effect:
     over = 1.0 / claimed if claimed is not None and (claimed < TOO_SURE or twice) else 1.0
     factors = np.hypot(honest[free] / stated[free] * over, shift_m / filtered[free])
     accuracy_m = float(np.median(factors * filtered[free]))
-    return Effect(status, float(np.median(factors)), accuracy_m, shift_m, claimed, d * int(free.sum()))
+    end = run.history.map_at(len(run.history.t_ns))
+    kept = dict(zip(end.ids, end.shape[:, :d, :d], strict=True))
+    bare = _sigma(np.array([kept.get(run.landmarks.ids[k], P[row]) for row, k in enumerate(mine)]))
+    larger = np.divide(bare_honest, bare_stated, out=np.ones(len(bare)), where=bare_stated > 0) * over
+    shape_m = float(np.median(np.hypot(larger * bare, shift_m)[free]))
+    return Effect(
+        status, float(np.median(factors)), accuracy_m, shape_m, shift_m, claimed, d * int(free.sum())
+    )  # fmt: skip
 
 
 def _off(places: Array, moved: Array, angle: Array) -> Array:
@@ -602,5 +616,17 @@ def _shared(run: Run, search: Search) -> Iterator[tuple[int, int]]:
     return ((at[id_], k) for k, id_ in enumerate(search.linear.problem.ids) if id_ in at)
 
 
+def _sigmas(linear: Linear, places: Array, its: Index, points: Flags) -> tuple[Array, Array]:
+    """Return the sigmas (K,) of the landmarks `its`, at places (K, d): in the world, and of the shape.
+
+    The shape is that of the `points` (K,), of all where there is none.
+    """
+    d, k, joint = places.shape[1], np.arange(len(its)), linear.reduced.joint()
+    dof = len(joint) // len(linear.state.groups[LANDMARKS])
+    rows = (its[:, None] * dof + np.arange(d)).ravel()
+    P, of = joint[np.ix_(rows, rows)], np.flatnonzero(points if points.any() else ~points)
+    return _sigma(P.reshape(len(k), d, len(k), d)[k, :, k]), _sigma(shape_of_points(places, P, of))
+
+
 def _sigma(P: Array) -> Array:
-    return np.asarray(np.sqrt(np.trace(P, axis1=1, axis2=2)))
+    return np.asarray(np.sqrt(np.maximum(np.trace(P, axis1=1, axis2=2), 0.0)))

@@ -18,6 +18,10 @@ from kalmark.filter import corrections, prediction
 from kalmark.filter.inertial import has_units, turn_own_errors
 from kalmark.filter.map import Map, StochasticMap
 
+__all__ = [
+    "Averaging", "Compiling", "Correction", "Ekf", "Estimator", "Fej", "Invariant", "Iterating", "Movement", "Update",
+]  # fmt: skip
+
 
 class Update(NamedTuple):
     """One correction: y (K, m) with noise R (K, p, p), of the first d numbers of the K blocks `slots`.

@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan
+from kalmark.events import Control, Event, Id, Scan, listed
 from kalmark.geometry.angles import wrap
 
 Times = Index
@@ -143,6 +143,11 @@ class Log:
     reference: dict[str, dict[str, float]] = field(default_factory=dict)
     true_ids: dict[Scan, tuple[Id | None, ...]] = field(default_factory=dict)
     origin: Array | None = None
+
+    def __repr__(self) -> str:
+        span = f" in {(self.events[-1].t_ns - self.events[0].t_ns) * 1e-9:.1f} s" if self.events else ""
+        truth = ", with truth" if self.truth or self.landmarks else ""
+        return f"<Log {self.name!r} of {listed(self.robots)}: {len(self.events)} events{span}{truth}>"
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self.events)

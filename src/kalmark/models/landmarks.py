@@ -18,6 +18,12 @@ from kalmark.geometry.directions import unit_many
 from kalmark.geometry.spaces import SE3, Space
 from kalmark.models import landmarks2d, landmarks3d, lines, seen, tags, walls
 
+__all__ = [
+    "BUILT_IN", "LINES", "AnchoredHomogeneous", "AnchoredHomogeneousLine", "AnchoredPlueckerLine", "AsPoint",
+    "Homogeneous", "HomogeneousLine", "InverseDepth2D", "InverseDepth3D", "InverseDepthLine", "PlueckerLine", "Point2D",
+    "Point3D", "PointSignature2D", "Polar2D", "Tag", "Wall2D",
+]  # fmt: skip
+
 TINY_M = 1e-12
 
 PriorDepth = Annotated[Number, "Inverse distance expected where the sensor sees none."]

@@ -320,11 +320,11 @@ def path_at(history: History, robot: str, t_ns: Ints, max_gap_s: float = FIX_GAP
     return out
 
 
-def aligned_fixes(run: Recording, robot: str) -> tuple[Rigid, Array, Array, Array]:
+def aligned_fixes(run: Recording, robot: str) -> tuple[Rigid, Array, Array, Array, Ints]:
     """Return the robust alignment (`rigid_robust`) of the path to a robot's fixes, with what it aligns, all (N, 2).
 
     That is: where the antenna was by the estimated path at the time of each fix, its offset from the robot, both in the
-    frame of the map, and the fix.
+    frame of the map, and the fix; last its time (N,), ns.
     """
     fixes = run.truth.fixes[robot]
     poses = path_at(run.history, robot, fixes.t_ns)
@@ -334,12 +334,12 @@ def aligned_fixes(run: Recording, robot: str) -> tuple[Rigid, Array, Array, Arra
     antenna = poses[:, :2] + offset
     known = np.isfinite(antenna).all(axis=1) & np.isfinite(fixes.xy).all(axis=1)
     antenna, offset, xy = antenna[known], offset[known], fixes.xy[known]
-    return rigid_robust(antenna, xy) if len(xy) > 1 else identity(), antenna, offset, xy
+    return rigid_robust(antenna, xy) if len(xy) > 1 else identity(), antenna, offset, xy, fixes.t_ns[known]
 
 
 def fix_distances(run: Recording, robot: str) -> Array:
     """Return the distances of the fixes from the path that is aligned to them robustly."""
-    to_fixes, antenna, _, xy = aligned_fixes(run, robot)
+    to_fixes, antenna, _, xy, _ = aligned_fixes(run, robot)
     return np.linalg.norm(to_fixes(antenna) - xy, axis=1)
 
 

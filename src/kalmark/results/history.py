@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.events import Id
+from kalmark.events import Id, listed
 from kalmark.report import Gap
 
 Ints = Index
@@ -99,7 +99,9 @@ class MapSnapshot(NamedTuple):
     """The landmarks of the map after step `step`: ids, places (K, n) and their covariances (K, q, q), kinds.
 
     In the plane places are positions.  In space they are positions, endpoints of lines or poses of tags, padded with
-    NaN (see `kalmark.results.landmarks`).
+    NaN (see `kalmark.results.landmarks`).  `shape` (K, q, q) are the
+    covariances without the motion of the world in common (`kalmark.results.gauge`), `robots` (R, d, d) those of the
+    robots' positions, in the order of their starts.
     """
 
     step: int
@@ -108,6 +110,8 @@ class MapSnapshot(NamedTuple):
     means: Array
     covariances: Array
     kinds: tuple[str, ...]
+    shape: Array
+    robots: Array
 
 
 class Camera(NamedTuple):
@@ -271,6 +275,9 @@ class History:
     repeats: tuple[Repeated, ...] = ()
     stepped: str = "scan"
 
+    def __repr__(self) -> str:
+        return f"<History of {listed(self.robots)}: {len(self.t_ns)} steps, {len(self.outcome)} observations>"
+
     @property
     def scans(self) -> int:
         """The number of scans."""
@@ -324,8 +331,21 @@ class History:
 
     def map_at(self, step: int) -> MapSnapshot:
         """Return the last map that was kept up to a step; before the first there is nothing in it."""
-        nothing = MapSnapshot(step, 0, (), np.empty((0, self.d)), np.empty((0, self.d, self.d)), ())
+        d = self.d
+        nothing = MapSnapshot(step, 0, (), np.empty((0, d)), np.empty((0, d, d)), (), *np.empty((2, 0, d, d)))
         return next((m for m in reversed(self.maps) if m.step <= step), nothing)
+
+    def robot_shape(self, steps: Ints) -> Array:
+        """Return the covariances (K, d, d) of the robots' positions after steps (K,) that are of the shape of the map.
+
+        They are those of the last map that was kept; before the first those in the world.
+        """
+        out, names = self.covariance[steps, : self.d, : self.d].copy(), [s.robot for s in self.starts]
+        at = np.searchsorted([m.step for m in self.maps], steps, side="right") - 1
+        for row, (k, step) in enumerate(zip(at.tolist(), steps.tolist(), strict=True)):
+            if k >= 0 and self.robot[step] in names:
+                out[row] = self.maps[k].robots[names.index(self.robot[step])]
+        return out
 
     def arrays(self) -> Arrays:
         """Return everything as named arrays, those of the contract among them (t in seconds)."""
@@ -336,6 +356,8 @@ class History:
         named |= {
             "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
             "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
+            "map_shape": padded([m.shape for m in self.maps], [len(m.ids) for m in self.maps], width, matrices=True),
+            "map_robot": np.array([m.robots for m in self.maps]).reshape(len(self.maps), -1, self.d, self.d),
             "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
             "map_landmark": texts([i for m in self.maps for i in m.ids]),
             "map_kind": texts([kind for m in self.maps for kind in m.kinds]),
@@ -354,14 +376,16 @@ class History:
         """Return the history that `arrays` gave.  Raises KeyError if one is missing."""
         given: dict[str, Any] = {name: named[name] for name in _array_fields()}
         given |= {name: rows_of(prefix, kind, named, joined) for name, (prefix, kind, joined) in ROWS.items()}
-        ends, keys = np.cumsum(named["map_size"])[:-1], ("mean", "covariance", "landmark", "kind")
+        ends, keys = np.cumsum(named["map_size"])[:-1], ("mean", "covariance", "landmark", "kind", "shape")
         parts = zip(*(np.split(named[f"map_{key}"], ends) for key in keys), strict=True)
         times = zip(
-            named["map_step"].tolist(), named["map_t_ns"].tolist(), parts, strict=False
+            named["map_step"].tolist(), named["map_t_ns"].tolist(), parts, named["map_robot"], strict=False
         )  # no map: one empty part
         given["maps"] = tuple(
-            MapSnapshot(step, t_ns, tuple(map(as_id, names.tolist())), means, covariances, tuple(kinds.tolist()))
-            for step, t_ns, (means, covariances, names, kinds) in times
+            MapSnapshot(
+                step, t_ns, tuple(map(as_id, names.tolist())), means, covariances, tuple(kinds.tolist()), shape, robots
+            )
+            for step, t_ns, (means, covariances, names, kinds, shape), robots in times
         )
         spans = zip(named["control_robot"].tolist(), named["control_span"].tolist(), strict=True)
         given["stepped"] = str(named["stepped"])

@@ -20,13 +20,14 @@ from __future__ import annotations
 import csv
 import io
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import scipy.linalg as la
 
 from kalmark.arrays import Array
 from kalmark.declare import is_own
@@ -35,12 +36,15 @@ from kalmark.events import Id
 from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
 from kalmark.models.landmarks import PointSignature2D, Wall2D
 from kalmark.models.protocols import Landmark, Segmented, place_of
+from kalmark.results.gauge import Datum, generators
 from kalmark.results.history import Ints, as_id, padded_all
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 POINT, WALL, LINE, TAG = 3, 4, 6, 7
+DATUM = 128  # landmarks
+TINY = 1e-30
 EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
 # kinds whose state is their place; what is not (inverse depth, say) is not well known yet
 EUCLIDEAN = ("", "point", "point3", "point_signature", "tag")
@@ -108,6 +112,62 @@ def shapes(means: Array, covariances: Array, kinds: Sequence[str], d: int = 3) -
     )
 
 
+def _ends(place: Array, d: int) -> Array:
+    """Return the points (1, d) of a place, or both ends (2, d) of a line."""
+    return place.reshape(2, d) if len(place) == 2 * d else place[None, :d]
+
+
+def _across(ends: Array) -> Array:
+    """Return the projections (N, d, d) across the line through two ends, of a single point 1."""
+    u = ends[-1] - ends[0]
+    return np.tile(np.eye(len(u)) - np.outer(u, u) / max(float(u @ u), TINY), (len(ends), 1, 1))
+
+
+def _motion(place: Array, d: int, size: int, origin: Array) -> Array:
+    """Return how the error (size,) of a place moves (size, q) with the world about an origin."""
+    ends = _ends(place, d)
+    G = generators(ends, origin)
+    whole = G[0] if d == 3 and len(place) == TAG else G[:, :d].reshape(-1, G.shape[2])
+    return np.vstack([whole, np.zeros((size - len(whole), G.shape[2]))])
+
+
+def _place_jacobian(slam: Slam, name: Id) -> Array:
+    """Return the Jacobian (m, dof) of a landmark's place in its error."""
+    model = slam.landmark_model(name)
+    assert model is not None  # it is in the map
+    dof = model.space.dof
+    if isinstance(model, Segmented):
+        t = slam.segment_ends(name)
+        P_l = model.endpoints(slam.mean(name)[None], np.array([model.first_ends if t is None else t]))[1]
+        return np.asarray(P_l.reshape(-1, dof))
+    found = None if model.kind in EUCLIDEAN else place_of(model, slam.mean(name)[None])
+    return np.eye(dof) if found is None else found[1][0]
+
+
+def _crosses(slam: Slam, names: Sequence[Id], others: Sequence[Id]) -> Iterator[tuple[Id, Array]]:
+    """Yield the cross-covariance (dof, n) of each of some robots and landmarks with others, all of these."""
+    among = set(others)
+    rest = [name for name in names if name not in among]
+    for first in range(0, len(rest), DATUM):
+        some = rest[first : first + DATUM]
+        yield from _parts(slam, some, slam.covariance(*some, *others), len(some))
+    yield from _parts(slam, others, slam.covariance(*others), 0)
+
+
+def _parts(slam: Slam, names: Sequence[Id], P: Array, before: int) -> Iterator[tuple[Id, Array]]:
+    """Yield the rows of each name in a joint covariance, without the columns of the names before the others."""
+    dofs = [slam.robots[str(name)].motion.space.dof if name in slam.robots else _dof(slam, name) for name in names]
+    ends = np.cumsum([0, *dofs]).tolist()
+    for name, first, end in zip(names, ends, ends[1:], strict=False):
+        yield name, P[first:end, ends[-1] if before else 0 :]
+
+
+def _dof(slam: Slam, name: Id) -> int:
+    model = slam.landmark_model(name)
+    assert model is not None
+    return model.space.dof
+
+
 @dataclass(frozen=True)
 class MapLandmarks:
     """The landmarks of a map: ids, kinds, places with covariances and how often each was observed.
@@ -124,6 +184,9 @@ class MapLandmarks:
     observations: list[int]
     in_space: bool = False
     exact: frozenset[Id] = frozenset()
+
+    def __repr__(self) -> str:
+        return f"<MapLandmarks: {len(self)}, known exactly {len(self.exact)}>"
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -147,6 +210,36 @@ class MapLandmarks:
         observations = [int(count) for count in table.observations]
         exact = frozenset(name for name in table.ids if slam.is_known(name))
         return cls(list(table.ids), list(table.kinds), means, covariances, observations, in_space, exact)
+
+    def shape(self, slam: Slam, robots: Sequence[str]) -> tuple[MapLandmarks, Array]:
+        """Return the map with the covariances of its shape, and those (R, d, d) of the robots' positions.
+
+        The datum are at most `DATUM` landmarks, evenly chosen by their certainty.
+        """
+        d = 3 if self.in_space else 2
+        points, P = self.positions()
+        exact = np.array([name in self.exact for name in self.ids], dtype=np.bool_)
+        sigma = np.where(np.isfinite(points).all(axis=1) & ~exact, np.trace(P, axis1=1, axis2=2), np.inf)
+        order = np.argsort(sigma, kind="stable")[: np.isfinite(sigma).sum()]
+        own = np.array([slam.covariance(name)[:d, :d] for name in robots]).reshape(-1, d, d)
+        if not len(order):
+            return self, own
+        some = order[np.unique(np.linspace(0, len(order) - 1, min(DATUM, len(order))).round().astype(int))].tolist()
+        ends, names = [_ends(self.means[k], d) for k in some], [self.ids[k] for k in some]
+        J = la.block_diag(*(_place_jacobian(slam, self.ids[k])[: e.size] for k, e in zip(some, ends, strict=True)))
+        datum = Datum.of(
+            np.concatenate(ends), np.concatenate([_across(e) for e in ends]), J @ slam.covariance(*names) @ J.T,
+            points[exact],
+        )  # fmt: skip
+        out = list(self.covariances)
+        with_datum = dict(_crosses(slam, [*robots, *(self.ids[k] for k in order.tolist())], names))
+        for k in order.tolist():
+            G = _motion(self.means[k], d, len(out[k]), datum.origin)
+            out[k] = datum.shape(G, out[k], _place_jacobian(slam, self.ids[k]) @ with_datum[self.ids[k]] @ J.T)
+        for row, name in enumerate(robots):
+            G = generators(slam.mean(name)[None, :d], datum.origin)[0, :d]
+            own[row] = datum.shape(G, own[row], with_datum[name][:d] @ J.T)
+        return replace(self, covariances=out), own
 
     def split(self) -> tuple[MapLandmarks, MapLandmarks]:
         """Return the landmarks of the map, and those known exactly beside it."""

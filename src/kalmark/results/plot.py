@@ -32,13 +32,13 @@ LANDMARK_COLOUR = "#d2691e"
 EUCLIDEAN_COLOUR, OTHER_COLOUR, LINE_COLOUR = "#1f5fa8", "#c8412f", "#8c1c13"
 GROUPS = {  # of landmarks that are drawn alike, by the dimensions of the scene
     2: (
-        *((LANDMARK_COLOUR, "estimated landmarks, 3σ"),) * 2,
-        (LINE_COLOUR, "walls, 3σ of their ends"),
+        *((LANDMARK_COLOUR, "estimated landmarks, 3σ {}"),) * 2,
+        (LINE_COLOUR, "walls, 3σ of their ends {}"),
     ),
     3: (
-        (EUCLIDEAN_COLOUR, "Euclidean landmarks, 3σ"),
-        (OTHER_COLOUR, "landmarks that are not Euclidean, 3σ"),
-        (LINE_COLOUR, "lines, 3σ of their ends"),
+        (EUCLIDEAN_COLOUR, "Euclidean landmarks, 3σ {}"),
+        (OTHER_COLOUR, "landmarks that are not Euclidean, 3σ {}"),
+        (LINE_COLOUR, "lines, 3σ of their ends {}"),
     ),
 }
 LONG = 3000  # a path of more steps than this is drawn thinner
@@ -77,18 +77,21 @@ def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim
         replace_file(FilePath(path), partial(figure.savefig, dpi=dpi, format="png", **style))
 
 
-def save_map(run: Recording, path: str | PathLike[str]) -> None:
-    """Draw the map of a run and write it as a PNG."""
-    save_figure(draw_map(run), path)
+def save_map(run: Recording, path: str | PathLike[str], world: bool = False) -> None:
+    """Draw the map of a run and write it as a PNG, with the ellipses of its shape or those in the world."""
+    save_figure(draw_map(run, world=world), path)
 
 
-def draw_map(run: Recording, step: int | None = None, view: str | tuple[float, float] = "normal") -> Figure:
+def draw_map(
+    run: Recording, step: int | None = None, view: str | tuple[float, float] = "normal", world: bool = False
+) -> Figure:
     """Return the figure of a run's map after a step, by default the last: axes in metres, in the frame of the map.
 
+    Ellipses are those of the shape, without what the start leaves open (`kalmark.results.gauge`), or in the `world`.
     In space `view` is where the left half looks from: "normal", "top", "side", "front" or (elevation, azimuth) in
     degrees.
     """
-    scene = Scene.of(run, step)
+    scene = Scene.of(run, step, world)
     spans = [(scene.high - scene.low)[:2]]
     if scene.d == 3:
         projection = Projection.of(scene, view)
@@ -160,7 +163,7 @@ def strokes(scene: Scene) -> list[Stroke]:
         out.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
         out.append(Stroke(scene.bridges(robot), style | {"linestyle": ":"}))
     truth = {"color": TRUTH_COLOUR, "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
-    label = "true paths" if several else "true path"
+    label = f"true path{'s' if several else ''}{scene.how}"
     out += [Stroke(broken(scene.truth[robot], scene.stretches[robot]), truth, label, truth) for robot in scene.truth]
     small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
     aligned = "position fixes (aligned, not used)"
@@ -188,9 +191,11 @@ def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[St
     if points:
         colour, zorder = (INK, 6) if scene.d == 2 else (TRUTH_COLOUR, 2)
         plus = _marks("+", colour, 4 if crowded else 8, zorder) | {"markeredgewidth": 0.6 if crowded else 1.0}
-        out.append(Stroke(np.array(points), plus, "true landmarks", _marks("+", colour, 7, 1)))
+        out.append(Stroke(np.array(points), plus, f"true landmarks{scene.how}", _marks("+", colour, 7, 1)))
     if lines:
-        out.append(Stroke(joined(lines, scene.d), style, "true walls" if scene.d == 2 else "true lines", style))
+        out.append(
+            Stroke(joined(lines, scene.d), style, f"true {'walls' if scene.d == 2 else 'lines'}{scene.how}", style)
+        )
     tags = np.array([l for l in scene.true_landmarks.values() if len(l) == TAG]).reshape(-1, TAG)
     return [*out, Stroke(joined(squares(tags, scene.size)), style)] if len(tags) else out
 
@@ -213,7 +218,9 @@ def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
         width, alpha = (0.9, 1.0) if scene.d == 2 else (0.7, 0.55)
         thin = {"linewidth": 0.5 * width, "alpha": 0.75 * alpha} if crowded else {"linewidth": width, "alpha": alpha}
         sample = {"color": colour, "marker": "."}
-        out.append(Stroke(joined(rings, scene.d), {"color": colour, "zorder": 4, **thin}, label, sample))
+        out.append(
+            Stroke(joined(rings, scene.d), {"color": colour, "zorder": 4, **thin}, label.format(scene.of_what), sample)
+        )
         out.append(Stroke(shapes.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
     if len(shapes.lines):
         out.append(Stroke(joined(shapes.lines, scene.d), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
@@ -236,9 +243,9 @@ def _robot_strokes(scene: Scene) -> list[Stroke]:
         marker, size = (_arrow(float(path[-1, 2])), 15) if d == 2 else ("o", 6)
         mark = _marks(_arrow(0.0) if d == 2 else "o", INK, 11 if d == 2 else 6, 1)
         ends.append(Stroke(path[-1:, :d], _marks(marker, colour, size, 8) | {"markeredgecolor": "white"}, "end", mark))
-        ring = joined(contours(path[-1:, :d], scene.pose_covariances[robot][-1:, :d, :d])[0], d)
+        ring = joined(contours(path[-1:, :d], scene.pose_covariances[robot][-1:])[0], d)
         style = {"color": colour if d == 2 else POSE_COLOUR, "linewidth": 0.9, "zorder": 7}
-        rings.append(Stroke(ring, style, "3σ of the end", style | {"color": INK if d == 2 else POSE_COLOUR}))
+        rings.append(Stroke(ring, style, f"end, 3σ {scene.of_what}", style | {"color": INK if d == 2 else POSE_COLOUR}))
         if d == 3:
             thin = {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}
             rings.append(Stroke(joined(scene.frames(robot)), thin))

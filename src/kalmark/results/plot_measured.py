@@ -65,6 +65,11 @@ def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
     figure = Figure(figsize=(9.5, 7.0), layout="constrained", facecolor="white")
     axes = figure.subplots()
     y, e, Z = history.y[rows][:, columns] * scale, *_expected(history.e[rows], history.Z[rows], columns, scale)
+    for k in np.flatnonzero(
+        scale == DEGREES
+    ):  # an expectation is drawn beside its measurement, across 180 degrees, too
+        y[:, k] = wrap_deg(y[:, k])
+        e[:, k] = np.where(np.isfinite(y[:, k]), y[:, k] + wrap_deg(e[:, k] - y[:, k]), e[:, k])
     used = np.isin(history.outcome[rows], ("associated", "new"))
     axes.plot(*y.T, "+", color=MARK, ms=9, mew=1.4, zorder=4)
     _draw(axes, e[used], Z[used], USED, "-")
@@ -87,6 +92,11 @@ def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
     figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
     figure.legend(handles=_legend(used, e, len(missed)), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
+
+
+def wrap_deg(angle: Array) -> Array:
+    """Return angles (N,) in [-180, 180) degrees."""
+    return np.asarray((angle + 180.0) % 360.0 - 180.0)
 
 
 def _expected(e: Array, Z: Array, columns: list[int], scale: Array) -> tuple[Array, Array]:

@@ -51,13 +51,14 @@ def draw_scan(run: Recording, told: Explanation) -> Figure:
     axes = figure.subplots()
     mine = np.flatnonzero(run.history.robot[: told.step + 1] == told.robot)[-PATH:]
     axes.plot(*run.history.poses[mine, :2].T, color=ROBOT, lw=1)
-    axes.plot(*contours(told.pose[None, :2], told.covariance[None, :2, :2])[0, 0].T, color=ROBOT, lw=1)
+    here = told.pose[None, :2]
+    axes.plot(*contours(here, run.history.robot_shape(np.array([told.step]))[:, :2, :2])[0, 0].T, color=ROBOT, lw=1)
     axes.plot(*told.pose[:2], "o", color=ROBOT, ms=7)
     (low, high), kept = _extent(told), run.history.map_at(told.step)
     inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
-    means, covariances = kept.means[inside, :2], kept.covariances[inside, :2, :2]
+    means = kept.means[inside, :2]
     axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
-    axes.plot(*joined(contours(means, covariances)[:, 0], 2).T, color=FAINT, lw=0.8)
+    axes.plot(*joined(contours(means, kept.shape[inside, :2, :2])[:, 0], 2).T, color=FAINT, lw=0.8)
     _observations(axes, told, low, high)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -163,7 +164,7 @@ def _legend(told: Explanation) -> list[Line2D]:
     mark: dict[str, Any] = {"ls": "", "marker": "x", "mew": 2}
     marks = [Line2D([], [], **mark, color=OUTCOME.get(o, INK), label=f"{o}{d2}") for o, d2 in outcomes.items()]
     return [
-        Line2D([], [], color=ROBOT, marker="o", label="robot after the scan, 3 sigma"),
+        Line2D([], [], color=ROBOT, marker="o", label="robot after the scan, 3 sigma of the shape"),
         Line2D([], [], ls="", marker="s", color=INK, mfc="none", label="landmark compared with, d2"),
         Line2D([], [], ls="", marker=".", color=FAINT, label="other landmarks, as kept last"),
         *marks,

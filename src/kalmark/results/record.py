@@ -220,9 +220,11 @@ class _Recorder:
             self.due, self.kept = self.due + due, self.kept + len(self.maps[-1].ids)
 
     def _snapshot(self) -> MapSnapshot:
-        landmarks = MapLandmarks.of(self.slam, exactly_known=False)
-        ids, kinds = tuple(landmarks.ids), tuple(landmarks.kinds)
-        return MapSnapshot(len(self.reports) - 1, self.reports[-1].t_ns, ids, *landmarks.places(), kinds)
+        whole = MapLandmarks.of(self.slam)
+        landmarks, (shape, robots) = whole.split()[0], whole.shape(self.slam, [start.robot for start in self.starts])
+        of_shape, kinds = shape.split()[0].places()[1], tuple(landmarks.kinds)
+        when = len(self.reports) - 1, self.reports[-1].t_ns, tuple(landmarks.ids)
+        return MapSnapshot(*when, *landmarks.places(), kinds, of_shape, robots)
 
     def run(self, config: Mapping[str, Any] | None, wall_s: float) -> Run:
         """Return the run made of what was gathered."""

@@ -26,6 +26,7 @@ from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
+from kalmark.events import listed
 from kalmark.files import locked, replace_file, write
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of, seconds
@@ -171,6 +172,11 @@ class Recording:
     folder: Path | None = None
     summary: dict[str, Any] = field(default_factory=dict)
     reference: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        steps, lost = len(self.history.t_ns), f", stopped: {self.stopped}" if self.stopped else ""
+        of = f"{steps} steps, {len(self.history.outcome)} observations, {len(self.landmarks)} landmarks"
+        return f"<{type(self).__name__} {self.log.name!r} of {listed(self.history.robots)}: {of}{lost}>"
 
     @property
     def estimator(self) -> str:

@@ -23,21 +23,23 @@ from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.explain import Explanation, Fate, explained
 from kalmark.results.history import Camera, Change, History, Ints, MapSnapshot
-from kalmark.results.landmarks import shapes
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
 from kalmark.results.pictures import Pictures
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
+    POINTS,
     Scene,
     Sighting,
     broken,
     colour_of,
+    drawn_map,
     grouped,
     images,
     joined,
     squares,
     steps_of,
     stretches_of,
+    thin,
 )
 from kalmark.results.verdict import verdict_lines
 from kalmark.results.words import (
@@ -54,7 +56,6 @@ from kalmark.results.words import (
 
 NOT_FIGURES = ("robots", "warnings", "advice", "notes", "gaps", "repeats", "verdict")
 BINS = 120
-POINTS = 2000  # of a curve
 LANDMARKS = 40_000  # in all the maps of a page together
 SCANS = 60  # drawn at most, the most ambiguous ones
 CHANGES = 200  # in the table
@@ -70,8 +71,8 @@ _ROBOT = (
     ("diverged", "diverged", ""),
 )
 _HINTS = {
-    False: "3-sigma ellipses; drag the slider through time",
-    True: "3-sigma ellipsoids; drag to turn, scroll to come closer, drag the slider through time",
+    False: "3-sigma ellipses {}; drag the slider through time",
+    True: "3-sigma ellipsoids {}; drag to turn, scroll to come closer, drag the slider through time",
 }
 
 
@@ -79,12 +80,15 @@ def _items(lines: Iterable[str]) -> str:
     return "".join(f"<li>{html.escape(line)}</li>" for line in lines)
 
 
-def report_html(run: Recording) -> str:
-    """Return the page: the map over time, errors, NEES and NIS, associations, figures and configuration."""
+def report_html(run: Recording, world: bool = False) -> str:
+    """Return the page: the map over time, errors, NEES and NIS, associations, figures and configuration.
+
+    The map has the ellipses of its shape or those in the `world`.
+    """
     from plotly.offline import get_plotlyjs  # slow to import
 
     title, figures = headline(run)
-    summary = summary_of(run)
+    summary, scene = summary_of(run), Scene.of(run, world=world)
     verdict = summary.get("verdict")
     notes = [*summary.get("notes", ()), *summary.get("advice", ())]
     return _resource("report.html").format(
@@ -104,10 +108,10 @@ def report_html(run: Recording) -> str:
         skipped=_skipped(run, summary),
         config=html.escape(config_yaml(run.config)),
         plotly=get_plotlyjs(),
-        data=json.dumps(series(run), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
+        data=json.dumps(series(run, scene), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         scene=_resource("scene.js"),
         script=_resource("report.js"),
-        hint=_HINTS[run.history.in_space],
+        hint=_HINTS[run.history.in_space].format(scene.of_what),
     )
 
 
@@ -180,15 +184,17 @@ def _resource(name: str) -> str:
     return (resources.files("kalmark.results") / "page" / name).read_text(encoding="utf-8")
 
 
-def series(run: Recording) -> dict[str, Any]:
+def series(run: Recording, scene: Scene) -> dict[str, Any]:
     """Return all that the pictures of a report need; times in seconds since the first step."""
-    scene, t, pictures = Scene.of(run), run.history.t_s, Pictures(run)
+    t, pictures = run.history.t_s, Pictures(run)
     dof, maps = (3, 6)[scene.d - 2], run.history.maps
     stride = max(1, -(-sum(len(m.ids) for m in maps) // LANDMARKS))  # the page stays of a size to open
     maps = maps[::-1][::stride][::-1]  # the last among them
     true = scene.true_points()
     return {
         "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
+        "ellipses": scene.of_what,
+        "how": scene.how,
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
         "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
         "knownLandmarks": {"id": [str(i) for i in scene.known_ids], **xy(scene.known)},
@@ -204,13 +210,13 @@ def series(run: Recording) -> dict[str, Any]:
         "dof": dof,
         "neesBounds": anees_interval(dof),
         "outcomes": _outcomes(run, t),
-        "association": _association(run, t),
+        "association": _association(run, t, scene.world),
     }
 
 
 def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
     """Return a map: all points, the endpoints of lines last, with the group that each is drawn in."""
-    drawn = shapes(m.means, m.covariances, m.kinds, scene.d)
+    drawn = drawn_map(m, scene.d, scene.world)
     lines = {"lines": xy(joined(drawn.lines, scene.d))}
     head = {"t": round(t_s, 3), "id": [str(m.ids[row]) for row in drawn.row], "group": drawn.group.tolist()}
     tags = {"tags": xy(joined(squares(drawn.tags, scene.size)))} if scene.d == 3 else {}
@@ -250,10 +256,10 @@ def _seen(s: Sighting) -> dict[str, Any]:
 def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]:
     rows = np.flatnonzero(run.history.robot == robot)
     rows = rows[thin(len(rows))]
-    mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
+    mean, P = run.history.poses[rows], scene.pose_covariances[robot][thin(len(scene.paths[robot]))]
     out: dict[str, Any] = {"name": robot, "colour": scene.colour(robot), "t": significant(t[rows], 7)}
     d = scene.d
-    out |= gaussians(mean[:, :d], P[:, :d, :d])
+    out |= gaussians(mean[:, :d], P)
     stretches = scene.stretches[robot][thin(len(scene.stretches[robot]))]
     out["gaps"] = _gaps(stretches)
     out["dotted"] = _gaps(np.cumsum(scene.dotted[robot], dtype=np.int64)[thin(len(scene.dotted[robot]))])
@@ -361,11 +367,11 @@ def reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
     return [(outcome, reason, count) for (outcome, reason), count in said.most_common(most)]
 
 
-def _association(run: Recording, t: Array) -> dict[str, Any]:
+def _association(run: Recording, t: Array, world: bool) -> dict[str, Any]:
     """Return ambiguous scans in the order of time, and when landmarks were merged or removed."""
     changes = _told_changes(run.history)
     return {
-        "scans": [_ambiguous(explained(run, step)) for step in ambiguous(run.history).tolist()],
+        "scans": [_ambiguous(run.history, explained(run, step), world) for step in ambiguous(run.history).tolist()],
         "changes": {
             what: significant(np.array([t[c.step] for c in changes if c.what == what][:MARKS]), 7)
             for what in dict.fromkeys(c.what for c in changes)
@@ -400,8 +406,9 @@ def change_rows(run: Recording) -> Iterator[tuple[str, str, str, str]]:
         yield "", "", "", f"and {len(told) - CHANGES} more: see associations.csv"
 
 
-def _ambiguous(told: Explanation) -> dict[str, Any]:
-    pose = gaussians(told.pose[None, :2], told.covariance[None, :2, :2])
+def _ambiguous(history: History, told: Explanation, world: bool) -> dict[str, Any]:
+    here, P = told.pose[None, :2], told.covariance[None, :2, :2]
+    pose = gaussians(here, P if world else history.robot_shape(np.array([told.step]))[:, :2, :2])
     out = {"t": round(told.t_s, 3), "in_log": told.in_log, "robot": told.robot, "sensor": told.sensor, "pose": pose}
     return out | {"seen": [_fate(fate) for fate in told.fates]}
 
@@ -427,13 +434,6 @@ def gaussians(means: Array, covariances: Array) -> dict[str, Any]:
     """Return means (N, d) and covariances (N, d, d) column by column: x, y, pxx, pxy, pyy, in space more."""
     pairs = combinations_with_replacement(range(means.shape[1]), 2)
     return xy(means) | {f"p{'xyz'[i]}{'xyz'[j]}": significant(covariances[:, i, j]) for i, j in pairs}
-
-
-def thin(count: int) -> Ints:
-    """Return at most about 2,000 evenly spread indices, the last one among them."""
-    stride = max(1, -(-count // POINTS))
-    indices = np.arange(0, count, stride)
-    return np.append(indices, count - 1) if count and indices[-1] != count - 1 else indices
 
 
 def rounded(values: Array, digits: int) -> list[float | None]:

@@ -20,7 +20,7 @@ FILES = (
 """Patterns of the files of a run folder."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Run(Recording):
     """A recording with what is made of it: its figures, its pictures and its folder."""
 
@@ -53,19 +53,22 @@ class Run(Recording):
         replace_folder(folder, fill, FILES, "summary.json")
         return folder
 
-    def report(self, folder: str | Path) -> list[Path]:
-        """Write ``map.png``, ``report.html`` and each sensor's last scan into a folder; return their paths."""
+    def report(self, folder: str | Path, world: bool = False) -> list[Path]:
+        """Write ``map.png``, ``report.html`` and each sensor's last scan into a folder; return their paths.
+
+        Maps have the ellipses of the shape or those in the `world`.
+        """
         from kalmark.results.plot import save_figure, save_map  # matplotlib is slow to import
         from kalmark.results.plot_measured import measuring
         from kalmark.results.plot_scan import draw_sensor
         from kalmark.results.report import report_html
 
         folder = Path(folder)
-        save_map(self, folder / "map.png")
+        save_map(self, folder / "map.png", world)
         written = [folder / "map.png", folder / "report.html"]
         drawable: list[Camera | Measuring] = [*self.history.cameras, *measuring(self.history)]
         for seen in (sensor for sensor in drawable if len(steps_of(self.history, sensor))):
             written.append(folder / f"sensor_{file_name(seen.robot)}_{file_name(seen.sensor)}.png")
             save_figure(draw_sensor(self, seen.robot, seen.sensor), written[-1], dpi=110, rim=False)
-        write(folder / "report.html", report_html(self))
+        write(folder / "report.html", report_html(self, world))
         return written

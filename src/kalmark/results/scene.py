@@ -23,11 +23,11 @@ from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
 from kalmark.results.gaps import while_lost
-from kalmark.results.history import Camera, History, Ints, Measuring
+from kalmark.results.history import Camera, History, Ints, MapSnapshot, Measuring
 from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
 from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording
-from kalmark.results.truth import moved
+from kalmark.results.truth import as_rigid, moved
 
 COLUMN = re.compile(r"([uv])([lr]?)(\d*)_px")
 EXPECTED = {  # colours and their meaning, by whether the landmark is Euclidean, then whether it was used
@@ -42,6 +42,7 @@ COLOURS = ("#1f5fa8", "#c8553d", "#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#b
 SPACE_COLOURS = ("#2f8f5b", "#8456a8", "#b8892b", "#2a9aa5", "#6b6f2a", "#b0457a")  # landmarks are blue or red
 TRUTH_COLOUR, FIX_COLOUR, INK = "#8b929c", "#7a3fa0", "#2b2f36"
 GAP_STEPS = 10.0
+POINTS = 2000  # of a curve
 CLEAR = 0.3  # a point whose sigma is a larger part of its distance does not widen the picture
 REACH, REACH_M = 0.15, 0.5  # a contour widens the picture by at most this part of it, or so much
 PAD, PAD_M = 0.04, 0.2  # around it, a part of its longest side, or so much
@@ -55,13 +56,16 @@ SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0
 class Scene:
     """A run up to one of its steps, in the plane (d = 2) or in space (d = 3).
 
-    By robot: poses (N, 3|7) and their covariances up to the step, `stretches` (S,), the gaps in time up to each of all
-    its steps, `dotted` (S,), whether the way to each is unknown, positions by `dead` reckoning (N, d), true ones (S, d;
-    NaN: unknown), fixes (F, 2) to score with and those `used` by the filter (F, d).
+    By robot: poses (N, 3|7) and the covariances (N, d, d) of their positions up to the step, `stretches` (S,), the gaps
+    in time up to each of all its steps, `dotted` (S,), whether the way to each is unknown, positions by `dead`
+    reckoning (N, d), true ones (N, d; NaN: unknown), fixes (F, 2) to score with and those `used` by the filter (F, d),
+    up to the step, too.
     `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
     `known` (N, d) are the landmarks known exactly and `known_ids` their names.
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
-    corners of the box to draw, the same for all steps.
+    corners of the box to draw, the same for all steps.  Covariances are those of the shape (`kalmark.results.gauge`) or
+    those in the `world`.  The truth is `aligned` by a rigid motion of the path where the frames differ, and
+    for the shape.
     """
 
     d: int
@@ -82,16 +86,19 @@ class Scene:
     repeats: Array
     known: Array
     known_ids: tuple[Id, ...]
+    world: bool
+    aligned: bool
 
     @classmethod
-    def of(cls, run: Recording, step: int | None = None) -> Scene:
+    def of(cls, run: Recording, step: int | None = None, world: bool = False) -> Scene:
         """Return what to draw of a run after a step, by default the last; the box is that of the whole run."""
         history, d = run.history, run.history.d
         known = np.isfinite(run.truth.poses).all(axis=1)
-        if run.truth.frame == "truth":
-            to_map = run.truth.to_map()
-        else:  # they share no frame
-            to_map = rigid(run.truth.poses[known][:, :d], history.mean[known][:, :d])
+        aligned = bool(known.any()) and not (run.truth.frame == "truth" and (world or run.truth.anchored))
+        to_map = run.truth.to_map()
+        if aligned:
+            some = np.flatnonzero(known)[thin(int(known.sum()))]
+            to_map = rigid(_corners(run.truth.poses[some]), _corners(history.poses[some]))
         mine = {robot: history.robot == robot for robot in history.robots}
         truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
         scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
@@ -100,13 +107,16 @@ class Scene:
             i: l if d == 3 or len(l) == 2 * d else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()
         }
         used, (last, exact) = _used_fixes(run, d), run.landmarks.split()
-        whole = shapes(*last.places(), last.kinds, d)
+        end = history.map_at(len(history.t_ns))
+        as_kept = not world and end.ids == tuple(last.ids)
+        whole = drawn_map(end, d, world) if as_kept else shapes(*last.places(), last.kinds, d)
         now, ids = whole, tuple(last.ids)
         if step is not None:
             kept = history.map_at(step)
-            now, ids = shapes(kept.means, kept.covariances, kept.kinds, d), kept.ids
+            now, ids = drawn_map(kept, d, world), kept.ids
         until = slice(None) if step is None else slice(step + 1)
-        poses, P = history.poses, history.pose_covariances
+        poses, P = history.poses, history.pose_covariances[:, :d, :d]
+        P = P if world else history.robot_shape(np.arange(len(P)))
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
         true = [l.reshape(-1, d) if len(l) == 2 * d else l[None, :d] for l in landmarks.values()]
         known_at = exact.positions()[0][:, :d]
@@ -121,15 +131,31 @@ class Scene:
         }
         fixes = {}
         for robot in scored:  # the antenna's offset is taken off
-            to_fixes, _, offset, xy = aligned_fixes(run, robot)
+            to_fixes, _, offset, xy, t_ns = aligned_fixes(run, robot)
             fixes[robot] = to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
+            if step is not None:
+                fixes[robot] = fixes[robot][t_ns[: len(fixes[robot])] <= history.t_ns[step]]
+        if step is not None:  # no more than is known at that time
+            truth = {robot: points[: len(paths[robot])] for robot, points in truth.items()}
+            used = _used_fixes(run, d, int(history.t_ns[step]))
         cameras = history.cameras
         at = {str(name): now.means[k] for k, name in enumerate(ids)}
         twice = [np.array([at[row.landmark], at[row.other]]) for row in history.repeats if {*row[1:3]} <= at.keys()]
         return cls(
             d, paths, covariances, stretches, dotted, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
             joined([line[:, :d] for line in twice], d), known_at, tuple(exact.ids),
+            world, aligned,
         )  # fmt: skip
+
+    @property
+    def of_what(self) -> str:
+        """What the ellipses are of, for a legend."""
+        return "in the world" if self.world else "of the shape"
+
+    @property
+    def how(self) -> str:
+        """How the truth is drawn, for a legend."""
+        return ", aligned" if self.aligned else ""
 
     @property
     def size(self) -> float:
@@ -187,6 +213,11 @@ class Scene:
         return {i: l[: self.d] for i, l in self.true_landmarks.items() if len(l) != 2 * self.d}
 
 
+def drawn_map(kept: MapSnapshot, d: int, world: bool) -> Shapes:
+    """Return what is drawn of a map that was kept, with the covariances of its shape or in the world."""
+    return shapes(kept.means, kept.covariances if world else kept.shape, kept.kinds, d)
+
+
 def squares(tags: Array, size: float) -> list[Array]:
     """Return tags (T, 7) as squares (5, 3) that can be seen in a scene of this size."""
     return [_placed(tag, 0.03 * size * SQUARE) for tag in tags]
@@ -233,6 +264,13 @@ def broken(points: Array, stretches: Ints) -> Array:
     return np.insert(points, at, np.nan, axis=0)
 
 
+def thin(count: int) -> Ints:
+    """Return at most about 2,000 evenly spread indices, the last one among them."""
+    stride = max(1, -(-count // POINTS))
+    indices = np.arange(0, count, stride)
+    return np.append(indices, count - 1) if count and indices[-1] != count - 1 else indices
+
+
 def grouped(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
     """Return the group (N,) of each of these steps, and before which groups a gap in time is.
 
@@ -243,11 +281,18 @@ def grouped(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
     return np.cumsum(new) - 1, np.flatnonzero(np.diff(stretches[new])) + 1
 
 
-def _used_fixes(run: Recording, d: int) -> dict[str, Array]:
-    """Return the fixes (N, d) of each robot that the filter used; they are in the frame of the map."""
-    used = [fix for fix in run.history.fixes if fix.used]
+def _used_fixes(run: Recording, d: int, until_ns: float = np.inf) -> dict[str, Array]:
+    """Return the fixes (N, d) of each robot that the filter used until then; they are in the frame of the map."""
+    used = [fix for fix in run.history.fixes if fix.used and fix.t_ns <= until_ns]
     rows = {name: np.array([fix.y for fix in used if fix.robot == name]) for name in sorted({f.robot for f in used})}
     return {name: np.pad(y, ((0, 0), (0, d - y.shape[1]))) for name, y in rows.items()}
+
+
+def _corners(poses: Array) -> Array:
+    """Return the positions (4 N, 3) of poses (N, 7), or (3 N, 2) of (N, 3), and the ends of axes of 0.1 m there."""
+    d = 2 if poses.shape[1] == 3 else 3
+    ends = np.vstack([np.zeros(d), 0.1 * np.eye(d)])
+    return np.concatenate([as_rigid(pose)(ends) for pose in poses])
 
 
 def _placed(pose: Array, points: Array) -> Array:

@@ -50,4 +50,6 @@ def _trust(verdict: Mapping[str, Any]) -> str:
     if factor is None:
         return f", by {checked}" if (checked := str(verdict["checked"])).startswith(INNOVATIONS) else ""
     said = f"{figure(factor, 2)} times what the filter states" if abs(factor - 1.0) > SEEN else "as the filter states"
-    return f": its landmarks are good to {figure(accuracy, 2)} m (1 sigma, {said})"
+    world, shape = (figure(value, 2) for value in (accuracy, verdict.get("shape_accuracy_m", accuracy)))
+    good = f"{shape} m in shape, {world} m in the world" if shape != world else f"{world} m in shape and in the world"
+    return f": its landmarks are good to {good} (1 sigma, {said})"

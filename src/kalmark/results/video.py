@@ -35,11 +35,13 @@ def write_video(
     frames: int = 200,
     orbit_deg: float = 0.0,
     progress: bool = True,
+    world: bool = False,
 ) -> Path:
     """Write a run as a video of at most so many frames and return its path.
 
     The suffix of `path` becomes ``.gif`` if it is ``.mp4`` and ffmpeg is not installed.  In space the view turns by
-    `orbit_deg` in all.  Raises RunError for a run without scans and for other suffixes.
+    `orbit_deg` in all.  Ellipses are those of the shape, or in the `world`.  Raises RunError for a run without scans
+    and for other suffixes.
     """
     path = Path(path)
     if path.suffix not in (".mp4", ".gif"):
@@ -52,7 +54,7 @@ def write_video(
         path = path.with_suffix(".gif")
     count = len(run.history.t_ns)
     steps = np.unique(np.linspace(0, count - 1, max(1, min(frames, count))).round().astype(int)).tolist()
-    drawn = partial(_frames, run, steps, orbit_deg, progress)
+    drawn = partial(_frames, run, steps, orbit_deg, progress, world)
     replace_file(path, partial(_mp4 if path.suffix == ".mp4" else _gif, drawn(), fps))
     return path
 
@@ -77,21 +79,20 @@ def _picture(figure: Figure) -> Image.Image:
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()).quantize(64)
 
 
-def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool) -> Iterator[Figure]:
+def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool, world: bool) -> Iterator[Figure]:
     """Yield one figure again and again, drawn anew after each of the steps."""
     figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     t_s, title, pictures = run.history.t_s, headline(run)[0], Pictures(run)
     for k, step in enumerate(track(steps, "video", len(steps), show=progress)):
         figure.clear()
-        _draw(figure, run, step, orbit_deg * k / max(len(steps) - 1, 1), pictures)
+        _draw(figure, run, Scene.of(run, step, world), step, orbit_deg * k / max(len(steps) - 1, 1), pictures)
         figure.text(0.02, 0.955, title, fontsize=12, fontweight="bold", color=INK)
         figure.text(0.98, 0.955, f"{t_s[step]:.1f} s", fontsize=12, ha="right", color=INK)
         yield figure
 
 
-def _draw(figure: Figure, run: Recording, step: int, turned: float, pictures: Pictures) -> None:
-    scene = Scene.of(run, step)
+def _draw(figure: Figure, run: Recording, scene: Scene, step: int, turned: float, pictures: Pictures) -> None:
     if scene.d == 2:
         draw_plan(figure.add_axes((0.07, 0.09, 0.9, 0.84)), scene)
         return

@@ -28,7 +28,20 @@ from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
 from kalmark.association.ratio import accepted
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
-from kalmark.events import LONGEST_PAUSE_S, Control, Event, Fix, Frame, Id, Scan, checked_id, kind_of, seconds, when
+from kalmark.events import (
+    LONGEST_PAUSE_S,
+    Control,
+    Event,
+    Fix,
+    Frame,
+    Id,
+    Scan,
+    checked_id,
+    kind_of,
+    listed,
+    seconds,
+    when,
+)
 from kalmark.filter.estimators import Compiling, Estimator, Invariant
 from kalmark.geometry.spaces import RHO
 from kalmark.management import reparametrize as points
@@ -97,6 +110,12 @@ class Slam(Estimate):
             kinds = [kind for channel in self.state.channels.values() for kind in channel.landmark.space.kinds]
             axes = max(robot.motion.space.axes for robot in by_name.values())
             estimator.compile_ahead(axes, RHO in kinds)
+
+    def __repr__(self) -> str:
+        state = self.state
+        when_ = "before its first event" if state.t_ns is None else f"at t={seconds(state.t_ns)} s"
+        size, said = len(state.tracks.confirmed) + len(state.tracks.known), type(state.estimator).__name__
+        return f"<Slam of {listed(state.robots)} {when_}: {size} landmarks, {said}, {type(self.association).__name__}>"
 
     # ------------------------------------------------------------------ events
     def process(self, event: Event) -> Report:

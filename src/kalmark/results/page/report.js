@@ -185,7 +185,7 @@ const CHANGE = {merged: ["#1f5fa8", "triangle-down"], removed: ["#c8553d", "x-th
 /* One ambiguous scan: observations, the landmarks each was compared with, and the decision. */
 function drawScan(scan) {
   const traces = [], ring = contours(scan.pose, [0], 24, "xy");
-  traces.push({...ring, mode: "lines", line: {color: "#1f5fa8", width: 1}, name: "robot, 3 sigma", hoverinfo: "skip"},
+  traces.push({...ring, mode: "lines", line: {color: "#1f5fa8", width: 1}, name: `robot, ${SIGMAS}`, hoverinfo: "skip"},
     {x: scan.pose.x, y: scan.pose.y, mode: "markers", marker: {color: "#1f5fa8", size: 9}, showlegend: false,
      hovertemplate: `${scan.robot}<extra></extra>`});
   const named = new Set();

@@ -3,8 +3,9 @@
 const AXES = DATA.dof === 3 ? ["x", "y"] : ["x", "y", "z"], SPACE = AXES.length === 3;
 const TRUTH = SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)", FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = "#8c1c13", ALARM = "#b3261e", KNOWN = "#2f7d4f";
 const MEASURED = "#7d838d", SEGMENT = "rgba(58,104,200,0.55)";
-const GROUPS = !SPACE ? [["#d2691e", "landmarks, 3 sigma"]] :
-  [["#1f5fa8", "landmarks, 3 sigma"], ["#c8412f", "landmarks that are not Euclidean, 3 sigma"], [LINE, "lines, 3 sigma of their ends"]];
+const SIGMAS = `3 sigma ${DATA.ellipses}`;
+const GROUPS = !SPACE ? [["#d2691e", `landmarks, ${SIGMAS}`]] :
+  [["#1f5fa8", `landmarks, ${SIGMAS}`], ["#c8412f", `landmarks that are not Euclidean, ${SIGMAS}`], [LINE, `lines, ${SIGMAS}, of their ends`]];
 
 /* Points with what `value` (axis) gives of each axis. */
 const along = (value, axes = AXES) => Object.fromEntries([...axes].map(k => [k, value(k)]));
@@ -90,12 +91,12 @@ function still() {
   each(Object.values(DATA.usedFixes), "fixes used", f => marks(f, thin("x", FIX), [5, 2], skip));
   const thinly = r => { const s = stroke(r.dead, r.colour, 0.9, {opacity: 0.5}); return {...s, line: {...s.line, dash: "dash"}}; };
   each(DATA.robots.filter(r => r.dead), "dead reckoning", thinly);
-  each(DATA.robots.filter(r => r.truth), "true path", r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
+  each(DATA.robots.filter(r => r.truth), `true path${DATA.how}`, r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
   if (DATA.repeats.x.length) traces.push(stroke(DATA.repeats, ALARM, 1.2, {...skip, name: "landmarks mapped twice"}));
-  if (DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: "true lines"}));
+  if (DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: `true lines${DATA.how}`}));
   if (l.x.length)
     traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],
-                      {name: "true landmarks", hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
+                      {name: `true landmarks${DATA.how}`, hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
   const known = DATA.knownLandmarks;
   if (known.x.length)
     traces.push(marks({...boxed(known), text: known.id}, {symbol: SPACE ? "diamond-open" : "triangle-up-open", color: KNOWN}, [9, 4],
@@ -136,7 +137,7 @@ function moving(frame) {
     else traces.push({...dart(r, at), mode: "lines", ...own, fill: "toself", fillcolor: r.colour,
                       line: {color: "white", width: 1}, hovertemplate: `${r.name}: ${WHERE}<extra></extra>`});
     traces.push(stroke(contours(r, at, 48), SPACE ? POSE : r.colour, SPACE ? 0.8 : 1.4,
-                       {name: "robot, 3 sigma", legendgroup: "pose", showlegend: SPACE && i === 0}));
+                       {name: `robot, ${SIGMAS}`, legendgroup: "pose", showlegend: SPACE && i === 0}));
   });
   return traces;
 }

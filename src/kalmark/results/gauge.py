@@ -1,0 +1,103 @@
+"""Covariances of the shape of a map: without the rigid motion of the world that its errors have in common.
+
+A rigid motion g of robots and landmarks together changes no measurement between them.  Where the start alone says where
+the world is, all errors have its error in common, e = G g + s, G = [1, J (p - o)] of a point p, in space
+[1, -[p - o]x], about an origin o.  The shape is judged after the motion that aligns the map best with the true one,
+
+    g = T e,    T = (G' W G)^-1 G' W,
+
+so that its errors are s = (1 - G T) e, and its covariance
+
+    P_shape = P - X G' - G X' + G L G',    X = P T',    L = T P T'.
+
+This is the S-transform to the datum of inner constraints (Baarda 1973; as gauges: Kanatani and Morris 2001), which is
+the error that an aligned RMSE measures.  (1 - G T) G = 0: P_shape does not depend on the start's covariance, nor on
+which robot starts where.  The weights W are 1 / (v + v_q), v the variances of the shape itself and v_q their lower
+quartile: landmarks that are hardly known, such as points at great depth, do not move the datum.  Landmarks that are
+known exactly are fixed points of g: with two of them, in space three, nothing is open.  Where fixes or known landmarks
+tell where the world is, g is small, and shape and world coincide.  docs/evaluation.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from kalmark.arrays import Array, Index
+from kalmark.geometry.rotations import skew
+
+ROUNDS = 10  # until the weights are those of the shape
+LOW = 0.25  # the quartile
+EXACT_M = 1e-9
+
+
+class Datum(NamedTuple):
+    """The motion g = T e (q,) about `origin`, T (q, n), of errors e (n,) of the datum's points; L is its covariance."""
+
+    origin: Array
+    T: Array
+    L: Array
+
+    @classmethod
+    def of(cls, points: Array, across: Array, P: Array, fixed: Array) -> Datum:
+        """Return the datum of points (N, d) of the joint covariance P (N d, N d) that keeps points `fixed` (F, d).
+
+        `across` (N, d, d) are projections on what is measured of a point: 1, of a line's end that across the line.
+        """
+        d, origin = points.shape[1], points.mean(axis=0)
+        q = 3 * (d - 1)
+        free = la.null_space(generators(fixed, origin)[:, :d].reshape(-1, q)) if len(fixed) else np.eye(q)
+        G = generators(points, origin)[:, :d] @ free
+        seen, own = across @ G, _blocks(P, d)
+        v = np.trace(own, axis1=1, axis2=2)
+        for _ in range(ROUNDS):
+            weighted = seen / (v + np.quantile(v, LOW) + EXACT_M**2)[:, None, None]
+            M = np.einsum("kia,kib->ab", weighted, seen)
+            T = np.linalg.pinv(M, hermitian=True) @ weighted.reshape(len(P), len(M)).T
+            X = P @ T.T
+            v = np.trace(across @ _moved(own, G, X.reshape(len(points), d, len(M)), T @ X) @ across, axis1=1, axis2=2)
+            v = np.maximum(v, 0.0)
+        return cls(origin, free @ T, free @ (T @ X) @ free.T)
+
+    def shape(self, G: Array, P: Array, C: Array) -> Array:
+        """Return the covariance (m, m) of the shape of what moves by G (m, q), has P and C (m, n) with the datum's."""
+        return _moved(P, G, C @ self.T.T, self.L)
+
+
+def generators(points: Array, origin: Array) -> Array:
+    """Return G (K, q, q) of poses at points (K, d): how they move with the world, its translation and rotation."""
+    d = points.shape[1]
+    G = np.tile(np.eye(3 * (d - 1)), (len(points), 1, 1))
+    lever = points - origin
+    if d == 2:
+        G[:, 0, 2], G[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    else:
+        G[:, :3, 3:] = -np.array([skew(l) for l in lever]).reshape(-1, 3, 3)
+    return G
+
+
+def shape_of_points(points: Array, P: Array, of: Index) -> Array:
+    """Return the covariances (K, d, d) of the shape of points (K, d) of the joint covariance P (K d, K d).
+
+    The datum is that of the points `of` (M,), their numbers.
+    """
+    d = points.shape[1]
+    rows = (of[:, None] * d + np.arange(d)).ravel()
+    datum = Datum.of(points[of], np.tile(np.eye(d), (len(of), 1, 1)), P[np.ix_(rows, rows)], np.empty((0, d)))
+    C = P[:, rows].reshape(len(points), d, -1)
+    return datum.shape(generators(points, datum.origin)[:, :d], _blocks(P, d), C)
+
+
+def _moved(P: Array, G: Array, X: Array, L: Array) -> Array:
+    """Return P - X G' - G X' + G L G'."""
+    both = X @ G.swapaxes(-1, -2)
+    out = P - both - both.swapaxes(-1, -2) + G @ L @ G.swapaxes(-1, -2)
+    return np.asarray((out + out.swapaxes(-1, -2)) / 2)
+
+
+def _blocks(P: Array, d: int) -> Array:
+    """Return the diagonal blocks (K, d, d) of P (K d, K d)."""
+    k = len(P) // d
+    return P.reshape(k, d, k, d)[np.arange(k), :, np.arange(k)]
