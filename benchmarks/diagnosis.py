@@ -16,8 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kalmark.cli.run import run_log
-from kalmark.config import build_slam
+from kalmark.config import build_slam, config_dict, open_run
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.events import Control, Fix, Scan, order
 from kalmark.geometry import observe
@@ -282,7 +281,8 @@ def planted(fault: str, seed: int) -> tuple[Log, Run]:
     world = load_world("random_field", [*FIELD, *of_world])
     log = plant(simulate(world, seed), np.random.default_rng(seed))
     config = load_world("random_field", [*FIELD, *of_world, *of_filter]).config()
-    return log, record(build_slam(config, log), log, progress=False)
+    seen = replace(log.without_truth(), landmarks=log.landmarks)  # which are the survey where there is one
+    return log, record(build_slam(config, seen), seen, progress=False)
 
 
 def main() -> None:
@@ -321,8 +321,9 @@ def real(only: str) -> None:
     for name, (config, known) in REAL.items():
         if only not in name:
             continue
-        run = run_log(config[0], overrides=config[1:], progress=False)
-        verdict = diagnose(run)
+        config_, log = open_run(config[0], None, config[1:])
+        log = log.without_truth()
+        verdict = diagnose(record(build_slam(config_, log), log, progress=False, config=config_dict(config_)))
         told = [f"{cause.name} ({cause.score:.0f})" for cause in verdict.causes if not cause.harmless]
         missing = known - {cause.name for cause in verdict.causes}
         factor = "-" if verdict.sigma_factor is None else f"{verdict.sigma_factor:.2f}"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -19,7 +20,6 @@ from kalmark.config.building import config_dict
 from kalmark.diagnosis.mistakes import measured
 from kalmark.diagnosis.readings import ARM, CONSTANT, NAMES, SCALE, SIGMA, SIGN
 from kalmark.diagnosis.verdict import MISFIT, diagnose
-from kalmark.logs.log import Log
 from kalmark.results.record import record
 from kalmark.simulate import load_world, simulate
 
@@ -83,7 +83,8 @@ def causes(world: str, sensor: str, fault: Fault, seed: int, more: list[str]) ->
     log = simulate(made, seed)
     if fault.by:
         change = measured({(robot, sensor)}, lambda y: y * fault.by)
-        log = Log(log.name, log.robots, [change(event) for event in log], truth=log.truth)
+        log = replace(log, events=[change(event) for event in log])
+    log = log.without_truth()
     config = made.config()
     run = record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)
     return robot, [f"{c.name}: {c.evidence}; {c.cure}" for c in diagnose(run, 3000).causes if not c.harmless]

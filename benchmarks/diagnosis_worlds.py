@@ -19,7 +19,7 @@ import numpy as np
 
 from diagnosis import kidnapped, none, seen
 from kalmark.config import build_slam
-from kalmark.diagnosis.verdict import LEAST, SIGMAS, WRONG, diagnose
+from kalmark.diagnosis.verdict import LEAST, MOST_OFF, SIGMAS, diagnose
 from kalmark.events import Control, Fix, Scan, order
 from kalmark.logs.log import Log
 from kalmark.results.measures import rigid, rmse
@@ -211,7 +211,8 @@ def planted(place: Place, plant: Plant, seed: int) -> tuple[Log, Run]:
     world = load_world(place.world, place.settings)
     log = place.with_it(simulate(world, seed), np.random.default_rng(seed))
     log = plant(log, np.random.default_rng(seed))
-    return log, record(build_slam(world.config(), log), log, progress=False)
+    seen = log.without_truth()
+    return log, record(build_slam(world.config(), seen), seen, progress=False)
 
 
 def by_truth(log: Log, run: Run) -> str:
@@ -233,7 +234,7 @@ def by_truth(log: Log, run: Run) -> str:
     else:
         off = rmse(rigid(places, there)(places) - there)
     extent, sigma = rmse(there - there.mean(axis=0)), float(np.median(np.sqrt(np.trace(P, axis1=1, axis2=2))))
-    state = "ok" if off < max(LEAST * extent, SIGMAS * sigma) else "doubtful" if off < WRONG * extent else "wrong"
+    state = "ok" if off < max(LEAST * extent, SIGMAS * sigma) else "doubtful" if off < MOST_OFF * extent else "wrong"
     return f"{state} {off:.3f} m of {extent:.1f}"
 
 

@@ -145,9 +145,9 @@ def right(run: Run, log: Log) -> bool:
 
 def alarmed(run: Run, verdict: bool = False) -> bool:
     """Return whether a run warns about its map, without the truth, or whether the `verdict` on it does."""
-    blind = replace(run, truth=Truth(np.full_like(run.truth.poses, np.nan)))
     if verdict:
-        return diagnose(blind).map != "ok"
+        return diagnose(run).map != "ok"
+    blind = replace(run, truth=Truth(np.full_like(run.truth.poses, np.nan)))
     return any(ALARM in line for line in blind.evaluate()["warnings"])
 
 

@@ -333,7 +333,8 @@ def jumps(linear: Linear, t_s: Array) -> list[Finding]:
     starts = [*{robot: k for k, robot in reversed([*enumerate(linear.problem.robots)])}.values()]
     nodes = [*np.argsort(-squares)[: min(LOOKED_AT, int((squares > 0).sum()))].tolist(), *starts]
     found: list[Finding] = []
-    usual_s = float(np.median(np.diff(np.unique(t_s)))) if len(t_s) > 1 else 0.0
+    times = np.unique(t_s)
+    usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     for node, (chi2, step, W) in zip(nodes, _free_steps(linear, nodes), strict=True):
         if chi2 <= 0:
             continue

@@ -31,6 +31,7 @@ from kalmark.results.history import Start
 from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_robust, rmse
 from kalmark.results.record import record
 from kalmark.results.run import Run
+from kalmark.results.warnings import budgeted
 from kalmark.results.words import figure
 from kalmark.slam.held_readings import AGAIN
 
@@ -96,14 +97,15 @@ def fit(run: Run) -> Fit:
 
     What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
     time, and clutter fits none either.  What is deferred after a gap, until the robot is known again, contradicts
-    nothing, nor does what is of a landmark that no sensor has started, nor what was given before.
+    nothing, nor does what is of a landmark that no sensor has started, what was given before, or what an attention
+    leaves out.
     """
     history = run.history
     dof = np.maximum(np.isfinite(history.z).sum(axis=1), 1)
     d2 = np.minimum(np.nan_to_num(history.d2, nan=0.0) / dof, MOST)
     d2 = np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2)
     d2 = np.where((history.id == "") & (history.outcome != "associated"), LOST, d2)
-    early = np.char.find(history.reason, ALONE) >= 0
+    early = (np.char.find(history.reason, ALONE) >= 0) | budgeted(history)
     early |= (history.outcome == "deferred") & while_lost(history)[history.step]
     early |= history.reason == AGAIN
     return Fit(np.where(early, 1.0, d2), dof)

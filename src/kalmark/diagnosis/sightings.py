@@ -1,24 +1,30 @@
-"""What the order of sightings tells of a map without ids: one thing that is there twice, and a robot that was moved.
+"""Sightings of a map in their order: things that are in it twice, or that are not seen again; a robot that was moved.
 
-A residual shows neither: each landmark fits its own sightings.
+A residual shows none of them: each landmark fits its own sightings.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import chdtr
 
 from kalmark.arrays import Array
 from kalmark.batch.state import Ints
+from kalmark.diagnosis.gross import SAME
+from kalmark.geometry.angles import wrap
 from kalmark.results.run import Run
 
 NEIGHBOURS = 3  # of a landmark that may be the same thing
 NEAR_SCANS = 5  # within which both of two landmarks in view would be seen
 SELDOM = 1e-4  # the probability, over all pairs, that two things are never seen together by chance
 LEAST_SEEN = 4  # landmarks that are seen until a robot is moved
+EDGES = 0.05, 0.95  # of the bearings and ranges of all sightings: what is beyond them may be out of view
+TINY = 1e-300
 LATER, FEW_BACK, MOSTLY = 20, 0.25, 0.5  # scans after it, in which few of them are seen, and most landmarks are new
 
 
@@ -62,6 +68,66 @@ def split(run: Run) -> list[Pair]:
         if score > least:
             found.append(Pair(names[a], names[b], score))
     return found
+
+
+class Revisits(NamedTuple):
+    """How often landmarks came into view again as before, of these how often unseen, and since when, s of the log.
+
+    `score` is the logarithm of how seldom chance misses so many.
+    """
+
+    number: int
+    unseen: int
+    since_s: float
+    score: float
+
+
+def unseen(run: Run) -> Revisits | None:
+    """Return how often landmarks were not seen where they were seen before; None if that is seldom, or by chance.
+
+    A thing that stands is seen again from where it was seen, within a share `SAME` of its distance: nothing new hides
+    it there.  It is missed by chance in (1 - p)^n of the visits of n scans, p the share of scans in which it is seen on
+    the others.  One that is in the map twice, or begun where nothing is, is missed.
+    """
+    visits = [visit for robot in run.history.robots if not run.history.in_space for visit in _visits(run, robot)]
+    scans, seen, t_s = np.array(visits).reshape(-1, 3).T
+    missed = seen == 0
+    p = seen.sum() / max(scans[~missed].sum(), 1.0)
+    chance = float(chdtr(2.0 * missed.sum(), 2.0 * float(np.sum((1.0 - p) ** scans)))) if missed.any() else 1.0
+    if chance > SELDOM or missed.mean() <= FEW_BACK:
+        return None
+    return Revisits(len(missed), int(missed.sum()), float(t_s[missed].min()), -math.log(max(chance, TINY)))
+
+
+def _visits(run: Run, robot: str) -> Iterator[tuple[int, int, float]]:
+    """Yield of each time a landmark came into view again the scans in which it was, those that saw it, and the time."""
+    h, where = run.history, _places(run)
+    used = (h.robot[h.step] == robot) & h.fused & np.isin(h.landmark, [*where])
+    if not used.any():
+        return
+    steps = np.unique(h.step[(h.robot[h.step] == robot) & ~h.of_own])
+    poses, scan = h.poses[steps], np.searchsorted(steps, h.step[used])
+    far, bearing = _view(poses[scan], np.array([where[name] for name in h.landmark[used].tolist()]))
+    (low, high), most = np.quantile(bearing, EDGES), np.quantile(far, EDGES[1])
+    for name, place in where.items():
+        mine = np.unique(scan[h.landmark[used] == name])
+        if len(mine) < LEAST_SEEN:
+            continue
+        apart, k = cKDTree(poses[mine, :2]).query(poses[:, :2])
+        r, b = _view(poses, place)
+        inside = (apart < SAME * r[mine[k]]) & (b > low) & (b < high) & (r < most)
+        inside[: mine[0]] = False
+        there = np.union1d(mine, np.flatnonzero(inside))
+        for visit in np.split(there, np.flatnonzero(np.diff(there) > LATER) + 1)[1:]:
+            seen = int(np.isin(visit, mine).sum())
+            if seen or len(visit) >= LEAST_SEEN:
+                yield len(visit), seen, float(h.t_ns[steps[visit[0]]]) * 1e-9
+
+
+def _view(poses: Array, places: Array) -> tuple[Array, Array]:
+    """Return ranges and bearings (K,) of places (K, 2), or of one, from poses (K, 3)."""
+    v = places - poses[:, :2]
+    return np.linalg.norm(v, axis=1), np.asarray(wrap(np.arctan2(v[:, 1], v[:, 0]) - poses[:, 2]))
 
 
 def spacing(run: Run) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,30 +11,32 @@ import numpy as np
 from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis import copies, sightings
+from kalmark.diagnosis.blind import blind
 from kalmark.diagnosis.causes import JUMPS, Finding
 from kalmark.diagnosis.gross import FITS, LOST, MOVED, fit, gross, started_at, until
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.gross import MOST as MOST_D2
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.lost import lost
+from kalmark.diagnosis.lost import ends, lost
 from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.mounts import TURNED
-from kalmark.diagnosis.readings import NAMES, SIGMA, judged, reasons
+from kalmark.diagnosis.readings import SIGMA, judged, reasons
 from kalmark.diagnosis.search import LEAST_GAIN, Search
 from kalmark.diagnosis.searched import MORE, WORST, Searched, misfits, searched
 from kalmark.diagnosis.words import of_odd_control, words
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
-from kalmark.results.batch import filtered_map, log_of, of_the_filter_alone
+from kalmark.results.batch import filtered_map, of_the_filter_alone
+from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst
 from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
 from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import Placed
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
-from kalmark.results.verdict import INNOVATIONS, NO_LANDMARKS, NO_MAP
-from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, window_warnings, words_of
+from kalmark.results.verdict import INNOVATIONS, NO_BATCH, NO_LANDMARKS, NO_MAP
+from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, signs, window_warnings, words_of
 from kalmark.results.words import count, figure
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.surveyed import ELSEWHERE
@@ -43,7 +45,7 @@ from kalmark.tracks.surveys import MISFITS
 
 MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
-LEAST, WRONG = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
+LEAST, MOST_OFF = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
@@ -55,6 +57,7 @@ JUMP = "odometry_jump"  # the cause that controls say a motion that was none
 MISPLACED = "misplaced_landmark"  # the cause that a landmark is not where its sightings have it
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause that innovations look wrong, and nothing says why
+SEVERITY = dict.fromkeys((*JUMPS, "map_repeats", "lost"), WRONG) | {COPIES: OK}  # the others: doubtful
 LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that says something
 
 
@@ -76,8 +79,9 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What is to be thought of a map: `map` is ok, doubtful or wrong, the `causes` are why, best first.
+    """What is to be thought of a map: `map` is ok, unchecked, doubtful or wrong, the `causes` are why, best first.
 
+    `robots` is the same of the path of each robot: at best what the map is.
     `sigma_factor` is what the filter's sigmas are to be multiplied by, `accuracy_m` the sigma of a landmark's position
     after it in the world and `shape_accuracy_m` that without the motion of the world that the start leaves open
     (`kalmark.results.gauge`), all the median over landmarks; `shift_m` is by how much the shape of the map changes
@@ -91,11 +95,12 @@ class Verdict:
     accuracy_m: float | None = None
     shape_accuracy_m: float | None = None
     shift_m: float | None = None
+    robots: dict[str, str] = field(default_factory=dict)
     search: Search | None = field(default=None, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict as it is in ``summary.json``."""
-        keys = "map", "sigma_factor", "accuracy_m", "shape_accuracy_m", "shift_m", "checked"
+        keys = "map", "robots", "sigma_factor", "accuracy_m", "shape_accuracy_m", "shift_m", "checked"
         figures = {key: getattr(self, key) for key in keys}
         return figures | {"causes": [vars(cause) for cause in self.causes]}
 
@@ -103,38 +108,63 @@ class Verdict:
 def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     """Return the verdict on a run, from about so many of its observations; it is kept in the run's summary.
 
-    A bar on standard error tells how far it is if `progress`.  Raises KalmarkError if the log of the run cannot be read
-    again.
+    It reads the log without its truth (`blind`).  A bar on standard error tells how far it is if `progress`.  Raises
+    KalmarkError if the log of the run cannot be read again.
     """
-    log = log_of(run)
-    log = log if isinstance(log, Log) else Log(run.log.name, run.log.robots, list(log))
+    seen, log = blind(run)
+    verdict = _with_signs(seen, _of_causes(seen, log, most, progress))
     if not run.summary:
         run.evaluate()
     summary = run.summary
-    off, explained = readings_off(run, log, progress)
-    mistake = None if explained else gross(run, log, progress)
-    if mistake is not None and mistake.share > FEW:
-        others = (cause for cause in _structural(run, log, off) if cause.name != MISFIT)
-        verdict = Verdict("wrong", (_of_mistake(mistake), *others), "the log filtered again without the mistake")
-    else:
-        verdict = _judged(run, log, off, most, progress)
-        if mistake is not None:
-            of_it = (mistake.name, "kidnapped") if mistake.name in (LATE, MOVED) else ()
-            rest = [c for c in verdict.causes if c.name not in of_it]
-            verdict = replace(verdict, causes=(_of_mistake(mistake), *rest))
-            if of_it and verdict.map == "ok":  # of late scans nothing is of a landmark in turns: they vanish, too
-                verdict = replace(verdict, map="doubtful")
-        if run.stopped or summary.get("diverged") or repeats(summary) or any(_lost(run)):
-            verdict = replace(verdict, map="wrong")
     summary["verdict"] = verdict.as_dict()
     first = next((cause.name for cause in verdict.causes if not cause.harmless), "noise")
-    if first not in ("noise", MISFIT) and not first.endswith(("_sigma", "_noise")):
+    if first not in ("noise", MISFIT, UNCHECKED) and not first.endswith(("_sigma", "_noise")):
         summary["warnings"] = [w.replace(TOO_SMALL, f"see {first} in the verdict") for w in summary["warnings"]]
     return verdict
 
 
+def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
+    """Return the verdict by what is found in the log: a mistake that explains it, else the causes of what is left."""
+    off, explained = readings_off(run, log, progress)
+    mistake = None if explained else gross(run, log, progress)
+    if mistake is not None and mistake.share > FEW:
+        others = (cause for cause in _structural(run, log, off) if cause.name != MISFIT)
+        return Verdict(WRONG, (_of_mistake(mistake), *others), "the log filtered again without the mistake")
+    verdict = _judged(run, log, off, most, progress)
+    if mistake is None:
+        return verdict
+    of_it = (mistake.name, "kidnapped") if mistake.name in (LATE, MOVED) else ()
+    rest = [c for c in verdict.causes if c.name not in of_it]
+    status = worst(
+        verdict.map, DOUBTFUL if of_it else OK
+    )  # of late scans nothing is of a landmark in turns: they vanish
+    return replace(verdict, map=status, causes=(_of_mistake(mistake), *rest))
+
+
+def _with_signs(run: Run, verdict: Verdict) -> Verdict:
+    """Return a verdict that no warning of the run contradicts, with the status of each robot's path.
+
+    A path is at best what the map is, and a robot whose observations do not fit maps.  Where nothing is mapped, or all
+    of it was known, the path is what is judged.
+    """
+    found, at_end = signs(run, run.summary), [*ends(run)]
+    misfit = (sign.status for _, sign in at_end if sign.status != UNCHECKED)
+    status = worst(verdict.map, *(sign.status for sign in found), *misfit)
+    robots = {name: worst(status, *(s.status for of, s in at_end if of == name)) for name in run.history.robots}
+    if not {*run.landmarks.ids} - {*run.landmarks.exact}:
+        status = worst(status, *robots.values())
+    told = [s for s in (*found, *(s for _, s in at_end)) if worst(verdict.map, s.status) != verdict.map]
+    more = [Cause(s.status if s.status == UNCHECKED else MISFIT, begin_s(run), 0.0, s.line) for s in told]
+    return replace(verdict, map=status, causes=(*verdict.causes, *more), robots=robots)
+
+
 def _of_mistake(mistake: Mistake) -> Cause:
     return Cause(mistake.name, mistake.since_s, mistake.gain, mistake.evidence, mistake.cure)
+
+
+def status_of(causes: Iterable[Cause]) -> str:
+    """Return the best status of a map with causes that its shape does not show."""
+    return worst(*(SEVERITY.get(cause.name, DOUBTFUL) for cause in causes if not cause.harmless))
 
 
 def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> Verdict:
@@ -143,44 +173,58 @@ def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> 
     if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
         most = max(most, MOST)  # its reason may show in all of the log only
     try:
-        found = searched(run, log, most, limit, progress)
-    except (KalmarkError, np.linalg.LinAlgError) as error:
-        signs = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
-        signs = [*(odd_controls(run, log) if signs else ()), *signs]
-        none = NO_LANDMARKS if run.history.localizes else NO_MAP
-        why = str(error).removeprefix("batch solution: ") if len(run.landmarks) else none
-        harm = {cause.name for cause in first if not cause.harmless}
-        status = "wrong" if harm & {*JUMPS} else "doubtful" if signs or harm else "ok"
-        return Verdict(status, (*first, *signs), f"{INNOVATIONS}, no batch solution: {why}")
+        return _by_batch(run, log, first, searched(run, log, most, limit, progress))
+    except (KalmarkError, np.linalg.LinAlgError):
+        found = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
+    status = worst(status_of(first), DOUBTFUL if found else OK)
+    found = [*first, *(odd_controls(run, log) if found else ()), *found]
+    none = NO_LANDMARKS if run.history.localizes else NO_MAP
+    why = NO_BATCH if len(run.landmarks) else none
+    return Verdict(status, tuple(found), f"{INNOVATIONS}, no batch solution: {why}")
+
+
+def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdict:
+    """Return the verdict by a search in the batch problem, and by the causes that it cannot show, `first`."""
     effect = effect_of(run, found)
+    moved = [f for f in found.search.found if misplaced(run, f)]
+    status = worst(effect.status, status_of(first), DOUBTFUL if moved else OK)
+    causes = _ordered(run, first, found, _found(run, log, first, found, effect))
+    checked = f"batch solution of {len(found.given.associations.landmark)} observations"
+    figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
+    return Verdict(status, tuple(causes), checked, *figures, search=found.search)
+
+
+def _found(run: Run, log: Log, first: list[Cause], found: Searched, effect: Effect) -> list[Cause]:
+    """Return the causes that a search found, and the controls that jump: these go first where it was robust.
+
+    A robust solution rather leaves out what is after them; between segments it is not looked for jumps.
+    """
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
-    if found.given.segments is not None and not any(c.name in JUMPS for c in causes):  # between these it is not looked
+    odd = [*odd_controls(run, log)] if found.pulled else []
+    if odd:
+        causes = [cause for cause in causes if cause.name not in JUMPS]
+    elif found.given.segments is not None and not any(cause.name in JUMPS for cause in causes):
         causes += odd_controls(run, log)
-    twice = any(cause.name == COPIES for cause in first)  # then the filter is too sure for that
-    odd = [*odd_controls(run, log)] if found.pulled else []  # a robust solution rather leaves out what is after them
-    causes = [*(c for c in causes if not odd or c.name not in JUMPS), *odd]
-    causes = sorted(
-        [*causes, *(() if twice else _too_sure(run, effect))], key=lambda c: (c.harmless, c not in odd, -c.score)
-    )
+    if not any(cause.name == COPIES for cause in first):  # then the filter is too sure for that
+        causes += _too_sure(run, effect)
+    return [*odd, *sorted(causes, key=lambda cause: -cause.score)]
+
+
+def _ordered(run: Run, first: list[Cause], found: Searched, causes: list[Cause]) -> list[Cause]:
+    """Return the causes that a search cannot show and those that it found, each after what may be why.
+
+    Systematic errors double maps and carry robots away, a noise that is stated too small splits landmarks.
+    """
     if not any(c.name == "gap" and not c.harmless for c in first):  # else it is that what doubles maps
         steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
         alone = [c.score for c in first if c.name == "kidnapped" and not run.summary.get("repeats")]
         before = [c for c in causes if c.name in steady and c.score > min([SURELY, *alone])]
         first = [*before, *(_as_well(c, before) for c in first)]
-    noisy = [c for c in causes if c.name.endswith("_sigma") and c.score > SURELY]
-    split = [c for c in first if c.name == "split_landmarks" and noisy]  # which such noise does
-    first = [*(c for c in first if c not in split), *(c for c in noisy if split and c not in first), *split]
-    causes = [*first, *(c for c in causes if c not in first)]
-    causes.sort(key=lambda c: c.harmless)
-    wrong = any(misplaced(run, f) for f in found.search.found) or any(map(stayed_lost, run.summary.get("gaps", ())))
-    wrong |= any(c.name in ("misplaced_landmark", "split_landmarks", MISFIT, *NAMES) and not c.harmless for c in first)
-    if any(c.name in JUMPS and not c.harmless for c in first):
-        effect = replace(effect, status="wrong")
-    elif effect.status == "ok" and wrong:
-        effect = replace(effect, status="doubtful")
-    checked = f"batch solution of {len(found.given.associations.landmark)} observations"
-    figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
-    return Verdict(effect.status, tuple(causes), checked, *figures, found.search)
+    split = [c for c in first if c.name == "split_landmarks"]
+    noisy = [c for c in causes if split and c.name.endswith("_sigma") and c.score > SURELY and c not in first]
+    if noisy:
+        first = [*(c for c in first if c not in split), *noisy, *split]
+    return sorted([*first, *(c for c in causes if c not in first)], key=lambda c: c.harmless)
 
 
 def _all_misfit(run: Run) -> Iterator[str]:
@@ -281,6 +325,7 @@ def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
         *gaps(run),
         *repeats(run.summary),
         *split_landmarks(run),
+        *unseen_landmarks(run),
         *misplaced_landmarks(run),
         *_begun_again(run),
         *fits_nothing(run),
@@ -528,6 +573,15 @@ def split_landmarks(run: Run) -> Iterator[Cause]:
         )
 
 
+def unseen_landmarks(run: Run) -> Iterator[Cause]:
+    """Yield that landmarks are not seen again where they were seen: they are in the map twice, or nowhere."""
+    found = sightings.unseen(run)
+    if found is not None:
+        evidence = f"in {found.unseen} of {found.number} times a landmark came into view as before it was not seen"
+        cure = "things are in the map twice, or came and went: look at the errors of the controls, and at what moves"
+        yield Cause("unseen_landmarks", found.since_s, found.score, evidence, cure)
+
+
 def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
     """Yield that the filter claims smaller sigmas than the same data allow, if it does."""
     if effect.claimed is None:
@@ -546,7 +600,7 @@ def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
 class Effect:
     """What the causes do to a map: as in `Verdict`; `claimed` is the filter's sigma over what the data allow."""
 
-    status: str = "ok"
+    status: str = OK
     sigma_factor: float | None = None
     accuracy_m: float | None = None
     shape_accuracy_m: float | None = None
@@ -579,7 +633,7 @@ def effect_of(run: Run, found: Searched) -> Effect:
     if not free.any():
         return Effect(shift_m=shift_m)
     off_it = share > LEAST and shift_m > SIGMAS * float(np.median(filtered[free]))
-    status = "ok" if not off_it else "doubtful" if share < WRONG else "wrong"
+    status = OK if not off_it else DOUBTFUL if share < MOST_OFF else WRONG
     shift_m = max(shift_m, by_steady)  # told, but no alarm: under noise that is stated too small it is too much
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     same_data = not waited and not of_the_filter_alone(run.final_slam())  # what waited is not in the batch solution

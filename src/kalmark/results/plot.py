@@ -101,7 +101,7 @@ def draw_map(
     width = max(sum(aspects) * tall + 0.2 + 0.65 * len(spans), 6.0)
     title, figures = headline(run)
     lines, handles = _lines(figures, int(CHARACTERS * width)), legend(scene)
-    told = [*summary_of(run)["warnings"], *alarm(summary_of(run).get("verdict"))]
+    told = [*dict.fromkeys((*summary_of(run)["warnings"], *alarm(summary_of(run).get("verdict"))))]
     alarms = [part for line in told for part in textwrap.wrap(line, int(CHARACTERS * width))]
     columns = max(1, int(width / 1.9))
     below, above = 0.6 + 0.25 * -(-len(handles) // columns), 0.55 + LINE_INCHES * (len(lines) + len(alarms))

@@ -41,7 +41,7 @@ from kalmark.results.scene import (
     stretches_of,
     thin,
 )
-from kalmark.results.verdict import verdict_lines
+from kalmark.results.verdict import overall, verdict_lines
 from kalmark.results.words import (
     BATCH,
     DIFFERENCE_COLUMNS,
@@ -97,7 +97,7 @@ def report_html(run: Recording, world: bool = False) -> str:
         figures="".join(f"<span>{html.escape(figure)}</span>" for figure in figures),
         robots=robot_table(summary),
         summary=summary_table(summary),
-        map="" if verdict is None else verdict["map"],
+        map="" if verdict is None else overall(verdict),
         verdict=_items([] if verdict is None else verdict_lines(verdict)),
         warnings=_items(summary.get("warnings", ())),
         advice=_items(notes),

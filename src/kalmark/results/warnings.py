@@ -23,12 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Flags
 from kalmark.declare import registered_name
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry.gaussian import gate, quantile
 from kalmark.models import sensors
 from kalmark.results.calibration import mount_warnings
+from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
 from kalmark.results.gaps import gap_warnings
 from kalmark.results.history import History, Ints, Placed, UsedFix
 from kalmark.results.matching import LEAST, no_ids
@@ -37,6 +38,7 @@ from kalmark.results.recording import Recording
 from kalmark.results.repeats import repeat_warnings
 from kalmark.results.restarts import restarts
 from kalmark.results.words import count, figure
+from kalmark.slam.held_readings import AGAIN
 
 DEGREES = 100  # of freedom in a window, at least
 OBSERVATIONS = 60  # in a window of those left out, at least
@@ -209,9 +211,33 @@ def _left_out(worst: Window, median: float, count: int) -> str:
 
 def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
-    parts = (_lost, _observations, _robots, _sensors, _truth, _fixes, _noise, mount_warnings)
-    of_map = *gap_warnings(summary["gaps"]), *repeat_warnings(summary["repeats"])
-    return [*of_map, *(line for part in parts for line in part(run, summary))]
+    return [sign.line for sign in signs(run, summary)]
+
+
+def signs(run: Recording, summary: Mapping[str, Any]) -> list[Sign]:
+    """Return the warnings of a run, each with the best status that a verdict can have beside it.
+
+    Those about truth leave any, and so do those of which a verdict itself says what they do: about noise, starts that
+    fixes correct, robots that readings place elsewhere.
+    """
+    of_map = ((gap_warnings(summary["gaps"]), DOUBTFUL), (repeat_warnings(summary["repeats"]), WRONG))
+    parts = (
+        (_stopped, WRONG),
+        (_lost, DOUBTFUL),
+        (_placed, OK),
+        (_diverged, OK),
+        (_observations, UNCHECKED),
+        (_images, OK),
+        (_robots, UNCHECKED),
+        (_sensors, OK),
+        (_truth, OK),
+        (_first_fixes, OK),
+        (_fixes, DOUBTFUL),
+        (_noise, OK),
+        (mount_warnings, OK),
+    )
+    found = *of_map, *((part(run, summary), status) for part, status in parts)
+    return [Sign(line, status) for lines, status in found for line in lines]
 
 
 def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
@@ -225,18 +251,38 @@ def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _lost(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _stopped(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
     if run.stopped:
         yield f"the filter stopped: {run.stopped}"
-    begin_ns = run.history.t_ns[0] if len(run.history.t_ns) else 0
+
+
+def _lost(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
+    again = restarts(run.history)
     for fix in (fix for fix in run.history.fixes if fix.moved_m > 0):
-        when = f"{(fix.t_ns - begin_ns) * 1e-9:.1f} s after the first scan"
-        again = restarts(run.history).get(fix.robot)
-        what = "it was" if again is None or again.t_ns != fix.t_ns else "with all of the map it was"
-        yield f"{fix.robot} was lost {when}: its fixes agreed that it was {fix.moved_m:.1f} m away; {what} moved there"
+        if fix.robot not in again or again[fix.robot].t_ns != fix.t_ns:
+            yield _moved_by(run, fix, "it was")
+
+
+def _moved_by(run: Recording, fix: UsedFix, what: str) -> str:
+    when = f"{(fix.t_ns - _begin_ns(run)) * 1e-9:.1f} s after the first scan"
+    return f"{fix.robot} was lost {when}: its fixes agreed that it was {fix.moved_m:.1f} m away; {what} moved there"
+
+
+def _begin_ns(run: Recording) -> int:
+    return int(run.history.t_ns[0]) if len(run.history.t_ns) else 0
+
+
+def _placed(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
+    again = restarts(run.history)
+    for fix in (fix for fix in run.history.fixes if fix.moved_m > 0):
+        if fix.robot in again and again[fix.robot].t_ns == fix.t_ns:
+            yield _moved_by(run, fix, "with all of the map it was")
     for mine in placements(run.history):
-        when = f"first {(mine[0].t_ns - begin_ns) * 1e-9:.1f} s after the first scan"
+        when = f"first {(mine[0].t_ns - _begin_ns(run)) * 1e-9:.1f} s after the first scan"
         yield f"{words_of(mine)}, {when}: it was lost, or they jumped"
+
+
+def _diverged(_: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     lost = [name for name, figures in summary["robots"].items() if figures.get("diverged")]
     if lost:
         names = ", ".join(lost)
@@ -270,30 +316,37 @@ def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     turns = (np.abs(angles) > 2 * np.pi).any(axis=1)  # NaN, where a sensor has less numbers, is not
     if turns.any():
         yield f"{int(turns.sum())} bearings beyond 2 pi rad: are they in degrees?"
-    yield from _images(run)
+
+
+def budgeted(history: History) -> Flags:
+    """Return which observations (O,) an attention left out: that contradicts nothing."""
+    return np.logical_or.reduce([np.char.startswith(history.reason, start) for start in ATTENTION])
 
 
 def _unused(run: Recording) -> Iterator[str]:
-    """Tell of sensors most of whose observations could not be used."""
+    """Tell of sensors most of whose observations could not be used, and that none was of a known thing."""
     history, robots = run.history, run.history.robot[run.history.step]
-    by_design = np.logical_or.reduce([np.char.startswith(history.reason, start) for start in ATTENTION])
+    by_design = budgeted(history) | (history.reason == AGAIN)
     pairs = sorted(set(zip(robots.tolist(), history.sensor.tolist(), strict=True)))
     for robot, sensor in pairs:
         own = (robots == robot) & (history.sensor == sensor)
         of = f" of {sensor!r} of {robot!r}" if len(pairs) > 1 else ""
-        for outcome in ("ignored", "rejected"):
-            mine = own & (history.outcome == outcome) & ~by_design
-            if 2 * int(mine.sum()) <= int(own.sum()):
-                continue
-            reason, number = Counter(history.reason[mine].tolist()).most_common(1)[0]
-            if reason == NO_ID:
-                yield f"{number} observations{of} have no id and were ignored; try --set association.type=auto"
-                continue
-            said = reason or "no reason given"
-            yield f"{int(mine.sum())} of {int(own.sum())} observations{of} were {outcome}, most often: {said}"
+        mine = own & ~np.isin(history.outcome, ("associated", "new")) & ~by_design
+        if 2 * int(mine.sum()) <= int(own.sum()):
+            continue
+        reason, number = Counter(history.reason[mine].tolist()).most_common(1)[0]
+        if reason == NO_ID:
+            yield f"{number} observations{of} have no id and were ignored; try --set association.type=auto"
+            continue
+        outcomes = " or ".join(dict(Counter(history.outcome[mine].tolist()).most_common()))
+        said = reason or "no reason given"
+        yield f"{int(mine.sum())} of {int(own.sum())} observations{of} were {outcomes}, most often: {said}"
+    of_things = ~history.of_own
+    if of_things.any() and not (of_things & (history.outcome == "associated")).any():
+        yield "nothing was observed twice: no observation checks another one"
 
 
-def _images(run: Recording) -> Iterator[str]:
+def _images(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
     """Tell of cameras whose measurements lie outside their images."""
     history = run.history
     robots = history.robot[history.step]
@@ -376,7 +429,7 @@ def _some(names: set[str]) -> str:
     return ", ".join(first) + (", ..." if len(names) > len(first) else "")
 
 
-def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _first_fixes(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
     fixes = run.history.fixes
     starts = {start.robot: start for start in run.history.starts}
     for name in dict.fromkeys(fix.robot for fix in fixes):
@@ -389,6 +442,9 @@ def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
                 f"the first fix of {name} is {figure(far)} m from where its start puts it, "
                 f"which the configuration says is known to {figure(sigma)} m: set robots.{name}.start"
             )
+
+
+def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     value = summary.get("fix_nis_per_dof")
     if value is not None and value > FIX_NIS_HIGH and summary["fixes"] >= FEW_FIXES:
         yield f"NIS per degree of freedom of the fixes is {figure(value)} where 1 is consistent: too small a noise?"
