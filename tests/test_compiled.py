@@ -134,6 +134,38 @@ def test_compiled_code_that_is_damaged_on_the_disk_is_noticed_and_made_anew(tmp_
     assert done.stdout == "20\n"
 
 
+COMPILED = """
+import numpy as np
+from kalmark.compiled import compiled
+from kalmark.filter.kernels import product
+
+A = np.arange(12.0).reshape(3, 4)
+for _ in range(2):
+    function = compiled(product.py_func)
+    np.testing.assert_array_equal(function(A, A.T), A @ A.T)
+    print(sum(function.stats.cache_misses.values()))
+"""
+
+
+def test_of_processes_that_need_the_same_code_at_once_one_compiles_it(tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    environment = os.environ | {"KALMARK_CACHE": str(tmp_path)}
+    command = [sys.executable, "-c", COMPILED]
+    made = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    assert sorted(one.communicate()[0] for one in made) == ["0\n0\n", "0\n0\n", "1\n0\n"]
+
+
+def test_a_cache_that_cannot_be_written_is_warned_of_once_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    environment = os.environ | {"KALMARK_CACHE": str(tmp_path / "file")}
+    command = [sys.executable, "-c", COMPILED]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "1\n1\n"), done.stderr
+    (said,) = [line for line in done.stderr.splitlines() if "warning" in line]
+    assert said.startswith(f"kalmark: warning: compiled code cannot be kept in {tmp_path / 'file' / 'compiled'}")
+    assert said.endswith("KALMARK_CACHE can name another folder")
+
+
 def test_two_processes_that_save_two_overloads_at_once_name_two_files(tmp_path: Path) -> None:
     one, other = (_CheckedFiles(str(tmp_path), "f", source_stamp=0) for _ in range(2))
     with patch.object(other, "_load_index", return_value={}):  # read before the other was saved

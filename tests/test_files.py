@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import multiprocessing as mp
 import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
 from kalmark import files
 from kalmark.errors import RunError
-from kalmark.files import locked, refuse_bomb, replace_file, replace_folder, write
+from kalmark.files import locked, read_arrays, refuse_aliases, refuse_bomb, replace_file, replace_folder, write
 
 OWN = ("summary.json", "map_*.csv", "cells")
 
@@ -187,3 +191,33 @@ def test_an_archive_that_says_that_it_unpacks_to_far_more_is_refused_before_it_i
             archive.writestr(str(k), bytes(1_000_000))
     with zipfile.ZipFile(path) as archive, pytest.raises(RunError, match=r"100000000 bytes in a file of \d+, expected"):
         refuse_bomb(archive, path, RunError)
+
+
+def test_arrays_come_back_and_no_longer_than_their_file_is(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array(["x", "yy"]), "c": np.zeros((0, 4)), "d": np.array("")}
+    arrays |= {"e": np.asfortranarray(arrays["a"]), "f": np.array(True)}
+    np.savez_compressed(path, **arrays)
+    read = read_arrays(path, RunError)
+    assert {*read} == {*arrays}
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(read[name], array)
+        assert read[name].dtype == array.dtype
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"shape": (10**13,), "fortran_order": False, "descr": "<f8"})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", header.getvalue() + bytes(8))
+    with pytest.raises(ValueError, match=r"an array \(10000000000000,\) of float64 in 136 bytes"):
+        read_arrays(path, RunError)
+    path.write_bytes(b"PK")
+    with pytest.raises(RunError, match="expected a whole file of arrays"):
+        read_arrays(path, RunError)
+
+
+def test_yaml_whose_aliases_multiply_is_refused() -> None:
+    text = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    for one, other in itertools.pairwise("abcdefgh"):
+        text += f"{other}: &{other} [{', '.join([f'*{one}'] * 10)}]\n"
+    with pytest.raises(RunError, match=r"x.yaml: its aliases make more than 1000000 values of it"):
+        refuse_aliases(YAML(typ="safe", pure=True).load(text), "x.yaml", RunError)
+    refuse_aliases(YAML(typ="safe", pure=True).load("a: &a [1]\nb: [*a, *a]\n"), "x.yaml", RunError)

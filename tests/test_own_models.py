@@ -122,9 +122,9 @@ def test_models_of_a_user_go_from_python_to_the_command_line_and_back(own: Any, 
     kalmark("run", "first/config.yaml", "--out", "second", folder=tmp_path)
     for name in FILES:
         assert (tmp_path / "second" / name).read_text() == (saved / name).read_text(), name
-    assert "associated 1" in kalmark("explain", "second", "--scan", "3", folder=tmp_path)
+    assert "associated 1" in kalmark("explain", "second", "--scan", "3", "--trust", folder=tmp_path)
     for what, refused in (  # what only does points
-        ("batch solution", lambda: Run.load(tmp_path / "second").evaluate(batch=True)),
+        ("batch solution", lambda: Run.load(tmp_path / "second", trust=True).evaluate(batch=True)),
         ("day, to be replayed", lambda: replay_of(config, open_log(tmp_path / "day.signs"), progress=False)),
     ):
         with pytest.raises(km.KalmarkError, match=f"{what}: landmark 1 is a sign, expected points"):

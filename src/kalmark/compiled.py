@@ -25,7 +25,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from multiprocessing import parent_process
@@ -38,14 +38,18 @@ import platformdirs
 from llvmlite import ir
 from numba import types
 from numba.core import event
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, UserProvidedCacheLocator
 from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
 
+from kalmark.files import locked
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; it can take half a minute\n"
+
+LONGEST_WAIT_S = 300.0  # for another process that compiles the same function
 
 _FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
 
@@ -122,11 +126,30 @@ def compiled(function: F) -> F:
     return made
 
 
-class _OpenedLater(FunctionCache):  # type: ignore[misc]
-    """The cache of a function in a folder, opened when the function is first used: in one process, most never are."""
+class _Folder(UserProvidedCacheLocator):  # type: ignore[misc, unused-ignore]
+    """The folder of the cache, also where nothing can be written into it: then it is only read."""
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> _Folder:
+        """Return it without a look at what may be written; numba would go elsewhere, where old code may be."""
+        return cls(py_func, py_file)
+
+
+class _InFolder(CompileResultCacheImpl):  # type: ignore[misc, unused-ignore]
+    _locator_classes = (_Folder,)
+
+
+class _OpenedLater(FunctionCache):  # type: ignore[misc, unused-ignore]
+    """The cache of a function in a folder, opened when the function is first used: in one process, most never are.
+
+    Of several processes that need the same code at once one compiles it, and the others wait for it.  A cache that is
+    full, or cannot be written, is warned of: the code is there, and is compiled again the next time.
+    """
+
+    _impl_class = _InFolder
 
     def __init__(self, py_func: Callable[..., Any], folder: str) -> None:
-        self._py_func, self._folder = py_func, folder
+        self._py_func, self._folder, self._lock = py_func, folder, ExitStack()
 
     def __getattr__(self, name: str) -> Any:  # of what is not there until it is opened
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, self._folder
@@ -136,6 +159,39 @@ class _OpenedLater(FunctionCache):  # type: ignore[misc]
         finally:
             numba.config.CACHE_DIR = before
         return getattr(self, name)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return compiled code from the disk; None if this process is the one to compile it."""
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            self._lock.close()  # of one that could not be compiled
+            lock = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
+            with suppress(OSError):
+                lock.parent.mkdir(parents=True, exist_ok=True)
+            self._lock.enter_context(locked(lock, wait_s=LONGEST_WAIT_S))
+            found = super().load_overload(sig, target_context)
+            if found is not None:
+                self._lock.close()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep compiled code on the disk, if that can be."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _say_not_kept(self._folder, error.strerror or str(error))
+        finally:
+            self._lock.close()
+
+
+@cache
+def _say_not_kept(folder: str, why: str) -> None:
+    """Say on stderr that code cannot be kept, once in a process."""
+    if parent_process() is None:
+        sys.stderr.write(
+            f"kalmark: warning: compiled code cannot be kept in {folder} ({why}) and is compiled again the next time; "
+            "KALMARK_CACHE can name another folder\n"
+        )
 
 
 @cache
@@ -170,6 +226,8 @@ def ahead(function: Any, job: Callable[..., None], *arguments: str | int) -> Non
     mark = Path(cache_folder("filter")) / f"ahead-{hashlib.sha256(version.encode()).hexdigest()[:16]}"
     if parent_process() is not None or (os.cpu_count() or 1) < 2 or mark.exists() or function in _AHEAD:
         return
+    if not os.access(Path(cache_folder("filter")).parents[1], os.W_OK):
+        return  # nor would this process find it
     code = "import sys; from kalmark.compiled import work_ahead; work_ahead(*sys.argv[1:])"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with suppress(OSError):  # without a second process all is compiled in this one

@@ -5,9 +5,14 @@ from __future__ import annotations
 LONGEST = 1000  # characters of a message
 
 
+def printable(text: str) -> str:
+    """Return a text with line breaks and control characters as escapes, which no terminal obeys."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 def one_line(text: str) -> str:
-    """Return a text with line breaks and control characters as escapes; the middle of a long one is left out."""
-    plain = text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    """Return a text that is `printable`; the middle of a long one is left out."""
+    plain = printable(text)
     return plain if len(plain) <= LONGEST else f"{plain[: 2 * LONGEST // 3]} ... {plain[-LONGEST // 4 :]}"
 
 

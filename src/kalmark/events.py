@@ -13,6 +13,7 @@ from itertools import groupby
 from numbers import Real
 from operator import attrgetter
 from typing import Any
+from unicodedata import category
 
 import numpy as np
 
@@ -155,6 +156,11 @@ def measured(
     return array, worst
 
 
+def is_writable(text: str) -> bool:
+    """Return whether files and terminals can have a text as it is: no control characters, no lone surrogates."""
+    return text.isprintable() or not any(category(c) in ("Cc", "Cs") for c in text)
+
+
 def checked_id(value: Any, what: str) -> Id:
     """Return a landmark's id as int or str, refusing all but whole numbers and texts that are not empty."""
     if isinstance(value, np.generic) and value.dtype.kind in "iufU":
@@ -162,6 +168,8 @@ def checked_id(value: Any, what: str) -> Id:
     if isinstance(value, str) and value:
         if len(value) > LONGEST_ID:
             raise EventError(f"{what} is {shown(value)}, expected at most {LONGEST_ID} characters")
+        if not is_writable(value):
+            raise EventError(f"{what} is {shown(value)}, expected a text without control characters and surrogates")
         return str(value)
     if isinstance(value, int) and not isinstance(value, bool):
         if abs(value) >= 10**LONGEST_ID:

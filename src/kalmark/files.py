@@ -9,10 +9,13 @@ from __future__ import annotations
 import ctypes
 import errno
 import glob
+import io
+import math
 import os
 import shutil
 import time
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
@@ -21,11 +24,14 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
+import numpy as np
+
 from kalmark.errors import KalmarkError
 
 STALE_S = 3600.0  # older than this, what is beside a result was left by a program that was killed
 POLL_S = 0.05  # between two looks at a lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
+MOST_NODES = 1_000_000  # of a YAML file, its aliases counted as what they stand for
 FREE_BYTES, MOST_PACKED = (
     1 << 26,
     100,
@@ -200,6 +206,47 @@ def _locked(path: Path, shared: bool, wait_s: float | None) -> int:
             return -1
         if handle >= 0:
             os.close(handle)
+
+
+def read_arrays(path: Path, error: type[KalmarkError]) -> dict[str, Any]:
+    """Read the arrays of an .npz file, each as long as it says.  Raises `error`, ValueError or OSError."""
+    arrays = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            refuse_bomb(archive, path, error)
+            for name in archive.namelist():
+                arrays[name.removesuffix(".npy")] = _array(archive.read(name))
+    except (zipfile.BadZipFile, zlib.error, EOFError) as damage:
+        raise error(f"{path}: {damage}, expected a whole file of arrays") from None
+    return arrays
+
+
+def _array(data: bytes) -> Any:
+    """Return the array that the content of an .npy file is.  Raises ValueError."""
+    file = io.BytesIO(data)
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(file)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - file.tell():
+        raise ValueError(f"an array {shape} of {dtype} in {len(data)} bytes")
+    array = np.frombuffer(data, dtype, offset=file.tell()) if dtype.itemsize else np.zeros(math.prod(shape), dtype)
+    return array.reshape(shape, order="F" if fortran else "C").copy()
+
+
+def refuse_aliases(content: Any, where: str, error: type[KalmarkError]) -> None:
+    """Refuse the content of a YAML file whose aliases make far more of it than is written there."""
+    sizes: dict[int, int] = {}
+
+    def size(node: Any) -> int:
+        if not isinstance(node, dict | list):
+            return 1
+        if id(node) not in sizes:
+            sizes[id(node)] = MOST_NODES + 1  # of what holds itself
+            sizes[id(node)] = 1 + sum(map(size, node.values() if isinstance(node, dict) else node))
+        return sizes[id(node)]
+
+    if size(content) > MOST_NODES:
+        raise error(f"{where}: its aliases make more than {MOST_NODES} values of it, expected fewer")
 
 
 def refuse_bomb(archive: zipfile.ZipFile, path: Path, error: type[KalmarkError]) -> None:

@@ -20,6 +20,7 @@ from kalmark.cli.folders import compare, evaluate, explain, report, view
 from kalmark.cli.live import live
 from kalmark.cli.logs import config, data, simulate, worlds
 from kalmark.cli.run import demo, run, warm_up
+from kalmark.cli.shared import say
 from kalmark.cli.tune import tune
 from kalmark.errors import KalmarkError
 
@@ -63,12 +64,12 @@ for other in entry_points(group="kalmark.verbs"):  # of other packages; one that
     try:
         app.command(other.name)(other.load())
     except Exception as error:
-        sys.stderr.write(f"kalmark: the verb {other.name!r} of {other.value} cannot be loaded: {error}\n")
+        say(f"kalmark: the verb {other.name!r} of {other.value} cannot be loaded: {error}", err=True)
 
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"kalmark {version('kalmark')}")
+        say(f"kalmark {version('kalmark')}")
         raise typer.Exit
 
 
@@ -110,5 +111,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _refuse(line: str) -> int:
-    sys.stderr.write(f"kalmark: {line}\n")
+    say(f"kalmark: {line}", err=True)
     return 2

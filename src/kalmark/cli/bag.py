@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import print_table
+from kalmark.cli.shared import print_table, say
 from kalmark.errors import LogError
 
 if TYPE_CHECKING:
@@ -51,10 +51,10 @@ def bag(
     moving = sorted(f"{child} in {parent}" for parent, child in found.frames.moving)
     for what, pairs in (("frames that move", moving), ("frames that stand still", still)):
         if pairs:
-            typer.echo(f"{what}: {', '.join(pairs)}")
+            say(f"{what}: {', '.join(pairs)}")
     if out is not None:
         write(out, first_config(found, out))
-        typer.echo(f"{out}: look at the lines with GUESS, then kalmark run {shlex.quote(str(out))}")
+        say(f"{out}: look at the lines with GUESS, then kalmark run {shlex.quote(str(out))}")
 
 
 def _row(topic: TopicSummary) -> tuple[str, ...]:

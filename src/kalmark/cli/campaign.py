@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.shared import Overrides, announce_compilation_elsewhere, computing, number, print_table, writable
+from kalmark.cli.shared import Overrides, announce_compilation_elsewhere, computing, number, print_table, say, writable
 
 if TYPE_CHECKING:
     from kalmark.campaign import Campaign, Sweep
@@ -72,8 +72,8 @@ def campaign(
     else:
         print_campaign(result.campaigns[0])
     for path in dict.fromkeys(campaign.path for campaign in result.campaigns):
-        typer.echo(f"computed by the {path}")
-    typer.echo(f"{out}: report.html, summary.json, runs.parquet and, of each step, anees.csv and anees.png")
+        say(f"computed by the {path}")
+    say(f"{out}: report.html, summary.json, runs.parquet and, of each step, anees.csv and anees.png")
 
 
 def print_sweep(sweep: Sweep) -> None:

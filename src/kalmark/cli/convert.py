@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import writable
+from kalmark.cli.shared import Trust, say, writable
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ def convert(
     ],
     log_format: Annotated[str | None, typer.Option("--format", help="Format of IN, if not recognised.")] = None,
     robot: Annotated[str | None, typer.Option(help="Of this robot's path: .tum, .kitti.")] = None,
+    trust: Trust = False,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write a folder of Parquet files instead of CSV.")] = False,
 ) -> None:
     """Write a log as a native one, a folder of CSV files; with its results as MCAP or g2o; a path as TUM or KITTI."""
@@ -41,7 +42,7 @@ def convert(
         writable(out.parent)
     else:
         writable(out)
-    log, run = _read(source, log_format, whole=out.suffix != G2O)
+    log, run = _read(source, log_format, trust, whole=out.suffix != G2O)
     if out.suffix in POSES:
         _write_path(out, log, run, robot)
         return
@@ -51,11 +52,11 @@ def convert(
         from kalmark.results.mcap import export
 
         counts = export(out, log, run)
-        typer.echo(f"{out}: {sum(counts.values())} messages on {', '.join(sorted(counts))}")
+        say(f"{out}: {sum(counts.values())} messages on {', '.join(sorted(counts))}")
     elif log is not None:
         write_native(log, out, parquet=parquet)
     if log is not None:
-        typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}, read as {log.format}")
+        say(f"{out}: {len(log)} events of {', '.join(log.robots)}, read as {log.format}")
 
 
 def _write_path(out: Path, log: Log | None, run: Run | None, robot: str | None) -> None:
@@ -77,7 +78,7 @@ def _write_path(out: Path, log: Log | None, run: Run | None, robot: str | None) 
         there = ", ".join(paths) or "none: only a run has an estimated path, and this log has no truth"
         raise KalmarkError(f"{out}: paths of {there}; expected one, or --robot with one of them")
     files = write_path(out, paths[names[0]].t_ns, paths[names[0]].poses)
-    typer.echo(f"{', '.join(map(str, files))}: {len(paths[names[0]])} poses of {names[0]}")
+    say(f"{', '.join(map(str, files))}: {len(paths[names[0]])} poses of {names[0]}")
 
 
 def _write_graph(out: Path, source: Path, log: Log | None, run: Run | None) -> None:
@@ -92,7 +93,7 @@ def _write_graph(out: Path, source: Path, log: Log | None, run: Run | None) -> N
     write(out, g2o_text(run, log, slam.robots))
 
 
-def _read(source: Path, log_format: str | None, whole: bool) -> tuple[Log | None, Run | None]:
+def _read(source: Path, log_format: str | None, trust: bool, whole: bool) -> tuple[Log | None, Run | None]:
     """Return the log, with `whole` increments as it has them, and the run if `source` is the folder of one."""
     from kalmark.logs import open_log
 
@@ -101,7 +102,9 @@ def _read(source: Path, log_format: str | None, whole: bool) -> tuple[Log | None
         from kalmark.config import open_run
         from kalmark.results.run import Run
 
-        return open_run(source / "config.yaml", overrides=overrides)[1], Run.load(source)
+        run = Run.load(source, trust)
+        run.run_plugins()
+        return open_run(source / "config.yaml", overrides=overrides)[1], run
     if source.suffix in (".yaml", ".yml"):
         from kalmark.config import open_run
 

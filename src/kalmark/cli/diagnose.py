@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
-from kalmark.cli.shared import RunFolder, computing, print_table
+from kalmark.cli.shared import RunFolder, Trust, computing, print_table, say
 
 
 def diagnose(
     run: RunFolder,
+    trust: Trust = False,
     observations: Annotated[
         int, typer.Option(min=100, help="About how many observations to take; more is slower.")
     ] = 20_000,
@@ -27,21 +28,21 @@ def diagnose(
     from kalmark.results.verdict import verdict_lines
 
     with computing():
-        loaded = Run.load(run)
+        loaded = Run.load(run, trust)
         verdict = diagnosed(loaded, observations, progress=True)
         write(run / "summary.json", json.dumps(loaded.summary, indent=2, allow_nan=False) + "\n")
         picture = run / "diagnosis.png"
         save_figure(draw_diagnosis(loaded, verdict), picture)
     if as_json:
-        typer.echo(json.dumps(verdict.as_dict(), indent=2))
+        say(json.dumps(verdict.as_dict(), indent=2))
         return
     for line in verdict_lines(verdict.as_dict(), shown=None):
-        typer.echo(line)
-    typer.echo(f"(by the {verdict.checked})")
+        say(line)
+    say(f"(by the {verdict.checked})")
     rows = [row.cells() for row in breakdown(loaded)]
     print_table("innovations", ("of", "", "observations", "NIS per dof", "mean (sigma)", ""), rows, align="<<>>><")
     parts = list(nees_parts(loaded))
     if parts:
         columns = ("robot", "part", "NEES per dof", "outside its band from t (s)")
         print_table("against the truth", columns, parts, align="<<>>")
-    typer.echo(str(picture))
+    say(str(picture))

@@ -9,11 +9,12 @@ from typing import Annotated
 
 import typer
 
-from kalmark.cli.shared import RunFolder, computing, print_summary, print_table, writable
+from kalmark.cli.shared import RunFolder, Trust, computing, print_summary, print_table, say, writable
 
 
 def evaluate(
     run: RunFolder,
+    trust: Trust = False,
     truth: Annotated[
         Path | None,
         typer.Option(metavar="LOG", help="Judge by the truth of this log, or by a file of poses: TUM, KITTI."),
@@ -29,7 +30,7 @@ def evaluate(
     from kalmark.results.run import Run
 
     with computing():
-        loaded = Run.load(run)
+        loaded = Run.load(run, trust)
         if truth is not None:
             log = open_log(truth)
             robots = loaded.history.robots
@@ -40,13 +41,14 @@ def evaluate(
         if batch and truth is None:
             write(run / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
     if as_json:
-        typer.echo(json.dumps(summary, indent=2))
+        say(json.dumps(summary, indent=2))
     else:
         print_summary(str(run), summary)
 
 
 def report(
     run: RunFolder,
+    trust: Trust = False,
     video: Annotated[
         bool, typer.Option("--video", help="Also write video.mp4 (video.gif where ffmpeg is not installed).")
     ] = False,
@@ -59,17 +61,18 @@ def report(
     """Write map.png, report.html and a figure of each camera's last scan again."""
     from kalmark.results.run import Run
 
-    loaded = Run.load(run)
+    loaded = Run.load(run, trust)
     for path in loaded.report(run, world):
-        typer.echo(str(path))
+        say(str(path))
     if video:
         from kalmark.results.video import write_video
 
-        typer.echo(str(write_video(loaded, run / "video.mp4", fps, world=world)))
+        say(str(write_video(loaded, run / "video.mp4", fps, world=world)))
 
 
 def view(
     run: RunFolder,
+    trust: Trust = False,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
 ) -> None:
     """Replay a run: its page, with a slider through time, a map that turns, errors and associations."""
@@ -79,9 +82,9 @@ def view(
 
     page = run / "report.html"
     if not page.is_file() or not (run / "summary.json").is_file():
-        Run.load(run).report(run)
+        Run.load(run, trust).report(run)
     shown = open_ and webbrowser.open(page.resolve().as_uri())
-    typer.echo(f"{page}{'' if shown or not open_ else ': no browser was found, open it yourself'}")
+    say(f"{page}{'' if shown or not open_ else ': no browser was found, open it yourself'}")
 
 
 def compare(
@@ -98,13 +101,13 @@ def compare(
     writable(out.parent)
     told = compared({str(run): Run.load(run) for run in runs})
     if as_json:
-        typer.echo(json.dumps(told.figures, indent=2))
+        say(json.dumps(told.figures, indent=2))
     else:
         for title, rows in told.tables():
             print_table(title, ("", *told.names), rows, align="<" + ">" * len(told.names))
     out.parent.mkdir(parents=True, exist_ok=True)
     save_figure(draw_comparison(told), out)
-    typer.echo(str(out), err=as_json)
+    say(str(out), err=as_json)
 
 
 def explain(
@@ -113,6 +116,7 @@ def explain(
         float, typer.Option(metavar="T", help="The log's time in s, as in associations.csv; else since the first scan.")
     ],
     robot: Annotated[str | None, typer.Option(help="Of this robot. (default: the nearest scan of any)")] = None,
+    trust: Trust = False,
 ) -> None:
     """Say why one scan's observations became what they did, and draw it: what each was compared with, d2, gates."""
     from kalmark.results.explain import explain as explanation_of
@@ -121,10 +125,10 @@ def explain(
     from kalmark.results.recording import file_name
     from kalmark.results.run import Run
 
-    loaded = Run.load(run)
+    loaded = Run.load(run, trust)
     told = explanation_of(loaded, scan, robot)
     for line in told.lines():
-        typer.echo(line)
+        say(line)
     path = run / f"scan_{file_name(told.robot)}_{told.in_log}.png"
     save_figure(draw_scan(loaded, told), path)
-    typer.echo(str(path))
+    say(str(path))

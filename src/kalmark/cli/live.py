@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from kalmark.cli.shared import Overrides, computing, slam_of, writable
+from kalmark.cli.shared import Overrides, computing, say, slam_of, writable
 from kalmark.errors import DivergedError, KalmarkError
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class Checkpoints:
                 self.saved = self.slam.state.t_ns
             except KalmarkError as error:
                 if not self.failed:
-                    typer.echo(f"kalmark: warning: {error}", err=True)
+                    say(f"kalmark: warning: {error}", err=True)
                 self.failed = True
         now = time.monotonic()
         self.due = now + max(self.every_s, (now - begin) / BUSY)
@@ -148,7 +148,7 @@ def live(
             kept.end(told)
             if signals.came == signal.SIGINT:
                 raise KeyboardInterrupt from None
-            typer.echo(f"kalmark: ended by {error}", err=True)
+            say(f"kalmark: ended by {error}", err=True)
         finally:
             signals.leave()
     if told.lost:
@@ -182,7 +182,7 @@ def serve(
     except OSError as error:
         raise KalmarkError(f"--listen {port}: {error.strerror}, expected a free port") from None
     with server:
-        typer.echo(f"listening on {HERE}:{server.getsockname()[1]}", err=True)
+        say(f"listening on {HERE}:{server.getsockname()[1]}", err=True)
         server.settimeout(idle_s)
         while not told.lost:
             try:

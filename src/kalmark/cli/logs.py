@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, print_table, writable
+from kalmark.cli.shared import Overrides, print_table, say, writable
 
 if TYPE_CHECKING:
     from kalmark.simulate import World
@@ -34,8 +34,8 @@ def simulate(
     log = sim.simulate(loaded, seed)
     write_native(log, out)
     write(out / "config.yaml", fitting_config(loaded, seed))
-    typer.echo(f"{out}: {len(log)} events of {', '.join(log.robots)}; map them with")
-    typer.echo(f"kalmark run {shlex.quote(str(out / 'config.yaml'))}")
+    say(f"{out}: {len(log)} events of {', '.join(log.robots)}; map them with")
+    say(f"kalmark run {shlex.quote(str(out / 'config.yaml'))}")
 
 
 def fitting_config(world: World, seed: int) -> str:
@@ -57,7 +57,7 @@ def list_() -> None:
 
     rows = [(d.name, f"{d.bytes / 1e6:.1f} MB", d.what, d.licence) for d in list_data()]
     print_table("", ("name", "size", "what", "licence"), rows, align="<><<")
-    typer.echo("\nNot fetched; put a copy of your own where it is found:\n")
+    say("\nNot fetched; put a copy of your own where it is found:\n")
     print_table("", ("name", "what", "put"), [(d.name, d.what, d.put) for d in OWN_COPIES], align="<<<")
 
 
@@ -69,7 +69,7 @@ def fetch(name: Annotated[str, typer.Argument(help="A dataset, or a group like m
 
     from kalmark.logs.download import fetch as fetch_data
 
-    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn()
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), DownloadColumn(), TimeRemainingColumn()
     bar = Progress(*columns, console=Console(stderr=True), transient=True)
     task = bar.add_task(name, total=None)
 
@@ -78,7 +78,7 @@ def fetch(name: Annotated[str, typer.Argument(help="A dataset, or a group like m
         bar.update(task, description=file, completed=done, total=total)
 
     try:
-        typer.echo(str(fetch_data(name, show)))
+        say(str(fetch_data(name, show)))
     finally:
         if bar.live.is_started:
             bar.stop()
@@ -95,7 +95,7 @@ def config(
     if name is None:
         _list(shipped_configs())
     else:
-        typer.echo(resolve_config(name).read_text(encoding="utf-8"), nl=False)
+        say(resolve_config(name).read_text(encoding="utf-8").rstrip("\n"))
 
 
 def worlds(
@@ -110,7 +110,7 @@ def worlds(
     if name is None:
         _list(shipped_worlds())
     else:
-        typer.echo(resolve_name(name, shipped_worlds(), "world").read_text(encoding="utf-8"), nl=False)
+        say(resolve_name(name, shipped_worlds(), "world").read_text(encoding="utf-8").rstrip("\n"))
 
 
 def _list(shipped: dict[str, Path]) -> None:

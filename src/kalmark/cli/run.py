@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, computing, print_summary, slam_of, writable
+from kalmark.cli.shared import Overrides, computing, print_summary, say, slam_of, writable
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def run(
             except KalmarkError as error:
                 if batch:
                     raise
-                typer.echo(f"warning: no batch solution: {error}", err=True)
+                say(f"warning: no batch solution: {error}", err=True)
         judge(result)
         result.save(out)
     finish(result, out, name_on(name_of(Path(config), "config"), result.log.name))
@@ -84,7 +84,7 @@ def warm_up(
     """Compile beforehand all that runs of a configuration need."""
     with computing():
         slam_of(config, overrides or ()).warm_up()
-    typer.echo("compiled: no event of such a run waits for it")
+    say("compiled: no event of such a run waits for it")
 
 
 def judge(result: Run) -> None:
@@ -100,12 +100,12 @@ def finish(result: Run, out: Path, title: str) -> None:
 
     print_summary(title, result.summary)
     if result.skipped:
-        typer.echo(f"{count(result.summary['skipped'], 'record')} left out:")
+        say(f"{count(result.summary['skipped'], 'record')} left out:")
         for line in result.skipped[:SHOWN]:
-            typer.echo(f"  {line}")
+            say(f"  {line}")
         if len(result.skipped) > SHOWN:
-            typer.echo("  ...")
-    typer.echo(f"{out}: map.png, report.html and the rest of the run")
+            say("  ...")
+    say(f"{out}: map.png, report.html and the rest of the run")
 
 
 def demo(

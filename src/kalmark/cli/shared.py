@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.errors import KalmarkError
+from kalmark.errors import KalmarkError, printable
 from kalmark.results.words import (
     BATCH,
     DIFFERENCE_COLUMNS,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
 ]
+Trust = Annotated[bool, typer.Option("--trust", help="Run the plug-ins that the config.yaml of RUN names.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that `kalmark run` wrote.")]
 _SHOWN_IF_ANY = {"new", "ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
@@ -76,6 +77,11 @@ def writable(folder: Path) -> Path:
     return folder
 
 
+def say(text: str, err: bool = False) -> None:
+    """Print lines: all text for a terminal goes through here or `print_table`, so that no name in it is obeyed."""
+    typer.echo("\n".join(map(printable, text.split("\n"))), err=err)
+
+
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
     from kalmark.results.calibration import ESTIMATE_COLUMNS, MOUNT_COLUMNS, estimate_rows, mount_rows
@@ -99,7 +105,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         if any(key == "pose_nees" for key, _, _ in shown):
             most = [figure(f["pose_nees_most"], 2) for f in robots.values() if f.get("pose_nees_most") is not None]
             this = f", up to {', '.join(most)} in this one" if most else ""
-            typer.echo(f"consistent pose NEES: {summary.get('pose_dof', 3)} averaged over many runs{this}\n")
+            say(f"consistent pose NEES: {summary.get('pose_dof', 3)} averaged over many runs{this}\n")
     mounts = mount_rows(summary)
     if mounts:
         print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")
@@ -115,10 +121,10 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
             print_table(DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, differences, align="<>>>")
     for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
         for line in summary.get(key, ()):
-            typer.echo(f"{kind}: {line}")
+            say(f"{kind}: {line}")
     verdict = summary.get("verdict")
     for n, line in enumerate(verdict_lines(verdict) if verdict else ()):
-        typer.echo(f"{'  ' if n else 'verdict: '}{line}")
+        say(f"{'  ' if n else 'verdict: '}{line}")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:
@@ -133,14 +139,16 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]
 
     table = Table(box=box.SIMPLE, show_header=any(columns))
     for n, (column, side) in enumerate(zip(columns, align, strict=True)):
-        table.add_column(Text(column), justify="right" if side == ">" else "left", overflow="fold", no_wrap=n == 0)
+        table.add_column(
+            Text(printable(column)), justify="right" if side == ">" else "left", overflow="fold", no_wrap=n == 0
+        )
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+        table.add_row(*(Text(printable(cell)) for cell in row))
     console = Console()
     if not console.is_terminal:
         console.width = 140  # into a file or a pipe: whole lines
     if title:
-        console.print(Text(title, style="bold"))
+        console.print(Text(printable(title), style="bold"))
     console.print(table)
 
 

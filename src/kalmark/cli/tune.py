@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, computing, number, print_table, writable
+from kalmark.cli.shared import Overrides, computing, number, print_table, say, writable
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def tune(
     write(out, text)
     save_figure(draw_tuning(tuning, Path(config).stem), picture)
     show(tuning)
-    typer.echo(f"{out}: the new configuration; {picture}: the NIS before and after")
+    say(f"{out}: the new configuration; {picture}: the NIS before and after")
 
 
 def show(tuning: Tuning) -> None:
@@ -71,4 +71,4 @@ def show(tuning: Tuning) -> None:
     head = ("", "NIS per dof before", "after", "log-likelihood", "left out (%) before", "after")
     print_table("", head, rows, align="<>>>>>")
     for line in correlation_lines(tuning):
-        typer.echo(line)
+        say(line)

@@ -20,6 +20,7 @@ from ruamel.yaml.error import MarkedYAMLError
 from ruamel.yaml.reader import ReaderError
 
 from kalmark.errors import ConfigError
+from kalmark.files import refuse_aliases
 
 EACH = "each"
 SHARED = ("robots", "sensors")  # the mappings whose entry `each` stands for all
@@ -95,6 +96,7 @@ def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     content = _parse(text, str(path))
+    refuse_aliases(content, str(path), ConfigError)
     if not isinstance(content, CommentedMap) or not content:
         got = "an empty file" if not content and not isinstance(content, int | float) else show(content)
         raise ConfigError(f"{path}:1:1: got {got}, expected a mapping of keys")

@@ -111,6 +111,7 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     It reads the log without its truth (`blind`).  A bar on standard error tells how far it is if `progress`.  Raises
     KalmarkError if the log of the run cannot be read again.
     """
+    run.run_plugins()
     seen, log = blind(run)
     verdict = _with_signs(seen, _of_causes(seen, log, most, progress))
     if not run.summary:

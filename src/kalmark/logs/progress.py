@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
+from kalmark.errors import printable
+
 T = TypeVar("T")
 
 
@@ -48,10 +50,10 @@ def _bar(what: str, total: int | None) -> Any:
     from rich import progress as rich
     from rich.console import Console
 
-    parts = (rich.TextColumn("{task.description}"), rich.BarColumn(), rich.MofNCompleteColumn())
+    parts = (rich.TextColumn("{task.description}", markup=False), rich.BarColumn(), rich.MofNCompleteColumn())
     times = (rich.TimeElapsedColumn(), rich.TimeRemainingColumn())
     behind = rich.TextColumn("{task.fields[note]}")
     bar = rich.Progress(*parts, *times, behind, console=Console(stderr=True), auto_refresh=False)
-    bar.add_task(what, total=total, note="")
+    bar.add_task(printable(what), total=total, note="")
     bar.start()
     return bar

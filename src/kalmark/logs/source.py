@@ -17,6 +17,7 @@ from ruamel.yaml import YAML
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, order, shown
+from kalmark.files import refuse_aliases
 from kalmark.geometry import rotations
 from kalmark.logs.log import Log
 
@@ -302,6 +303,7 @@ def mapping(path: Path) -> dict[str, Any]:
         line = where.line + 1 if where is not None else 1
         problem = " ".join(str(getattr(error, "problem", None) or error).split()) or type(error).__name__
         raise LogError(f"{path}:{line}: not YAML ({problem[:80]}), expected a mapping") from None
+    refuse_aliases(content, str(path), LogError)
     if not isinstance(content, dict):
         raise LogError(f"{path}:1: holds {type(content).__name__}, expected a mapping")
     if not _is_plain(content):

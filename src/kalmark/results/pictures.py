@@ -63,6 +63,7 @@ def _read_again(run: Recording) -> Log | None:
         return None
     log = None
     with suppress(KalmarkError):
+        run.run_plugins()
         log = open_config_log(validate(Tree({"log": section}), Config), run.log.path)
         log = with_images(config_of(Tree(deepcopy(dict(run.config))), None), log)
     return log

@@ -26,8 +26,8 @@ from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
-from kalmark.events import listed
-from kalmark.files import locked, replace_file, write
+from kalmark.events import listed, shown
+from kalmark.files import locked, read_arrays, refuse_aliases, replace_file, write
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of, seconds
 from kalmark.results.history import History
@@ -119,6 +119,7 @@ def config_yaml(config: dict[str, Any]) -> str:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a saved configuration.  Raises RunError if it is not a mapping."""
     config = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    refuse_aliases(config, str(path), RunError)
     if not isinstance(config, dict):
         raise RunError(f"{path}: got {type(config).__name__}, expected a mapping of keys")
     return config
@@ -155,7 +156,8 @@ class Recording:
 
     `summary` is what `Run.evaluate` last returned.  `slam`, the filter after the last event, and `source`, the log
     itself, are None in a run that was loaded; `final_slam` reads the filter from ``map.kmk``.  `reference` holds what
-    others made of the same log, figures by their name, which the summary repeats.
+    others made of the same log, figures by their name, which the summary repeats.  Plug-ins of the
+    configuration are run only if the run is `trusted`.
     """
 
     history: History
@@ -172,6 +174,7 @@ class Recording:
     folder: Path | None = None
     summary: dict[str, Any] = field(default_factory=dict)
     reference: dict[str, Any] = field(default_factory=dict)
+    trusted: bool = True
 
     def __repr__(self) -> str:
         steps, lost = len(self.history.t_ns), f", stopped: {self.stopped}" if self.stopped else ""
@@ -208,7 +211,7 @@ class Recording:
     def final_slam(self) -> Slam:
         """Return the filter after the last event, read from ``map.kmk`` if the run was loaded.
 
-        This runs the `plugins` of the run's configuration.
+        This runs the `plugins` of the run's configuration.  Raises RunError if the run is not trusted.
         """
         if self.slam is not None:
             return self.slam
@@ -220,13 +223,24 @@ class Recording:
         return Slam.load(self.folder / "map.kmk")
 
     def run_plugins(self) -> None:
-        """Run the `plugins` of the run's configuration: what they register is known from then on."""
+        """Run the `plugins` of the run's configuration: what they register is known from then on.
+
+        Raises RunError if there are some, and the run is not trusted: whoever wrote the folder wrote their names.
+        """
+        if self.config.get("plugins") and not self.trusted:
+            raise RunError(
+                f"{self.folder}/config.yaml names plug-ins, {shown(self.config['plugins'])}, whose code would be run: "
+                "expected --trust, or Run.load(folder, trust=True), of who knows that they are his"
+            )
         for plugin in self.config.get("plugins") or ():
             load_plugin(Path(plugin))
 
     @classmethod
-    def load(cls, folder: str | Path) -> Self:
-        """Read a run folder.  Raises RunError naming the file that is missing or cannot be read."""
+    def load(cls, folder: str | Path, trust: bool = False) -> Self:
+        """Read a run folder; `trust`: what follows may run the plug-ins that its configuration names.
+
+        Raises RunError naming the file that is missing or cannot be read.
+        """
         folder = Path(folder)
         for name in NEEDED:
             if not (folder / name).is_file():
@@ -234,8 +248,7 @@ class Recording:
         try:
             with locked(folder, shared=True):  # no other program replaces it meanwhile
                 summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-                with np.load(folder / "history.npz", allow_pickle=False) as arrays:
-                    named = {key: arrays[key] for key in arrays.files}
+                named = read_arrays(folder / "history.npz", RunError)
                 log = summary["log"]
                 return cls(
                     history=History.from_arrays(named),
@@ -251,6 +264,7 @@ class Recording:
                     ],
                     stopped=summary.get("stopped", ""),
                     folder=folder,
+                    trusted=trust,
                     summary=summary,
                     reference={name: summary[name] for name in named["reference"].tolist()},
                 )

@@ -12,7 +12,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.association.protocol import Association
 from kalmark.errors import ModelError
-from kalmark.events import MOST, ROUNDED, Scan, finite, shown, unit_quaternion
+from kalmark.events import MOST, ROUNDED, Scan, finite, is_writable, shown, unit_quaternion
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
@@ -150,6 +150,9 @@ class Robot:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ModelError(f"Robot: name is {shown(self.name)}, expected a text that is not empty")
+        for name in (self.name, *(name for name in self.sensors if isinstance(name, str))):
+            if not is_writable(name):
+                raise ModelError(f"Robot: the name {shown(name)} has control characters or surrogates, expected none")
         what = f"robot {self.name!r}"
         if self.gaps not in ACTIONS:
             raise ModelError(f"{what}: gaps is {shown(self.gaps)}, expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}")

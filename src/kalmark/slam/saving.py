@@ -34,7 +34,7 @@ from kalmark.association import Association
 from kalmark.declare import by_class_name, registered_name
 from kalmark.errors import KalmarkError, MapError
 from kalmark.events import LONGEST_PAUSE_S, Id
-from kalmark.files import replace_file
+from kalmark.files import refuse_bomb, replace_file
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.maps import restored as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
@@ -365,6 +365,7 @@ def load(
 def _read(path: Path) -> tuple[Description, dict[str, bytes]]:
     """Return the description and the arrays' files, their checksums compared."""
     with zipfile.ZipFile(path) as archive:
+        refuse_bomb(archive, path, MapError)
         state = json.loads(archive.read(DESCRIPTION))
         if state.get("kalmark") != VERSION:
             raise MapError(f"version is {state.get('kalmark')!r}, expected {VERSION}")
