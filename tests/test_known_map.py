@@ -98,3 +98,47 @@ def test_a_missing_or_indefinite_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="landmark 1: cov has the eigenvalue -1"):
         km.Slam.from_config(tmp_path / "c.yaml")
     np.testing.assert_array_equal(read_known(tmp_path / "bad.csv", exact=True)[0].mean, [0, 0])
+
+
+SURVEY = """
+default_body: rig
+bodies:
+ - rig: {is_static: false, default_tag_size: 0.1}
+ - wall:
+    is_static: true
+    pose:
+      position: {x: 1, y: 0, z: 0}
+      rotation: {x: 0, y: 0, z: 1.5707963267948966}
+      position_noise: {x: 0.1, y: 0, z: 0}
+      rotation_noise: {x: 0, y: 0, z: 0.02}
+    tags:
+     - id: 4
+       size: 0.1
+       pose:
+         position: {x: 2, y: 0, z: 0}
+         rotation: {x: 0, y: 0, z: 0}
+         position_noise: {x: 0.3, y: 0, z: 0.2}
+         rotation_noise: {x: 0.03, y: 0, z: 0}
+     - {id: 5, size: 0.1}
+"""
+
+
+def test_the_surveyed_tags_of_tagslam_are_known_with_the_noise_of_their_body_and_their_own(tmp_path: Path) -> None:
+    (tmp_path / "tagslam.yaml").write_text(SURVEY)
+    (tmp_path / "c.yaml").write_text(
+        "map: {known: tagslam.yaml}\nlandmarks: {type: tag}\n"
+        "robots: {each: {motion: {type: odometry_3d}, sensors: {cam: {type: tag_pose}}}}\n"
+    )
+    slam = km.Slam.from_config(tmp_path / "c.yaml")
+    assert slam.landmarks().ids == [4]
+    np.testing.assert_allclose(slam.mean(4), [1, 2, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
+    # the body's x axis is y of the map; its turn about z moves the tag, 2 m away along y, along x
+    expected = np.diag([0.04**2, 0.1**2 + 0.3**2, 0.2**2, 0.0, 0.03**2, 0.02**2])
+    expected[0, 5] = expected[5, 0] = -2 * 0.02**2
+    np.testing.assert_allclose(slam.covariance(4), expected, atol=1e-12)
+    (tmp_path / "tagslam.yaml").write_text(SURVEY.replace("is_static: true", "is_static: false"))
+    with pytest.raises(ConfigError, match=r"no tag has a pose on a static body with a pose"):
+        km.Slam.from_config(tmp_path / "c.yaml")
+    (tmp_path / "tagslam.yaml").write_text(SURVEY.replace("x: 0.3", "x: far"))
+    with pytest.raises(ConfigError, match=r"tagslam\.yaml: .*far.*, expected poses with position and rotation"):
+        km.Slam.from_config(tmp_path / "c.yaml")

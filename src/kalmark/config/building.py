@@ -21,12 +21,15 @@ from kalmark.declare import built_in, registered_name
 from kalmark.detect.scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Frame, Scan
+from kalmark.logs import tagslam
 from kalmark.logs.images.pictures import size_of
-from kalmark.logs.known_map import KnownLandmark, read_known
+from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
 from kalmark.logs.log import Log
 from kalmark.models.inertial import Inertial, at_rest
+from kalmark.models.landmarks import PointHeight2D
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import state_columns
+from kalmark.models.seen import Raised
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 
@@ -49,9 +52,10 @@ def build_slam(config: Config, log: Log | None = None) -> Slam:
     kept_map = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
     kept_map["longest_pause_s"] = config.longest_pause_s
     slam: Slam = _made(config, ("robots",), Slam, robots, **types, **kept_map, upkeep=kept)
-    for landmark in _known(config, log):
+    for name, mean, cov, columns in _known(config, log):
+        high = columns == HIGH and robots[0].motion.space.world == "plane"
         try:
-            slam.add_landmark(*landmark)
+            slam.add_landmark(name, mean, cov, PointHeight2D() if high else None)
         except MapError as error:
             raise config.error(("map", "known"), f"got {m.known!r}, {error}") from None
     return slam
@@ -65,9 +69,12 @@ def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
     if given == TRUTH:
         if log is None or not log.landmarks:
             raise config.error(("map", "known"), "got truth, expected a log that has true landmarks")
-        return [KnownLandmark(name, place, None) for name, place in log.landmarks.items()]
+        return [KnownLandmark(name, place) for name, place in log.landmarks.items()]
     try:
-        return read_known(known_path(config), exact, None if log is None else log.origin)
+        path = known_path(config)
+        if path.suffix in (".yaml", ".yml"):
+            return tagslam.surveyed(path, exact)
+        return read_known(path, exact, None if log is None else log.origin)
     except LogError as error:
         raise config.error(("map", "known"), str(error)) from None
 
@@ -175,6 +182,9 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
     if world == "plane" and sensor.initialization.type != "immediate":
         own["initialization"] = _made(config, (*path, "initialization"), model_of, sensor.initialization)
     model = _made(config, path, model_of, sensor)
+    if world == "plane" and sensor.mount.z_m and not isinstance(model, Raised):
+        what = f"got {sensor.mount.z_m:g}, expected none: a {sensor.type} measures in the plane"
+        raise config.error((*path, "mount", "z_m"), what)
     return _made(config, path, Mount, model, at=pose_of(sensor.mount), **own)
 
 

@@ -100,7 +100,10 @@ class SpacePose(_Place):
 class MountConfig(PlanePose):
     """Where a sensor sits, in the robot's frame.  If either sigma is above 0, the mount is calibrated as below."""
 
-    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_SPACE, _SPACE_FOR_PLANE)
+    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_SPACE[1:], _SPACE_FOR_PLANE)
+
+    z_m: Number = 0.0
+    """Height above the plane of the map, of what measures distances: range, signal_strength, range_difference."""
 
 
 class SpaceMountConfig(SpacePose):
@@ -232,6 +235,11 @@ class PlaneMounted(Mounted):
     """Start landmarks at first sight, or late; late ones are points."""
     mount: MountConfig = MountConfig()
     """Where the sensor sits on the robot."""
+
+    @property
+    def height_m(self) -> float:
+        """That of the mount, the parameter `height_m` of a sensor of distances."""
+        return self.mount.z_m
 
 
 class SpaceMounted(Mounted):
@@ -461,7 +469,7 @@ class MapConfig(Section):
     """Inverse-depth and anchored points become Euclidean below this linearity index; or off."""
 
     known: str | None = None
-    """Landmarks known beforehand: a landmarks.csv beside this file or in KALMARK_DATA, or `truth`: those of the log."""
+    """Landmarks known: a landmarks.csv or tagslam.yaml, beside this file or in KALMARK_DATA; `truth`: of the log."""
     exact: bool = False
     """Take the landmarks of `known` as exact, whatever the columns cov_... of the file say."""
 

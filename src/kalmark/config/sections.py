@@ -211,10 +211,12 @@ def _section(role: str, name: str, world: str, models: tuple[type, ...]) -> type
     fields: dict[str, Any] = {} if name == role else {"type": (str, name)}
     if role == "sensor":
         fields["detector"] = (Annotated[Any, Choice("detector", sensor=models[0])] | None, None)
+    base = BASES.get((role, world), ModelSection)
     for parameter in parameters(models[0]):
+        if parameter.name in vars(base):  # it is another key of the section
+            continue
         others = [own for model in models[1:] for own in parameters(model) if own.name == parameter.name]
         fields[parameter.name] = _field(parameter, others, models)
-    base = BASES.get((role, world), ModelSection)
     text = "  ".join(dict.fromkeys(map(summary, models)))
     made: Any = create_model(name, __base__=base, __doc__=text, **fields)
     made.of_role, made.of_name, made.of_world = role, name, world

@@ -16,19 +16,23 @@ from kalmark.logs.source import Request
 from kalmark.logs.table import Refused, Row, read_table
 
 PLACES = ("x_m", "y_m", "z_m", "signature", "qx", "qy", "qz", "qw")
-KINDS = {
-    ("x_m", "y_m"), ("x_m", "y_m", "signature"), ("x_m", "y_m", "z_m"), ("x_m", "y_m", "z_m", *PLACES[4:]),
-}  # fmt: skip
+HIGH = PLACES[:3]
+TAG = (*HIGH, *PLACES[4:])
+KINDS = {PLACES[:2], (*PLACES[:2], "signature"), HIGH, TAG}
 LETTERS = {"x_m": "x", "y_m": "y", "z_m": "z", "signature": "s"}
 TURNS = ("rx", "ry", "rz")  # of a pose's error, after its position
 
 
 class KnownLandmark(NamedTuple):
-    """A landmark of a known map: its place (n,), and the covariance of its error, None of one known exactly."""
+    """A landmark of a known map: its place (n,), and the covariance of its error, None of one known exactly.
+
+    `columns` name the numbers of its place: in the plane the third may be a height or a signature.
+    """
 
     id: Id
     mean: Array
-    cov: Array | None
+    cov: Array | None = None
+    columns: tuple[str, ...] = ()
 
 
 def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> list[KnownLandmark]:
@@ -49,7 +53,7 @@ def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> 
         if names not in KINDS:
             raise Refused(f"{', '.join(names) or 'no place'}, expected the place of a point or the pose of a tag")
         mean = np.array(row.numbers(names))
-        found[name] = KnownLandmark(name, mean, None if exact else _covariance(row, names))
+        found[name] = KnownLandmark(name, mean, None if exact else _covariance(row, names), names)
 
     def refuse(line: str) -> None:
         raise LogError(line)

@@ -19,9 +19,11 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
+from kalmark.geometry.rotations import matrix
 from kalmark.logs.bag.reading import Bag, stamp
 from kalmark.logs.calibration import lens
 from kalmark.logs.columns import CORNERS, INCREMENT3
+from kalmark.logs.known_map import TAG, KnownLandmark
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     Format,
@@ -158,6 +160,41 @@ def described_camera(camera: dict[str, Any], mount: dict[str, float], pixel_nois
     section |= dict(zip(("width_px", "height_px"), map(int, camera["resolution"]), strict=True))
     section |= lens(camera["distortion_model"], camera["distortion_coeffs"])
     return section | {"sigma_px": pixel_noise, "mount": mount}
+
+
+# ------------------------------------------------------------------ the survey
+def surveyed(path: Path, exact: bool = False) -> list[KnownLandmark]:
+    """Return the tags of a tagslam.yaml that have a pose on a static body with a pose, as a known map.
+
+    Their covariances (6, 6) are those of `position_noise` (m) and `rotation_noise` (rad), standard deviations along and
+    about the axes of the pose itself: P = T_b P_b T_b' + T_t P_t T_t' for the tag t on the body b.  The correlation of
+    tags on one body is not kept.  Those without noise, and with `exact` all, are known exactly.  Raises LogError.
+    """
+    read_scene(path)
+    try:
+        bodies = [body for entry in mapping(path)["bodies"] for body in entry.values()]
+        placed = [(b["pose"], tag) for b in bodies if b["is_static"] and "pose" in b for tag in b.get("tags", [])]
+        tags = [(int(tag["id"]), frame_of(b), noise_of(b), frame_of(tag["pose"]), noise_of(tag["pose"]))
+                for b, tag in placed if "pose" in tag]  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogError(f"{path}: {error!r}, expected poses with position and rotation") from None
+    if not tags:
+        raise LogError(f"{path}: no tag has a pose on a static body with a pose, expected one for a known map")
+    found = []
+    for name, b, P_b, t, P_t in tags:
+        T, T_b, T_t = compose(b, t)
+        P = T_b @ P_b @ T_b.T + T_t @ P_t @ T_t.T
+        found.append(KnownLandmark(name, T, P if P.any() and not exact else None, TAG))
+    return found
+
+
+def noise_of(pose: dict[str, Any]) -> Array:
+    """Return the covariance (6, 6) of a pose as TagSLAM writes it, of errors in the frame that it is in."""
+    none = dict.fromkeys("xyz", 0.0)
+    sigmas = [[float(pose.get(f"{part}_noise", none)[axis]) for axis in "xyz"] for part in ("position", "rotation")]
+    R, P = matrix(frame_of(pose)[3:]), np.zeros((6, 6))
+    P[:3, :3], P[3:, 3:] = (R @ np.diag(np.square(each)) @ R.T for each in sigmas)
+    return P
 
 
 # ------------------------------------------------------------------ the bags

@@ -9,7 +9,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.geometry.frames3d import to_frame_many
 from kalmark.models.cameras import project_pinhole
-from kalmark.models.landmarks import Point2D, Point3D
+from kalmark.models.landmarks import Point2D, Point3D, PointHeight2D
 from kalmark.models.lines import crossing_angles, extended
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, UnknownDepth
 from kalmark.tracks.scan import ScanContext, Start
@@ -34,7 +34,12 @@ class Simplified(NamedTuple):
 
 
 def surveyed(model: Landmark, mean: Any) -> Landmark:
-    """Return the type of a landmark known beforehand: a point, also where a sensor would start one of unknown depth."""
+    """Return the type of a landmark known beforehand: a point, also where a sensor would start one of unknown depth.
+
+    In the plane one with three numbers has a height.
+    """
+    if model.space.world == "plane" and np.size(mean) == 3 != model.space.size:
+        return PointHeight2D()
     if not isinstance(model, UnknownDepth) or np.size(mean) == model.space.size:
         return model
     return Point2D() if model.space.world == "plane" else Point3D()

@@ -163,7 +163,7 @@ def _changing(model: Any, v: Array, y: Array) -> Any:
     if not isinstance(model, Spatial):
         return model.expect(v)[0]
     angular = np.array(model.angular, dtype=np.bool_)
-    return -type(model).expected(model.code, np.array(model.parameters), angular, np.ascontiguousarray(v), y)[1]
+    return -type(model).expected(model.code, model.constants, angular, np.ascontiguousarray(v), y)[1]
 
 
 def _inverse(

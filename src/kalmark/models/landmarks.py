@@ -70,6 +70,17 @@ class PointSignature2D(Point2D):
     space: ClassVar[Space] = Space("point_signature", (spaces.VECTOR, spaces.SCALAR))
 
 
+@register("landmark", "point_height")
+class PointHeight2D(Point2D):
+    """A surveyed point (x, y, z) at a height above the plane, in which the robot stays.
+
+    Sensors of distances measure the way through space; others see its place in the plane.
+    """
+
+    kind: ClassVar[str] = "point_height"
+    space: ClassVar[Space] = Space("point_height", (spaces.VECTOR, spaces.SCALAR))
+
+
 @register("landmark", "polar")
 class Polar2D(_Landmark):
     """A point of the plane by anchor, direction and distance (4 numbers), for ranges with poor bearings.

@@ -31,7 +31,6 @@ from kalmark.models.protocols import (
     FullSensor,
     Landmark,
     Motion,
-    Parametrized,
     Sensor,
     finds_depth,
     parameter_covariance,
@@ -167,7 +166,7 @@ def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
     """Return the argument of `linearize`, a `View` of compiled models or a `PythonView`; `mount` (3,) or (7,)."""
     angular = np.array(sensor.angular, dtype=np.bool_)
     if is_built_in(sensor, landmark):
-        par = np.array(sensor.parameters if isinstance(sensor, Parametrized) else NOTHING, dtype=np.float64)
+        par = np.array(sensor.constants, dtype=np.float64)
         varied = None if parameter_covariance(sensor) is None else type(sensor).varied
         plain = type(sensor) is sensors.RangeBearing and type(landmark) is landmarks.Point2D and varied is None
         models = landmark.look, type(sensor).expected, int(sensor.code)
@@ -308,7 +307,9 @@ def _linearized(
     _, look_at, expect_at, code, at, par, angular, vary_at = view
     pose = len(at)
     if len(head) > 2 * pose:
-        par = head[2 * pose :].copy()
+        par = par.copy()
+        for i in range(len(head) - 2 * pose):
+            par[i] = head[2 * pose + i]
     v, V_T, V_l = seen.look(look_at, (T, l))
     e, z, E_v = seen.expect(expect_at, (code, par, angular, v, y))
     E_T, E_l = chained(E_v, V_T), chained(E_v, V_l)

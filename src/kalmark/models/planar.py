@@ -1,4 +1,7 @@
-"""Sensors of the plane: each measures something at v = (x, y[, signature]) in its frame.  [S] A.4, Table 2."""
+"""Sensors of the plane: each measures something at v = (x, y[, signature]) in its frame.  [S] A.4, Table 2.
+
+A range alone has the same equation in space and to a landmark at another height: r = |v|, v with three numbers.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,11 @@ from kalmark.declare import Estimated, Limit, NotNegative, Number, Positive, dec
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import seen
-from kalmark.models.seen import Sensing, refuse_negative_ranges
+from kalmark.models.seen import Cone, Distancing, Expecting, Raised, raised, refuse_negative_ranges
 
-__all__ = ["Bearing", "Position2D", "Range", "RangeBearing", "RangeBearingSignature"]
+__all__ = ["Bearing", "Position2D", "Range", "Range3D", "RangeBearing", "RangeBearingSignature"]
 
-RANGE_BEARING, BEARING, RANGE, POSITION, RANGE_BEARING_SIGNATURE = range(1, 6)  # codes of the sensors
+RANGE_BEARING, BEARING, POSITION, RANGE_BEARING_SIGNATURE = range(1, 5)  # codes of the sensors
 BearingNoise = Annotated[Positive, "Noise of the bearing."]
 
 
@@ -33,11 +36,11 @@ def measured_in_plane(code: int, v: Array) -> tuple[Array, Array]:
             E_v[i, 0, 0] = E_v[i, 1, 1] = 1.0
         return e, E_v
     y, Y_p = scan_many(v)
-    first, last = (1, 2) if code == BEARING else (0, 1 if code == RANGE else 2)
-    m = last - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
+    first = 1 if code == BEARING else 0
+    m = 2 - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
     e, E_v = np.empty((k, m)), np.zeros((k, m, d))
     for i in range(k):
-        for j in range(first, last):
+        for j in range(first, 2):
             e[i, j - first] = y[i, j]
             E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
         if code == RANGE_BEARING_SIGNATURE:
@@ -58,6 +61,22 @@ def in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple
 
 
 @compiled
+def distance(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z (K, 1), E_v (K, 1, d) of ranges of v (K, d), e = (|v| + offset) / gain; `par` = gain, offset, height.
+
+    At v = 0, where a range has no derivative, E_v is 0.
+    """
+    k, d = v.shape
+    p, e, E_v = raised(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
+    for i in range(k):
+        r = math.sqrt(p[i, 0] * p[i, 0] + p[i, 1] * p[i, 1] + p[i, 2] * p[i, 2])
+        e[i, 0] = (r + par[1]) / par[0]
+        for j in range(d if r > 0.0 else 0):
+            E_v[i, 0, j] = p[i, j] / r / par[0]
+    return e, y - e, E_v
+
+
+@compiled
 def by_gain_and_offset(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
     """Return E_p (K, m, 2): how measurements e (K, m), the first a range, change with its gain and offset."""
     E_p = np.zeros((len(e), e.shape[1], 2))
@@ -67,7 +86,7 @@ def by_gain_and_offset(code: int, par: Array, angular: Flags, v: Array, e: Array
 
 
 @declared
-class _Planar(Sensing):
+class _Planar(Expecting):
     """What the planar sensors share: limits of sight, built-in expectation."""
 
     _: KW_ONLY
@@ -79,10 +98,6 @@ class _Planar(Sensing):
     expected: ClassVar[Any] = in_plane
     code: ClassVar[int]
 
-    def expect(self, v: Array) -> tuple[Array, Array]:
-        """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
-        return measured_in_plane(self.code, np.ascontiguousarray(v, dtype=np.float64))
-
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d) lie within the sensor's range limits and field of view."""
         distance, bearing = np.hypot(v[:, 0], v[:, 1]), np.abs(np.arctan2(v[:, 1], v[:, 0]))
@@ -91,7 +106,7 @@ class _Planar(Sensing):
 
 
 @declared
-class _Ranging(_Planar):
+class _Ranging(Expecting):
     """Sensors whose first component is a range, scale * distance + bias: its noise may grow with it.  [F].
 
     Where the scale or the bias has a sigma they are in the map, as the `parameters` gain = 1 / scale and offset =
@@ -132,33 +147,14 @@ class _Ranging(_Planar):
         gain, offset = parameters.tolist()
         return replace(self, scale=1.0 / gain, bias_m=offset / gain)
 
-    def expect(self, v: Array) -> tuple[Array, Array]:
-        """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""
-        e, E_v = super().expect(v)
-        e[:, 0] = self.scale * e[:, 0] + self.bias_m
-        E_v[:, 0] *= self.scale
-        return e, E_v
-
     def parameters_jacobian(self, v: Array) -> Array:
         """Return E_p (K, m, 2): how the measurements of v (K, d) change with gain and offset."""
-        e, _ = self.expect(v)
-        E_p = np.zeros((*e.shape, 2))
-        E_p[:, 0, 0], E_p[:, 0, 1] = -self.scale * e[:, 0], self.scale
-        return E_p
+        e, nothing = self.expect(v)[0], np.zeros(1, dtype=np.bool_)
+        return np.asarray(by_gain_and_offset(0, self.parameters, nothing, v, e))
 
     def distances(self, y: Array) -> Array:
         """Return the distances (K,) that measurements y (K, m) stand for."""
         return np.asarray((y[:, 0] - self.bias_m) / self.scale)
-
-    def points(self, y: Array) -> tuple[Array, Array]:
-        """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
-        seen = y[:, :2].copy()
-        if self.scale == 1.0 and self.bias_m == 0.0:
-            return inv_scan_many(seen)
-        seen[:, 0] = self.distances(y)
-        p, P_y = inv_scan_many(seen)
-        P_y[:, :, 0] /= self.scale
-        return p, P_y
 
     @property
     def additive(self) -> bool:
@@ -185,8 +181,22 @@ class _Ranging(_Planar):
         refuse_negative_ranges(y)
 
 
+class _RangingBearing(_Ranging, _Planar):
+    """Sensors of the plane whose first components are a range and a bearing."""
+
+    def points(self, y: Array) -> tuple[Array, Array]:
+        """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
+        seen = y[:, :2].copy()
+        if self.scale == 1.0 and self.bias_m == 0.0:
+            return inv_scan_many(seen)
+        seen[:, 0] = self.distances(y)
+        p, P_y = inv_scan_many(seen)
+        P_y[:, :, 0] /= self.scale
+        return p, P_y
+
+
 @register("sensor", "range_bearing")
-class RangeBearing(_Ranging):
+class RangeBearing(_RangingBearing):
     """Distance and direction of a landmark: a laser.
 
     sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61).
@@ -227,13 +237,34 @@ class Bearing(_Planar):
         return intersection(at_origin, at_T)[0][:, None]
 
 
-@register("sensor", "range")
-class Range(_Ranging):
-    """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
+@declared
+class _Range(_Ranging, Cone, Distancing):
+    """A range alone, of either world."""
 
-    code: ClassVar[int] = RANGE
+    expected: ClassVar[Any] = distance
     columns: ClassVar[tuple[str, ...]] = ("range_m",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m",)
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, 2 or 3) lie within the range limits and the cone of sight about x."""
+        return super().sees(self.risen(v))
+
+
+@register("sensor", "range")
+class Range(_Range, Raised):
+    """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
+
+    def distances(self, y: Array) -> Array:
+        """Return the distances (K,) in the plane that ranges y (K, 1) of landmarks at height 0 stand for."""
+        return self.level(super().distances(y))
+
+
+@register("sensor", "range")
+class Range3D(_Range):
+    """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
+
+    world: ClassVar[str] = "space"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
 
 
 @register("sensor", "position")
@@ -256,7 +287,7 @@ class Position2D(_Planar):
 
 
 @register("sensor", "range_bearing_signature")
-class RangeBearingSignature(_Ranging):
+class RangeBearingSignature(_RangingBearing):
     """Distance, direction and signature of a landmark, a number that differs from landmark to landmark.
 
     [T] 3: a landmark is (x, y, s).

@@ -422,8 +422,8 @@ class Distant(Protocol):
 
 
 def distances_alone(sensor: Sensor) -> bool:
-    """Return whether all that a sensor measures is one number that tells the distance: a range, a strength."""
-    return len(sensor.columns) == 1 and isinstance(sensor, Distant)
+    """Return whether a sensor measures one number alone that tells the distance in the plane: a range, a strength."""
+    return len(sensor.columns) == 1 and isinstance(sensor, Distant) and world_of(sensor) != "space"
 
 
 @runtime_checkable

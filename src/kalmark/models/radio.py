@@ -16,7 +16,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, Limit, Number, Positive, declared, register
-from kalmark.models.seen import Expecting
+from kalmark.models.seen import Distancing, Raised, raised
 
 __all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
 
@@ -26,16 +26,16 @@ DECIBELS = 10.0 / math.log(10.0)  # in one unit of a natural logarithm of power
 
 @compiled
 def strength(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Expect the strength of what is at v (K, d): `par` = (strength at 1 m, exponent).  Log-distance path loss."""
+    """Expect the strength of what is at v (K, d): `par` = (strength at 1 m, exponent, height).  Log-distance."""
     k, d = v.shape
-    e, E_v = np.empty((k, 1)), np.zeros((k, 1, d))
+    p, e, E_v = raised(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
     for i in range(k):
         square = NEAREST_M * NEAREST_M
-        for j in range(d):
-            square += v[i, j] * v[i, j]
+        for j in range(3):
+            square += p[i, j] * p[i, j]
         e[i, 0] = par[0] - par[1] * DECIBELS * 0.5 * math.log(square)
         for j in range(d):
-            E_v[i, 0, j] = -par[1] * DECIBELS * v[i, j] / square
+            E_v[i, 0, j] = -par[1] * DECIBELS * p[i, j] / square
     return e, y - e, E_v
 
 
@@ -50,24 +50,24 @@ def by_path_loss(code: int, par: Array, angular: Flags, v: Array, e: Array) -> A
 
 @compiled
 def difference(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Expect how much farther v (K, d) is from the right receiver than from the left one, `par` m from each other."""
+    """Expect how much farther v (K, d) is from the right receiver than the left one; `par` = (baseline, height)."""
     k, d = v.shape
-    e, E_v = np.zeros((k, 1)), np.zeros((k, 1, d))
+    p, e, E_v = raised(v, par[1]), np.zeros((k, 1)), np.zeros((k, 1, d))
     for i in range(k):
         for sign in (1.0, -1.0):  # the right receiver is at y = -par / 2
             square = NEAREST_M * NEAREST_M
-            for j in range(d):
-                x = v[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)
+            for j in range(3):
+                x = p[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)
                 square += x * x
             distance = math.sqrt(square)
             e[i, 0] += sign * distance
             for j in range(d):
-                E_v[i, 0, j] += sign * (v[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)) / distance
+                E_v[i, 0, j] += sign * (p[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)) / distance
     return e, y - e, E_v
 
 
 @declared
-class _Receiver(Expecting):
+class _Receiver(Distancing):
     """What both share: a point of either world, and a largest distance."""
 
     _: KW_ONLY
@@ -77,7 +77,7 @@ class _Receiver(Expecting):
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d) are near enough."""
-        near: Flags = np.linalg.norm(v, axis=1) <= self.range_max_m
+        near: Flags = np.linalg.norm(self.risen(v), axis=1) <= self.range_max_m
         return near
 
 
@@ -119,15 +119,12 @@ class _SignalStrength(_Receiver):
 
 
 @register("sensor", "signal_strength")
-class SignalStrength2D(_SignalStrength):
+class SignalStrength2D(_SignalStrength, Raised):
     """Received signal strength of a landmark that sends, by the log-distance path loss."""
 
-    world: ClassVar[str] = "plane"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
-
     def distances(self, y: Array) -> Array:
-        """Return the distances (K,) at which strengths y (K, 1) are expected."""
-        return np.asarray(10.0 ** ((self.strength_dbm - y[:, 0]) / (10.0 * self.exponent)))
+        """Return the distances (K,) in the plane at which strengths y (K, 1) of landmarks at height 0 are expected."""
+        return self.level(np.asarray(10.0 ** ((self.strength_dbm - y[:, 0]) / (10.0 * self.exponent))))
 
 
 @register("sensor", "signal_strength")
@@ -155,11 +152,8 @@ class _RangeDifference(_Receiver):
 
 
 @register("sensor", "range_difference")
-class RangeDifference2D(_RangeDifference):
+class RangeDifference2D(_RangeDifference, Raised):
     """Time difference of arrival at two receivers, times the speed of light or sound: right less left."""
-
-    world: ClassVar[str] = "plane"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
 
 
 @register("sensor", "range_difference")

@@ -17,13 +17,16 @@ filter compiles neither into itself and never those that nobody uses.
 
 from __future__ import annotations
 
+import math
+from dataclasses import KW_ONLY
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import by_address, compiled, signature_of
+from kalmark.declare import Limit, NotNegative, Number, Positive, declared
 from kalmark.errors import EventError
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.directions import spherical_many
@@ -169,6 +172,19 @@ def tag_corners(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tu
 
 
 @compiled
+def raised(v: Array, height: float) -> Array:
+    """Return views v (K, 2 or 3) in space (K, 3), from a sensor `height` m above the plane; in space that is 0.
+
+    What has no height of its own is in the plane.
+    """
+    k, d = v.shape
+    p = np.empty((k, 3))
+    for i in range(k):
+        p[i, 0], p[i, 1], p[i, 2] = v[i, 0], v[i, 1], (v[i, 2] if d > 2 else 0.0) - height
+    return p
+
+
+@compiled
 def residual(y: Array, e: Array, angular: Flags) -> Array:
     """Return z = y - e (K, m), the angles among them wrapped.  [S] (26)."""
     z = y - e
@@ -230,18 +246,22 @@ class Expecting(Sensing):
 
     @property
     def parameters(self) -> Array:
-        """The numbers (n,) of the compiled expectation."""
+        """The parameters (p,), which may be in the map."""
         return np.zeros(0)
 
-    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
-        """Return the expected measurements (K, m) of views v (K, d), and E_v (K, p, d or the view's errors).
+    @property
+    def constants(self) -> Array:
+        """The numbers (n,) of the compiled expectation: the parameters, and what is never in the map."""
+        return np.array(self.parameters)
 
-        `y` (K, m), what was measured, is needed where it tells what cannot be expected: a tag's size, a segment's ends.
-        """
-        y = np.zeros((len(v), len(self.columns))) if y is None else y
+    def expect(self, v: Array) -> tuple[Array, Array]:
+        """Return the expected measurements (K, m) of views v (K, d), and E_v (K, p, d or the view's errors)."""
+        return self._expected(v, np.zeros((len(v), len(self.columns))))
+
+    def _expected(self, v: Array, y: Array) -> tuple[Array, Array]:
         angular = np.array(self.angular, dtype=np.bool_)
         v, y = np.ascontiguousarray(v, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
-        e, _, E_v = type(self).expected(self.code, np.array(self.parameters), angular, v, y)
+        e, _, E_v = type(self).expected(self.code, self.constants, angular, v, y)
         return e, E_v
 
 
@@ -251,3 +271,64 @@ class Spatial(Expecting):
     world: ClassVar[str] = "space"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
     additive: ClassVar[bool] = True
+
+    def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
+        """Return the expected measurements (K, m) of views v (K, d), and E_v (K, p, d or the view's errors).
+
+        `y` (K, m), what was measured, is needed where it tells what cannot be expected: a tag's size, a segment's ends.
+        """
+        return self._expected(v, np.zeros((len(v), len(self.columns))) if y is None else y)
+
+
+@declared
+class Cone(Expecting):
+    """Limits of sight about x, of points in three dimensions."""
+
+    _: KW_ONLY
+    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
+    fov_rad: Annotated[Positive, "Field of view, a cone about the sensor's x axis."] = 2 * math.pi
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, 3) lie within the range limits and the cone of sight about x."""
+        distance = np.linalg.norm(v, axis=1)
+        off = np.arctan2(np.hypot(v[:, 1], v[:, 2]), v[:, 0])
+        return (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
+
+
+class Distancing(Expecting):
+    """Sensors of distances in three dimensions, in either world; their constants end with their height."""
+
+    @property
+    def height(self) -> float:
+        """The sensor's height above the plane of the map, m; in space, where its pose has it, 0."""
+        return 0.0
+
+    @property
+    def constants(self) -> Array:
+        """The parameters and the height (p + 1,)."""
+        return np.append(self.parameters, self.height)
+
+    def risen(self, v: Array) -> Array:
+        """Return views v (K, 2 or 3) in space (K, 3), from the sensor's height."""
+        return np.asarray(raised(np.ascontiguousarray(v, dtype=np.float64), self.height))
+
+
+@declared
+class Raised(Distancing):
+    """Those on a robot of the plane, which sees landmarks at their own heights."""
+
+    _: KW_ONLY
+    height_m: Annotated[Number, "Of the sensor above the plane of the map."] = 0.0
+
+    world: ClassVar[str] = "plane"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point", "point_height")
+
+    @property
+    def height(self) -> float:
+        """The sensor's height above the plane of the map, m."""
+        return self.height_m
+
+    def level(self, slant: Array) -> Array:
+        """Return the distances (K,) in the plane of landmarks at height 0 that are `slant` (K,) m away."""
+        return np.sqrt(np.maximum(slant**2 - self.height_m**2, 0.0))

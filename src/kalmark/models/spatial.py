@@ -9,12 +9,12 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.declare import Limit, NotNegative, Positive, declared, register
+from kalmark.declare import Limit, NotNegative, Positive, register
 from kalmark.errors import EventError
 from kalmark.events import unit_quaternion
 from kalmark.geometry.directions import inv_spherical_many
 from kalmark.models import seen, walls
-from kalmark.models.seen import Spatial, refuse_negative_ranges
+from kalmark.models.seen import Cone, Spatial, refuse_negative_ranges
 
 __all__ = ["Position3D", "RangeBearing3D", "TagPose", "Wall"]
 
@@ -64,24 +64,8 @@ class Wall(Spatial):
                 raise EventError(f"observation {i}: right_m is {row[2]}, expected less than left_m, {row[3]}")
 
 
-@declared
-class _Cone(Spatial):
-    """Range sensors: limits of sight about x."""
-
-    _: KW_ONLY
-    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
-    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
-    fov_rad: Annotated[Positive, "Field of view, a cone about the sensor's x axis."] = 2 * math.pi
-
-    def sees(self, v: Array) -> Flags:
-        """Return which of v (K, 3) lie within the range limits and the cone of sight about x."""
-        distance = np.linalg.norm(v, axis=1)
-        off = np.arctan2(np.hypot(v[:, 1], v[:, 2]), v[:, 0])
-        return (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
-
-
 @register("sensor", "range_bearing_3d")
-class RangeBearing3D(_Cone):
+class RangeBearing3D(Cone, Spatial):
     """Distance, azimuth and elevation of a landmark; x is forward, z up: a 3-D laser, a radar."""
 
     sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.1
@@ -102,7 +86,7 @@ class RangeBearing3D(_Cone):
 
 
 @register("sensor", "position_3d")
-class Position3D(_Cone):
+class Position3D(Cone, Spatial):
     """Position of a landmark (x, y, z) in the sensor's frame; x is forward, z up: an RGB-D camera, a lidar."""
 
     sigma_x_m: Annotated[Positive, "Noise, along x."] = 0.1

@@ -34,7 +34,7 @@ from kalmark.declare import is_own
 from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
 from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
-from kalmark.models.landmarks import PointSignature2D, Wall2D
+from kalmark.models.landmarks import Point2D, PointHeight2D, Wall2D
 from kalmark.models.protocols import Landmark, Segmented, place_of
 from kalmark.results.gauge import Datum, generators
 from kalmark.results.history import Ints, as_id, padded_all
@@ -47,9 +47,9 @@ DATUM = 128  # landmarks
 TINY = 1e-30
 EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
 # kinds whose state is their place; what is not (inverse depth, say) is not well known yet
-EUCLIDEAN = ("", "point", "point3", "point_signature", "tag")
-_PLANE = {"point_signature": ("x_m", "y_m", "signature"), "wall": ("x_m", "y_m", "x2_m", "y2_m")}
+EUCLIDEAN = ("", "point", "point3", "point_signature", "point_height", "tag")
 _POINT = ("x_m", "y_m", "z_m")
+_PLANE = {"point_signature": (*_POINT[:2], "signature"), "point_height": _POINT, "wall": ("x_m", "y_m", "x2_m", "y2_m")}
 _LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
 _TAG = (*_POINT, "qx", "qy", "qz", "qw")
 _SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
@@ -61,10 +61,10 @@ def places(
 ) -> tuple[Array, Array] | None:
     """Return the places and covariances of the states (K, n) of landmarks of one model.
 
-    `ends` (K of (2,)) are the abscissas of lines' ends.  The pose of a tag and a point with its signature are their
-    own places.  None if a model does not say where it is.
+    `ends` (K of (2,)) are the abscissas of lines' ends.  The pose of a tag and a point of the plane, with its
+    signature or height, are their own places.  None if a model does not say where it is.
     """
-    if model is None or model.space.kinds == SE3.kinds or isinstance(model, PointSignature2D):
+    if model is None or model.space.kinds == SE3.kinds or isinstance(model, Point2D):
         return means, covariances
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if isinstance(model, Segmented):
@@ -302,6 +302,7 @@ class MapLandmarks:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
             table, exact = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ())), set[Id]()
+            plane = False
             for number, row in enumerate(rows, start=2):
                 try:
                     names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
@@ -311,13 +312,14 @@ class MapLandmarks:
                         cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
                     table.ids.append(as_id(row["id"]))
                     table.kinds.append(row["kind"])
+                    plane |= row["kind"] == PointHeight2D.kind or not row.get("z_m")
                     table.means.append(np.array([float(row[name]) for name in names]))
                     table.covariances.append(cov)
                     table.observations.append(int(row["observations"]))
                     exact |= {table.ids[-1]} if row.get("known") else set()
                 except (KeyError, TypeError, ValueError) as error:
                     raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
-        return replace(table, exact=frozenset(exact))
+        return replace(table, exact=frozenset(exact), in_space=table.in_space and not plane)
 
 
 def refuse_other_than_points(slam: Slam, what: str, *, walls: bool = False) -> None:

@@ -17,6 +17,7 @@ from kalmark.geometry.rotations import to_euler
 from kalmark.logs import FORMATS
 from kalmark.logs.log import Log
 from kalmark.models.protocols import calibrating, parameter_names, state_columns
+from kalmark.models.seen import Raised
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import Biased, Camera, Measuring, Mounted
@@ -92,6 +93,8 @@ def _robot(robot: Any) -> dict[str, Any]:
 
 def _sensor(mount: Any) -> dict[str, Any]:
     out, at = model(mount.sensor), describe_pose(mount.at)
+    if isinstance(mount.sensor, Raised):
+        at["z_m"] = out.pop("height_m")
     if any(at.values()):
         out["mount"] = at
     for part in PARTS:

@@ -81,32 +81,34 @@ def policy_of(
     reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
     varies = channel.noise_at is not None or channel.robust is not None
     looks_back = channel.counts or channel.sees_velocity
-    approaches = channel.far is not None or channel.depths
+    approaches, deferred = channel.far is not None or channel.depths, _deferred(mount, channel.landmark)
     return Policy(
-        association, upkeep, mount.attention, mount.detector, _deferred(mount), delayed, _starts(association, upkeep),
-        averages(association), upkeep.hold_back and not weighs(association), reviews,
+        association, upkeep, mount.attention, mount.detector, deferred, delayed,
+        _starts(association, upkeep), averages(association), upkeep.hold_back and not weighs(association), reviews,
         0.0 if channel.joins else linear or 0.0,
         upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
         not channel.finds_depth and channel.mount >= 0 and any(isinstance(kind, AnchoredHomogeneous) for kind in seen),
         (channel.robust is not None or association.threshold(channel.dof, math.inf) < math.inf)
-        and delayed is None and (_deferred(mount) is None or channel.is_ambiguous) and channel.starts_landmarks,
+        and delayed is None and (deferred is None or channel.is_ambiguous) and channel.starts_landmarks,
         type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
         and not (reviews or varies or looks_back or approaches),
     )  # fmt: skip
 
 
-def _deferred(mount: Mount) -> Initialization | None:
+def _deferred(mount: Mount, landmark: Landmark) -> Initialization | None:
     """Return how a mounted sensor starts landmarks from several measurements, None if one is enough for it."""
     sensor, way = mount.sensor, mount.initialization
     if way is None:
         if distances_alone(sensor) and isinstance(sensor, Ranging):
-            return Trilateration()
+            return Trilateration() if landmark.kind == "point" else None
         return Mirrored() if isinstance(sensor, Ambiguous) else None
     if isinstance(way, Delayed):
         return None
     if not distances_alone(sensor) or (isinstance(way, Hypotheses) and not isinstance(sensor, Ranging)):
         what = f"{type(sensor).__name__} does not measure ranges alone"
         raise ModelError(f"Mount: initialization is {way!r}, but its {what}")
+    if landmark.kind != "point":
+        raise ModelError(f"Mount: initialization is {way!r}, but its landmarks are {landmark.kind}, expected point")
     return way
 
 
@@ -120,24 +122,28 @@ def _starts(association: Association, upkeep: Upkeep) -> tuple[Answer, ...]:
     return (NEW, REMAP) if weighs(association) else (NEW, REMAP, DEFERRED)
 
 
+def landmark_of(mount: Mount, landmarks: Landmark | None) -> Landmark:
+    """Return the type of landmark that a mounted sensor starts; `landmarks` is that of the Slam, if it has one."""
+    late = mount.initialization is not None
+    return mount.landmark or landmarks or default_landmark(mount.sensor, mount.at, mount.cov is not None, late)
+
+
+def kinds_of(robots: Mapping[str, Robot], landmarks: Landmark | None) -> list[Landmark]:
+    """Return the types of landmarks that the sensors of all robots start, one of each kind."""
+    mounts = (m for robot in robots.values() for m in robot.sensors.values() if not isinstance(m.sensor, OfState))
+    return list({kind.kind: kind for kind in (landmark_of(m, landmarks) for m in mounts)}.values())
+
+
 def channel_of(
-    robots: Mapping[str, Robot], robot: Robot, mount: Mount, slot: int, landmarks: Landmark | None,
+    robots: Mapping[str, Robot], robot: Robot, mount: Mount, slot: int, landmark: Landmark, others: list[Landmark],
     association: Association, estimator: Estimator,
 ) -> Channel:  # fmt: skip
-    """Return the channel of a robot's mount whose block is on a slot (-1: none).
+    """Return the channel of a robot's mount whose block is on a slot (-1: none), of the landmarks that all start.
 
     Raises ModelError if sensor or landmark are of another world than the robots, or do not fit each other.
     """
-
-    def landmark_of(m: Mount) -> Landmark:
-        late = m.initialization is not None
-        return m.landmark or landmarks or default_landmark(m.sensor, m.at, m.cov is not None, late)
-
-    landmark = landmark_of(mount)
     refuse_other_world(robots, type(mount.sensor).__name__, world_of(mount.sensor))
     refuse_other_world(robots, landmark.kind, landmark.space.world)
-    mounts = (m for robot in robots.values() for m in robot.sensors.values() if not isinstance(m.sensor, OfState))
-    others = list({other.kind: other for other in map(landmark_of, mounts)}.values())
 
     def threshold(dof: int) -> float:
         return association.threshold(dof, estimator.default_gate)

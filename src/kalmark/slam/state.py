@@ -21,7 +21,7 @@ from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
 from kalmark.slam.held_readings import SELDOM, Given
 from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
-from kalmark.slam.policy import Policy, channel_of, policy_of, refuse_other_world
+from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, policy_of, refuse_other_world
 from kalmark.slam.reader import LEAST_S, Reader
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.standing import standing_of
@@ -76,8 +76,9 @@ class State:
         self.standing: dict[str, str] = {}
         self.inner = {bias_name(name) for name in robots}
         self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}
+        kinds = kinds_of(robots, settings.landmarks)
         for robot in robots.values():
-            self._place(robot)
+            self._place(robot, kinds)
         self.blocks = len(self.tracks.slots)  # the first of the map: they stay
         alone = [front_end for front_end in self.front_ends.values() if not front_end.waits]
         if len(robots) == 1 and len(alone) == 1 and len(self.front_ends) == len(next(iter(robots.values())).sensors):
@@ -94,7 +95,7 @@ class State:
         """How the map is predicted and corrected."""
         return self.settings.estimator
 
-    def _place(self, robot: Robot) -> None:
+    def _place(self, robot: Robot, kinds: list[Landmark]) -> None:
         """Enter a robot, the bias of its controls and its mounts into the map.  Raises ModelError."""
         settings = self.settings
         if robot.name in self.inner:
@@ -121,8 +122,9 @@ class State:
                 self.readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot, standing)
                 continue
             association = mount.association or settings.association
+            landmark = landmark_of(mount, settings.landmarks)
             channel = channel_of(
-                self.robots, robot, mount, mount_slot, settings.landmarks, association, self.estimator
+                self.robots, robot, mount, mount_slot, landmark, kinds, association, self.estimator
             )  # fmt: skip
             self.channels[robot.name, name] = channel
             if isinstance(mount.detector, SearchingDetector):

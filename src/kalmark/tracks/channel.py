@@ -29,7 +29,11 @@ from kalmark.models.velocity_view import moving_view_of, velocity_of
 Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
 
 ROBOT = "robot"
-ALIKE = {"point": ("point_signature", ROBOT), "point3": (ROBOT,), "tag": (ROBOT,)}  # what else one model applies to
+ALIKE = {
+    "point": ("point_signature", "point_height", ROBOT),
+    "point3": (ROBOT,),
+    "tag": (ROBOT,),
+}  # what else one model applies to
 EUCLIDEAN = ("point", "point3")
 TINY_RHO = 1e-9  # 1 / m: as good as infinitely far
 HUBER, STUDENT = ROBUST = ("huber", "student")
@@ -174,7 +178,7 @@ class Channel:
         models: dict[str, ObservationModel] = {}
         for landmark in (*types, self.landmark):
             model = ObservationModel(landmark, self.sensor, self.at, self.motion, self.since)
-            models |= {kind: model for kind in (landmark.kind, *ALIKE.get(landmark.kind, ()))}
+            models = dict.fromkeys(ALIKE.get(landmark.kind, ()), model) | models | {landmark.kind: model}
         if self.sees_velocity:
             models.pop(ROBOT, None)  # which does not stand still
         return models
