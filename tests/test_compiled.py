@@ -174,3 +174,41 @@ def test_two_processes_that_save_two_overloads_at_once_name_two_files(tmp_path: 
     assert other.load("b") == 2 and one.load("a") in (1, None)
     one.save("a", 1)
     assert (one.load("a"), one.load("b")) == (1, 2)
+
+
+WITHOUT = """
+import numpy as np
+import kalmark as km
+
+def drive(robot, sensor, views, options, ids):
+    slam = km.Slam(robot, **options)
+    for k in range(4):
+        name = robot.name
+        slam.process(km.Control(t_s=0.1 * k, robot=name, u=np.full(len(robot.motion.columns), 0.01)))
+        named = range(len(views)) if ids else None
+        slam.process(km.Scan(t_s=0.1 * k + 0.05, robot=name, sensor="eye", y=sensor.expect(views)[0], ids=named))
+    return len(slam.landmarks()), slam.mean("r")[0], np.trace(slam.covariance("r"))
+
+rng = np.random.default_rng(1)
+jcbb = km.association.JointCompatibility()
+for ids in (True, False):
+    for d, motion, sensor in ((2, km.motion.Unicycle(), km.sensors.RangeBearing()),
+                              (3, km.motion.Odometry3D(), km.sensors.RangeBearing3D())):
+        robot = km.Robot("r", motion, sensors={"eye": km.Mount(sensor)})
+        views = rng.uniform(1.0, 5.0, (4, d))
+        print(*drive(robot, sensor, views, {} if ids else {"association": jcbb}, ids))
+robot = km.Robot("r", km.motion.Unicycle(), sensors={"eye": km.Mount(km.sensors.RangeBearing())})
+print(*drive(robot, km.sensors.RangeBearing(), rng.uniform(1.0, 30.0, (140, 2)), {}, True))
+"""
+
+
+def test_the_filter_runs_without_compilation_as_it_does_with_it() -> None:
+    told = []
+    for disabled in ("0", "1"):
+        environment = os.environ | {"NUMBA_DISABLE_JIT": disabled}
+        command = [sys.executable, "-c", WITHOUT]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        told.append(np.array([line.split() for line in done.stdout.splitlines()], dtype=np.float64))
+    assert told[1] == pytest.approx(told[0], rel=1e-6)
+    assert told[0][-1, 0] == 140  # a compressed map

@@ -126,6 +126,12 @@ def compiled(function: F) -> F:
     return made
 
 
+def in_python(function: F) -> F:
+    """Return the Python form of a compiled function."""
+    python: F = function if numba.config.DISABLE_JIT else function.py_func  # type: ignore[attr-defined]
+    return python
+
+
 class _Folder(UserProvidedCacheLocator):  # type: ignore[misc, unused-ignore]
     """The folder of the cache, also where nothing can be written into it: then it is only read."""
 
@@ -196,7 +202,13 @@ def _say_not_kept(folder: str, why: str) -> None:
 
 @cache
 def address_of(function: Any, signature: Signature) -> int:
-    """Return the address of a compiled function for arguments of a signature: compiled, or loaded from disk, now."""
+    """Return the address of a compiled function for arguments of a signature: compiled, or loaded from disk, now.
+
+    With ``NUMBA_DISABLE_JIT`` nothing is compiled: a number then stands for the function.
+    """
+    if numba.config.DISABLE_JIT:
+        _FUNCTIONS[id(function)] = function
+        return id(function)
     caught_up(function)
     function.compile(signature.args)
     result = function.overloads[signature.args]
@@ -224,7 +236,13 @@ def ahead(function: Any, job: Callable[..., None], *arguments: str | int) -> Non
     text = json.dumps([job.__module__, job.__name__, *arguments])
     version = f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version} {text}"
     mark = Path(cache_folder("filter")) / f"ahead-{hashlib.sha256(version.encode()).hexdigest()[:16]}"
-    if parent_process() is not None or (os.cpu_count() or 1) < 2 or mark.exists() or function in _AHEAD:
+    if (
+        numba.config.DISABLE_JIT
+        or parent_process() is not None
+        or (os.cpu_count() or 1) < 2
+        or mark.exists()
+        or function in _AHEAD
+    ):
         return
     if not os.access(Path(cache_folder("filter")).parents[1], os.W_OK):
         return  # nor would this process find it

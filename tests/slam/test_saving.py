@@ -202,6 +202,9 @@ def test_a_users_motion_whose_control_has_changed_is_refused(tmp_path: Path) -> 
     class Walker(km.motion.Unicycle):
         columns = ("v_mps", "w_radps", "hop_m")
 
+        def control_noise(self, u: np.ndarray) -> np.ndarray:
+            return np.eye(len(self.columns))
+
     km.Slam(robots(motion=Walker())).save(tmp_path / "map.kmk")
     Walker.columns = ("v_mps", "w_radps")  # type: ignore[misc, assignment]
     with pytest.raises(MapError, match=r"columns of the motion are .*, expected .*hop_m"):

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Index
-from kalmark.compiled import compiled
+from kalmark.compiled import compiled, in_python
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import wrap
@@ -89,7 +89,7 @@ def looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
 
     Row for row a `head` (K, .), pose and mount as of `kalmark.models.observe`, sees a landmark l (K, .).
     """
-    look = _looked if isinstance(view, tuple) else _looked.py_func  # type: ignore[attr-defined]
+    look = _looked if isinstance(view, tuple) else in_python(_looked)
     return look(view, *(np.ascontiguousarray(a) for a in (head, l, y)))
 
 

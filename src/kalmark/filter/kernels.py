@@ -6,6 +6,7 @@ Rank-k updates go through BLAS (dsyrk): in C order our lower triangle is Fortran
 
 from __future__ import annotations
 
+import ctypes
 import math
 import sys
 from importlib.machinery import PathFinder
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.binding
+import numba
 import numpy as np
 import scipy
 from numba import types
@@ -33,14 +35,18 @@ def _load_blas(module: str) -> str:
     return module
 
 
-_BLAS = _load_blas("scipy.linalg.cython_blas")
-llvmlite.binding.add_symbol("kalmark_dsyrk", get_cython_function_address(_BLAS, "dsyrk"))
-llvmlite.binding.add_symbol("kalmark_dgemm", get_cython_function_address(_BLAS, "dgemm"))
-_LAPACK = _load_blas("scipy.linalg.cython_lapack")
-llvmlite.binding.add_symbol("kalmark_dpotrf", get_cython_function_address(_LAPACK, "dpotrf"))
-_dsyrk = types.ExternalFunction("kalmark_dsyrk", types.void(*[types.intp] * 10))
-_dgemm = types.ExternalFunction("kalmark_dgemm", types.void(*[types.intp] * 13))
-_dpotrf = types.ExternalFunction("kalmark_dpotrf", types.void(*[types.intp] * 5))
+def _routine(module: str, name: str, arguments: int) -> Any:
+    """Return a routine of SciPy's BLAS or LAPACK, whose arguments are addresses, for compiled code or for Python."""
+    address, form = get_cython_function_address(_load_blas(f"scipy.linalg.{module}"), name), ctypes.c_void_p
+    if numba.config.DISABLE_JIT:
+        return ctypes.CFUNCTYPE(None, *[form] * arguments)(address)
+    llvmlite.binding.add_symbol(f"kalmark_{name}", address)
+    return types.ExternalFunction(f"kalmark_{name}", types.void(*[types.intp] * arguments))
+
+
+_dsyrk = _routine("cython_blas", "dsyrk", 10)
+_dgemm = _routine("cython_blas", "dgemm", 13)
+_dpotrf = _routine("cython_lapack", "dpotrf", 5)
 _UPPER_NO = np.array([ord("U"), ord("N")], dtype=np.uint8)
 _TRANS_NO = np.array([ord("T"), ord("N"), ord("T")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])

@@ -6,6 +6,7 @@ numbers.  Kept in float32 it takes half of that; all arithmetic is in float64 al
 
 from __future__ import annotations
 
+import ctypes
 import os
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import carray, types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
@@ -28,14 +29,23 @@ PANEL = 128
 UPDATE = 16_000  # bytes a row that a full update may need while it is under way
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _pointer(_: Any, address: Any) -> Any:
+def _pointer(address: int) -> Any:
     """Return an address as a pointer."""
+    return ctypes.c_void_p(int(address))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _compiled_pointer(_: Any, address: Any) -> Any:
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], cgutils.voidptr_t)
 
     return types.voidptr(types.int64), generate
+
+
+@overload(_pointer, strict=False)  # type: ignore[untyped-decorator]
+def _pointer_form(address: Any) -> Any:
+    return lambda address: _compiled_pointer(address)  # noqa: PLW0108 - numba compares the arguments
 
 
 @compiled
