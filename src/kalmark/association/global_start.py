@@ -8,6 +8,7 @@ taken if a matching as good is not expected by chance and none from elsewhere co
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -19,10 +20,9 @@ from kalmark.association.query import Query
 from kalmark.association.relocalization import aligned, same
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
+from kalmark.report import Observation
 from kalmark.tracks.known import Known
-from kalmark.tracks.track import Tracks
 
-LOST_RAD = 1.0  # a sigma of the heading above which a pose says nothing
 FEWEST, FEWEST_NAMED = 3, 2  # pairs without and with ids
 BASES = 8  # pairs of observations from which poses are computed
 SIGMAS = 3.0  # by which the distances of a pair may differ
@@ -34,11 +34,15 @@ AT_ONCE = 20_000  # poses tested at once
 
 
 class Located(NamedTuple):
-    """The pose T (3,) of the sensor, and what each observation is of; or, without them, why it is not known yet."""
+    """The pose T (3,) of the sensor, and what each observation is of; or, without them, why it is not known yet.
+
+    `fates` (K,) are those of observations that have corrected what is known of the pose, and do not determine it.
+    """
 
     T: Array | None
     decisions: list[Decision] | None
     why: str
+    fates: Sequence[Observation] = ()
 
 
 class Pose(NamedTuple):
@@ -51,11 +55,6 @@ class Pose(NamedTuple):
     def pairs(self) -> int:
         """How many observations are of landmarks."""
         return int((self.matched >= 0).sum())
-
-
-def is_lost(r: Array, P: Array, tracks: Tracks) -> bool:
-    """Return whether a robot of the plane at r (3 or more,) may be anywhere in a known map."""
-    return len(r) == 3 and len(tracks.known) >= FEWEST and P[2, 2] >= LOST_RAD**2
 
 
 def located(query: Query) -> Located:

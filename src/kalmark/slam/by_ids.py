@@ -27,7 +27,8 @@ def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Re
     """Correct the map by a scan whose policy is `by_ids`; None of a scan of which something is to be decided."""
     tracks, name, ids = state.tracks, event.robot, cast("tuple[Id, ...]", event.ids)
     moving = state.moving[name]
-    if not ids or moving.held.is_adrift or tracks.tentative or state.clones.clones or state.surveys.misfits:
+    waiting = tracks.tentative or state.clones.clones or state.surveys.misfits or state.sums
+    if not ids or moving.held.is_adrift or waiting:
         return None
     seen, kinds = [track for track in map(tracks.confirmed.get, ids) if track], set(map(tracks.sorts.get, ids))
     alike = len(seen) == len(ids) and len(kinds) == 1 and not tracks.known

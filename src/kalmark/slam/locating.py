@@ -1,39 +1,207 @@
-"""A robot that may be anywhere, put where its scan fits the map: at a global start, and after a gap."""
+"""A robot that may be anywhere: put where its scan fits the map, at a global start and after a gap, or a Gaussian sum.
+
+A sensor that finds places determines a pose by one scan of known landmarks (`association/global_start.py`).  What says
+less, a range, a strength or a bearing with an id, corrects a Gaussian sum of poses, from the first one whose
+linearisation does not hold over the robot's covariance until it holds over that of the sum.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array
-from kalmark.association.global_start import Located, is_lost, located
+from kalmark.arrays import Array, Flags
+from kalmark.association.global_start import FEWEST, Located, located
 from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
 from kalmark.association.relocalization import relocalized
 from kalmark.events import Id
+from kalmark.filter.map import Map
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose, inverse
+from kalmark.geometry.gaussian import gate
+from kalmark.models.observe import linearize
+from kalmark.models.protocols import distances_alone, place_of
+from kalmark.report import Judged, Observation
+from kalmark.slam.gaussian_sum import IN_A_ROW, GaussianSum, Seen, bent_axes, log_likelihood, written
 from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
+from kalmark.tracks.linearity import bends, turn_holds
 from kalmark.tracks.scan import ScanContext
+from kalmark.tracks.surveys import SURVEYED
 
-HEADING_RAD = 0.3  # a sigma above which a correction is not linearised at the prediction
+UNNAMED = "the pose of its robot is not known yet, and it has no id of a known landmark"
+ONE = "from an unknown place it takes two known landmarks, expected a second one or a start with a smaller sigma_xy_m"
+DIRECTION = "it tells no distance from an unknown place, expected ranges beside it or a start with a smaller sigma_xy_m"
 
 
 def started(state: State, scan: ScanContext, query: Query) -> Located | None:
-    """Move a robot that may be anywhere in a known map to where its scan fits; None of a robot that may not."""
-    if not state.tracks.known:
+    """Move a robot that may be anywhere in a known map to where its scan fits; None of a robot that may not.
+
+    A scan that does not determine the pose corrects a Gaussian sum of poses, or waits with the reason.
+    """
+    name, P = scan.event.robot, _covariance(state, scan)
+    sum_ = state.sums.get(name)
+    shown = sum_ is not None and sum_.shows
+    if scan.dimensions != 2 or not (state.tracks.known or state.surveys.trial):
         return None
-    pose, dof = state.map.mean(scan.robot)[: len(scan.channel.at)], scan.channel.pose_dof
-    if not is_lost(pose, state.map.covariance([scan.robot])[:dof, :dof], state.tracks):
+    if scan.channel.gives_places:
+        if len(state.tracks.known) < FEWEST or (not shown and turn_holds(P)):
+            return None
+        found = located(query)
+        if found.T is not None:
+            _put(state, scan, found.T)
+            state.sums.pop(name, None)
+        return found
+    if not can_be_summed(scan.channel):
         return None
-    found = located(query)
-    if found.T is not None:
-        _put(state, scan, found.T)
-    return found
+    if sum_ is None or not sum_.shows:
+        is_turn, bent = turn_holds(P), _bent(state, scan)
+        if bent is None:
+            return None if is_turn or len(state.tracks.known) < FEWEST else Located(None, None, UNNAMED)
+        is_distance = distances_alone(scan.channel.sensor)
+        if is_turn and not (bent[1:].any() and is_distance):
+            return None
+        if not is_turn and bent[1:].any() and not is_distance:
+            return Located(None, None, DIRECTION)
+        if not is_turn and bent[1:].any() and len(state.tracks.known) + len(state.surveys.trial) < 2:
+            return Located(None, None, ONE)
+        moving = state.moving[name]
+        sum_ = state.sums[name] = GaussianSum.of(state.map, moving, state.blocks, scan.event.t_ns, _gate(scan))
+    return _summed(state, scan, sum_)
+
+
+def _bent(state: State, scan: ScanContext) -> Flags | None:
+    """Return along which axes (3,) of the pose no linearisation describes what is seen of known landmarks.
+
+    None where nothing is.
+    """
+    tracks, channel, map_ = state.tracks, scan.channel, state.map
+    names: list[Any] = [name if name in tracks.known or name in state.surveys.trial else None for name in scan.ids]
+    groups, pose = tracks.any_by_model(channel, names), _covariance(state, scan)
+    found = [np.zeros(3, dtype=np.bool_)]
+    for model, rows in groups:
+        l = np.array([_place(state, names[k])[: model.d] for k in rows])
+        update = scan.known_update(model, l, rows)
+        head = channel.head(map_, scan.robot)
+        found.append(bends(update.model, head, pose, update.y, update.R))
+    return np.any(found, axis=0) if groups else None
+
+
+def _place(state: State, name: Any) -> Array:
+    """Return the numbers of a landmark that is known exactly, or of a survey in the map."""
+    known = state.tracks.known
+    return known.mean(name) if name in known else state.map.mean(state.tracks.slot(name))
+
+
+def weighed(state: State, scan: ScanContext, judged: Sequence[Judged]) -> None:
+    """Compare the filter of a robot with the sum of where else it may be, by what both expected of a scan."""
+    sum_ = state.sums.get(scan.event.robot)
+    if sum_ is None or not can_be_summed(scan.channel) or not judged:
+        return
+    done = {group.rows[i]: (group.done, i) for group in judged for i in range(len(group.rows))}
+    gain = 0.0
+    for k, one in _seen(state, scan, sum_.prior.map):
+        gain += log_likelihood(*done[k], one) if k in done else 0.0
+        gain -= sum_.observe(state.estimator.for_fixes(), one)[1]
+    most = 0.5 * _gate(scan)
+    sum_.lead += min(max(gain, -most), most)  # what is wrong in a scan may be so together
+    if sum_.lead > (IN_A_ROW + 2) * most:
+        del state.sums[scan.event.robot]
+    elif sum_.lead <= 0.0 and sum_.is_found:
+        sum_.lead = -math.inf
+        _show(state, scan, sum_)
+
+
+def can_be_summed(channel: Channel) -> bool:
+    """Return whether what a sensor observes corrects a Gaussian sum where no linearisation bears it."""
+    return channel.dimensions == 2 and not channel.gives_places and not channel.sees_velocity
+
+
+def is_doubted(state: State, scan: ScanContext) -> bool:
+    """Begin a sum of where else a robot may be that its sightings contradict; return whether there is one."""
+    name = scan.event.robot
+    if not (can_be_summed(scan.channel) and distances_alone(scan.channel.sensor)):
+        return False
+    if name not in state.sums:
+        moving = state.moving[name]
+        state.sums[name] = GaussianSum.anywhere(state.map, moving, state.blocks, scan.event.t_ns, _gate(scan))
+    return True
+
+
+def _covariance(state: State, scan: ScanContext) -> Array:
+    """Return the covariance (3, 3) or (6, 6) of the pose of a scan's robot."""
+    dof = scan.channel.pose_dof
+    return state.map.covariance([scan.robot])[:dof, :dof]
+
+
+def _gate(scan: ScanContext) -> float:
+    return gate(SURVEYED, scan.channel.dof)
+
+
+def _seen(state: State, scan: ScanContext, map_: Map) -> list[tuple[int, Seen]]:
+    """Return the observations of landmarks that are known, with their numbers, as those of a robot in a map alone.
+
+    The covariance of a survey is noise: what it says of the survey is left alone.
+    """
+    tracks, channel, out = state.tracks, scan.channel, list[tuple[int, Seen]]()
+    for k, name in enumerate(scan.ids):
+        kind = tracks.sort(name) if name in tracks.known or name in state.surveys.trial else None
+        model = channel.models.get(kind or "")
+        if model is None or name is None:
+            continue
+        l = _place(state, name)[: model.d]
+        update = replace(scan, map=map_).known_update(model, l[None], [k])
+        if name not in tracks.known:
+            E_l = linearize(model.model, channel.head(map_, scan.robot), l[None], scan.y[k : k + 1])[3][0]
+            P_l = state.map.covariance([tracks.slot(name)])[: model.d, : model.d]
+            update = update._replace(R=update.R + E_l @ P_l @ E_l.T)
+        place = place_of(model.landmark, l[None])
+        is_distance = distances_alone(channel.sensor) and place is not None
+        where = np.full(2, np.nan) if place is None else place[0][0, :2]
+        out.append((k, Seen(update, where, channel.at, _gate(scan), is_distance)))
+    return out
+
+
+def _summed(state: State, scan: ScanContext, sum_: GaussianSum) -> Located:
+    """Correct a sum by a scan; return what becomes of the observations."""
+    robot, report, m = scan.event.robot, scan.report, scan.y.shape[1]
+    seen = _seen(state, scan, state.map)
+    report.blank(scan.channel.dof)
+    fates = [Observation(k, i, "deferred", None, None, UNNAMED) for k, i in enumerate(scan.ids)]
+    for k, one in seen:
+        done, _ = sum_.observe(state.estimator.for_fixes(), one)
+        d2, is_used = None, True
+        if done is not None:
+            report.fill([k], done._replace(e=done.e[:, :m]))
+            d2, is_used = float(done.d2[0]) if np.isfinite(done.d2[0]) else None, bool(done.fused[0])
+        why = "" if is_used else f"outside the gate of {one.gate:.2f}"
+        fates[k] = Observation(k, scan.ids[k], "associated" if is_used else "rejected", scan.ids[k], d2, why)
+        if is_used and (name := scan.ids[k]) in state.tracks.known and name is not None:
+            state.tracks.known.count([name], [True])
+    _show(state, scan, sum_)
+    for _, one in seen:
+        holds = turn_holds(_covariance(state, scan)) and not bent_axes(state.map, scan.robot, one).any()
+        sum_.linear = sum_.linear + 1 if holds else 0
+    if sum_.linear >= IN_A_ROW:
+        del state.sums[robot]
+    return Located(None, None, "", fates)
+
+
+def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
+    """Write the moments of a sum to the map: of the robot, of the constants of its controls and of its mounts."""
+    name = scan.event.robot
+    moving = state.moving[name]
+    mounts = [channel.mount for (robot, _), channel in [*state.channels.items()] if robot == name]
+    mounts += [reader.mount for (robot, _), reader in state.readers.items() if robot == name]
+    slots = [moving.slot, *(slot for slot in (moving.bias, *mounts) if slot is not None and slot >= 0)]
+    written(state.map, slots, *sum_.moments(slots))
+    state.clones.moved(name)
 
 
 def decided(
@@ -60,7 +228,7 @@ def decided(
 def _fitting(state: State, scan: ScanContext, query: Query) -> Array | None:
     """Return where the sensor (3,) of a robot adrift is; None of others, or if its scan fits nowhere."""
     held = state.moving[scan.event.robot].held
-    if held.is_adrift and (len(scan.pose()) != 3 or state.map.covariance([scan.robot])[2, 2] < HEADING_RAD**2):
+    if held.is_adrift and (len(scan.pose()) != 3 or turn_holds(_covariance(state, scan))):
         held.recovered()
     scan.adrift = held.is_adrift
     if scan.adrift:

@@ -65,4 +65,6 @@ def move(state: State, name: str, part: Part) -> None:
             given.moved(part)
     if name in state.alternatives and not state.alternatives[name].move(state.estimator, part):
         del state.alternatives[name]
+    if name in state.sums and not state.sums[name].move(state.estimator, part):
+        del state.sums[name]
     state.clones.moved(name)

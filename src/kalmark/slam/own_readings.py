@@ -35,7 +35,9 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
     if not reader.counts and state.repeats(key, event.t_ns, event.y):
         return again(report, [None] * len(event.y), R.shape[1], event.robot)
     other = state.alternatives.get(event.robot)
-    reader.drift(event.t_ns, state.map, *([] if other is None else [other.map]))
+    sum_ = state.sums.get(event.robot)
+    others = [*([] if other is None else [other]), *([] if sum_ is None else sum_.all())]
+    reader.drift(event.t_ns, state.map, *(each.map for each in others))
     clones = {state.clones.clones[number].t_ns: number for number in state.clones.of(key)}
     found = list[Observation]()
     report.blank(R.shape[1])
@@ -49,6 +51,8 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         update = reader.update(state.map, state.moving[event.robot], clone, event, k, R[k : k + 1], since_s)
         estimator = reader.estimator(state.estimator, is_loop)
         fits = other is not None and not reader.counts and other.correct(estimator, update)
+        if sum_ is not None and not reader.counts:
+            sum_.correct(estimator, update)
         done = state.corrected(update, event, estimator)
         done = done._replace(e=done.e[:, : event.width])
         report.fill([k], done)
@@ -98,6 +102,8 @@ def fix(state: State, event: Fix) -> Report:
     update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
     estimator, other = state.estimator.for_fixes(), state.alternatives.get(event.robot)
     fits = other is not None and other.correct(estimator, update)
+    if event.robot in state.sums:
+        state.sums[event.robot].correct(estimator, update)
     done = state.corrected(update, event, estimator)
     report.e, report.z, report.Z = done.e, done.z, done.Z
     report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)

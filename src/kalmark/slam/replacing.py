@@ -26,11 +26,11 @@ from kalmark.geometry.angles import rotation, wrap
 from kalmark.geometry.gaussian import gate
 from kalmark.geometry.rotations import exp, multiply
 from kalmark.geometry.spaces import ANCHOR, VECTOR, VECTOR3, Space
+from kalmark.tracks.linearity import TURN_RAD
 
 NEEDED, KEPT = 5, 30  # fixes that must agree, and the last so many that are compared
 SHARE = 0.999  # of agreeing fixes that are believed
 LOOSE = 2.0  # sigmas of a fix, for what the robot's motion adds between the fixes
-TURN_RAD = 0.3  # to so much they must tell the heading
 
 
 class LeftOut(NamedTuple):

@@ -41,6 +41,7 @@ from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
 from kalmark.slam.alternative import Alternative, alone
+from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_readings import Given
 from kalmark.slam.motion import Mean, Moving, bias_block, bias_name
 from kalmark.slam.reader import Reader
@@ -130,6 +131,7 @@ def _state(state: State) -> Description:
         "alternatives": [
             [name, other.since_ns, other.misses, other.map.state()] for name, other in state.alternatives.items()
         ],
+        "sums": [_sum(name, of) for name, of in state.sums.items()],
         "clones": [[number, _record(clone)] for number, clone in state.clones.clones.items()],
         "latest": state.clones.latest,
         "numbered": state.clones.numbered,
@@ -186,6 +188,18 @@ def _id(name: Any) -> Any:
     return name
 
 
+def _sum(name: str, of: GaussianSum) -> list[Any]:
+    maps = [each.map.state() for each in of.all()]
+    return [name, of.prior_log, str(of.lead), of.linear, of.log_weights.tolist(), of.prior.since_ns, maps]
+
+
+def _arrays_of_sums(state: State) -> Iterator[tuple[str, Array]]:
+    for i, of in enumerate(state.sums.values()):
+        for j, each in enumerate(of.all()):
+            for name, array in each.map.arrays():
+                yield f"sum{i}.{j}.{name}", array
+
+
 def _arrays(state: State) -> Iterator[tuple[str, Array]]:
     yield from state.map.arrays()
     for i, of in enumerate(state.tracks.known.of_kind.values()):
@@ -196,6 +210,7 @@ def _arrays(state: State) -> Iterator[tuple[str, Array]]:
     for i, other in enumerate(state.alternatives.values()):
         for name, array in other.map.arrays():
             yield f"alternative{i}.{name}", array
+    yield from _arrays_of_sums(state)
     for i, moving in enumerate(state.moving.values()):
         if moving.held.u is not None and moving.held.N is not None:
             yield f"u{i}", moving.held.u
@@ -273,6 +288,7 @@ class Saved:
             moving = alone(state.moving[name])
             state.alternatives[name] = Alternative(own, moving, int(since_ns), _count(misses, "misses"))
         state.given = {(str(r), str(sensor)): Given.restored(*saved) for r, sensor, saved in s.get("given", ())}
+        self._fill_sums(state)
         judged = s.get("surveys", {"trial": (), "misfits": (), "strangers": ()})
         state.surveys.trial = {name: _count(number, f"sightings of {name!r}") for name, number in judged["trial"]}
         state.surveys.misfits = {name: (int(out), frozenset(fit)) for name, out, fit in judged["misfits"]}
@@ -298,6 +314,16 @@ class Saved:
                 return _array(self._members, f"{name}{i}", shape)
 
             state.front_ends[robot, sensor].restore(seen, read)
+
+    def _fill_sums(self, state: State) -> None:
+        for i, (name, prior_log, lead, linear, log_weights, since_ns, maps) in enumerate(self._state.get("sums", ())):
+            each = list[Alternative]()
+            for j, of in enumerate(maps):
+                at = f"sum{i}.{j}."
+                own = restored_map(of, lambda key, *shape, at=at: _array(self._members, at + key, *shape))
+                each.append(Alternative(own, alone(state.moving[name]), int(since_ns)))
+            logs = np.array(log_weights, dtype=np.float64).reshape(len(maps) - 1)
+            state.sums[name] = GaussianSum(each[0], each[1:], logs, float(prior_log), float(lead), int(linear))
 
     def _fill_moving(self, state: State) -> None:
         """Fill in how the robots move."""

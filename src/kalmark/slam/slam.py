@@ -309,9 +309,10 @@ class Slam(Estimate):
         query = Query(scan)
         located = locating.started(state, scan, query)
         if located is not None and located.T is None:
-            scan.report.blank(scan.channel.dof)
-            fate = [Observation(k, i, "deferred", None, None, located.why) for k, i in enumerate(scan.ids)]
-            scan.report.observations = fate
+            if not located.fates:
+                scan.report.blank(scan.channel.dof)
+            waits = [Observation(k, i, "deferred", None, None, located.why) for k, i in enumerate(scan.ids)]
+            scan.report.observations = located.fates or waits
             return
         if located is None:
             query, decisions = locating.decided(state, scan, query, lambda asked: self._decided(policy, asked))
@@ -325,6 +326,8 @@ class Slam(Estimate):
         again = starting.left_open(state, scan, groups, decisions) if policy.restarts else []
         judged, found = correct(state, scan, policy, groups, decisions)
         judged = exact + judged
+        if state.sums:
+            locating.weighed(state, scan, judged)
         if again:
             found = found + starting.restart(state, scan, again, decisions)
         if not found and not policy.reviews and sum(len(group.rows) for group in judged) == len(decisions):

@@ -19,6 +19,7 @@ from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
 from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
+from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_readings import SELDOM, Given
 from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, policy_of, refuse_other_world
@@ -54,8 +55,9 @@ class State:
 
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
     `standing` are, of robots that are noticed to stand, the names of the sensors that do; `alternatives` are, of robots
-    whose readings do not fit, the other explanations of these; `taken` are the events of this very time: the kind, the
-    robot and the sensor of each; `given` is what each sensor gave last.
+    whose readings do not fit, the other explanations of these; `sums` are, of robots that may be in several places,
+    their poses; `taken` are the events of this very time: the kind, the robot and the sensor of each; `given` is what
+    each sensor gave last.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
@@ -68,6 +70,7 @@ class State:
         self.given: dict[ChannelKey, Given] = {}
         self.placed = 0  # fixes that have told where the map is in the world; a survey counts as many
         self.alternatives: dict[str, Alternative] = {}
+        self.sums: dict[str, GaussianSum] = {}
         self.moving: dict[str, Moving] = {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}

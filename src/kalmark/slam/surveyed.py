@@ -12,25 +12,25 @@ from kalmark.arrays import Array
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate
+from kalmark.slam.locating import can_be_summed, is_doubted
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
+from kalmark.tracks.linearity import turn_holds
 from kalmark.tracks.scan import ScanContext
+from kalmark.tracks.surveys import SURVEYED
 
-SURVEYED = 0.9999  # of right sightings are within the gate
 ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped anew"
 WIDER = 2.0  # times what a robot that was elsewhere has moved by
 DOUBLED = 20  # times at most that a robot is moved by one scan, each time farther
-SURE_RAD = 0.3  # a sigma of the heading above which nothing can be expected
 
 
 def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
-    """Return the gate of sightings of surveyed landmarks; infinite while the heading of their robot is not known."""
+    """Return the gate of sightings of surveyed landmarks; infinite while no turn of their robot is linear."""
     least = policy.association.threshold(scan.channel.dof, gate(SURVEYED, scan.channel.dof))
     if least == math.inf:
         return least
-    turns = slice(2, 3) if scan.dimensions == 2 else slice(3, 6)
-    sure = state.map.covariance([scan.robot]).diagonal()[turns].max() <= SURE_RAD**2
-    return least if sure else math.inf
+    dof, is_summed = scan.channel.pose_dof, can_be_summed(scan.channel)
+    return least if is_summed or turn_holds(state.map.covariance([scan.robot])[:dof, :dof]) else math.inf
 
 
 def is_tried(state: State, robot: str, names: Sequence[Any]) -> bool:
@@ -56,6 +56,8 @@ def corrected(
     tried = [name in trial or name in known for name in names]
     fitting = [names[k] for k in np.flatnonzero(done.fused & (done.d2 <= least)).tolist()]
     lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
+    if (lost or state.surveys.contradict()) and is_doubted(state, scan):
+        lost = False
     out = np.array([k for k in beyond if (lost or not tried[k]) and done.d2[k] <= update.gate], dtype=np.int64)
     if not len(out):
         return done

@@ -11,6 +11,7 @@ from collections.abc import Collection
 
 from kalmark.events import Id
 
+SURVEYED = 0.9999  # of right sightings are within the gate
 MISFITS, TWICE = 5, 2  # sightings in a row that do not fit, and landmarks that do: the survey is wrong
 TRUSTED = 5  # sightings that fit, after which it is right
 
@@ -56,6 +57,11 @@ class Surveys:
             self.misfits.pop(name, None)
         strangers.clear()
         return True
+
+    def contradict(self) -> bool:
+        """Return whether no more landmarks fit than do not meanwhile: then it may be the robot."""
+        fitting = frozenset[Id]().union(*(fit for _, fit in self.misfits.values()))
+        return len(self.misfits) >= TWICE and len(self.misfits) >= len(fitting - self.misfits.keys())
 
     def wrong(self) -> list[Id]:
         """Return the landmarks that stand elsewhere."""
