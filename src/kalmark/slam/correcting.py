@@ -22,6 +22,7 @@ from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
+from kalmark.tracks.surveys import SURVEYED
 
 
 def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],
@@ -97,7 +98,7 @@ def _misfits(
     regular: Flags = np.asarray(np.isfinite(Z).all(axis=(1, 2)), dtype=np.bool_)
     z, Z = np.where(regular[:, None], done.z, 0.0), np.where(regular[:, None, None], Z, np.eye(Z.shape[1]))
     d2 = np.sum(z * np.linalg.solve(Z, z[..., None])[..., 0], axis=1)
-    return np.asarray(~regular | (d2 > gate(surveyed.SURVEYED, scan.channel.dof)))
+    return np.asarray(~regular | (d2 > gate(SURVEYED, scan.channel.dof)))
 
 
 def _approach(

@@ -71,7 +71,7 @@ def _give_up(state: State, scan: ScanContext, policy: Policy, found: dict[Id | N
 def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
     """Map management after a scan: landmarks that are gone, that are one, tentative ones without hope."""
     report, ids = scan.report, scan.event.ids
-    for name in state.surveys.wrong() if state.surveys.misfits else ():
+    for name in state.surveys.wrong() if state.surveys.misfits and not state.sums else ():  # else it may be the robot
         state.remove(name)
         report.removed += ((name, surveyed.ELSEWHERE),)
     for judgement in existence.judged(scan, policy.upkeep) if policy.upkeep.p_detect is not None else ():
