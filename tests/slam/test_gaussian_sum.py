@@ -43,13 +43,8 @@ class Hall:
         outliers: float = 0.0, stale: tuple[tuple[float, float], ...] = (), lag_s: float = 3.0, all_: bool = False,
         sensor: Any = None,
     ) -> None:  # fmt: skip
-        self.rng, self.beacons, self.at, self.rest_s, self.stale = (
-            np.random.default_rng(seed),
-            beacons,
-            at,
-            rest_s,
-            stale,
-        )
+        self.rng, self.beacons, self.at = np.random.default_rng(seed), beacons, at
+        self.rest_s, self.stale = rest_s, stale
         self.outliers, self.lag_s, self.all = outliers, lag_s, all_
         self.x = np.array([*self.rng.uniform(2.5, 6.5, 2), self.rng.uniform(-math.pi, math.pi)])
         self.sensor = km.sensors.Range(RANGE_M) if sensor is None else sensor
@@ -125,7 +120,7 @@ def test_a_heading_that_may_be_any_is_found_by_ranges_and_its_covariance_is_righ
 
 def test_a_place_that_may_be_any_of_a_hall_is_found_by_ranges_and_its_covariance_is_right() -> None:
     runs = []
-    for seed in range(20):
+    for seed in range(14):
         hall = Hall(seed, beacons="nesw" if seed % 2 else "nes")
         runs.append(hall.drive(hall.slam(MIDDLE, ANYWHERE), 3.0))
         assert runs[-1].used > 0.95
@@ -135,7 +130,7 @@ def test_a_place_that_may_be_any_of_a_hall_is_found_by_ranges_and_its_covariance
 
 def test_ten_seconds_of_rest_say_nothing_of_a_heading_and_driving_does() -> None:
     runs = []
-    for seed in range(4):
+    for seed in range(3):
         hall = Hall(seed, rest_s=10.0)
         slam = hall.slam(hall.near(), np.diag([0.3, 0.3, 3.0]) ** 2)
         runs.append(hall.drive(slam, 10.0))
@@ -172,16 +167,16 @@ def test_bearings_from_a_known_place_find_a_heading_that_may_be_any() -> None:
 
 @pytest.mark.parametrize("all_", [False, True])
 def test_two_stale_epochs_move_no_robot(all_: bool) -> None:
-    for seed in range(3):
+    for seed in range(2):
         hall = Hall(seed, stale=((3.0, 3.1), (5.0, 5.1)), lag_s=2.5, all_=all_)
-        found = hall.drive(hall.slam(hall.x.copy(), 0.01 * np.eye(3)), 8.0)
+        found = hall.drive(hall.slam(hall.x.copy(), 0.01 * np.eye(3)), 7.0)
         assert rmse(found) < 0.1
         assert found.used > 0.95
 
 
 @pytest.mark.parametrize("all_", [False, True])
 def test_a_robot_comes_back_after_a_second_and_a_half_of_stale_ranges(all_: bool) -> None:
-    for seed in range(3):
+    for seed in range(2):
         hall = Hall(seed, stale=((4.0, 5.5),), all_=all_)
         found = hall.drive(hall.slam(hall.x.copy(), 0.01 * np.eye(3)), 9.0)
         assert rmse(found, 7.5) < 0.1

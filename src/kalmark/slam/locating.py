@@ -45,11 +45,11 @@ def started(state: State, scan: ScanContext, query: Query) -> Located | None:
 
     A scan that does not determine the pose corrects a Gaussian sum of poses, or waits with the reason.
     """
+    if scan.dimensions != 2 or not (state.tracks.known or state.surveys.trial):
+        return None
     name, P = scan.event.robot, _covariance(state, scan)
     sum_ = state.sums.get(name)
     shown = sum_ is not None and sum_.shows
-    if scan.dimensions != 2 or not (state.tracks.known or state.surveys.trial):
-        return None
     if scan.channel.gives_places:
         if len(state.tracks.known) < FEWEST or (not shown and turn_holds(P)):
             return None
@@ -60,7 +60,7 @@ def started(state: State, scan: ScanContext, query: Query) -> Located | None:
         return found
     if not can_be_summed(scan.channel):
         return None
-    if sum_ is None or not sum_.shows:
+    if sum_ is None or not shown:
         is_turn, bent = turn_holds(P), _bent(state, scan)
         if bent is None:
             return None if is_turn or len(state.tracks.known) < FEWEST else Located(None, None, UNNAMED)
@@ -135,9 +135,8 @@ def is_doubted(state: State, scan: ScanContext) -> bool:
 
 
 def _covariance(state: State, scan: ScanContext) -> Array:
-    """Return the covariance (3, 3) or (6, 6) of the pose of a scan's robot."""
-    dof = scan.channel.pose_dof
-    return state.map.covariance([scan.robot])[:dof, :dof]
+    """Return the covariance (3, 3) of the pose of a scan's robot, of the plane."""
+    return state.map.covariance([scan.robot])[:3, :3]
 
 
 def _gate(scan: ScanContext) -> float:

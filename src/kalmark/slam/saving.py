@@ -13,7 +13,7 @@ import math
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -284,9 +284,8 @@ class Saved:
         clones.numbered = _count(s["numbered"], "number of clones")
         self._fill_moving(state)
         for i, (name, since_ns, misses, of) in enumerate(s["alternatives"]):
-            own = restored_map(of, lambda key, *shape, i=i: _array(self._members, f"alternative{i}.{key}", *shape))
-            moving = alone(state.moving[name])
-            state.alternatives[name] = Alternative(own, moving, int(since_ns), _count(misses, "misses"))
+            other = self._other(state, name, of, since_ns, f"alternative{i}")
+            state.alternatives[name] = replace(other, misses=_count(misses, "misses"))
         state.given = {(str(r), str(sensor)): Given.restored(*saved) for r, sensor, saved in s.get("given", ())}
         self._fill_sums(state)
         judged = s.get("surveys", {"trial": (), "misfits": (), "strangers": ()})
@@ -315,13 +314,14 @@ class Saved:
 
             state.front_ends[robot, sensor].restore(seen, read)
 
+    def _other(self, state: State, name: str, of: Description, since_ns: int, at: str) -> Alternative:
+        """Return another filter of a robot, whose arrays' names begin with `at`."""
+        own = restored_map(of, lambda key, *shape: _array(self._members, f"{at}.{key}", *shape))
+        return Alternative(own, alone(state.moving[name]), int(since_ns))
+
     def _fill_sums(self, state: State) -> None:
         for i, (name, prior_log, lead, linear, log_weights, since_ns, maps) in enumerate(self._state.get("sums", ())):
-            each = list[Alternative]()
-            for j, of in enumerate(maps):
-                at = f"sum{i}.{j}."
-                own = restored_map(of, lambda key, *shape, at=at: _array(self._members, at + key, *shape))
-                each.append(Alternative(own, alone(state.moving[name]), int(since_ns)))
+            each = [self._other(state, name, of, since_ns, f"sum{i}.{j}") for j, of in enumerate(maps)]
             logs = np.array(log_weights, dtype=np.float64).reshape(len(maps) - 1)
             state.sums[name] = GaussianSum(each[0], each[1:], logs, float(prior_log), float(lead), int(linear))
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.geometry.angles import rotation, wrap
-from kalmark.geometry.spaces import SE2, SE3
+from kalmark.geometry.spaces import SE2
 from kalmark.models.observe import linearize
 
 SIGMAS = 2.0  # of the pose, at which its sigma points are
@@ -34,25 +34,21 @@ def turn_holds(P: Array) -> bool:
 
 
 def axes(P: Array) -> Array:
-    """Return the steps (dof, dof) to the sigma points of a pose, by rows, P (dof, dof) = sum of their squares.
+    """Return the steps (3, 3) to the sigma points of a pose, by rows, P (3, 3) = sum of their squares.
 
-    Those of the heading, with the position as it is correlated, come first, then those of the position.
+    That of the heading, with the position as it is correlated, comes first, then those of the position.
     """
-    d, turns = (2, 1) if len(P) == 3 else (3, 3)
-    variances, U = np.linalg.eigh(P[d:, d:])
-    sigmas = np.sqrt(np.maximum(variances, 1e-24))
-    along = P[:, d:] @ U / sigmas
-    own, V = np.linalg.eigh((P - along @ along.T)[:d, :d])
-    steps = np.zeros((turns + d, len(P)))
-    steps[:turns] = (along * np.minimum(SIGMAS, math.pi / sigmas)).T
-    steps[turns:, :d] = (SIGMAS * V * np.sqrt(np.maximum(own, 0.0))).T
+    sigma = math.sqrt(max(float(P[2, 2]), 1e-24))
+    along = P[:, 2] / sigma
+    own, V = np.linalg.eigh((P - np.outer(along, along))[:2, :2])
+    steps = np.zeros((3, 3))
+    steps[0] = along * min(SIGMAS, math.pi / sigma)
+    steps[1:, :2] = (SIGMAS * V * np.sqrt(np.maximum(own, 0.0))).T
     return steps
 
 
 def turned(r: Array, step: Array) -> Array:
-    """Return a pose r (3,) or (7,) moved by a step (3,) or (6,), in the plane along the arc that an unknown turn is."""
-    if len(r) == 7:
-        return SE3.plus(r, step)
+    """Return a pose r (3,) moved by a step (3,), along the arc that an unknown turn is."""
     if step[2] == 0.0:
         return SE2.plus(r, step)
     arm = np.array([step[1], -step[0]]) / step[2]  # from the place about which the heading turns the position
@@ -60,19 +56,19 @@ def turned(r: Array, step: Array) -> Array:
 
 
 def bends(view: Any, head: Array, P: Array, y: Array, R: Array) -> Flags:
-    """Return along which axes (dof,) of a pose no linearisation describes some of the observations y (K, m + n).
+    """Return along which axes (3,) of a pose no linearisation describes some of the observations y (K, m + n).
 
     They are of landmarks known exactly, whose numbers come behind the measurement; `head` (h,) begins with the pose of
-    the covariance P (dof, dof), and R (K, p, p) is the noise.
+    the covariance P (3, 3), and R (K, p, p) is the noise.
     """
-    size, none, steps = 3 if len(P) == 3 else 7, np.zeros((len(y), 0)), axes(P)
+    none, steps = np.zeros((len(y), 0)), axes(P)
     e, _, E_h, _ = linearize(view, head, none, y)  # innovations are wrapped: they count from what is expected
     white = np.linalg.inv(np.linalg.cholesky(R))
-    linear = np.einsum("kpq,kqi,ai->akp", white, E_h[:, :, : len(P)], steps)
+    linear = np.einsum("kpq,kqi,ai->akp", white, E_h[:, :, :3], steps)
     off = np.empty((2, *linear.shape))
     for a, step in enumerate(steps):
         for i, sign in enumerate((1.0, -1.0)):
-            there = np.concatenate([turned(head[:size], sign * step), head[size:]])
+            there = np.concatenate([turned(head[:3], sign * step), head[3:]])
             change = -linearize(view, there, none, e)[1]
             off[i, a] = np.einsum("kpq,kq->kp", white, change) - sign * linear[a]
     off[~np.isfinite(off)] = np.inf
