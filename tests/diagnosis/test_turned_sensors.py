@@ -41,7 +41,7 @@ def test_a_sensor_that_is_turned_by_ten_degrees_on_the_way_is_named_first() -> N
     assert (cause.name, cause.since_s) == ("mount", pytest.approx(10.0, abs=0.5))
     assert cause.evidence.startswith(f"from t={cause.since_s:.1f} s on the sensor rover.lidar is turned by ")
     assert float(cause.evidence.split("turned by ")[1].split()[0]) == pytest.approx(10.0, abs=0.5)
-    assert cause.cure == f"--set log.to_s={cause.since_s - log.events[0].t_s - 0.05:.1f}"
+    assert cause.cure == ""
     assert all(other.score < 0.02 * cause.score for other in others), others
 
 

@@ -233,13 +233,7 @@ def later(run: Run, log: Log, first: int) -> Mistake | None:
     if found is None:
         return None
     evidence = f"from t={t_ns * 1e-9:.1f} s on {found.evidence}"
-    return found._replace(evidence=evidence, cure=until(run, log, t_ns))
-
-
-def until(run: Run, log: Log, t_ns: int) -> str:
-    """Return the line that ends a log before a time."""
-    begin_s = float((run.config.get("log") or {}).get("from_s") or 0.0)
-    return f"--set log.to_s={max(begin_s + (t_ns - log.events[0].t_ns) * 1e-9 - 0.05, 0.0):.1f}"
+    return found._replace(evidence=evidence, cure="")
 
 
 def misfits_from(now: Fit) -> int | None:
@@ -380,7 +374,7 @@ def kidnapped(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
     evidence = (
         f"{robot} was elsewhere from t={t_ns * 1e-9:.1f} s on: the log before and after it fits, but not together"
     )
-    return Mistake("kidnapped", evidence, until(run, log, t_ns), run.config, None, gain, t_ns * 1e-9)
+    return Mistake("kidnapped", evidence, "", run.config, None, gain, t_ns * 1e-9)
 
 
 def moved(run: Run, log: Log, first: int, again: Run) -> Mistake | None:

@@ -13,7 +13,7 @@ from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis import copies, sightings
 from kalmark.diagnosis.blind import blind
 from kalmark.diagnosis.causes import JUMPS, Finding
-from kalmark.diagnosis.gross import FITS, LOST, MOVED, fit, gross, started_at, until
+from kalmark.diagnosis.gross import FITS, LOST, MOVED, fit, gross, started_at
 from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.gross import MOST as MOST_D2
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
@@ -283,7 +283,7 @@ def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     if odd is not None:
         name, told = JUMP, of_odd_control(finding, odd)
     if name == TURNED and log is not None:
-        told = f"from t={since_s:.1f} s on {told[0]}", until(run, log, round(since_s * 1e9))
+        told = f"from t={since_s:.1f} s on {told[0]}", ""
     return Cause(name, since_s, finding.gain, *told, harmless)
 
 
@@ -557,7 +557,7 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
     if odd is not None:
         yield Cause(JUMP, odd.t_s, score, *of_odd_control(Finding(JUMP, (first.robot, ""), 0.0, 0.0, 0.0), odd))
         return
-    yield Cause("kidnapped", first.t_s, score, evidence, until(run, log, round(first.t_s * 1e9)))
+    yield Cause("kidnapped", first.t_s, score, evidence)
 
 
 def split_landmarks(run: Run) -> Iterator[Cause]:
