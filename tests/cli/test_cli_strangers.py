@@ -36,7 +36,7 @@ def test_plug_ins_of_a_run_folder_are_run_only_if_it_is_trusted(kalmark: Kalmark
     for verb in (["diagnose", out], ["convert", out, "out.mcap"]):
         done = kalmark(*verb)
         assert done.status == 2
-        said = r"kalmark: .*config\.yaml names plug-ins, \[.*theirs\.py.*\], .* expected --trust, .*\n"
+        said = r"kalmark: .*config\.yaml names plug-ins, .*, whose code would be run: expected --trust, .*\n"
         assert re.fullmatch(said, done.err)
     assert kalmark("evaluate", out).status == 0
     assert kalmark("report", out).status == 0

@@ -78,13 +78,6 @@ def test_a_robot_that_is_never_controlled_is_named() -> None:
     assert "robot b has 10 scans but no controls: it is taken to stand still" in lines
 
 
-def test_controls_in_other_units_of_time_than_the_scans_are_noticed() -> None:
-    log = circle(steps=40)
-    controls = [Control(t_ns=e.t_ns // 1000, robot=e.robot, u=e.u) for e in log if isinstance(e, Control)]
-    lines = warned(log, [*controls, *(e for e in log if isinstance(e, Scan))])
-    assert any("controls of robot rover cover 0% of the time of its scans" in line for line in lines)
-
-
 def test_bearings_in_degrees_are_noticed() -> None:
     log = circle(steps=20)
     events: list[Event] = [scan(e, y=e.y * [1.0, 180 / np.pi]) if isinstance(e, Scan) else e for e in log]

@@ -21,7 +21,7 @@ from kalmark.models import landmarks2d, landmarks3d, lines, seen, tags, walls
 __all__ = [
     "BUILT_IN", "LINES", "AnchoredHomogeneous", "AnchoredHomogeneousLine", "AnchoredPlueckerLine", "AsPoint",
     "Homogeneous", "HomogeneousLine", "InverseDepth2D", "InverseDepth3D", "InverseDepthLine", "PlueckerLine", "Point2D",
-    "Point3D", "PointSignature2D", "Polar2D", "Tag", "Wall2D",
+    "Point3D", "PointHeight2D", "PointSignature2D", "Polar2D", "Tag", "Wall2D",
 ]  # fmt: skip
 
 TINY_M = 1e-12

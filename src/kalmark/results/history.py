@@ -357,7 +357,9 @@ class History:
             "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
             "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
             "map_shape": padded([m.shape for m in self.maps], [len(m.ids) for m in self.maps], width, matrices=True),
-            "map_robot": np.array([m.robots for m in self.maps]).reshape(len(self.maps), -1, self.d, self.d),
+            "map_robot": np.array([m.robots for m in self.maps]).reshape(
+                len(self.maps), -1 if self.maps else 0, self.d, self.d
+            ),
             "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
             "map_landmark": texts([i for m in self.maps for i in m.ids]),
             "map_kind": texts([kind for m in self.maps for kind in m.kinds]),

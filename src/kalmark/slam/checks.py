@@ -167,7 +167,7 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
     what, p = f"{when(event)}: cov", innovation_size(sensor)
     if event.cov is None:
         R = sensor.noise(event.y)
-        if np.shape(R) != (count, p, p):
+        if np.shape(R) != (count, p, p) and not isinstance(sensor, OwnNoise):
             wrong = f"noise of {count} measurements has shape {np.shape(R)}, expected ({count}, {p}, {p})"
             raise EventError(f"{when(event)}: {event.robot}.{event.sensor}, {type(sensor).__name__}: {wrong}")
         return R

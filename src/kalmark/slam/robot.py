@@ -150,7 +150,8 @@ class Robot:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise ModelError(f"Robot: name is {shown(self.name)}, expected a text that is not empty")
-        for name in (self.name, *(name for name in self.sensors if isinstance(name, str))):
+        sensors = self.sensors if isinstance(self.sensors, Mapping) else ()
+        for name in (self.name, *(name for name in sensors if isinstance(name, str))):
             if not is_writable(name):
                 raise ModelError(f"Robot: the name {shown(name)} has control characters or surrogates, expected none")
         what = f"robot {self.name!r}"
