@@ -32,10 +32,8 @@ STALE_S = 3600.0  # older than this, what is beside a result was left by a progr
 POLL_S = 0.05  # between two looks at a lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
 MOST_NODES = 1_000_000  # of a YAML file, its aliases counted as what they stand for
-FREE_BYTES, MOST_PACKED = (
-    1 << 26,
-    100,
-)  # of an archive: unpacked size, and that by its own size, which results stay below
+FREE_BYTES = 1 << 26  # of an archive: what it may unpack to, whatever its own size
+MOST_PACKED = 100  # times its own size that it may unpack to beyond that: results stay below
 
 
 def write(path: Path, text: str) -> None:
