@@ -13,6 +13,7 @@ import pytest
 import kalmark as km
 from batch_dense import Link, Sight, link, optimum
 from kalmark.batch.data import replayed
+from kalmark.batch.problem import Rows
 from kalmark.batch.solver import Batch
 from kalmark.batch.state import POSES, State, plus
 from kalmark.config import build_slam, load_config, open_config_log
@@ -195,6 +196,23 @@ def test_the_hessian_is_the_derivative_of_the_gradient() -> None:
     x = np.concatenate([start.groups[POSES].ravel(), start.groups[1].ravel()])
     numerical = np.array([(gradient(x + d) - gradient(x - d)) / 2e-5 for d in 1e-5 * np.eye(len(x))])
     assert np.allclose(problem.hessian(start, m).toarray(), numerical, atol=1e-4)
+
+
+def test_the_gradient_of_a_robust_factor_is_the_derivative_of_its_sum() -> None:
+    """Residuals within and beyond the length of Huber side by side: those within count in full."""
+    events, *_ = odometry_log()
+    problem = replayed(given_by(filtered([robot("r", ODOMETRY)], events)), events)
+    factor, start, rng = replace(problem.factors[0], huber=3.0), problem.start, np.random.default_rng(0)
+    x = np.concatenate([start.groups[POSES].ravel(), start.groups[1].ravel()])
+    n, x = 3 * len(start.groups[POSES]), x + 0.1 * rng.normal(size=len(x))
+
+    def rows(x: Array) -> Rows:
+        return factor.rows(State(start.spaces, (x[:n].reshape(-1, 3), x[n:].reshape(-1, 2))))
+
+    lengths = np.linalg.norm(rows(x).z.reshape(len(factor.y), -1), axis=1)
+    assert (lengths < 3.0).sum() > 3 < (lengths > 3.0).sum()
+    numerical = [(rows(x + d).chi2 - rows(x - d).chi2) / 4e-6 for d in 1e-6 * np.eye(len(x))]
+    assert np.allclose(-rows(x).H.T @ rows(x).z, numerical, atol=1e-5)
 
 
 def test_the_start_of_the_search_does_not_matter_even_turned_by_half_a_radian() -> None:

@@ -546,7 +546,6 @@ def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidn
     assert 100 < verdict.causes[0].score < 0.5 * fit(run).chi2
 
 
-@pytest.mark.xfail(strict=True, reason="named as bearing_sigma and outliers")
 def test_wrong_ids_that_pull_the_solution_far_are_named_alone_and_the_map_is_not_ok() -> None:
     exact = (f"{SIGMA}=0.03", "robots.rover.sensors.lidar.sigma_bearing_rad=0.004")
     rng, made = np.random.default_rng(0), world_of(*exact)

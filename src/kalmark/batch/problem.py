@@ -104,7 +104,7 @@ class Factor:
         length = np.sqrt(np.sum(z**2, axis=1))
         inside = np.minimum(length, self.huber)
         if (length > self.huber).any():
-            root = np.sqrt(inside / np.maximum(length, self.huber))[:, None]
+            root = np.sqrt(self.huber / np.maximum(length, self.huber))[:, None]
             z, E = root * z, root[:, :, None] * E
         return Rows(z.ravel(), self.term.jacobian(E, state), float(inside @ (2 * length - inside)))
 
