@@ -14,7 +14,7 @@ from kalmark.filter.compressed.map import CompressedMap
 START = np.array([2.0, 2.0, 0.3])
 
 
-def steps(rng: np.random.Generator, marks: np.ndarray, count: int = 500) -> list[tuple[km.Control, km.Scan]]:
+def steps(rng: np.random.Generator, marks: np.ndarray, count: int = 300) -> list[tuple[km.Control, km.Scan]]:
     """Return rounds on a ring among landmarks, of which the robot sees those within 3 m."""
     truth, out = START.copy(), []
     for t in range(count):
