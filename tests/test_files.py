@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import io
 import itertools
 import multiprocessing as mp
@@ -16,7 +18,16 @@ from ruamel.yaml import YAML
 
 from kalmark import files
 from kalmark.errors import RunError
-from kalmark.files import locked, read_arrays, refuse_aliases, refuse_bomb, replace_file, replace_folder, write
+from kalmark.files import (
+    locked,
+    read_arrays,
+    refuse_aliases,
+    refuse_bomb,
+    replace_file,
+    replace_folder,
+    unpacked,
+    write,
+)
 
 OWN = ("summary.json", "map_*.csv", "cells")
 
@@ -191,6 +202,26 @@ def test_an_archive_that_says_that_it_unpacks_to_far_more_is_refused_before_it_i
             archive.writestr(str(k), bytes(1_000_000))
     with zipfile.ZipFile(path) as archive, pytest.raises(RunError, match=r"100000000 bytes in a file of \d+, expected"):
         refuse_bomb(archive, path, RunError)
+
+
+@pytest.mark.parametrize(("ending", "compress"), [("gz", gzip.compress), ("bz2", bz2.compress)])
+def test_a_compressed_file_is_read_to_its_limit_and_no_further(
+    ending: str, compress: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "FREE_BYTES", 10_000)
+    monkeypatch.setattr(files, "PIECE", 1000)
+    path, content = tmp_path / f"a.{ending}", bytes(10_000)
+    path.write_bytes(compress(content))
+    assert b"".join(unpacked(path, RunError)) == content
+    path.write_bytes(compress(bytes(1_000_000)))
+    read = 0
+    with pytest.raises(RunError, match=rf"a\.{ending}: unpacks to more than \d+ bytes, expected at most that"):
+        for piece in unpacked(path, RunError):
+            read += len(piece)
+    assert read <= files.most_unpacked(path) < 1_000_000
+    path.write_bytes(compress(content)[:-8])
+    with pytest.raises(RunError, match=r"cannot be unpacked .*, expected a complete file"):
+        list(unpacked(path, RunError))
 
 
 def test_arrays_come_back_and_no_longer_than_their_file_is(tmp_path: Path) -> None:

@@ -6,9 +6,11 @@ to one place: the one that comes last stays.  What a killed program left beside 
 
 from __future__ import annotations
 
+import bz2
 import ctypes
 import errno
 import glob
+import gzip
 import io
 import math
 import os
@@ -32,6 +34,7 @@ STALE_S = 3600.0  # older than this, what is beside a result was left by a progr
 POLL_S = 0.05  # between two looks at a lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
 MOST_NODES = 1_000_000  # of a YAML file, its aliases counted as what they stand for
+PIECE = 1 << 20  # bytes that are unpacked at once
 FREE_BYTES = 1 << 26  # of an archive: what it may unpack to, whatever its own size
 MOST_PACKED = 100  # times its own size that it may unpack to beyond that: results stay below
 
@@ -247,9 +250,26 @@ def refuse_aliases(content: Any, where: str, error: type[KalmarkError]) -> None:
         raise error(f"{where}: its aliases make more than {MOST_NODES} values of it, expected fewer")
 
 
+def unpacked(path: Path, error: type[KalmarkError]) -> Iterator[bytes]:
+    """Yield a .gz or .bz2 file unpacked, piece by piece.  Raises `error` if it is damaged or unpacks to too much."""
+    try:
+        most = most_unpacked(path)
+        with (bz2.open if path.suffix == ".bz2" else gzip.open)(path) as file:
+            while piece := file.read(PIECE):
+                if file.tell() > most:
+                    raise error(f"{path}: unpacks to more than {most} bytes, expected at most that for its size")
+                yield piece
+    except (OSError, EOFError, zlib.error) as damage:
+        raise error(f"{path}: cannot be unpacked ({damage}), expected a complete file") from None
+
+
+def most_unpacked(path: Path) -> int:
+    """Return how many bytes a compressed file of this size may unpack to."""
+    return FREE_BYTES + MOST_PACKED * path.stat().st_size
+
+
 def refuse_bomb(archive: zipfile.ZipFile, path: Path, error: type[KalmarkError]) -> None:
     """Refuse an archive whose members say that they are far larger than the file, before any of them is unpacked."""
-    size, unpacked = path.stat().st_size, sum(member.file_size for member in archive.infolist())
-    most = FREE_BYTES + MOST_PACKED * size
-    if unpacked > most:
-        raise error(f"{path}: {unpacked} bytes in a file of {size}, expected at most {most}")
+    size, most = sum(member.file_size for member in archive.infolist()), most_unpacked(path)
+    if size > most:
+        raise error(f"{path}: {size} bytes in a file of {path.stat().st_size}, expected at most {most}")

@@ -7,8 +7,6 @@ download cache (default: the platform's), `KALMARK_DATA_URL` a mirror: a URL wit
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import hashlib
 import json
 import os
@@ -22,13 +20,13 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import quote, urlsplit
 
 import platformdirs
 
 from kalmark.errors import DataError, LogError
-from kalmark.files import locked
+from kalmark.files import locked, refuse_bomb, unpacked
 from kalmark.logs.source import nearest
 
 ORIGIN = "https://raw.githubusercontent.com/{repo}/{commit}/{path}"
@@ -256,11 +254,11 @@ def unpack(path: Path) -> None:
     try:
         if path.suffix == ".zip":
             with zipfile.ZipFile(path) as archive:
+                refuse_bomb(archive, path, DataError)
                 archive.extractall(path.parent)  # strips absolute paths and ".."
             return
-        opener: Any = {".gz": gzip.open, ".bz2": bz2.open}[path.suffix]
-        with opener(path) as packed, path.with_suffix("").open("wb") as plain:
-            shutil.copyfileobj(packed, plain)
+        with path.with_suffix("").open("wb") as plain:
+            plain.writelines(unpacked(path, DataError))
     except (zipfile.BadZipFile, EOFError, OSError) as error:
         raise DataError(f"{path.name}: cannot be unpacked ({error}), expected a complete archive") from None
 

@@ -20,6 +20,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, order
+from kalmark.files import read_arrays, unpacked
 from kalmark.geometry.gaussian import sigma_probability
 from kalmark.logs.columns import CORNERS, INCREMENT3, TWIST3
 from kalmark.logs.log import Log, Trajectory
@@ -58,9 +59,8 @@ def read(path: Path, request: Request) -> Log:
     Raises LogError if the file is cut or something is missing in it.
     """
     try:
-        with gzip.open(path, "rt", encoding="utf-8") as file:
-            content = json.load(file)
-    except (OSError, EOFError, ValueError, zlib.error) as error:
+        content = json.loads(b"".join(unpacked(path, LogError)))
+    except ValueError as error:
         raise LogError(f"{path}: cannot be read ({error}), expected a whole recording") from None
     try:
         return recording(path, content, request)
@@ -121,9 +121,9 @@ def tracks(
     if not numbers.is_file():
         return {}, {}
     try:
-        with np.load(numbers) as file:
-            truth, states, nees = file["TRUTH"], file["X"], file["NEES"].ravel()
-    except Exception as error:  # the reader has no common error for damaged files
+        arrays = read_arrays(numbers, LogError)
+        truth, states, nees = arrays["TRUTH"], arrays["X"], arrays["NEES"].ravel()
+    except (OSError, ValueError, KeyError) as error:
         raise LogError(f"{numbers}: cannot be read ({error}), expected TRUTH, X and NEES") from None
     frames = truth.shape[1]
     t_ns = np.arange(frames + 1, dtype=np.int64) * step_ns

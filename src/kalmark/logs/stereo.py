@@ -15,6 +15,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
+from kalmark.files import read_arrays
 from kalmark.logs.arrays import arrays, events_of, find_variables, refuse_shapes, times
 from kalmark.logs.columns import TWIST3
 from kalmark.logs.log import Log, Trajectory
@@ -100,8 +101,8 @@ def read_kitti(path: Path, request: Request, min_disparity_px: Any = 1.0, rates:
     own calibration confirms: p_c = R (p_i - t), not R p_i + t.
     """
     low = quantity(min_disparity_px, "min_disparity_px")
-    with np.load(path) as file:
-        data = {name: np.asarray(file[name], dtype=np.float64) for name in KITTI}
+    found = read_arrays(path, LogError)
+    data = {name: np.asarray(found[name], dtype=np.float64) for name in KITTI}
     y, steps, K, T = data["features"], data["time_stamps"].size, data["K"], data["cam_T_imu"]
     velocities = dict.fromkeys(("linear_velocity", "rotational_velocity"), (3, steps))
     refuse_shapes(path, data, {"features": (4, y.shape[1] if y.ndim == 3 else 0, steps), **velocities,

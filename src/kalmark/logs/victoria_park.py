@@ -15,6 +15,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
+from kalmark.files import refuse_bomb
 from kalmark.logs.arrays import arrays, times
 from kalmark.logs.columns import BEAM
 from kalmark.logs.log import Log, PositionTrack, Times
@@ -64,6 +65,7 @@ def ascii_text(path: Path, name: str, otherwise: str) -> tuple[Path, str]:
     file = path / ASCII_ZIP
     try:
         with zipfile.ZipFile(file) as archive:
+            refuse_bomb(archive, file, LogError)
             return file / name, archive.read(name).decode("ascii")
     except (OSError, KeyError, UnicodeDecodeError, zipfile.BadZipFile) as error:
         raise LogError(f"{file}: {error}, expected a zip with {name} (or {otherwise})") from None

@@ -5,8 +5,6 @@ The library rosbags reads the files; here its many errors become one line each.
 
 from __future__ import annotations
 
-import bz2
-import shutil
 import tempfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -15,6 +13,7 @@ from typing import Any, NamedTuple, Self
 
 from kalmark.errors import LogError
 from kalmark.events import shown
+from kalmark.files import unpacked
 from kalmark.logs.source import nearest
 from kalmark.logs.table import Refused
 
@@ -131,11 +130,8 @@ class Bag:
         if self.path.suffix != ".bz2":
             return self.path
         bag = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kalmark-"))) / self.path.stem
-        try:
-            with bz2.open(self.path) as packed, bag.open("wb") as plain:
-                shutil.copyfileobj(packed, plain)
-        except (OSError, EOFError) as error:
-            raise LogError(f"{self.path}: cannot be unpacked ({error}), expected a whole bag") from None
+        with bag.open("wb") as plain:
+            plain.writelines(unpacked(self.path, LogError))
         return bag
 
     def _damaged(self, error: Exception) -> LogError:

@@ -7,7 +7,6 @@ true state at the first image where the log has that, else at rest.
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Frame, shown
+from kalmark.files import unpacked
 from kalmark.logs.calibration import read_calibration
 from kalmark.logs.columns import INERTIAL, TWIST3
 from kalmark.logs.images.pictures import frames_of
@@ -99,9 +99,9 @@ def lines_of(file: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield (line, cells) of a CSV file, packed or not, without its comments.  Raises LogError."""
     packed = file.with_name(f"{file.name}.gz")
     try:
-        text = gzip.decompress(packed.read_bytes()).decode() if packed.is_file() else read_text(file)
-    except (OSError, EOFError, UnicodeDecodeError) as error:
-        raise LogError(f"{packed}: cannot be unpacked ({error}), expected a complete file") from None
+        text = b"".join(unpacked(packed, LogError)).decode() if packed.is_file() else read_text(file)
+    except UnicodeDecodeError as error:
+        raise LogError(f"{packed}: {error}, expected UTF-8") from None
     for line, content in enumerate(text.splitlines(), 1):
         if content.strip() and not content.lstrip().startswith("#"):
             yield line, [cell.strip() for cell in content.split(",")]
