@@ -317,7 +317,7 @@ def start(
         x[n + i] = x_first[n + i] = l[0, i]
     L_r, L_y, R = kernels.product(L_T[0], T_r), kernels.product(L_v[0], V_y[0]), np.zeros((2, 2))
     R[0, 0], R[1, 1] = range_variance(noise, v[0, 0], v[0, 1]), noise[2] ** 2
-    kernels.augment(P, n + 2, n, np.arange(3), L_r, kernels.quadratic(L_y, R))
+    kernels.augment(P, n + 2, np.arange(n, n + 2), np.arange(3), L_r, kernels.quadratic(L_y, R))
 
 
 @compiled

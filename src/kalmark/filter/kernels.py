@@ -54,6 +54,7 @@ _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 CACHED = 256  # rows of a covariance that stays in a cache between one pass over it and the next
 BAND = 128  # rows of a larger one that do
 TILE = 64  # rows of a tile of which two do
+FEW = 8  # rows of a factor whose product takes less time without BLAS
 
 # What rounding may take off a variance: with these a covariance stays one where 1e-5 rad are beside metres
 KEPT = 2.0**-50  # of what a variance loses to a correction, and of the terms that a prediction adds up
@@ -185,16 +186,23 @@ def predict(P: Array, n: int, index: Index, F: Array, Q: Array) -> None:
 
 
 @compiled
-def augment(P: Array, n: int, at: int, index: Index, G: Array, Q: Array) -> None:
-    """Append a block at rows `at`: P_Lx = G P_x, P_LL = G P G' + Q, G (d, k) on the rows `index`.  [S] (35)-(38)."""
-    d = len(G)
-    clear(P, n, at, d)
-    B, P_LL = product(G, rows_of(P, index, n)), quadratic(G, submatrix(P, index))
-    rows = np.empty(d, np.int64)
-    for a in range(d):
-        rows[a] = at + a
-        for b in range(d):
-            B[a, at + b] = P_LL[a, b] + 0.5 * (Q[a, b] + Q[b, a])
+def any_product(A: Array, B: Array) -> Array:
+    """Return A B, for an A (m, k) of any size."""
+    return product(A, B) if len(A) <= FEW else A @ B
+
+
+@compiled
+def augment(P: Array, n: int, rows: Index, index: Index, G: Array, Q: Array) -> None:
+    """Append blocks at `rows` (d,): P_Lx = G P_x, P_LL = G P G' + Q, G (d, k) on the rows `index`.  [S] (35)-(38)."""
+    B = any_product(G, rows_of(P, index, n))
+    GP, G_T = np.empty(G.shape), np.empty((G.shape[1], len(G)))
+    for a in range(len(rows)):
+        for c in range(len(index)):
+            GP[a, c], G_T[c, a] = B[a, index[c]], G[a, c]
+    P_LL = any_product(GP, G_T)
+    for a in range(len(rows)):
+        for b in range(len(rows)):
+            B[a, rows[b]] = 0.5 * (P_LL[a, b] + P_LL[b, a] + (Q[a, b] + Q[b, a]))
     set_rows(P, rows, B)
 
 

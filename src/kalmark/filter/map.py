@@ -209,9 +209,14 @@ class StochasticMap(Layout):
 
     def augment(self, space: Space, mean: Array, index: Index, G: Array, Q: Array) -> int:
         """Add a block computed from the rows `index`: P_Lx = G P_x, P_LL = G P G' + Q.  [S] (35)-(38)."""
-        slot = self._place(space, mean)
-        kernels.augment(self.P, self.n, self.blocks[slot, P_AT], index, np.ascontiguousarray(G), Q)
-        return slot
+        return self.extend([space], [mean], index, G, Q)[0]
+
+    def extend(self, spaces: Sequence[Space], means: Sequence[Array], index: Index, G: Array, Q: Array) -> list[int]:
+        """Add blocks, as `augment` adds one, with the rows of G (d, k) and Q (d, d) one block after the other."""
+        slots = [self._place(space, mean) for space, mean in zip(spaces, means, strict=True)]
+        rows = np.concatenate([self.rows(slot) for slot in slots])
+        kernels.augment(self.P, self.n, rows, index, np.ascontiguousarray(G), Q)
+        return slots
 
     def remove(self, slot: int) -> None:
         """Marginalise a block out; its slot is free for another of its shape.  [S] Table 1, state reduction."""

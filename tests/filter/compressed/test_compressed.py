@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import kalmark as km
 from kalmark.errors import MapError
+from kalmark.filter import kernels
 from kalmark.filter.compressed import map as compressed_map
 from kalmark.filter.compressed import ranks
 from kalmark.filter.compressed.map import CompressedMap
@@ -109,6 +111,29 @@ def test_what_a_full_update_leaves_out_far_from_the_robot_is_below_rounding(
     assert shares[1] == 1.0
 
 
+def test_blocks_that_enter_together_are_what_they_are_one_after_the_other() -> None:
+    slam = slam_of(km.estimators.Invariant(), most=1000)
+    for t, event in enumerate(drive(300, 2)):
+        slam.process(event)
+        if t == 280:
+            slam.map.full_update()
+    together, alone = slam.map, deepcopy(slam.map)
+    slots = [i for i, space in enumerate(together.spaces) if space is not None]
+    new = [i for i in slots if i not in together.entered]
+    assert len(new) > 4
+    assert together.displaced
+    together._enter(new)
+    for i in new:
+        alone._enter([i])
+    found = []
+    for m in (together, alone):
+        rows = [m.active.rows(at[i]) for at in (m.entered, m.auxiliary) for i in slots]
+        found.append((m.means(np.array(slots), 2), kernels.submatrix(m.active.P, np.concatenate(rows))))
+    scale = np.sqrt(np.abs(np.diag(found[1][1]))) + 1.0
+    np.testing.assert_allclose(found[0][0], found[1][0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found[0][1] / np.outer(scale, scale), found[1][1] / np.outer(scale, scale), atol=1e-12)
+
+
 def counted(map_: Any) -> list[str]:
     """Return the list to which a map writes its full updates, corrections, starts, and the slots that enter."""
     done: list[Any] = []
@@ -123,10 +148,9 @@ def counted(map_: Any) -> list[str]:
         done.append("correct all")
         correct_all(*args)
 
-    def entered(slot: int) -> None:
-        if slot not in map_.entered:
-            done.append(slot)
-        enter(slot)
+    def entered(slots: Iterable[int]) -> None:
+        done.extend(slot for slot in slots if slot not in map_.entered)
+        enter(slots)
 
     def corrected(*args: Any) -> None:
         done.append("correct")

@@ -58,12 +58,19 @@ def keep(R: Array, V: Array, rows: Index, w: Array, a: Array, W: Array, P_AB: Ar
 
 
 @compiled
+def signed(R: Array, q: int) -> Array:
+    """Return the left factor L of rows R = [w, a, W], W (N, q): L R' = W W' - w a' - a w'."""
+    m = (R.shape[1] - q) // 2
+    return np.hstack((-R[:, m : 2 * m], -R[:, :m], R[:, 2 * m :]))
+
+
+@compiled
 def corrected(
     C: Array, rows: Index, columns: Index, done: tuple[int, int], where: Index, R: Array, V: Array, P_AA: Array, q: int
 ) -> None:  # fmt: skip
     """Bring elements [rows][:, columns] that were read before their panel was done up to date."""
     panel, column = done
-    m = (R.shape[1] - q) // 2
+    to_come = signed(R[rows], q) @ R[columns].T  # of active rows anything
     for a in range(len(rows)):
         for b in range(len(columns)):
             i, j = max(rows[a], columns[b]), min(rows[a], columns[b])
@@ -74,12 +81,7 @@ def corrected(
             elif where[j] >= 0:
                 C[a, b] = V[i // PANEL, where[j], i % PANEL]
             elif i // PANEL > panel or j >= column:
-                s = 0.0
-                for c in range(m):
-                    s -= R[i, c] * R[j, m + c] + R[i, m + c] * R[j, c]
-                for c in range(2 * m, 2 * m + q):
-                    s += R[i, c] * R[j, c]
-                C[a, b] -= s
+                C[a, b] -= to_come[a, b]
 
 
 @dataclass(frozen=True)
@@ -186,9 +188,8 @@ class FullUpdate:
         before = int(self.costs[begun - 1]) if begun else 0
         end = max(begun + 1, int(np.searchsorted(self.costs, before + work, side="right")))
         start, self.column = self.column, min(last, end * PANEL)
-        m, R = self.turns // 2, self.R[first:last]
-        if R.shape[1]:
-            L = np.hstack([-R[:, m : 2 * m], -R[:, :m], R[:, 2 * m :]])
+        if self.R.shape[1]:
+            L = signed(self.R[first:last], self.q)
             subtract(panel[: last - first], L, self.R, start, self.column, self.turns + self.widths)
         return int(self.costs[end - 1]) - before
 

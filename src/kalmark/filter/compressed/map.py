@@ -29,7 +29,7 @@ from kalmark.filter.compressed.reading import carried_along, joined, split
 from kalmark.filter.compressed.schedule import PREFAULT, SLICE, Schedule
 from kalmark.filter.compressed.search import Search
 from kalmark.filter.compressed.storage import PANEL, Triangle
-from kalmark.filter.layout import P_AT, P_SIZE, Layout, State, laid_out
+from kalmark.filter.layout import P_AT, P_SIZE, X_AT, X_SIZE, Layout, State, laid_out
 from kalmark.filter.map import AT_ONCE, NO_SLOTS, Marginal, Pairs, StochasticMap
 from kalmark.filter.nearness import Asked, Nearest, Seen, nearest
 from kalmark.filter.neighbours import Sorts, distances, near_places
@@ -110,7 +110,7 @@ class CompressedMap(Layout):
     # ------------------------------------------------------------------ reading
     def index(self, slot: int) -> Index:
         """Return the rows of a block in the active map, which it enters if need be."""
-        self._enter(slot)
+        self._enter([slot])
         return self.active.rows(self.entered[slot])
 
     def mean(self, slot: int) -> Array:
@@ -332,14 +332,13 @@ class CompressedMap(Layout):
 
     def set_predicted(self, slot: int, mean: Array) -> None:
         """Write a block's mean after a motion."""
-        self._enter(slot)
+        self._enter([slot])
         self.active.set_predicted(self.entered[slot], mean)
         self.take_as_moving(slot)
 
     def movable(self, robot: int, added: Sequence[int]) -> Marginal:
         """Return the active map, which the robot and the blocks `added` to its control enter, and their slots there."""
-        for slot in (robot, *added):
-            self._enter(slot)
+        self._enter([robot, *added])
         self.take_as_moving(robot)
         return Marginal(self.active, self.entered[robot], -1, self._at[list(added)] if added else NO_SLOTS)
 
@@ -349,18 +348,9 @@ class CompressedMap(Layout):
 
         So have all inverse distances where a correction transports: theirs is more than the rotation of the world.
         """
-        for slot in self._anchored if transports else ():
-            self._enter(slot)
-        self._enter(robot)
-        if mount >= 0:
-            self._enter(mount)
+        head = [robot] if mount < 0 else [robot, mount]
+        self._enter([*(self._anchored if transports else ()), *head, *slots.tolist()])
         at = self._at[slots]
-        if -1 in at.tolist():
-            if self._job is not None:
-                self._job.know(slots[at < 0])  # all at once, rather than each as it enters
-            for slot in slots.tolist():
-                self._enter(slot)
-            at = self._at[slots]
         if not self.schedule.begun:
             observed = self.active.blocks[[self.entered[robot], *at], P_SIZE].sum()
             self.schedule.begin(self.active.n, int(observed))
@@ -388,40 +378,47 @@ class CompressedMap(Layout):
         if self._full(progress):  # now, since the next correction begins with the work of a new interval
             self.full_update()
 
-    def _enter(self, slot: int) -> None:
-        """Make a block active: augment it from the auxiliary states, and give it one of its own.  O(active^2)."""
-        if slot in self.entered:
+    def _enter(self, slots: Sequence[int]) -> None:
+        """Make blocks active: augment them from the auxiliary states, and give them some of their own.  O(active^2)."""
+        slots = [slot for slot in dict.fromkeys(slots) if slot not in self.entered]
+        if not slots:
             return
-        space = self.spaces[slot]
-        assert space is not None
-        x, G, Q, x_left = self._inactive(np.array([slot]))[1]
-        at = self.active.augment(space, x, self._extra_rows(), G, Q) if len(self.A0) else self.active.add(space, x, Q)
-        self.active.x_first[self.active.numbers(at)] = self.x_first[self.numbers(slot)]
-        self.activate(slot, at)
-        rows = self.active.rows(at)
-        state = self.active.add(scalars(len(rows)), np.zeros(len(rows)))
-        s = self.active.rows(state)
-        self.active.P[np.maximum(rows, s), np.minimum(rows, s)] = 1.0
+        m, spaces = self.active, [space for slot in slots if (space := self.spaces[slot]) is not None]
+        blocks, (x, G, Q, x_left) = self._inactive(np.array(slots))
+        numbers = [slice(first, first + size) for first, size in blocks[:, [X_AT, X_SIZE]].tolist()]
+        found = m.extend(spaces, [x[where] for where in numbers], self._extra_rows(), G, Q)
+        for slot, at in zip(slots, found, strict=True):
+            m.x_first[m.numbers(at)] = self.x_first[self.numbers(slot)]
+            self.activate(slot, at)
+        sizes = [space.dof for space in spaces]
+        states = m.extend(
+            [scalars(d) for d in sizes], [np.zeros(d) for d in sizes], NO_ROWS, G[:, :0], np.zeros_like(Q)
+        )
+        rows, s = (np.concatenate([m.rows(at) for at in some]) for some in (found, states))
+        m.P[np.maximum(rows, s), np.minimum(rows, s)] = 1.0
         for name, displaced in self.displaced.items():
             self.displaced[name] = np.insert(displaced, len(self.A0), np.zeros(len(s)))
-        self.attach(slot, state)
-        self.watch(slot, x_left)
+        self.attach(slots, states)
+        variances = np.diag(Q)
+        for slot, where, first, d in zip(slots, numbers, blocks[:, P_AT].tolist(), sizes, strict=True):
+            self.watch(slot, x_left[where], variances[first : first + d])
 
-    def attach(self, slot: int, at: int) -> None:
-        """Take a block of the active map as the auxiliary state of a slot."""
-        self.auxiliary[slot] = at
-        where = self.active.numbers(at)
-        self.A0 = np.concatenate([self.A0, self.rows(slot)])
-        self._s = np.concatenate([self._s, self.active.rows(at)])
-        self._s_x = np.concatenate([self._s_x, np.arange(where.start, where.stop)])
+    def attach(self, slots: Sequence[int], states: Sequence[int]) -> None:
+        """Take blocks of the active map as the auxiliary states of slots."""
+        self.auxiliary.update(zip(slots, states, strict=True))
+        where = [self.active.numbers(at) for at in states]
+        self.A0 = np.concatenate([self.A0, *(self.rows(slot) for slot in slots)])
+        self._s = np.concatenate([self._s, *(self.active.rows(at) for at in states)])
+        self._s_x = np.concatenate([self._s_x, *(np.arange(at.start, at.stop) for at in where)])
         self._displaced_x = np.concatenate([self._s_x, self._immediate.numbers])
 
-    def watch(self, slot: int, left: Array) -> None:
-        """Watch how far an active block goes from the mean at which its inactive error coordinates were left."""
+    def watch(self, slot: int, left: Array, variances: Array) -> None:
+        """Watch how far an active block goes from the mean at which its inactive error coordinates were left.
+
+        `variances` are those stored.
+        """
         space, at = self.spaces[slot], self.entered.get(slot)
         if space is not None and at is not None:
-            rows = self.rows(slot)
-            variances = np.diag(self._read(rows, rows))
             here = self.active.numbers(at).start, int(self.active.rows(at)[0])
             self.drift.watch(slot, space, *here, left, variances)
 

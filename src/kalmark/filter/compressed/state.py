@@ -56,12 +56,15 @@ def _activate(m: CompressedMap, interval: State) -> None:
             if not fits or (what == "active" and slot in departed):
                 raise MapError(f"{what} block {at} of slot {slot} is {there}, expected one of {space}")
             used.add(at)
-            (m.activate if what == "active" else m.attach)(slot, at)
+            if what == "active":
+                m.activate(slot, at)
+            else:
+                m.attach([slot], [at])
     blocks = {i for i, space in enumerate(m.active.spaces) if space is not None}
     if used != blocks or not departed.keys() <= m.auxiliary.keys():
         raise MapError(f"the active map has {len(m.active.spaces)} blocks, expected each to belong to one of the map")
     for slot in m.auxiliary:
-        m.watch(slot, m.x[m.numbers(slot)])
+        m.watch(slot, m.x[m.numbers(slot)], m.storage.diagonal(m.rows(slot)))
     for slot in interval["moving"]:
         if slot in m.entered:
             m.take_as_moving(slot)
