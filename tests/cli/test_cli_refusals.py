@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -290,3 +292,18 @@ def test_a_full_disk_gets_one_line(kalmark: Kalmark, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("kalmark.config.open_run", full)
     done = kalmark("run", "native", "--log", ".")
     assert done.status == 2 and done.err == "kalmark: No space left on device; what was being written is not complete\n"
+
+
+def test_the_result_of_another_log_is_replaced_only_where_the_folder_is_named(
+    kalmark: Kalmark, log: Path, tmp_path: Path
+) -> None:
+    folder, summary = tmp_path / "out" / "native", tmp_path / "out" / "native" / "summary.json"
+    assert kalmark("run", "native", "--log", log).status == 0
+    other = shutil.copytree(log, tmp_path / "other")
+    before = summary.read_bytes()
+    said = refused(kalmark("run", "native", "--log", other))
+    assert re.search(r"out/native has the result of .*, expected that of .*/other: --out DIR names another", said)
+    assert summary.read_bytes() == before
+    assert kalmark("run", "native", "--log", log).status == 0
+    assert kalmark("run", "native", "--log", other, "--out", folder).status == 0
+    assert json.loads(summary.read_text())["log"]["path"] == str(other.resolve())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kalmark.cli.shared import Overrides, computing, print_summary, say, slam_of, writable
-from kalmark.errors import KalmarkError
+from kalmark.errors import KalmarkError, RunError
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
@@ -32,21 +33,40 @@ def run_log(
     overrides: Sequence[str] = (),
     on_error: str | None = None,
     progress: bool = True,
+    own: Path | None = None,
 ) -> Run:
-    """Return the run of a configuration over the log that it names, or over another one read in the same way."""
+    """Return the run of a configuration over the log that it names, or over another one read in the same way.
+
+    Raises RunError, before anything is computed, if the run folder `own` has the result of another log.
+    """
     from kalmark import config as cfg
     from kalmark.results.record import record
 
     override = [] if on_error is None else [f"log.on_error={on_error}"]
     config, log = cfg.open_run(config_path, log_path, [*overrides, *override], progress=True)
+    if own is not None:
+        refuse_other(own, str(log.path))
     slam = cfg.build_slam(config, log)
     return record(slam, log, progress=progress, on_error=config.log.on_error, config=cfg.config_dict(config))
+
+
+def refuse_other(folder: Path, path: str) -> None:
+    """Refuse to replace the result of another log than that at `path`.  Raises RunError."""
+    try:
+        other = str(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["log"]["path"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return  # no result
+    if other != path:
+        raise RunError(
+            f"{folder} has the result of {other}, expected that of {path}: --out DIR names another folder, "
+            f"--out {folder} replaces it"
+        )
 
 
 def run(
     config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
     log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
-    out: Annotated[Path | None, typer.Option(help="The run folder to write. (default: out/CONFIG)")] = None,
+    out: Annotated[Path | None, typer.Option(help="The run folder. (default: out/CONFIG, not of another log)")] = None,
     overrides: Overrides = None,
     on_error: Annotated[
         OnError | None, typer.Option(help="Refuse bad input, or leave it out and list it. (default: raise)")
@@ -59,9 +79,11 @@ def run(
     """Run one log through one filter and write a run folder."""
     from kalmark.config.tree import name_of, name_on
 
-    out = writable(out or Path("out") / Path(config).stem)
+    usual = Path("out") / Path(config).stem
+    own, out = usual if out is None else None, writable(out or usual)
     with computing():
-        result = run_log(config, log, overrides=overrides or (), on_error=on_error.value if on_error else None)
+        left_out = on_error.value if on_error else None
+        result = run_log(config, log, overrides=overrides or (), on_error=left_out, own=own)
         summary = result.evaluate()
         if batch or (batch is None and summary.get("corner_rms_px") is not None):
             try:
