@@ -367,6 +367,10 @@ def unknown_ids() -> Iterator[Figure]:
     yield Figure(section, "DLR: map against that with ids, RMS, raw / aligned", ".3 m", dlr,
                  row("difference of the maps, RMS:", "{0} m / {2} m"))  # fmt: skip
     yield Figure(section, "DLR: landmarks with ids / without", "", dlr, row("landmarks:", "{0} / {3}"))
+    ghosts, name = "python benchmarks/ghosts.py", "landmarks not seen again, 8 worlds of 3 seeds"
+    yield Figure(section, f"{name}: trees marked, nobody walks", "1 %", ghosts, row("all:", "{0} of {2}"))
+    yield Figure(section, f"{name}: of a walker marked / of these expected again", "- / 90 %", ghosts,
+                 row("all:", "{10} of {12} / {15} of {17}"))  # fmt: skip
     for robot in range(1, 6):
         each = f'python benchmarks/unknown_ids.py mrclam mrclam --set log.ids=hidden --set association.type=auto --set "log.robots=[{robot}]"'
         yield Figure(section, f"MRCLAM 6, robot {robot}: wrong pairs", "2 in 1,000", each, row("wrong:", "{0} of {2}"))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import repeat
 from typing import Any, NamedTuple
 
@@ -293,13 +293,19 @@ class LandmarkEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class LandmarkTable:
-    """All landmarks of a map, column by column; iterate for `LandmarkEstimate` rows."""
+    """All landmarks of a map, column by column; iterate for `LandmarkEstimate` rows.
+
+    `log_odds` are those that a landmark exists, of the landmarks that were looked at again; `unseen` are those that are
+    not seen again where they should be (docs/association.md).
+    """
 
     ids: list[Id]
     kinds: list[str]
     means: list[Array]
     covariances: list[Array]
     observations: list[int]
+    log_odds: Mapping[Id, float] = field(default_factory=dict)
+    unseen: frozenset[Id] = frozenset()
 
     def __len__(self) -> int:
         return len(self.ids)

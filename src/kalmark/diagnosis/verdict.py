@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import pdtrc
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.state import LANDMARKS
@@ -47,6 +48,7 @@ MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verd
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, MOST_OFF = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
+LIKELY = 0.05  # the probability of so many marks, or more, up to which they are not by chance
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
@@ -575,9 +577,24 @@ def split_landmarks(run: Run) -> Iterator[Cause]:
 
 
 def unseen_landmarks(run: Run) -> Iterator[Cause]:
-    """Yield that landmarks are not seen again where they were seen: they are in the map twice, or nowhere."""
-    found = sightings.unseen(run)
-    if found is not None:
+    """Yield that landmarks are not seen again where they should be: they are in the map twice, or nowhere.
+
+    Of landmarks that are there a share `FEW` is marked by chance.  Where ids say what was seen, the times are counted
+    at which landmarks came into view as before.
+    """
+    marks, h, found = run.landmarks, run.history, sightings.unseen(run)
+    names = [name for name in marks.ids if name in marks.unseen]
+    by_chance = float(pdtrc(len(names) - 1, FEW * len(marks))) > LIKELY if names else True
+    if names:
+        where = dict(zip(marks.ids, marks.positions()[0].tolist(), strict=True))
+        some = ", ".join(f"{name} at ({', '.join(f'{x:.1f}' for x in where[name])}) m" for name in names[:LISTED])
+        some += ", ..." * (len(names) > LISTED)
+        evidence = f"{len(names)} of {len(marks)} landmarks were not seen again where they should be: {some}"
+        first = h.t_ns[h.step[np.isin(h.landmark, [str(name) for name in names])]].min(initial=h.t_ns[-1])
+        score = -sum(marks.log_odds[name] for name in names)
+        cure = "they moved, or are in the map twice: --set upkeep.gone=remove takes them out"
+        yield Cause("unseen_landmarks", float(first) * 1e-9, score, evidence, cure, by_chance)
+    if found is not None and by_chance:
         evidence = f"in {found.unseen} of {found.number} times a landmark came into view as before it was not seen"
         cure = "things are in the map twice, or came and went: look at the errors of the controls, and at what moves"
         yield Cause("unseen_landmarks", found.since_s, found.score, evidence, cure)

@@ -38,13 +38,15 @@ class KnownLandmark(NamedTuple):
 def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> list[KnownLandmark]:
     """Return the landmarks of a ``landmarks.csv``: id, x_m, y_m[, z_m][, signature | qx, qy, qz, qw], cov_xx, ...
 
-    Those with empty columns of the covariance, or with none, are known exactly; with `exact` all are.  Places on the
-    globe, lat_deg, lon_deg[, height_m], are counted from the `origin` of the log (3,).  Raises LogError naming file and
-    line.
+    Those with a `mark`, which a run did not see again, are left out.  Those with empty columns of the covariance, or
+    with none, are known exactly; with `exact` all are.  Places on the globe, lat_deg, lon_deg[, height_m], are counted
+    from the `origin` of the log (3,).  Raises LogError naming file and line.
     """
     found: dict[Id, KnownLandmark] = {}
 
     def take(row: Row) -> None:
+        if "mark" in row.table.index and row.text("mark"):
+            return
         name, names = row.id(), tuple(n for n in PLACES if n in row.table.index and row.text(n))
         if name is None:
             raise Refused("id is empty, expected the landmark's id")
@@ -58,7 +60,7 @@ def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> 
     def refuse(line: str) -> None:
         raise LogError(line)
 
-    allowed, globe = ("kind", "observations", "known", *PLACES[2:]), Globe(origin)
+    allowed, globe = ("kind", "observations", "known", "log_odds", "mark", *PLACES[2:]), Globe(origin)
     table = read_table(path, ("id", "x_m", "y_m"), allowed=allowed, globe=globe)
     if table.globe is not None and origin is None:
         raise LogError(f"{path}: lat_deg and lon_deg, but the log has no origin on the globe, expected log.origin")

@@ -1,103 +1,244 @@
-"""Does a landmark still exist?  Its log odds, from scans in which it should be in view.
+"""Existence of landmarks: their log odds, by the looks of a sensor in which each was expected, and seen or not.
 
-Each such scan adds log p_detect / p_false if it was observed, and log (1 - p_detect) / (1 - p_false) if not.  A
-landmark is removed when its odds have fallen to 1 in `odds`; they never rise above that, so that a landmark that has
-stood for long can be removed as well.  Thrun et al. 10; Montemerlo and Thrun.
+A look (`tracks/looks.py`) counts for the landmarks about the sensor that are surely within its field of view and range.
+Of each are kept how often it was `seen`, the misses until it was last seen, `absent`, and those since, `missed`.  The
+detection probabilities of the landmarks of a map are spread by a Beta density (a, b), the likeliest one for these
+counts beside a share of landmarks that never were there.  A thing that stands is compared with two that do not; these
+are still seen with a probability f of density (1, 1 / p_false - 1).  One that is gone since it was last seen:
+
+    log int Beta(p | a + seen, b + absent) (1 - p)^missed dp - log int Beta(f) (1 - f)^missed df,
+
+and one that never was there:
+
+    log int Beta(p | a, b) p^seen (1 - p)^(absent + missed) dp - log int Beta(f) f^seen (1 - f)^(absent + missed) df.
+
+The lesser of them, from log `odds` on, are the log odds; at minus that the landmark is marked, or removed where
+that is wanted.  Probabilities that are stated have narrow densities.  Thrun et al. 10; Montemerlo and Thrun; the
+Beta-binomial: Gelman et al., Bayesian Data Analysis 5.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import betaln
 
 from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.protocols import Segmented, Visible, field_of_view
-from kalmark.tracks.channel import ObservationModel
+from kalmark.tracks.channel import Channel, ObservationModel
+from kalmark.tracks.looks import Looks, cells_of
 from kalmark.tracks.scan import ScanContext
+from kalmark.tracks.track import Track, Tracks
 
+USED = ("associated", "new")
 AROUND = 64  # landmarks nearest to the sensor that may be in view
-MARGIN = 0.1  # of ranges and of the field of view, within which a landmark may be out of view after all
+MARGIN = 0.02  # of ranges and of the field of view, within which a landmark may be out of view after all
 OCCLUDER_M = 0.3  # half the width of an object that hides others
+LEAST, MOST = 2.0, 512  # looks at a landmark that has a share of its own; such landmarks that are compared
+SURE = 1e6  # looks that a stated detection probability is worth
+MEANS, WORTH = np.linspace(0.05, 0.98, 32)[None], np.geomspace(1.0, 256.0, 9)[:, None]  # of densities that are tried
+SHARES = 1e-3, 1e-2, 3e-2, 0.1, 0.3, 0.5  # of landmarks that never were there
+REFIT = 64  # looks until the detection probability is found anew
 
 
-class Judgement(NamedTuple):
-    """The log odds of a landmark after a scan, and the scans in a row in which it was missed."""
+class Detection(NamedTuple):
+    """The Beta density (a, b) of the detection probabilities of landmarks."""
 
-    name: Id
-    log_odds: float
-    missed: int
-    gone: bool
+    a: Any = 0.5
+    b: Any = 0.5
 
 
-def judged(scan: ScanContext, upkeep: Upkeep) -> list[Judgement]:
-    """Return the log odds of the landmarks that should be in view, of those whose odds this scan decides."""
-    if upkeep.p_detect is None or not isinstance(scan.channel.sensor, Visible):
+def concerns(scan: ScanContext, upkeep: Upkeep) -> bool:
+    """Return whether a scan counts: by default if association decides what was seen, and where things are is seen."""
+    ids = scan.event.ids
+    hidden = upkeep.p_detect is not None or (scan.channel.gives_places and (ids is None or None in ids))
+    return hidden and scan.channel.has_limits
+
+
+def look(scan: ScanContext, upkeep: Upkeep) -> list[Track]:
+    """Count what a scan saw of what was expected; return the landmarks that it missed."""
+    tracks, pose = scan.tracks, scan.pose()
+    looks, stated = tracks.looks.setdefault(scan.key, Looks()), upkeep.p_detect is not None
+    if not looks.is_due(pose, tracks.changes) and not stated:
         return []
-    hit = math.log(upkeep.p_detect / upkeep.p_false)
-    miss = math.log((1 - upkeep.p_detect) / (1 - upkeep.p_false))
-    most = math.log(upkeep.odds)
-    seen = {o.landmark for o in scan.report.observations if o.landmark is not None}
-    unclear = {c.landmark for c in scan.report.candidates if c.d2 <= scan.channel.gate} - seen
-    found = []
-    for name in _expected(scan):
-        if name not in unclear:
-            track = scan.tracks.confirmed[name]
-            before = most if track.log_odds is None else track.log_odds
-            odds = min(before + (hit if name in seen else miss), most)
-            found.append(Judgement(name, odds, 0 if name in seen else track.missed + 1, odds < -most))
+    made = scan.report.observations
+    seen, left, fused = set[Id](), list[int](), 0
+    for o in made:
+        fused += o.outcome == "associated"
+        if o.outcome not in USED:
+            left.append(o.index)
+        if o.landmark is not None and o.outcome != "new":
+            seen.add(o.landmark)
+    if not stated and (fused == 0 or 2 * fused < len(made)):  # it may be elsewhere, or covered
+        return []
+    begun = {o.landmark for o in made if o.outcome == "new"} if fused < len(made) else set()
+    far, missed = looks.scale_m, list[Track]()
+    for model, near in _around(scan):
+        names = [name for name in near if name not in begun] if begun else near
+        v = model.landmark.seen_from(pose, scan.map.means(tracks.slots_of(names), model.d))[0]
+        sure = _surely(scan.channel, v)
+        names, v = [names[i] for i in np.flatnonzero(sure).tolist()], v[sure]
+        r, bearing = np.sqrt((v[:, : scan.dimensions] ** 2).sum(axis=1)), np.arctan2(v[:, 1], v[:, 0])
+        there, hidden = np.array([name in seen for name in names], dtype=np.bool_), _hidden(scan, r, bearing)
+        clear = there | ~_unclear(scan, model, names, v, ~there, left)
+        cells = cells_of(r, bearing, hidden)
+        weights = np.where(hidden, 0.0, 1.0) if stated else looks.weights(cells)
+        looks.count(cells[clear], there[clear])
+        far = float(r[there].mean()) if there.any() else far
+        for i in np.flatnonzero(clear & ~there & (weights > 0.0)).tolist():
+            missed.append(tracks.confirmed[names[i]])
+            missed[-1].missed += float(weights[i])
+    for name in seen:
+        track = tracks.confirmed.get(name)
+        if track is not None:
+            track.seen, track.absent, track.missed = track.seen + 1, track.absent + track.missed, 0.0
+    tracks.looked += 1
+    looks.take(pose, tracks.changes, far)
+    return missed
+
+
+def gone(tracks: Tracks, upkeep: Upkeep, missed: Sequence[Track]) -> list[Track]:
+    """Return those of the `missed` landmarks that are gone, or never were there."""
+    if not upkeep.removes:
+        return []
+    if upkeep.p_detect is None and tracks.looked % REFIT == 0:
+        tracks.detection = detection([*tracks.confirmed.values()], upkeep)
+    if not missed:
+        return []
+    density = _stated(upkeep) or Detection(*tracks.detection)
+    sure = log_odds(missed, density, upkeep) <= -math.log(upkeep.odds)
+    return [track for track, yes in zip(missed, sure.tolist(), strict=True) if yes]
+
+
+def _stated(upkeep: Upkeep) -> Detection | None:
+    """Return the detection probability that is stated, as a density; None if the log has it."""
+    p = upkeep.p_detect
+    return None if p is None else Detection(SURE * p, SURE * (1.0 - p))
+
+
+def detection(tracks: Sequence[Track], upkeep: Upkeep) -> Detection:
+    """Return the density of the detection probabilities of the landmarks that are there; narrow if that is stated.
+
+    It is the likeliest one with a share of landmarks that never were there.
+    """
+    given = _stated(upkeep)
+    if given is not None:
+        return given
+    seen, absent, missed = _counts(tracks[:: len(tracks) // MOST + 1])
+    out = absent + missed
+    some = seen + out >= LEAST
+    seen, out = seen[some], out[some]
+    a, b = (each.ravel()[:, None] for each in (WORTH * MEANS, WORTH * (1.0 - MEANS)))
+    there = _likely(Detection(a, b), seen, out)
+    never = _likely(_false(upkeep), seen, out)
+    likely = [np.logaddexp(math.log1p(-p) + there, math.log(p) + never).sum(axis=1) for p in SHARES]
+    best = int(np.argmax(np.max(likely, axis=0)))
+    return Detection(float(a[best, 0]), float(b[best, 0]))
+
+
+def log_odds(tracks: Sequence[Track], density: Detection, upkeep: Upkeep) -> Array:
+    """Return the log odds (K,) that landmarks exist, at most log `odds`."""
+    (seen, absent, missed), (a, b), false = _counts(tracks), density, _false(upkeep)
+    later = _likely(Detection(a + seen, b + absent), 0.0, missed) - _likely(false, 0.0, missed)
+    ever = _likely(density, seen, absent + missed) - _likely(false, seen, absent + missed)
+    found: Array = math.log(upkeep.odds) + np.minimum(np.minimum(later, ever), 0.0)
     return found
 
 
-def _expected(scan: ScanContext) -> list[Id]:
-    """Return the landmarks near the sensor that it should surely observe."""
-    found, channel = list[Id](), scan.channel
-    for model, names in _around(scan):
-        l = scan.map.means(scan.tracks.slots_of(names), model.d)
-        v = model.landmark.seen_from(scan.pose(), l)[0]
-        sure = _surely(channel.sensor, v) & ~_hidden(scan, v)
-        found += [name for name, yes in zip(names, sure.tolist(), strict=True) if yes]
-    return found
+def _likely(density: Detection, seen: Array | float, out: Array | float) -> Array:
+    """Return the log likelihood (K,) of counts of sightings and misses."""
+    a, b = density
+    return np.asarray(betaln(a + seen, b + out) - betaln(a, b))
+
+
+def _false(upkeep: Upkeep) -> Detection:
+    """Return the density of the probability that something else is taken for a landmark that is not there."""
+    worth = 1.0 / upkeep.p_false if upkeep.p_detect is None else SURE
+    return Detection(worth * upkeep.p_false, worth * (1.0 - upkeep.p_false))
+
+
+def unseen(odds: Mapping[Id, float], upkeep: Upkeep) -> frozenset[Id]:
+    """Return the landmarks with such log odds that are not seen again where they should be."""
+    return frozenset(name for name, value in odds.items() if value <= -math.log(upkeep.odds))
+
+
+def of_map(tracks: Tracks, upkeep: Upkeep) -> dict[Id, float]:
+    """Return the log odds of the landmarks of a map that were looked at since they began."""
+    mapped = [*tracks.confirmed.values()]
+    judged = [track for track in mapped if track.seen or track.missed > 0.0]
+    odds = log_odds(judged, detection(mapped, upkeep), upkeep) if judged else np.empty(0)
+    return dict(zip([track.id for track in judged], odds.tolist(), strict=True))
+
+
+def _counts(tracks: Sequence[Track]) -> tuple[Array, Array, Array]:
+    """Return sightings, misses before the last one and misses since then, each (K,)."""
+    found = np.array([(track.seen, track.absent, track.missed) for track in tracks], dtype=np.float64).reshape(-1, 3)
+    return found[:, 0], found[:, 1], found[:, 2]
 
 
 def _around(scan: ScanContext) -> list[tuple[ObservationModel, list[Id]]]:
     """Return the landmarks nearest to the sensor, those of one kind together, that are points."""
     tracks, channel = scan.tracks, scan.channel
-    kinds = frozenset(k for k, model in channel.models.items() if not isinstance(model.landmark, Segmented))
     if channel.gives_places:
-        at = scan.pose()[None, : scan.dimensions]
-        sorts = tracks.sorts_of(kinds, len(scan.map.blocks))
-        found = scan.map.pairs(sorts, scan.robot, channel.mount, at, AROUND, math.inf).slots
+        sorts = tracks.sorts_of(channel.points, len(scan.map.blocks))
+        found = scan.map.around(sorts, scan.pose()[: scan.dimensions], AROUND)
         names = [tracks.names[slot] for slot in found.tolist()]
     else:
-        names = [name for name in tracks.observable(channel) if tracks.confirmed[name].model.kind in kinds]
+        names = [name for name in tracks.observable(channel) if tracks.confirmed[name].model.kind in channel.points]
     return [(model, [names[i] for i in rows]) for model, rows in tracks.by_model(channel, names)] if names else []
 
 
-def _surely(sensor: Any, v: Array) -> Flags:
+def _unclear(
+    scan: ScanContext, model: ObservationModel, names: list[Id], v: Array, missed: Flags, left: list[int]
+) -> Flags:  # fmt: skip
+    """Return which of the `missed` landmarks v (K, d) one of the observations `left`, of no landmark, may be of."""
+    out = np.zeros(len(names), dtype=np.bool_)
+    if not left or not missed.any():
+        return out
+    if not scan.channel.gives_places:
+        near = {c.landmark for c in scan.report.candidates if c.d2 <= scan.channel.gate}
+        return np.array([name in near for name in names], dtype=np.bool_)
+    some = np.flatnonzero(missed)
+    places = scan.channel.sensor.invert(scan.y[left])[0][:, : scan.dimensions]
+    k = np.argmin(np.linalg.norm(v[some, None, : scan.dimensions] - places, axis=2), axis=1)
+    d2 = scan.predict(model, scan.tracks.slots_of([names[i] for i in some]), [left[i] for i in k.tolist()])[1]
+    out[some] = ~(d2 > scan.channel.gate)
+    return out
+
+
+def _surely(channel: Channel, v: Array) -> Flags:
     """Return which landmarks v (K, d) in the sensor frame are well inside what a sensor observes."""
-    sure: Flags = sensor.sees(v)
-    fov = field_of_view(sensor)
-    if v.shape[1] in (2, 3):
-        d = 2 if v.shape[1] == 2 or fov < 2 * math.pi else 3
-        for scale in (1 - MARGIN, 1 + MARGIN):
-            sure &= sensor.sees(np.hstack([scale * v[:, :d], v[:, d:]]))
-    for turn in (-MARGIN * fov / 2, MARGIN * fov / 2) if fov < 2 * math.pi else ():
-        c, s = math.cos(turn), math.sin(turn)
-        sure &= sensor.sees(np.hstack([v[:, :2] @ np.array([[c, s], [-s, c]]), v[:, 2:]]))
+    changed = np.matmul(v, _changes(channel.fov_rad, v.shape[1]))
+    sure: Flags = channel.sensor.sees(changed.reshape(-1, v.shape[1])).reshape(len(changed), -1).all(axis=0)
     return sure
 
 
-def _hidden(scan: ScanContext, v: Array) -> Flags:
-    """Return which landmarks v (K, d) of the plane lie behind something that was observed nearer."""
+@lru_cache
+def _changes(fov: float, size: int) -> Array:
+    """Return the matrices (N, size, size) of nothing, and of small changes of the range and of the bearing."""
+    out, limited = [np.eye(size)], fov < 2 * math.pi
+    if size in (2, 3):
+        scaled = np.arange(size) < (2 if limited else 3)
+        out += [np.diag(np.where(scaled, 1.0 + change, 1.0)) for change in (-MARGIN, MARGIN)]
+    for turn in (-MARGIN * fov / 2, MARGIN * fov / 2) if limited else ():
+        out.append(np.eye(size))
+        out[-1][:2, :2] = [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]
+    return np.array(out)
+
+
+def _hidden(scan: ScanContext, far: Array, bearing: Array) -> Flags:
+    """Return which landmarks of the plane, at ranges and bearings (K,), are behind what was observed nearer."""
     if scan.dimensions == 3 or not len(scan.y) or not scan.channel.gives_places:
-        return np.zeros(len(v), dtype=np.bool_)
+        return np.zeros(len(far), dtype=np.bool_)
     p: Array = scan.channel.sensor.invert(scan.y)[0][:, :2]
-    near, far = np.linalg.norm(p, axis=1), np.linalg.norm(v[:, :2], axis=1)
-    apart = np.abs(np.angle(np.exp(1j * (np.arctan2(v[:, 1], v[:, 0])[:, None] - np.arctan2(p[:, 1], p[:, 0])))))
+    near = np.sqrt((p**2).sum(axis=1))
+    apart = np.abs(bearing[:, None] - np.arctan2(p[:, 1], p[:, 0]))
+    apart = np.minimum(apart, 2 * math.pi - apart)
     behind = far[:, None] > near + 2 * OCCLUDER_M
     hidden: Flags = (behind & (apart < np.arctan(OCCLUDER_M / np.maximum(near, OCCLUDER_M)))).any(axis=1)
     return hidden

@@ -23,9 +23,10 @@ class Upkeep:
     With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are
     searched while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those beyond doubt.
 
-    With `p_detect`, the probability that the sensor sees a landmark in its view, one that should be seen and is not is
-    removed when it is `odds` times likelier that it is gone (`existence.py`); `p_false` is the probability that
-    something else is taken for a landmark that is gone.
+    A landmark without an id that should be seen and is not is marked, with `gone` "remove" removed, when it is `odds`
+    times likelier that nothing is there (`existence.py`).  The probability that the sensor sees a landmark in its view
+    is found in the log.  Where it is stated, `p_detect`, each scan counts, with ids too, and what is gone is removed.
+    `p_false` is the probability that something else is taken for a landmark that is gone.
     """
 
     confirm: Annotated[
@@ -42,10 +43,11 @@ class Upkeep:
         "Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it anew.",
     ] = False
     odds: Annotated[float, Within(ge=1), "So many times likelier than chance is beyond doubt."] = 100.0
+    gone: Annotated[Literal["mark", "remove"], "What becomes of landmarks that are not seen again."] = "mark"
     p_detect: Annotated[
         float | None,
         Within(gt=0, lt=1),
-        "How often one in view is seen; with it, those that are not seen again and again are removed.",
+        "How often one in view is seen (absent: as in the log); with it, what is not seen again is removed.",
     ] = None
     p_false: Annotated[Probability, "How often something else is taken for a landmark that is gone."] = 0.05
     keep_poses: Annotated[
@@ -59,6 +61,11 @@ class Upkeep:
             raise refuse(self, "within", f"at least confirm, {self.confirm}")
         if self.p_detect is not None and self.p_detect <= self.p_false:
             raise refuse(self, "p_detect", f"a probability between p_false, {self.p_false}, and 1")
+
+    @property
+    def removes(self) -> bool:
+        """Whether landmarks that are not seen again are removed."""
+        return self.gone == "remove" or self.p_detect is not None
 
     def confirms(self, hits: int) -> bool:
         """Return whether a tentative landmark seen so often is one."""

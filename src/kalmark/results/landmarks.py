@@ -20,8 +20,8 @@ from __future__ import annotations
 import csv
 import io
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 POINT, WALL, LINE, TAG = 3, 4, 6, 7
 DATUM = 128  # landmarks
+UNSEEN = "not seen again"
 TINY = 1e-30
 EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
 # kinds whose state is their place; what is not (inverse depth, say) is not well known yet
@@ -174,7 +175,8 @@ class MapLandmarks:
 
     The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
     in the map is (`kalmark.results.landmarks`); NaN if its model does not say where it is.  `exact` are those known
-    exactly beforehand, which the filter had outside its map.
+    exactly beforehand, which the filter had outside its map.  `log_odds` are those that a landmark exists, of the
+    landmarks that were looked at again, and `unseen` those that were not seen again where they should be.
     """
 
     ids: list[Id]
@@ -184,6 +186,8 @@ class MapLandmarks:
     observations: list[int]
     in_space: bool = False
     exact: frozenset[Id] = frozenset()
+    log_odds: Mapping[Id, float] = field(default_factory=dict)
+    unseen: frozenset[Id] = frozenset()
 
     def __repr__(self) -> str:
         return f"<MapLandmarks: {len(self)}, known exactly {len(self.exact)}>"
@@ -209,7 +213,8 @@ class MapLandmarks:
                 means[k], covariances[k] = mean, covariance
         observations = [int(count) for count in table.observations]
         exact = frozenset(name for name in table.ids if slam.is_known(name))
-        return cls(list(table.ids), list(table.kinds), means, covariances, observations, in_space, exact)
+        of = means, covariances, observations, in_space, exact, table.log_odds, table.unseen
+        return cls(list(table.ids), list(table.kinds), *of)
 
     def shape(self, slam: Slam, robots: Sequence[str]) -> tuple[MapLandmarks, Array]:
         """Return the map with the covariances of its shape, and those (R, d, d) of the robots' positions.
@@ -252,6 +257,7 @@ class MapLandmarks:
         return MapLandmarks(
             [self.ids[k] for k in rows], [self.kinds[k] for k in rows], [self.means[k] for k in rows],
             [self.covariances[k] for k in rows], [self.observations[k] for k in rows], self.in_space, self.exact,
+            self.log_odds, self.unseen,
         )  # fmt: skip
 
     def positions(self) -> tuple[Array, Array]:
@@ -273,7 +279,8 @@ class MapLandmarks:
     def to_csv(self) -> str:
         """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations.
 
-        If there are any known exactly, `known` is "exactly" in their rows.
+        If there are any known exactly, `known` is "exactly" in their rows; if any were looked at again, there are the
+        `log_odds` that they exist, and `mark` is "not seen again" of those that were not where they should be.
         """
         axes = [
             _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
@@ -286,14 +293,18 @@ class MapLandmarks:
         pairs = [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        known = ["known"] if self.exact else []
-        writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations", *known])
+        more = ["known"] * bool(self.exact) + ["log_odds", "mark"] * bool(self.log_odds)
+        writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations", *more])
         for i, names in enumerate(axes):
             at, row = ({name: j for j, name in enumerate(of)} for of in (names, _errors(names)))
             mean = [repr(float(self.means[i][at[name]])) if name in at else "" for name in columns]
             cov = [repr(float(self.covariances[i][row[a], row[b]])) if {a, b} <= row.keys() else "" for a, b in pairs]
-            known = ["exactly" if self.ids[i] in self.exact else ""] if self.exact else []
-            writer.writerow([self.ids[i], self.kinds[i], *mean, *cov, self.observations[i], *known])
+            name = self.ids[i]
+            more = ["exactly" if name in self.exact else ""] if self.exact else []
+            if self.log_odds:
+                odds = repr(float(self.log_odds[name])) if name in self.log_odds else ""
+                more += [odds, UNSEEN if name in self.unseen else ""]
+            writer.writerow([name, self.kinds[i], *mean, *cov, self.observations[i], *more])
         return out.getvalue()
 
     @classmethod
@@ -302,7 +313,7 @@ class MapLandmarks:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
             table, exact = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ())), set[Id]()
-            plane = False
+            plane, odds, unseen = False, dict[Id, float](), set[Id]()
             for number, row in enumerate(rows, start=2):
                 try:
                     names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
@@ -317,9 +328,12 @@ class MapLandmarks:
                     table.covariances.append(cov)
                     table.observations.append(int(row["observations"]))
                     exact |= {table.ids[-1]} if row.get("known") else set()
+                    odds |= {table.ids[-1]: float(row["log_odds"])} if row.get("log_odds") else {}
+                    unseen |= {table.ids[-1]} if row.get("mark") else set()
                 except (KeyError, TypeError, ValueError) as error:
                     raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
-        return replace(table, exact=frozenset(exact), in_space=table.in_space and not plane)
+        in_space = table.in_space and not plane
+        return replace(table, in_space=in_space, exact=frozenset(exact), log_odds=odds, unseen=frozenset(unseen))
 
 
 def refuse_other_than_points(slam: Slam, what: str, *, walls: bool = False) -> None:

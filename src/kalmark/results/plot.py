@@ -175,6 +175,9 @@ def strokes(scene: Scene) -> list[Stroke]:
         + _landmark_strokes(scene, crowded)
         + _robot_strokes(scene)
     )
+    if len(scene.unseen):
+        cross = _marks("x", ALARM_COLOUR, 3 if crowded else 6, 7) | {"markeredgewidth": 0.8}
+        out.append(Stroke(scene.unseen, cross, "landmarks not seen again", cross | {"markersize": 6}))
     if len(scene.repeats):
         twice = {"color": ALARM_COLOUR, "linewidth": 0.9, "alpha": 0.8, "zorder": 5}
         out.append(Stroke(scene.repeats, twice, "landmarks mapped twice", twice))

@@ -198,6 +198,7 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
         "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
         "knownLandmarks": {"id": [str(i) for i in scene.known_ids], **xy(scene.known)},
+        "unseenLandmarks": xy(scene.unseen),
         "trueLines": xy(joined(scene.true_lines(), scene.d)),
         "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
         "repeats": xy(scene.repeats),

@@ -62,6 +62,7 @@ class Scene:
     up to the step, too.
     `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
     `known` (N, d) are the landmarks known exactly and `known_ids` their names.
+    `unseen` (N, d) are those that were not seen again where they should be.
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
     corners of the box to draw, the same for all steps.  Covariances are those of the shape (`kalmark.results.gauge`) or
     those in the `world`.  The truth is `aligned` by a rigid motion of the path where the frames differ, and
@@ -84,6 +85,7 @@ class Scene:
     low: Array
     high: Array
     repeats: Array
+    unseen: Array
     known: Array
     known_ids: tuple[Id, ...]
     world: bool
@@ -141,9 +143,10 @@ class Scene:
         cameras = history.cameras
         at = {str(name): now.means[k] for k, name in enumerate(ids)}
         twice = [np.array([at[row.landmark], at[row.other]]) for row in history.repeats if {*row[1:3]} <= at.keys()]
+        unseen = np.array([at[str(i)][:d] for i in last.ids if i in last.unseen and str(i) in at]).reshape(-1, d)
         return cls(
             d, paths, covariances, stretches, dotted, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
-            joined([line[:, :d] for line in twice], d), known_at, tuple(exact.ids),
+            joined([line[:, :d] for line in twice], d), unseen, known_at, tuple(exact.ids),
             world, aligned,
         )  # fmt: skip
 

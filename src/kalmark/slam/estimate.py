@@ -12,6 +12,7 @@ from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.map import AT_ONCE, Map
+from kalmark.management import existence
 from kalmark.models.protocols import Landmark, Segmented, place_of
 from kalmark.report import Expectations, LandmarkTable
 from kalmark.slam.robot import Robot
@@ -92,7 +93,7 @@ class Estimate:
 
         Those known exactly, outside the map, come last and have the covariance 0; or without them.
         """
-        tracks = self.tracks.confirmed.values()
+        state, tracks = self.state, self.tracks.confirmed.values()
         kinds, counts = [track.model.kind for track in tracks], [track.observations for track in tracks]
         means, covs = self._each([track.slot for track in tracks])
         names, known = [track.id for track in tracks], self.tracks.known
@@ -103,7 +104,9 @@ class Estimate:
             means.append(known.mean(name))
             covs.append(np.zeros((space.dof, space.dof)))
             counts.append(known.observations(name))
-        return LandmarkTable(names, kinds, means, covs, counts)
+        upkeep = next((state.policies[key].upkeep for key in self.tracks.looks), state.settings.upkeep)
+        odds = existence.of_map(self.tracks, upkeep)
+        return LandmarkTable(names, kinds, means, covs, counts, odds, existence.unseen(odds, upkeep))
 
     def _each(self, slots: list[int]) -> tuple[list[Array], list[Array]]:
         """Return the mean and the covariance of each of some blocks."""

@@ -74,13 +74,10 @@ def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
     for name in state.surveys.wrong() if state.surveys.misfits and not state.sums else ():  # else it may be the robot
         state.remove(name)
         report.removed += ((name, surveyed.ELSEWHERE),)
-    for judgement in existence.judged(scan, policy.upkeep) if policy.upkeep.p_detect is not None else ():
-        track = state.tracks.confirmed[judgement.name]
-        track.log_odds, track.missed = judgement.log_odds, judgement.missed
-        if judgement.gone:
+    if existence.concerns(scan, policy.upkeep):
+        for track in existence.gone(state.tracks, policy.upkeep, existence.look(scan, policy.upkeep)):
             state.remove(track.id)
-            why = f"should be in view and was not seen, {judgement.missed} scans in a row"
-            report.removed += ((track.id, why),)
+            report.removed += ((track.id, f"should be in view and was not seen, {round(track.missed)} scans in a row"),)
     if ids is None or None in ids:
         merging.merge_seen(state, scan, policy)
         if policy.upkeep.repeats != "off" and of_map.is_due(state.tracks):

@@ -50,14 +50,24 @@ from kalmark.slam.robot import Mount, Robot, mount_name
 from kalmark.slam.state import Settings, State
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.clones import Clone, Clones, Measurement
+from kalmark.tracks.looks import Looks
 from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 13
+VERSION = 14
 DESCRIPTION, SUMS = "slam.json", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
-OF_TRACKS = ("recent", "last_scan", "changes", "searched", "unnamed", "experience")  # beside the tracks
+OF_TRACKS = (
+    "recent",
+    "last_scan",
+    "changes",
+    "searched",
+    "unnamed",
+    "experience",
+    "looked",
+    "detection",
+)  # beside the tracks
 PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
 MODELS = ("association", "estimator", "landmarks", "upkeep")  # among the settings
@@ -127,6 +137,7 @@ def _state(state: State) -> Description:
         ],
         "reserved": sorted(map(_id, tracks.reserved)),
         **{name: getattr(tracks, name) for name in OF_TRACKS},
+        "looks": [[*key, *looks.saved()] for key, looks in tracks.looks.items()],
         "given": [[*key, given.saved()] for key, given in state.given.items()],
         "alternatives": [
             [name, other.since_ns, other.misses, other.map.state()] for name, other in state.alternatives.items()
@@ -275,7 +286,9 @@ class Saved:
         for name in OF_TRACKS:
             setattr(tracks, name, s[name])
         tracks.experience = float(s["experience"][0]), float(s["experience"][1])
-        for name in ("changes", "searched", "unnamed"):
+        tracks.detection = float(s["detection"][0]), float(s["detection"][1])
+        tracks.looks = {(str(r), str(sensor)): Looks.restored(*saved) for r, sensor, *saved in s["looks"]}
+        for name in ("changes", "searched", "unnamed", "looked"):
             setattr(tracks, name, _count(s[name], name))
         for number, c in s["clones"]:
             users = {(str(robot), str(sensor)) for robot, sensor in c["users"]}
@@ -440,7 +453,7 @@ def _track(record: Description, own: Sequence[Landmark]) -> Track:
         "measurements": [_measurement(m) for m in record["measurements"]],
     }
     track = Track(**(record | changed))
-    for what in ("searched", "found", "hits", "chances", "missed"):
+    for what in ("searched", "found", "hits", "chances", "seen"):
         _count(getattr(track, what), f"{what} of {name!r}")
     return track
 

@@ -155,6 +155,9 @@ class Channel:
         self.starts_landmarks = full and any_depth
         placed = all(has_place(model.landmark.space) for model in self.models.values())
         self.gives_places = full and self.finds_depth and placed
+        self.has_limits, self.fov_rad = isinstance(sensor, protocols.Visible), protocols.field_of_view(sensor)
+        segmented = (kind for kind, model in self.models.items() if isinstance(model.landmark, protocols.Segmented))
+        self.points = self.kinds - {*segmented}  # kinds of landmarks that are no lines
         self.is_ambiguous = isinstance(sensor, protocols.Ambiguous)
         self.check = sensor.check if isinstance(sensor, protocols.Checked) else None
         self.start_noise = sensor.start_noise if isinstance(sensor, protocols.StartNoise) else None

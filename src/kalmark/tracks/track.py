@@ -16,6 +16,7 @@ from kalmark.models.protocols import Landmark, Segmented
 from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.known import KnownLandmarks
+from kalmark.tracks.looks import Looks
 
 Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan
 ChannelKey = tuple[str, str]  # robot, sensor
@@ -63,11 +64,11 @@ class Track:
 
     `slot` is its block, -1 while it has none.  `observations` counts those that were used.  `searched` and `found`
     count the scans in which it was expected and observed; `hits` of `chances` are these of a tentative one, `unseen`
-    the scans since it was last observed.  `log_odds` of its existence (None: never judged), `missed` scans in a row
-    without it where it should be in view.  `covisible` landmarks were observed in one scan with it.  `compared` says
-    after how many observations, and after how many changes of the map, it was last compared with others.  `extent`
-    (2,) are the abscissas of the segment observed of a line, `size_m` is the measured size of a tag.  `first` is the
-    observation that started it, and
+    the scans since it was last observed.  `seen` are the looks (`looks.py`) that saw it again, `absent` those before
+    the last of them that should have and did not, `missed` those since.  `covisible` landmarks were observed in one
+    scan with it.  `compared` says after how many observations, and after how many changes of the map, it was last
+    compared with others.  `extent` (2,) are the abscissas of the segment observed of a line, `size_m` is the measured
+    size of a tag.  `first` is the observation that started it, and
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
     A tentative one may be where sightings `of` a landmark have it that do not fit that: then `log_odds` are those that
     it is right, and `covisible` are those of the first `searched` landmarks that fitted meanwhile.
@@ -84,7 +85,9 @@ class Track:
     chances: int = 1
     unseen: int = -1
     log_odds: float | None = None
-    missed: int = 0
+    seen: int = 0
+    absent: float = 0.0
+    missed: float = 0.0
     covisible: set[Id] = field(default_factory=set)
     compared: tuple[int, int] = (0, -1)
     extent: Array | None = None
@@ -108,7 +111,8 @@ class Tracks:
     `searched` those until the map was last searched for repeats.  `candidates` are pending
     measurements without a landmark, by channel.  `reserved` are ids of the log or of a survey that look like invented
     names: u1, u2, ...  `experience` counts observations without ids that were of landmarks of the map, and were not.
-    `known` are the landmarks that are known exactly, outside the map.
+    `known` are the landmarks that are known exactly, outside the map.  `looks` of each sensor and `looked`, how many,
+    decide whether landmarks exist, with the Beta density `detection` of their detection probabilities.
     """
 
     def __init__(self, robots: Iterable[str]) -> None:
@@ -127,6 +131,8 @@ class Tracks:
         self.reserved: set[Id] = set()
         self.experience = (0.0, 0.0)
         self.known = KnownLandmarks()
+        self.looks: dict[ChannelKey, Looks] = {}
+        self.looked, self.detection = 0, (0.5, 0.5)
         self._sort_at: Index = np.full(64, -1)  # by slot: the number of a landmark's kind in `_numbers`, -1 for none
         self._numbers: dict[str, int] = {}
         self._wanted: dict[frozenset[str], Flags] = {}
@@ -186,6 +192,8 @@ class Tracks:
     def merge(self, kept: Track, gone: Track) -> None:
         """Let one track have what is known of another, which is to be removed: they are one landmark."""
         kept.observations += gone.observations
+        kept.seen, kept.absent = kept.seen + gone.seen, kept.absent + gone.absent
+        kept.missed = min(kept.missed, gone.missed)
         for name in list(gone.covisible):
             if name in self.confirmed:
                 self.confirmed[name].covisible.add(kept.id)

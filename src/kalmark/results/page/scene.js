@@ -97,6 +97,8 @@ function still() {
   if (l.x.length)
     traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],
                       {name: `true landmarks${DATA.how}`, hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
+  if (DATA.unseenLandmarks.x.length)
+    traces.push(marks(boxed(DATA.unseenLandmarks), thin("x", ALARM), [6, 3], {...skip, name: "landmarks not seen again"}));
   const known = DATA.knownLandmarks;
   if (known.x.length)
     traces.push(marks({...boxed(known), text: known.id}, {symbol: SPACE ? "diamond-open" : "triangle-up-open", color: KNOWN}, [9, 4],

@@ -1,0 +1,106 @@
+"""Looks of a sensor at the landmarks about it, and its detection probability over the field of view, counted in them.
+
+A look is a scan that is told from the last one by where the sensor is: scans in a row miss a landmark for the same
+reason.  What is seen of what is expected depends on the range, the bearing and on what stands nearer; each is counted
+by itself, so that a chance where little is seen (beyond the reach of a detector, behind a tree) counts for little.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+
+from kalmark.arrays import Array, Flags, Index
+from kalmark.errors import MapError
+
+MOVED, TURNED_RAD, STANDING = 0.1, 0.2, 20  # of the range; a turn; scans of a sensor that stands: another look
+PER_OCTAVE, NEAREST_LOG2, RANGES, BEARINGS = 4, 8, 80, 24  # of ranges, from 2^-8 m on; sectors of bearings
+AGAIN = 8  # looks until what a miss counts is found anew
+CELLS = RANGES + BEARINGS + 2  # the last two: nothing stands nearer, something does
+PARTS = (slice(0, RANGES), slice(RANGES, RANGES + BEARINGS), slice(RANGES + BEARINGS, CELLS))
+MOST = 0.98  # of a detection probability
+
+
+@dataclass
+class Looks:
+    """The last look of a sensor, and what was seen of what was expected in all of them.
+
+    `pose` (3,) or (7,) is that of the sensor at the last look, `scale_m` how far it saw, `since` the scans since then
+    and `changes` the landmarks that had come or gone; so many looks were `taken`.  `counts` (2, CELLS) are the
+    landmarks seen and expected, by range, by bearing, and by whether something stands nearer, `table` (CELLS,) what a
+    miss counts there.
+    """
+
+    pose: Array | None = None
+    scale_m: float = 1.0
+    since: int = 0
+    changes: int = -1
+    taken: int = 0
+    counts: Array = field(default_factory=lambda: np.zeros((2, CELLS)))
+    table: Array = field(default_factory=lambda: np.ones(CELLS))
+
+    def is_due(self, pose: Array, changes: int) -> bool:
+        """Return whether a scan from this pose is another look; a landmark that came or went makes it one."""
+        self.since += 1
+        if self.pose is None or changes != self.changes or self.since >= STANDING:
+            return True
+        d = 2 if len(pose) == 3 else 3
+        if math.dist(pose[:d].tolist(), self.pose[:d].tolist()) > MOVED * self.scale_m:
+            return True
+        if d == 2:
+            return abs(math.remainder(float(pose[2] - self.pose[2]), 2 * math.pi)) > TURNED_RAD
+        return 2 * math.acos(min(1.0, abs(float(pose[3:] @ self.pose[3:])))) > TURNED_RAD
+
+    def take(self, pose: Array, changes: int, scale_m: float) -> None:
+        """Take note of a look."""
+        self.pose, self.changes, self.since, self.scale_m = pose.copy(), changes, 0, scale_m
+        self.taken += 1
+
+    def weights(self, cells: Index) -> Array:
+        """Return what a miss counts (K,) in these cells (K, 3), 1 where most is seen.
+
+        It is log(1 - p) / log(1 - q), p the detection probability there and q that of what is seen.
+        """
+        if self.taken % AGAIN == 0:
+            self.table = np.concatenate([self._weights(part) for part in PARTS])
+        w: Array = self.table[cells].prod(axis=1)
+        return w
+
+    def _weights(self, part: slice) -> Array:
+        seen, expected = self.counts[:, part]
+        p = (seen + 0.5) / (expected + 1.0)
+        if not seen.any():
+            return np.ones(len(p))
+        q = min(float(seen @ p / seen.sum()), MOST)
+        return np.asarray(np.log1p(-np.minimum(p, q)) / math.log1p(-q))
+
+    def count(self, cells: Index, seen: Flags) -> None:
+        """Count what was seen (K,) of what was expected in these cells (K, 3)."""
+        np.add.at(self.counts[1], cells.ravel(), 1.0)
+        np.add.at(self.counts[0], cells[seen].ravel(), 1.0)
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the numbers for a file."""
+        return self.pose, self.scale_m, self.since, self.changes, self.taken, self.counts, self.table
+
+    @classmethod
+    def restored(cls, pose: Any, scale_m: float, since: int, changes: int, taken: int, *tables: Any) -> Self:
+        """Return what `saved` gave.  Raises MapError."""
+        at = None if pose is None else np.array(pose, dtype=np.float64)
+        counts, table = (np.array(each, dtype=np.float64) for each in tables)
+        if counts.shape != (2, CELLS) or table.shape != (CELLS,) or not (counts >= 0).all() or not (table >= 0).all():
+            raise MapError(f"the counts of looks are arrays {counts.shape} and {table.shape}, expected {(2, CELLS)}")
+        return cls(at, float(scale_m), int(since), int(changes), int(taken), counts, table)
+
+
+def cells_of(r: Array, bearing: Array, hidden: Flags) -> Index:
+    """Return the cells (K, 3) of landmarks at ranges r and bearings (K,), with something that stands nearer or not."""
+    cells = np.empty((len(r), 3), np.int64)
+    octave = PER_OCTAVE * (np.log2(np.maximum(r, 2.0**-NEAREST_LOG2)) + NEAREST_LOG2)
+    cells[:, 0] = np.minimum(octave, RANGES - 1)
+    cells[:, 1] = RANGES + (bearing / (2 * math.pi) + 0.5) * BEARINGS % BEARINGS
+    cells[:, 2] = RANGES + BEARINGS + hidden
+    return cells
