@@ -44,26 +44,21 @@ class Gated:
     def associate(self, query: Query) -> list[Decision]:
         """Answer with the ids where there are, with the pairs of `match` elsewhere."""
         if self.alone and (sure := query.nearest(self.nearest, self.farther, chi2_gate(self.gate, query.dof()))):
-            query.learn(float(len(sure)), 0.0)
             return [(name, "") for name in sure]
         answers: list[Decision] = [(i, "") if i is not None else (NEW, "no landmark near") for i in query.ids]
         open_ = np.array([k for k, i in enumerate(query.ids) if i is None], dtype=np.int64)
         gate, far = chi2_gate(self.gate, query.dof()), chi2_gate(self.new_gate, query.dof())
         names, d2 = self.near(query, open_, gate) if len(open_) else ([], np.zeros((0, 0)))
         if not names:
-            query.learn(0.0, float(len(open_)))
             return answers
-        pairs, reasons, mixed, known = self.match(query, open_, names, d2, gate)
+        pairs, reasons, mixed = self.match(query, open_, names, d2, gate)
         mixture = None if mixed is None else Mixture(open_, names, mixed)
-        told, strange = 0, 0  # of landmarks of the map, and beyond all of them
         for row, (k, pair) in enumerate(zip(open_.tolist(), pairs.tolist(), strict=True)):
             if pair >= 0:
                 answers[k] = (names[pair], reasons.get(row, ""))
-                told += 1
                 continue
             nearest = int(d2[row].argmin())
             d = float(d2[row, nearest])
-            strange += d > far
             if pair == Answer.MIXTURE.value and mixture is not None:
                 answers[k] = (mixture, reasons[row])
             elif pair < Answer.NONE.value:
@@ -73,11 +68,6 @@ class Gated:
                 answers[k] = (None, reasons.get(row, why))
             elif d <= far:
                 answers[k] = (None, f"between {names[nearest]!r} and a new landmark: d2 {d:.1f}")
-        if known is None:
-            query.learn(float(told), float(strange))
-        else:
-            certain = known[~np.isnan(known)]
-            query.learn(float(certain.sum()), float((1.0 - certain).sum()))
         return answers
 
     def near(self, query: Query, open_: Index, gate: float, nearest: int = 0) -> tuple[list[Id], Array]:

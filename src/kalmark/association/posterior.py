@@ -2,8 +2,9 @@
 
 A matching of c pairs has the likelihood N(v; 0, Z) of its joint innovation, linearised where the scan itself would be,
 times the density of what is not in the map for each observation that it leaves without a pair: that of the landmarks
-near it.  What share of a scan is in the map has a prior Beta(1/2 + a, 1/2 + b): Jeffreys', rather all or nothing of it,
-and the `experience` of a observations that lately were and b that were not.
+near it (`geometry/density.py`).  What shares of a scan are of landmarks just seen, of others of the map, and of none
+have a prior Dirichlet(1/2 + a, 1/2, 1/2): Jeffreys', rather all or nothing, and the `experience` of a observations that
+lately were of landmarks just seen.  These say nothing about a return to older ones.
 """
 
 from __future__ import annotations
@@ -18,8 +19,6 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.association.matchings import matchings
 from kalmark.association.query import Candidates
 from kalmark.geometry.gaussian import gate as chi2_gate
-
-Experience = tuple[float, float]
 
 WELL_KNOWN = math.log(16.0)  # |Z| / |R| up to which the robot knows where a landmark is
 SLACK = 1  # pairs that a matching may have less than the largest
@@ -47,6 +46,10 @@ class Posterior(NamedTuple):
     def none(self) -> Array:
         """Return how likely each observation is of no landmark (K,)."""
         return self.weights @ (self.pairs < 0)
+
+    def again(self, just: Flags) -> float:
+        """Return how many observations are expected to be of landmarks `just` (K, L) seen."""
+        return float(self.weights @ [_again(one, just).sum() for one in self.pairs])
 
     def why(self, row: int, names: Sequence[object]) -> str:
         """Return what an observation may be, for a reason."""
@@ -81,52 +84,59 @@ def agreeing(
 
 
 def posterior(
-    together: Candidates, open_: Index, d2: Array, near: Flags, p: int, gate: float, most: int, experience: Experience
-) -> Posterior:
+    together: Candidates, open_: Index, d2: Array, near: Flags, just: Flags, p: int, gate: float, most: int,
+    experience: float,
+) -> Posterior:  # fmt: skip
     """Return what is known of the matchings of the observations `open_` with the landmarks.
 
-    d2 (K, L) are the squared distances of all pairs, `near` those that may be; `gate` is the probability with which a
-    right matching is let through.  At most so many trials are made.
+    d2 (K, L) are the squared distances of all pairs, `near` those that may be, `just` those of landmarks just seen;
+    `gate` is the probability with which a right matching is let through.  At most so many trials are made.
     """
     found, finished = agreeing(together, open_, d2, near, gate, most)
     pairs = np.vstack([found, np.full((1, len(d2)), -1)])
-    density = _log_density(together, open_, d2, near, p)
-    scores = np.array([_score(together, open_, one, density, p, gate, experience) for one in pairs])
+    density = together.log_density(open_)
+
+    def likelihood(one: Index) -> float:
+        return _log_likelihood(together, open_, one, density, p, gate)
+
+    def share(one: Index) -> float:
+        again, pairs = int(_again(one, just).sum()), int((one >= 0).sum())
+        return sum(math.lgamma(n + 0.5) for n in (again + experience, pairs - again, len(one) - pairs))
+
+    scores = np.array([likelihood(one) + share(one) for one in pairs])
     best = int(np.argmax(scores))
     without = np.tile(pairs[best], (len(d2), 1))  # each of its pairs may be one by chance
     np.fill_diagonal(without, -1)
     without = without[pairs[best] >= 0]
-    scores = np.concatenate([scores, [_score(together, open_, one, density, p, gate, experience) for one in without]])
+    scores = np.concatenate([scores, [likelihood(one) + share(one) for one in without]])
     pairs = np.concatenate([pairs, without])
     likely = np.argsort(-scores, kind="stable")
     weights = np.exp(scores[likely] - scores[likely[0]])
     first = pairs[likely[0]]
     count = int((first >= 0).sum())
-    ratio = scores[likely[0]] - _log_share(count, len(d2), experience)  # of likelihoods: has the mean 1 by chance
-    chance = math.comb(len(d2), count) * math.exp(-ratio) if count else math.inf
+    again = _again(first, just)
+    others = count - int(again.sum())
+    ratio = likelihood(first) - (likelihood(np.where(again, first, -1)) if others else 0.0)  # has the mean 1 by chance
+    chance = math.comb(len(d2) - count + (others or count), others or count) * math.exp(-ratio) if count else math.inf
     alike = ((found == first) & (found >= 0)).sum(axis=1)
     elsewhere = int(((alike < p) & ((found >= 0).sum(axis=1) >= count - 1)).sum())
     return Posterior(pairs[likely], weights / weights.sum(), chance, elsewhere, finished)
 
 
-def _score(
-    together: Candidates, open_: Index, pairs: Index, density: Array, p: int, gate: float, experience: Experience
-) -> float:
-    """Return the logarithm of how likely a matching (K,) is, up to a constant."""
+def _again(pairs: Index, just: Flags) -> Flags:
+    """Return which observations a matching (K,) pairs with landmarks just seen, `just` (K, L)."""
+    return np.asarray((pairs >= 0) & just[np.arange(len(pairs)), pairs])
+
+
+def _log_likelihood(together: Candidates, open_: Index, pairs: Index, density: Array, p: int, gate: float) -> float:
+    """Return the logarithm of how likely the observations are by a matching (K,), over that of no pair at all."""
     rows = np.flatnonzero(pairs >= 0)
     if not len(rows):
-        return _log_share(0, len(pairs), experience)
+        return 0.0
     d2, log_det = together.fit(open_[rows], pairs[rows])
     if not d2 <= chi2_gate(gate, p * len(rows)):
         return -np.inf
-    known = _log_share(len(rows), len(pairs), experience)
-    return float(known - 0.5 * (d2 + log_det + len(rows) * p * np.log(2 * np.pi)) - density[rows].sum())
-
-
-def _log_share(count: int, of: int, experience: Experience) -> float:
-    """Return the logarithm of how likely it is that just these `count` of all are in the map, up to a constant."""
-    a, b = experience
-    return math.lgamma(count + a + 0.5) + math.lgamma(of - count + b + 0.5)
+    return float(-0.5 * (d2 + log_det + len(rows) * p * np.log(2 * np.pi)) - density[rows].sum())
 
 
 def added(together: Candidates, open_: Index, pairs: Index, row: int, columns: Index) -> float:
@@ -137,17 +147,3 @@ def added(together: Candidates, open_: Index, pairs: Index, row: int, columns: I
     free = columns[~np.isin(columns, pairs)]
     d2 = [together.fit(open_[rows], np.append(pairs[rows[:-1]], column))[0] for column in free.tolist()]
     return min(d2, default=np.inf) - before
-
-
-def _log_density(together: Candidates, open_: Index, d2: Array, near: Flags, p: int) -> Array:
-    """Return the logarithm of the density of landmarks about each observation, in its units."""
-    from scipy.special import gammaln
-
-    log_ball = 0.5 * p * np.log(np.pi) - gammaln(0.5 * p + 1)
-    density = np.zeros(len(d2))
-    for row in np.flatnonzero(near.any(axis=1)).tolist():
-        _, log_det = together.fit(open_[row : row + 1], np.argmin(d2[row], keepdims=True))
-        known = d2[row][np.isfinite(d2[row])]
-        reach = max(known.max(), chi2_gate(0.99, p))
-        density[row] = np.log(len(known)) - log_ball - 0.5 * p * np.log(reach) - 0.5 * log_det
-    return density

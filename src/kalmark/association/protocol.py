@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from kalmark.arrays import Array, Index
+from kalmark.arrays import Index
 from kalmark.association.posterior import Posterior
 from kalmark.association.query import Query
 from kalmark.events import Id
@@ -49,14 +49,12 @@ Decision = tuple[Id | Answer | Mixture | None, str]
 class Matched(NamedTuple):
     """The number of the landmark paired with each observation (K,), or the value of an `Answer`; some with reasons.
 
-    `mixed` are the matchings to average over, `known` (K,) the probability that each observation is of a landmark of
-    the map, nan where it is unknown; None: only the pairs are known.
+    `mixed` are the matchings to average over.
     """
 
     pairs: Index
     reasons: dict[int, str]
     mixed: Posterior | None = None
-    known: Array | None = None
 
 
 @runtime_checkable

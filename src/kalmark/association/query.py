@@ -15,6 +15,7 @@ from kalmark.filter.layout import P_AT
 from kalmark.filter.local import beside
 from kalmark.filter.map import Marginal, Pairs
 from kalmark.filter.observed import add_blocks, observed_block
+from kalmark.geometry.density import NEIGHBOURS, log_density, log_volume_change
 from kalmark.models.observe import linearize
 from kalmark.report import Compared
 from kalmark.tracks.channel import ObservationModel
@@ -32,12 +33,12 @@ def log_volume_ratio(Z: Array, R: Array) -> Array:
 class Query:
     """One scan before it is fused: what an association may ask about it.
 
-    `learned` are the numbers of observations without ids that are likely of landmarks of the map, and that are not.
+    `learned` is the number of observations without ids that are likely of landmarks just seen.
     """
 
     def __init__(self, scan: ScanContext) -> None:
         self.scan, self.ids, self.y = scan, scan.ids, scan.y
-        self.learned = 0.0, 0.0
+        self.learned = 0.0
         self._pairs: Pairs | None = None  # near each other when candidates were asked for,
         self._names: list[Id] = []  # and the landmarks of these
         self._known = scan.tracks.known  # exactly, and outside the map
@@ -46,13 +47,13 @@ class Query:
         """Return the size p of one innovation."""
         return self.scan.channel.dof
 
-    def experience(self) -> tuple[float, float]:
-        """Return how many of the last observations without ids were of landmarks of the map, and how many were not."""
+    def experience(self) -> float:
+        """Return how many of the last observations without ids were of landmarks just seen."""
         return self.scan.tracks.experience
 
-    def learn(self, known: float, unknown: float) -> None:
-        """Say how many observations without ids are likely of landmarks of the map, and how many are not."""
-        self.learned = known, unknown
+    def learn(self, again: float) -> None:
+        """Say how many observations without ids are likely of landmarks just seen."""
+        self.learned = float(again)
 
     def key(self) -> tuple[int, ...]:
         """Return numbers, at least 0, that differ from those of all other scans."""
@@ -235,3 +236,14 @@ class Candidates:
         R = self._scan.noise_of(self._model, m.means(here[columns], self._model.d), rows)
         Z, _ = self._model.predict(m, robot, mount, here[columns], self._scan.y[rows], R)
         return log_volume_ratio(Z, R)
+
+    def log_density(self, rows: Index) -> Array:
+        """Return the logarithm of the density of landmarks where observations (M,) seem to be, in their units.
+
+        That of the landmarks nearest to there, but for the one that an observation may be of.
+        """
+        scan, channel, n = self._scan, self._scan.channel, self._scan.dimensions
+        v, V, l, _ = self.places()
+        p = channel.landmark.from_view(scan.pose(), channel.calibrated(scan.map).invert(scan.y[rows])[0])[0]
+        gaps = np.sort(np.linalg.norm(p[:, None, :n] - l, axis=2), axis=1)[:, 1 : NEIGHBOURS + 1]
+        return log_density(gaps, np.linalg.norm(v[rows], axis=1), n) + log_volume_change(V[rows], scan.R[rows])

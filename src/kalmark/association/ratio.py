@@ -22,16 +22,16 @@ from kalmark.association.protocol import DEFERRED, Decision
 from kalmark.association.query import Query
 from kalmark.events import Id
 from kalmark.filter.map import Map
+from kalmark.geometry.density import NEIGHBOURS, log_density, log_volume_change
 from kalmark.tracks.track import Tracks
 
-NEIGHBOURS = 4  # by whose distance the density of landmarks is estimated
-LEAST_M = 0.1  # they are not taken to stand closer than this
 LOOSE = math.log(10.0)  # above it the place of a pair is so small against the landmarks' spacing that it needs no other
 
 
-def density(map_: Map, tracks: Tracks, names: Sequence[Id], sensor: Array) -> float:
-    """Return how many landmarks there are per m^2 or m^3 about some of them; `sensor` is a pose, (3,) or (7,).
+def log_density_about(map_: Map, tracks: Tracks, names: Sequence[Id], sensor: Array) -> float:
+    """Return the logarithm of how many landmarks there are per m^2 or m^3 about some of them.
 
+    `sensor` is a pose, (3,) or (7,).
     Only covisible landmarks count: they are certainly others.  One that was always alone has all the space to itself
     from which it was observed.
     """
@@ -39,16 +39,14 @@ def density(map_: Map, tracks: Tracks, names: Sequence[Id], sensor: Array) -> fl
     for name in names:
         if name in tracks.known:
             of = tracks.known.of_kind[str(tracks.known.kind(name))]
-            gaps = of.gaps(tracks.known.mean(name)[:d], NEIGHBOURS)
-            reach = gaps[-1] if len(gaps) else np.linalg.norm(tracks.known.mean(name)[:d] - sensor[:d])
-            found.append(max(len(gaps), 1) / max(float(reach), LEAST_M) ** d)
-            continue
-        others = [n for n in tracks.confirmed[name].covisible if n != name and n in tracks.confirmed]
-        p = map_.means(tracks.slots_of([name, *others]), d)
-        gaps = np.sort(np.linalg.norm(p[1:] - p[0], axis=1))[:NEIGHBOURS]
-        reach = gaps[-1] if len(gaps) else np.linalg.norm(p[0] - sensor[:d])
-        found.append(max(len(gaps), 1) / max(float(reach), LEAST_M) ** d)
-    return float(np.median(found)) / (math.pi if d == 2 else 4 / 3 * math.pi)
+            at = tracks.known.mean(name)[:d]
+            gaps = of.gaps(at, NEIGHBOURS)
+        else:
+            others = [n for n in tracks.confirmed[name].covisible if n != name and n in tracks.confirmed]
+            at, *p = map_.means(tracks.slots_of([name, *others]), d)
+            gaps = np.sort([np.linalg.norm(other - at) for other in p])
+        found.append(log_density(gaps[None], float(np.linalg.norm(at - sensor[:d])), d)[0])
+    return float(np.median(found))
 
 
 class LogRatios(NamedTuple):
@@ -111,14 +109,13 @@ def accepted(query: Query, decisions: list[Decision], odds: float) -> list[Decis
     mine = [k for k, there in enumerate(mapped) if ids[k] is None and there]
     if not mine or not scan.channel.gives_places:
         return decisions
-    V_y = scan.channel.sensor.invert(scan.y)[1]
-    if V_y.shape[1] != V_y.shape[2]:
-        return decisions
     sure = [k for k, there in enumerate(mapped) if ids[k] is not None and there]
     rows = np.array([*sure, *mine])
     names: list[Any] = [decisions[k][0] for k in rows]
     z, Z = query.jointly(rows, names)
-    chance = math.log(density(scan.map, tracks, names, scan.pose())) + np.linalg.slogdet(V_y[rows])[1]
+    V_y = scan.channel.sensor.invert(scan.y[rows])[1][:, : scan.dimensions]
+    change = log_volume_change(V_y @ scan.R[rows] @ V_y.swapaxes(1, 2), scan.R[rows])
+    chance = log_density_about(scan.map, tracks, names, scan.pose()) + change
     found = log_ratios(z, Z, chance, len(sure))
     out, at = list(decisions), dict(zip(found.order, found.ratio.tolist(), strict=True))
     for i in doubtful(found, len(sure), odds):

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.association.gated import Gated, GlobalAssignment, JointCompatibility, assigned
+from kalmark.association.gated import Gated, JointCompatibility, assigned
 from kalmark.association.posterior import WELL_KNOWN, Posterior, added, agreeing, expected_in_gate, posterior
 from kalmark.association.protocol import Answer, Matched
 from kalmark.association.query import Query
@@ -18,7 +18,6 @@ from kalmark.geometry.gaussian import gate as chi2_gate
 
 NEW, DEFERRED, MIXTURE, REMAP = (each.value for each in (Answer.NEW, Answer.DEFERRED, Answer.MIXTURE, Answer.REMAP))
 
-CLEAR = 0.05  # landmarks in a gate by chance, up to which each observation can be told by itself
 NONE = 0.99  # how likely an observation must be of nothing in the map to be of something new
 BY_CHANCE = 1e-3  # matchings as good to be expected by chance where there is more than one landmark in a gate
 WIDEST = 256  # candidates for an observation
@@ -59,15 +58,16 @@ class Weighing(Gated):
         rows, columns = np.nonzero(np.isfinite(d2))
         just = np.zeros(d2.shape, dtype=np.bool_)
         just[rows, columns] = together.log_volume_ratio(open_[rows], columns) <= WELL_KNOWN
-        crowded, fit = expected_in_gate(np.where(just, np.inf, d2), gate, query.dof()).max(), d2 <= gate
-        lost = query.scan.adrift or crowded > 1
-        if not lost and crowded <= CLEAR and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
-            return GlobalAssignment.match(self, query, open_, names, d2, gate)  # type: ignore[arg-type]
-        far = chi2_gate(self.new_gate, query.dof())
+        fit, far = d2 <= gate, chi2_gate(self.new_gate, query.dof())
+        lost = query.scan.adrift or expected_in_gate(np.where(just, np.inf, d2), gate, query.dof()).max() > 1
+        if not lost and not fit[~just].any() and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
+            query.learn(fit.sum())
+            return Matched(np.where(fit.any(axis=1), fit.argmax(axis=1), -1), {})
         near: Flags = np.isfinite(d2) if lost else fit  # far off, the distances themselves are not to be trusted
-        found = posterior(together, open_, d2, near, query.dof(), self.gate, self.most_nodes, query.experience())
+        search = self.gate, self.most_nodes, query.experience()
+        found = posterior(together, open_, d2, near, just, query.dof(), *search)
         told = np.asarray(near.any(axis=1))
-        pairs, reasons, mixed, _ = self.choose(query, names, found, told, lost)
+        pairs, reasons, mixed = self.choose(query, names, found, told, lost)
         none = np.where(told, found.none() if found.finished else np.nan, np.where(d2.min(axis=1) > far, 1.0, np.nan))
         if lost and (pairs == REMAP).all():  # it has not recognised anything
             return self.remapped(np.where(just, d2, np.inf), gate, far, reasons)
@@ -76,13 +76,14 @@ class Weighing(Gated):
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
             if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
                 pairs[row], reasons[row] = NEW, "no landmark fits there, from where the others are seen"
-        return Matched(pairs, reasons, mixed, 1.0 - none)
+        query.learn(found.again(just) if found.finished else 0.0)
+        return Matched(pairs, reasons, mixed)
 
     def remapped(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:
         """Pair what a lost robot sees with what it has just seen, at these d2 (K, L); the rest is strange to it."""
         pairs = assigned(d2, gate)
         pairs = np.where(pairs >= 0, pairs, np.where(d2.min(axis=1) > far, REMAP, DEFERRED))
-        return Matched(pairs, reasons, None, np.full(len(d2), np.nan))
+        return Matched(pairs, reasons)
 
     def choose(self, query: Query, names: list[Id], found: Posterior, near: Flags, lost: bool) -> Matched:
         """Choose from the matchings; `near` (K,) marks the observations with a candidate inside the gate."""

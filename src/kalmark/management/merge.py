@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Index
-from kalmark.association.ratio import density, log_ratios
+from kalmark.association.ratio import log_density_about, log_ratios
 from kalmark.events import Id
 from kalmark.filter import kernels
 from kalmark.filter.layout import P_AT, P_SIZE
@@ -120,7 +120,7 @@ def proposal(map_: Map, tracks: Tracks, name: Id, robot: int, sensor: Array, odd
     look, tried = _Reading(map_, tracks, robot, d), []
     for pairs in _hypotheses(look, name):
         z, Z = look.differences(pairs)
-        chance = math.log(density(map_, tracks, [name], sensor))
+        chance = log_density_about(map_, tracks, [name], sensor)
         found = log_ratios(z, Z, np.full(len(pairs), chance))
         best = int(np.argmax(np.cumsum(found.ratio))) + 1
         d2 = 2.0 * float((found.bound - found.ratio)[:best].sum())

@@ -55,7 +55,7 @@ from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
 
 Description = dict[str, Any]
 
-VERSION = 14
+VERSION = 15
 DESCRIPTION, SUMS = "slam.json", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
 OF_TRACKS = (
@@ -285,7 +285,7 @@ class Saved:
         tracks.reserve(s["reserved"])
         for name in OF_TRACKS:
             setattr(tracks, name, s[name])
-        tracks.experience = float(s["experience"][0]), float(s["experience"][1])
+        tracks.experience = float(s["experience"])
         tracks.detection = float(s["detection"][0]), float(s["detection"][1])
         tracks.looks = {(str(r), str(sensor)): Looks.restored(*saved) for r, sensor, *saved in s["looks"]}
         for name in ("changes", "searched", "unnamed", "looked"):

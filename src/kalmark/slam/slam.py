@@ -319,7 +319,7 @@ class Slam(Estimate):
         else:
             query = Query(scan)
             decisions = self._decided(policy, query, located.decisions)
-        state.tracks.learn(*query.learned)
+        state.tracks.learn(query.learned)
         names = [name for name, _ in decisions]
         groups = state.tracks.by_model(scan.channel, names, scan.event.robot)
         exact = correct_by_known(state, scan, policy, decisions) if state.tracks.known else []

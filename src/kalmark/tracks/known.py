@@ -13,6 +13,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.events import Id
 from kalmark.filter.neighbours import has_place
+from kalmark.geometry.density import NEIGHBOURS, log_density
 from kalmark.models.protocols import Landmark, Segmented, place_of
 
 if TYPE_CHECKING:
@@ -101,8 +102,9 @@ class Known:
     def density(self) -> float:
         """Return how many landmarks of the plane there are per m^2 about one of them: the median."""
         if self._density is None:
-            gaps = self.tree().query(self.places(), k=min(5, len(self.names)))[0][:, -1]
-            self._density = float(np.median(min(4, len(self.names) - 1) / (np.pi * np.maximum(gaps, 0.1) ** 2)))
+            gaps = self.tree().query(self.places(), k=min(NEIGHBOURS + 1, len(self.names)))[0]
+            others = gaps.reshape(len(self.names), -1)[:, 1:]
+            self._density = float(np.exp(np.median(log_density(others, np.inf, 2))))
         return self._density
 
     def gaps(self, p: Array, count: int) -> Array:

@@ -110,7 +110,7 @@ class Tracks:
     `last_scan` those of the last scan; `changes` counts landmarks that have come or gone,
     `searched` those until the map was last searched for repeats.  `candidates` are pending
     measurements without a landmark, by channel.  `reserved` are ids of the log or of a survey that look like invented
-    names: u1, u2, ...  `experience` counts observations without ids that were of landmarks of the map, and were not.
+    names: u1, u2, ...  `experience` counts observations without ids that were of landmarks just seen.
     `known` are the landmarks that are known exactly, outside the map.  `looks` of each sensor and `looked`, how many,
     decide whether landmarks exist, with the Beta density `detection` of their detection probabilities.
     """
@@ -129,7 +129,7 @@ class Tracks:
         self.changes = self.searched = 0
         self.unnamed = 0
         self.reserved: set[Id] = set()
-        self.experience = (0.0, 0.0)
+        self.experience = 0.0
         self.known = KnownLandmarks()
         self.looks: dict[ChannelKey, Looks] = {}
         self.looked, self.detection = 0, (0.5, 0.5)
@@ -213,10 +213,10 @@ class Tracks:
             self.recent = [name for name in self.recent if name not in names][-RECENT:] + names
             self.last_scan = names
 
-    def learn(self, known: float, unknown: float) -> None:
-        """Remember how much of a scan was in the map, the less so the longer ago."""
-        if known + unknown > 0:
-            self.experience = FORGETTING * self.experience[0] + known, FORGETTING * self.experience[1] + unknown
+    def learn(self, again: float) -> None:
+        """Remember how many observations of a scan were of landmarks just seen, the less the longer ago."""
+        if again > 0:
+            self.experience = FORGETTING * self.experience + again
 
     def waiting(self) -> Iterator[Pending]:
         """Return all that is pending: of landmarks with ids, and candidates."""
