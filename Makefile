@@ -20,6 +20,7 @@ lint: $(VENV)/test.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python benchmarks/structure.py --check
 
 bench: $(VENV)/bench.stamp
 	$(BIN)/python benchmarks/step.py

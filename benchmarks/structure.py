@@ -1,18 +1,25 @@
-"""Count the structure of the sources: import cycles, functions that take the whole Slam, lines, documented shapes.
+"""Counts of the structure of the sources, and their ratchet: no count of docs/architecture.md may rise.
 
-    python benchmarks/structure.py [--missing] [--scan]
+    python benchmarks/structure.py [--missing | --check | --write]
 
-`--missing` lists the public functions whose docstring states no shape, `--scan` runs one scan with and one without ids
-and counts the files that its calls enter.  The rule for shapes: a public function or method that takes or returns an
-array (by its annotations; mappings of named arrays excepted) has a docstring with a shape, such as (K, 3) or (n,).
+Without an option the counts are printed, with the files and the calls of functions, compiled ones included, that a
+control and a scan of a robot that moves enter.  `--check` compares them with the table of docs/architecture.md and
+exits with 1 if one is above its limit, or so far below that the limit has to follow; `--write` lowers the limits.  A
+limit is raised by hand, with its reason in the same line.  `--missing` lists the public functions whose docstring
+states no shape: one that takes or returns an array (by its annotations; mappings of named arrays excepted) has a
+docstring with a shape, such as (K, 3) or (n,).
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import math
+import os
 import re
+import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -21,6 +28,11 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parent.parent
 SOURCES = ROOT / "src" / "kalmark"
+LIMITS = ROOT / "docs" / "architecture.md"
+ROW = re.compile(r"^\| (?P<name>[^|]+?) \| (?P<limit>\d+) \|(?P<why>[^|]*)\|$", re.MULTILINE)
+SLACK = 0.002  # of a limit, by which a count may be below it
+QUESTIONS = ("what", "which", "how", "where", "why", "when", "whether")
+MANY_BRANCHES, MANY_ARGUMENTS, OFTEN = 15, 7, 3
 ARRAY = re.compile(r"\b(NDArray|ndarray)\b")
 NAMED = ("dict[", "Mapping[")
 SIZE = r"(?:[^(),]|\([^()]*\))"
@@ -42,7 +54,7 @@ def modules() -> dict[str, Path]:
 
 
 def imports(names: dict[str, Path]) -> dict[str, set[str]]:
-    """Return the modules that each module imports, for types and inside functions included."""
+    """Return the modules that each module imports: for types, inside functions and by `import_module` included."""
     found = {}
     for name, file in names.items():
         package = name.split(".") if file.stem == "__init__" else name.split(".")[:-1]
@@ -50,6 +62,8 @@ def imports(names: dict[str, Path]) -> dict[str, set[str]]:
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Import):
                 found[name] |= {alias.name for alias in node.names}
+            if isinstance(node, ast.Call) and called(node) == "import_module":
+                found[name] |= {str(a.value) for a in node.args if isinstance(a, ast.Constant)}
             if isinstance(node, ast.ImportFrom):
                 base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
                 base = ".".join(part for part in (base, node.module) if part)
@@ -108,67 +122,152 @@ def of_arrays() -> list[Public]:
     return found
 
 
-def taking_slam() -> list[str]:
-    """Return the functions outside slam/slam.py that take the whole Slam, in the packages below the logs."""
-    below = ("association", "filter", "management", "models", "slam", "tracks")
-    found = []
-    for name, file in modules().items():
-        if name.split(".")[1:2] and name.split(".")[1] in below and name != "kalmark.slam.slam":
-            for node in ast.walk(ast.parse(file.read_text())):
-                if isinstance(node, Function) and any(a.arg == "slam" for a in node.args.args):
-                    found.append(f"{name}.{node.name}")
+def called(node: ast.Call) -> str:
+    """Return the name of the function that is called, without what it is an attribute of."""
+    return str(getattr(node.func, "id", getattr(node.func, "attr", "")))
+
+
+def branches(node: ast.AST) -> int:
+    """Return the branch points below a node: also conditional expressions, `and`, `or`, comprehensions, handlers."""
+    number = 0
+    for x in ast.walk(node):
+        number += isinstance(x, ast.If | ast.IfExp | ast.For | ast.While | ast.ExceptHandler | ast.Assert)
+        number += isinstance(x, ast.match_case)
+        if isinstance(x, ast.BoolOp):
+            number += len(x.values) - 1
+        if isinstance(x, ast.comprehension):
+            number += 1 + len(x.ifs)
+    return number
+
+
+def of_function(node: Function) -> Iterator[str]:
+    """Yield the names of the counts that a function belongs to."""
+    args, points = node.args, branches(node)
+    own = bool(args.args) and args.args[0].arg in ("self", "cls")
+    if len(args.posonlyargs) + len(args.args) + len(args.kwonlyargs) - own >= MANY_ARGUMENTS:
+        yield f"functions of {MANY_ARGUMENTS} arguments or more"
+    if any(a.arg in ("slam", "state") for a in args.args):
+        yield "functions that take the slam or its state whole"
+    if points > MANY_BRANCHES:
+        yield f"functions over {MANY_BRANCHES} branch points"
+    yield "functions"
+    yield from ["branch points"] * points
+
+
+def of_node(node: ast.AST) -> Iterator[str]:
+    """Yield the names of the counts that a node of a syntax tree belongs to."""
+    yield "syntax nodes"
+    if isinstance(node, Function):
+        yield from of_function(node)
+    elif isinstance(node, ast.ClassDef):
+        yield "classes"
+        if any("Protocol" in ast.unparse(base) for base in node.bases):
+            yield "protocols"
+    elif isinstance(node, ast.Call):
+        if called(node) in ("isinstance", "hasattr", "getattr"):
+            yield "calls of isinstance, hasattr, getattr"
+        if called(node) == "import_module":
+            yield "imports hidden from the contract"
+
+
+def of_module(tree: ast.Module) -> Iterator[str]:
+    """Yield the names of the counts that a module belongs to, once for each of its named numbers and texts."""
+    if (ast.get_docstring(tree) or "").lower().startswith(QUESTIONS):
+        yield "modules that begin with a question word"
+    for x in tree.body:
+        targets = x.targets if isinstance(x, ast.Assign) else [x.target] if isinstance(x, ast.AnnAssign) else []
+        if isinstance(getattr(x, "value", None), ast.Constant | ast.UnaryOp | ast.BinOp):
+            yield from ["named numbers and texts" for y in targets if isinstance(y, ast.Name) and y.id.isupper()]
+
+
+def counts() -> dict[str, int]:
+    """Return the counts by their names."""
+    files = [file for file in modules().values()]
+    trees = [ast.parse(file.read_text()) for file in files]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    public = [node.name for node in nodes if isinstance(node, Function) and not node.name.startswith("_")]
+    stems = Counter(file.stem for file in files if file.stem != "__init__")
+    found = Counter(name for node in nodes for name in of_node(node))
+    found.update(name for tree in trees for name in of_module(tree))
+    found["file names used more than once"] = sum(n for n in stems.values() if n > 1)
+    found[f"public names of {OFTEN} functions or more"] = sum(n >= OFTEN for n in Counter(public).values())
+    found["modules in the largest import cycle"] = largest_cycle(imports(modules()))
+    found["public functions of arrays without shapes"] = sum(not one.documented for one in of_arrays())
     return found
 
 
-def files_to_touch() -> dict[str, int]:
-    """Return how many files CONTRIBUTING.md names for each kind of addition: alternatives count once."""
-    rows = [line.split("|") for line in (ROOT / "CONTRIBUTING.md").read_text().splitlines() if line.startswith("| a")]
-    return {cells[1].strip(): cells[2].count(";") + 1 for cells in rows}
-
-
-def files_of_a_scan(with_ids: bool) -> set[str]:
-    """Return the files that the calls of one scan enter, after a few scans of the same landmarks."""
+def of_a_scan() -> None:
+    """Print the files and calls that a control and a scan of a robot that moves enter, after a few of its scans."""
     import kalmark as km
-
-    files = set[str]()
 
     def enter(frame: FrameType, event: str, _: Any) -> None:
         if event == "call" and frame.f_code.co_filename.startswith(str(SOURCES)):
-            files.add(str(Path(frame.f_code.co_filename).relative_to(SOURCES)))
+            entered.append(frame.f_code.co_filename)
 
-    rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
-    slam = km.Slam([rover], None if with_ids else km.association.NearestNeighbour())
-    for t_s in range(1, 7):
-        scan = km.Scan(t_s, "rover", "lidar", y=[[4.2, 0.3], [5.0, -0.6]], ids=[7, 8] if with_ids else None)
-        slam.process(km.Control(t_s, "rover", u=(0.0, 0.0)))
-        sys.setprofile(enter if t_s == 6 else None)
-        slam.process(scan)
-        sys.setprofile(None)
-    return files
+    for kind, ids in (("known", [7, 8]), ("unknown", None)):
+        rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+        slam, entered = km.Slam([rover], km.association.NearestNeighbour() if ids is None else None), list[str]()
+        for t_s in range(1, 7):
+            x = 0.1 * t_s
+            y = [[math.hypot(4 - x, 1), math.atan2(1, 4 - x)], [math.hypot(4 - x, 3), math.atan2(-3, 4 - x)]]
+            sys.setprofile(enter if t_s == 6 else None)
+            slam.process(km.Control(t_s, "rover", u=(0.1, 0.0)))
+            slam.process(km.Scan(t_s, "rover", "lidar", y=y, ids=ids))
+            sys.setprofile(None)
+        print(f"files that a control and a scan of {kind} ids enter\t{len({*entered})}")
+        print(f"calls of a control and a scan of {kind} ids\t{len(entered)}")
 
 
-def main() -> None:
-    """Print the counts."""
+def traced() -> dict[str, int]:
+    """Return the counts of `of_a_scan`, made where nothing is compiled, so that compiled functions are entered too."""
+    command = [sys.executable, __file__, "--scan"]
+    done = subprocess.run(command, env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, stdout=subprocess.PIPE, check=True)
+    rows = (line.split("\t") for line in done.stdout.decode().splitlines())
+    return {name: int(number) for name, number in rows}
+
+
+def against_limits(found: dict[str, int]) -> list[str]:
+    """Return a line for each count that is not within its limit, above or too far below."""
+    limits, wrong = {row["name"]: int(row["limit"]) for row in ROW.finditer(LIMITS.read_text())}, []
+    for name, number in found.items():
+        if name not in limits or number > limits[name]:
+            wrong.append(f"{name}: {number}, at most {limits.get(name)}: remove some, or raise it with the reason")
+        elif number < limits[name] * (1 - SLACK) - 1:
+            wrong.append(f"{name}: {number}, at most {limits[name]}: lower the limit by --write")
+    return wrong
+
+
+def lowered(text: str, found: dict[str, int]) -> str:
+    """Return the text of docs/architecture.md with the limits that are above their counts lowered to these."""
+
+    def row(old: re.Match[str]) -> str:
+        name, limit = old["name"], int(old["limit"])
+        return f"| {name} | {min(limit, found.get(name, limit))} |{old['why']}|"
+
+    return ROW.sub(row, text)
+
+
+def main() -> int:
+    """Print the counts, or hold them against their limits."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--missing", action="store_true")
-    parser.add_argument("--scan", action="store_true")
-    given, public = parser.parse_args(), of_arrays()
-    if given.missing:
-        print(*(one.place for one in public if not one.documented), sep="\n")
-        return
+    for option in ("--missing", "--check", "--write", "--scan"):
+        parser.add_argument(option, action="store_true", help=argparse.SUPPRESS if option == "--scan" else None)
+    given = parser.parse_args()
     if given.scan:
-        for name, with_ids in (("known ids", True), ("unknown ids", False)):
-            print(f"files of one scan, {name}: {len(files_of_a_scan(with_ids))}")
-        return
-    names = modules()
-    documented = sum(one.documented for one in public)
-    print(f"lines {sum(len(file.read_text().splitlines()) for file in names.values())}, modules {len(names)}")
-    print(f"modules in the largest import cycle: {largest_cycle(imports(names))}")
-    print(f"functions that take the whole Slam: {len(taking_slam())}")
-    for kind, count in files_to_touch().items():
-        print(f"files to touch, {kind}: {count}")
-    print(f"public functions with shapes: {documented} of {len(public)}, {documented / len(public):.1%}")
+        of_a_scan()
+        return 0
+    if given.missing:
+        print(*(one.place for one in of_arrays() if not one.documented), sep="\n")
+        return 0
+    found = counts() | traced()
+    if given.write:
+        LIMITS.write_text(lowered(LIMITS.read_text(), found))
+    if given.check:
+        print(*(wrong := against_limits(found)), sep="\n")
+        return 1 if wrong else 0
+    print(*(f"{name}: {number}" for name, number in found.items()), sep="\n")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
