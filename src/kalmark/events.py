@@ -1,4 +1,4 @@
-"""What happens to a robot: `Control`, `Scan`, `Frame` and `Fix`, the only things that enter the filter.
+"""The events of a robot: `Control`, `Scan`, `Frame` and `Fix`, the only input of the filter.
 
 Logs, the simulator and a live robot all speak these four.  Time is int64 nanoseconds inside, seconds at the edge.
 """

@@ -1,4 +1,4 @@
-"""What `Slam.process` answers: what became of each observation and why."""
+"""The report of `Slam.process`: the outcome of each observation and its reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which landmark was that?  By the identity the log gives, or by what fits: each for itself, together, or jointly.
+"""Data association: the landmark of each observation, by the log's ids, by nearest neighbours, together, or jointly.
 
 What an association may ask and answer is in `protocol`; a user's own one needs no more than `Association` says.
 """

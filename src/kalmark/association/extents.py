@@ -1,4 +1,4 @@
-"""Which observations cannot be of a wall, though on its line: what is seen does not join what is known of it.
+"""Extents of walls: observations on the line of a wall whose ends do not meet the part of it that is known.
 
 Two walls of a corridor with a door between them are on one line, which their measurements fit alike.
 """

@@ -1,4 +1,4 @@
-"""Where a robot starts in a known map, by one scan: nothing is known of its pose beforehand.  [T] exercise 1, [F].
+"""The start of a robot in a known map by one scan, without a prior of its pose.  [T] exercise 1, [F].
 
 Two observed places and two landmarks as far from each other determine a pose.  Each such pose is tested with all of the
 scan: how many places are at landmarks (RANSAC of Fischler and Bolles 1981, but every pair is tried).  The best one is

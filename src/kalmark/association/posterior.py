@@ -1,4 +1,4 @@
-"""How likely each matching of a scan with landmarks is: what an association chooses from, draws from or averages over.
+"""The posterior of the matchings of a scan with landmarks: an association takes the best, draws, or averages over it.
 
 A matching of c pairs has the likelihood N(v; 0, Z) of its joint innovation, linearised where the scan itself would be,
 times the density of what is not in the map for each observation that it leaves without a pair: that of the landmarks

@@ -1,4 +1,4 @@
-"""What an association may ask about a scan and what it may answer.
+"""The protocol of an association: its questions about a scan and its answers.
 
 It answers for each observation with a landmark's id, `NEW`, `REMAP`, `DEFERRED`, a `Mixture` of landmarks, or None
 (leave it alone), and why.

@@ -1,4 +1,4 @@
-"""What an association may ask about a scan, answered from the map and the tracks."""
+"""The questions of an association about a scan, answered from the map and the tracks."""
 
 from __future__ import annotations
 

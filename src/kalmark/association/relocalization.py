@@ -1,4 +1,4 @@
-"""Where a robot is whose heading is unknown: by the landmarks that agree with a scan, whatever the pose was.
+"""The pose of a robot of unknown heading, by the landmarks that agree with a scan, whatever the pose was.
 
 A correction linearises at the predicted pose, and from one that is turned by more than a right angle its iteration ends
 anywhere.  Observed places v and landmarks l in pairs determine the pose in closed form, l = T v: Umeyama 1991.

@@ -1,4 +1,4 @@
-"""What reads run folders: `kalmark evaluate`, `report`, `view`, `compare` and `explain`."""
+"""Commands on run folders: `kalmark evaluate`, `report`, `view`, `compare` and `explain`."""
 
 from __future__ import annotations
 

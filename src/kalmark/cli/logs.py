@@ -1,4 +1,4 @@
-"""What makes logs, `kalmark simulate` and `data`, and files to start from, `kalmark config` and `worlds`."""
+"""Commands that make logs, `kalmark simulate` and `data`, and first files, `kalmark config` and `worlds`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What several verbs share: arguments and options, and figures as tables on standard output."""
+"""Arguments and options of several commands, and tables of figures on standard output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a configuration names: of a motion Kalibr's `imu.yaml` or a preset; of a camera its `calibration`."""
+"""Files that a configuration names: of a motion Kalibr's `imu.yaml` or a preset; of a camera its `calibration`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every laser detector shares: the raw scan it takes, the detections it gives, and how it serves a mount."""
+"""The parts common to laser detectors: the raw scan, the detections, and the service of a mount."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Whether a run can be trusted, and if not, why: found without truth, in what the batch solution leaves of its data."""
+"""The verdict on a run, without truth: by the residuals of its batch solution."""

@@ -1,4 +1,4 @@
-"""What may be wrong with a log or its configuration: systematic errors, noise, landmarks, steps and observations.
+"""Possible faults of a log or its configuration: systematic errors, noise, landmarks, steps and observations.
 
 Each kind of cause answers with findings.  `gain` is the logarithm of the likelihood ratio against a run without the
 cause, the common measure of all; `p` is the probability of such a finding, or a larger one, where nothing is wrong.

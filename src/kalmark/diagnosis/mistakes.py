@@ -1,4 +1,4 @@
-"""What may have been done wrongly with a log or its configuration: units, signs, columns, mounts, times.
+"""Mistakes in a log or its configuration: units, signs, columns, mounts, times.
 
 Each mistake has the log and the configuration without it, so that the filter can be asked whether they fit.
 """

@@ -1,4 +1,4 @@
-"""Why the readings of a sensor of the state do not fit: its noise, its mount, its constants, the signs of its columns.
+"""Causes of misfits of a sensor of the state: its noise, its mount, its constants, the signs of its columns.
 
 The log is filtered again with each of them changed, and the likelihoods of all innovations are compared.  A mount or a
 constant is put into the map with a sigma as large as the innovations: the filter says what it is.

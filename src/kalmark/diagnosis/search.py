@@ -1,4 +1,4 @@
-"""Which causes explain a run: one after the other, the likeliest first, each taken out of the data before the next."""
+"""The search for the causes of a run: the likeliest first, each taken out of the data before the next."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the map of a run can be trusted, to what accuracy, and if not, why: without any truth."""
+"""The verdict on the map of a run: its status, its accuracy and the causes of misfit, without any truth."""
 
 from __future__ import annotations
 

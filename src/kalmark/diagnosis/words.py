@@ -1,4 +1,4 @@
-"""What a cause is in words, with its figure, and the line of a configuration that takes it out."""
+"""The text of a cause, with its figure, and the line of a configuration that takes it out."""
 
 from __future__ import annotations
 

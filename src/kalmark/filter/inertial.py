@@ -1,4 +1,4 @@
-"""What the invariant filter does besides for an inertial unit: errors of its own turn with its heading.
+"""The errors of an inertial unit that turn with its heading, in the invariant filter.
 
 A correction of the heading by psi is a motion of the world, x = S(psi) x_hat.  Biases, and what they did to tilt and
 velocity, are the unit's own: R = S(psi) Exp(tau) R_hat, and tau = M R_hat d_b of a bias in the body, whatever psi is.

@@ -1,4 +1,4 @@
-"""Where the blocks of a map are: their slots, their means, and the rows they have in a covariance."""
+"""The blocks of a map: their slots, their means, and their rows in a covariance."""
 
 from __future__ import annotations
 

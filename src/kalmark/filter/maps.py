@@ -1,4 +1,4 @@
-"""Which map: dense, compressed, or dense as long as it is small."""
+"""The choice of a map: dense, compressed, or dense as long as it is small."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which landmarks a scan without ids is of, where each observation can only be of one: in one compiled call."""
+"""The landmarks of a scan without ids where each observation can be of one landmark only, in one compiled call."""
 
 from __future__ import annotations
 

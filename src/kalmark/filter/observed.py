@@ -1,4 +1,4 @@
-"""What a scan observes: a block of a few rows of the map, how its measurements depend on it, and what is expected.
+"""The part of a map that a scan observes: a few rows, the Jacobian of the measurements by them, the expectation.
 
 The head of the observed block is the observing robot's pose and, if it is in the map, the sensor's mount; the first
 numbers of K landmarks follow.  An observation is of the head and of one landmark: of its rows of a Jacobian H, all else

@@ -1,4 +1,4 @@
-"""What turns in a correction of the invariant filter, and with which rotation.  docs/invariant.md.
+"""The blocks that a correction of the invariant filter turns, and their rotation.  docs/invariant.md.
 
 The map turns with the sensor that observes it: the gauge.  What leans on a lever arm, or on the heading of another
 inertial unit, turns with that.  With the rotation errors of the observing robot and of other units r, and an arm a,

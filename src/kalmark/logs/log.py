@@ -1,4 +1,4 @@
-"""What a log is: events in time order and, where the source has it, the truth to score against."""
+"""A log: events in time order and, where the source has it, the truth to score against."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every importer shares: the door it is called through, the log it gives back, exact times and rows of text."""
+"""The parts common to importers: the call, the log, exact times and rows of text."""
 
 from __future__ import annotations
 

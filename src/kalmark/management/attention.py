@@ -1,4 +1,4 @@
-"""What of a scan is used: which landmarks are corrected, where new ones start, which are given up.
+"""The part of a scan that is used: landmarks to correct, observations to start new ones, landmarks to give up.
 
 Measurement selection: Davison 2005; [TB] 4.4.
 """

@@ -1,4 +1,4 @@
-"""When more is known of a landmark: a Euclidean point, a longer segment.  [TB] 4.4; Civera et al. 2008."""
+"""Reparametrisation of a landmark that is better known: a Euclidean point, a longer segment.  [TB] 4.4; Civera 2008."""
 
 from __future__ import annotations
 

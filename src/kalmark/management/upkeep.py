@@ -1,4 +1,4 @@
-"""How a map keeps itself clean: when a sighting becomes a landmark, when a landmark goes, when two are one."""
+"""Upkeep of a map: when an observation becomes a landmark, when a landmark is removed, when two are one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the motions share: exact arcs in the plane with their noise, and the bases of all models of a motion."""
+"""Formulas of several motions: exact arcs in the plane with their noise, and the bases of all models of a motion."""
 
 from __future__ import annotations
 

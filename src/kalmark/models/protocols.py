@@ -1,4 +1,4 @@
-"""What a motion, a sensor and a landmark must offer, and what they may offer besides.
+"""The protocols of a motion, a sensor and a landmark, and their optional capabilities.
 
 N + M, not N x M: a sensor knows a point in its own frame only.  Models are batched: K landmarks at once, values (K, d),
 Jacobians (K, m, d).  `pointwise` lifts one-point functions.

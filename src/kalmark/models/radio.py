@@ -1,4 +1,4 @@
-"""What radio receivers and microphones measure of a landmark that sends: its strength, its difference of arrival.
+"""Sensors of radio and sound: the strength of a landmark that sends, the difference of its times of arrival.
 
 Neither finds where a landmark is at once: they correct landmarks that other sensors have started, or a survey.
 Strengths from several places do, in the plane: `management/trilateration.py`.

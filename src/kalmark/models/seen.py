@@ -1,4 +1,4 @@
-"""What a landmark looks like from a pose and what a sensor makes of that view, each called by its address.
+"""The view of a landmark from a pose and the measurement of that view, each called by its address.
 
 ======================================  ===========================================  ==================
 landmark                                view v (K, d)                                sensors

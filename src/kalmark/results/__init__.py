@@ -1,1 +1,1 @@
-"""What to make of the reports of a run: records, figures, pictures, pages."""
+"""Results of a run from its reports: records, figures, pictures, pages."""

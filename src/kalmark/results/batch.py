@@ -1,4 +1,4 @@
-"""How far a filter is from the maximum likelihood of the same data: the entry `batch` of ``summary.json``.
+"""The distance of a filter from the maximum likelihood of the same data: the entry `batch` of ``summary.json``.
 
 The strongest check of a filter on data without truth.  A consistent filter ends with the same map as the batch solution
 to a fraction of its sigma, and with the same sigma; one that is not claims to know better than the optimum can.

@@ -1,4 +1,4 @@
-"""What a run found out about mounts that calibrate themselves, and in which directions it found nothing.
+"""The self-calibration of mounts in a run: values, sigmas, and directions that were not observed.
 
 The posterior covariance P of a mount is compared with its prior C: the eigenvectors of C^-1/2 P C^-1/2 are directions
 in units of the prior's sigmas, the eigenvalues by how much each has become better known.  An eigenvalue near 1 belongs

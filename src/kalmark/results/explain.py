@@ -1,4 +1,4 @@
-"""Why one scan's observations became what they did: what each was compared with, by what gates, what was decided."""
+"""The explanation of a scan: candidates, gates and decisions of each of its observations."""
 
 from __future__ import annotations
 

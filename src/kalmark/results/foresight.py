@@ -1,4 +1,4 @@
-"""What a run's history keeps of landmarks that a scan should have shown: in view, not measured.  [TB] Obs.vis.
+"""Landmarks that were in view of a scan and were not measured, in the history of a run.  [TB] Obs.vis.
 
 It is asked before a scan is used, of some scans, and so many landmarks of each: what is kept is bounded, and so is the
 time that it takes, a few landmarks a scan.

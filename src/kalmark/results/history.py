@@ -1,4 +1,4 @@
-"""What a run leaves behind: one row a step, one row an observation, and the map at some sixty instants.
+"""The history of a run: one row a step, one row an observation, and the map at some sixty instants.
 
 A *step* is one scan and the controls before it; of a log without scans one fix, without fixes too one control.  Plain
 arrays, saved as ``history.npz`` without pickle; rows of few are named tuples, each field an array in the file, vectors

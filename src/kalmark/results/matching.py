@@ -1,4 +1,4 @@
-"""How often an observation was taken for another landmark's, where the log knows better than the filter was told."""
+"""The rate of wrong associations, where the log knows the landmarks and the filter did not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recording reads off the filter: its configuration as files have it, cameras, mounts, corners and noise."""
+"""The description of a filter in a recording: its configuration, cameras, mounts, corners and noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the pictures of a run show: at one step, in the frame of the map; and scan by scan, in the images of cameras.
+"""The content of the pictures of a run: at one step in the frame of the map, and scan by scan in the images of cameras.
 
 A `Scene` has paths, landmarks, truth, fixes and cameras, for robots in the plane (d = 2) and in space (d = 3) alike;
 `kalmark.results.plot` draws it for ``map.png``, `kalmark.results.report` writes it into the page.

@@ -1,4 +1,4 @@
-"""What a run is judged by: true poses at its steps, true landmarks, position fixes, and the frame they are in."""
+"""The truth that a run is scored by: poses at its steps, landmarks, position fixes, and their frame."""
 
 from __future__ import annotations
 

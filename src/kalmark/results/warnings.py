@@ -1,4 +1,4 @@
-"""What is worth a second look before a run's figures are believed, and what noise is stated too large: a line each.
+"""Warnings of a run: doubts about its figures, and noise that is stated too large, one line each.
 
 Is the map wrong from some time on?  A filter on a wrong map contradicts itself: innovations that are too large or keep
 their signs, and observations that fit nothing.  So NIS, observations left out and the whiteness of innovations are

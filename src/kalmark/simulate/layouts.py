@@ -1,4 +1,4 @@
-"""Where the landmarks of a simulated world stand: Sola's cloister ([S] App. C), a loop, a random field, a list.
+"""Layouts of landmarks of a simulated world: Sola's cloister ([S] App. C), a loop, a random field, a list.
 
 Layouts of the plane serve robots of space as well: their landmarks are at z = 0.  Those of space are the toolbox's
 thick cloister and house ([TB] `thickCloister`, `house`), a random box, a room of tags and planes with textures.

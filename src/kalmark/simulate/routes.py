@@ -1,4 +1,4 @@
-"""Where a simulated robot is told to go: a constant control, waypoints, a random walk between places, lanes."""
+"""Routes of a simulated robot: a constant control, waypoints, a random walk between places, lanes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the sensors of simulated robots see from their true poses, and what they measure of it, right or wrong.
+"""Simulated measurements from true poses, right or wrong.
 
 What is seen is judged without noise, and noise is added afterwards: a measurement may so come to lie beyond the border
 of the image, but its noise is that of the sensor everywhere.  ([TB] adds it before and cuts what falls outside.)

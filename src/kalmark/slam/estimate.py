@@ -1,4 +1,4 @@
-"""What the filter estimates, as it can be read: means, covariances, places, expectations."""
+"""The estimate of a filter: means, covariances, places, expectations."""
 
 from __future__ import annotations
 

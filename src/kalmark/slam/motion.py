@@ -1,4 +1,4 @@
-"""How a robot moves: the control it holds, cut into parts by the scans between.
+"""The motion of a robot: the control that it holds, cut into parts by the scans between.
 
 A rate acts from its time until the robot's next control, so a scan in between splits its interval.  An increment is the
 motion that ended at its time.  A robot that coasts moves without a control, which changes its velocity at its time.

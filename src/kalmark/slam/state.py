@@ -1,4 +1,4 @@
-"""What a Slam is made of and what events have made of it; how blocks and clones enter the map and leave it."""
+"""The state of a Slam: its parts and their changes by events; blocks and clones that enter the map and leave it."""
 
 from __future__ import annotations
 

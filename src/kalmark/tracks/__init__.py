@@ -1,1 +1,1 @@
-"""What the filter knows of robots, mounted sensors and landmarks beside the Gaussian."""
+"""Records of robots, mounted sensors and landmarks beside the Gaussian."""

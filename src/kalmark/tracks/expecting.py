@@ -1,4 +1,4 @@
-"""What a sensor should measure of the landmarks, asked without a scan: nothing is corrected.  [S] 2.4, [TB] Obs.
+"""Expected measurements of landmarks, without a scan: nothing is corrected.  [S] 2.4, [TB] Obs.
 
 `feasible_observations` and `find_known_feature` of the guide and `vis`, `exp` and `Jac` of the toolbox are here: which
 landmarks are in view, what is expected of them and how uncertain that is.  It is linearised as a correction is.

@@ -1,4 +1,4 @@
-"""What makes scans of images: detectors that look at each by itself, front ends that search where they expect."""
+"""The makers of scans of images: detectors of single images, front ends that search where landmarks are expected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a sensor should measure of all landmarks in view, jointly: what one measurement says of the others.
+"""The joint expectation of the measurements of all landmarks in view: mutual information of one with the others.
 
 With the Jacobians H of all expectations e and the joint covariance P of what they depend on, S = H P H' is what the
 expectations are uncertain by together, C = P H'.  A measurement y of one of them, with noise R, changes all others:

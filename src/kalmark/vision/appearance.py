@@ -1,4 +1,4 @@
-"""How a landmark looked, and how it must look from elsewhere: patches warped by the homography of their plane.
+"""The appearance of a landmark from another pose: patches warped by the homography of their plane.
 
 The landmark at p lies on a plane with normal N (`planes`).  A corner of a patch, seen along the unit ray m, is at
 X = m (N.x)/(N.m) in the frame of the camera that took it, x = p in it.  From where the camera is now the four corners

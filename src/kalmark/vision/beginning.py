@@ -1,4 +1,4 @@
-"""How the map of one moving camera begins: inverse distances of its first landmarks, from the first frames together.
+"""The first map of one moving camera: inverse distances of its landmarks, from the first frames together.
 
 While the camera has moved little, its images show products of motion and inverse distance.  Nearly the same images
 result where it moves the other way and what is near is far (Koenderink and van Doorn 1991): a filter, which takes a

@@ -1,4 +1,4 @@
-"""Where new landmarks start: the best corner of cells of the image in which there is none.  Shi and Tomasi 1994."""
+"""Starts of new landmarks in an image: the best corner of each cell in which there is none.  Shi and Tomasi 1994."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How often a landmark was searched for in images, found and fitted; and whether it is worth its place any more."""
+"""Counts of the searches for a landmark in images, found and fitted; the decision to keep it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which matches belong together: one-point RANSAC, then active search for the rest.  Civera et al. 2010; Davison 2005.
+"""Matches that agree: one-point RANSAC, then active search for the rest.  Civera et al. 2010; Davison 2005.
 
 One match of one landmark, fused into a copy of the mean, says nearly all of how the camera has turned.  Where the
 others then are found within a pixel or two, they agree with it.  What agrees with the best of a few such matches is

@@ -1,4 +1,4 @@
-"""What a configuration asks for of a bag's topics, and whether they can be that."""
+"""The topics of a bag that a configuration names, checked against their types."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which readings of inertial units and compasses are taken, and how good they may be."""
+"""The readings of inertial units and compasses in a first configuration, with their noise."""
 
 from __future__ import annotations
 

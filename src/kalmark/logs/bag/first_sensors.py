@@ -1,4 +1,4 @@
-"""What topics of observations are: their entries, and the sections of their sensors."""
+"""The topics of observations in a first configuration: their entries and the sections of their sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a robot starts: what its fixes say of it."""
+"""The start of a robot in a first configuration, by its fixes."""
 
 from __future__ import annotations
 

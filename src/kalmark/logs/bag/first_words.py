@@ -1,4 +1,4 @@
-"""What a first configuration is written in: YAML on one line, and a topic in words."""
+"""The text of a first configuration: YAML on one line, and a topic in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an inertial unit or a compass of a bag says of its robot, as readings of sensors of the state.
+"""Inertial units and compasses of a bag as readings of sensors of the state.
 
 ROS gives orientations in the axes east, north, up: a heading is 0 to the east and grows to the left (REP 103).
 """

@@ -1,4 +1,4 @@
-"""What each type of message says of a robot: one row a type in `MESSAGES`.
+"""The content of each type of message: one row a type in `MESSAGES`.
 
 A row names what can be read from the message: where the robot is (`pose`; `noisy`: with a covariance), how fast it
 moves (`twist`), its speed and steering (`drive`), a position on the globe (`globe`), what a sensor saw (`seen`), what

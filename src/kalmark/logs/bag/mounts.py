@@ -1,4 +1,4 @@
-"""Where the sensors of a bag are mounted: by frames of tf that stand still to each other."""
+"""The mounts of the sensors of a bag, by frames of tf that stand still to each other."""
 
 from __future__ import annotations
 

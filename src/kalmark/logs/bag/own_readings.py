@@ -1,4 +1,4 @@
-"""What inertial units and compasses of a bag say of their own robot: readings of its sensors, or controls."""
+"""Readings of the own robot in a bag, of inertial units and compasses: of its sensors, or controls."""
 
 from __future__ import annotations
 

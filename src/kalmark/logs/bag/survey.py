@@ -1,4 +1,4 @@
-"""What is in a bag: topics, types, rates, gaps and frames; and what a first configuration is made of."""
+"""The content of a bag: topics, types, rates, gaps and frames; the source of a first configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a topic of a bag is in a log: the types of `log.topics.TOPIC` in a configuration, each declared once.
+"""The meaning of a topic of a bag: the types of `log.topics.TOPIC` in a configuration, each declared once.
 
 `wants` names what the topic's messages must offer, an attribute of `kalmark.logs.bag.messages.Message`; `columns` are
 those of the control that comes of it.

@@ -1,4 +1,4 @@
-"""What a log of images describes: a camera that moves in space, and the search in its images."""
+"""The description of a log of images: a camera that moves in space, and the search in its images."""
 
 from __future__ import annotations
 
